@@ -1,0 +1,70 @@
+# `make run`, `make test` and `make lint` each set up .venv from nothing where it is missing or older than what it is made from.
+
+SHELL := /bin/bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DEFAULT_GOAL := help
+.PHONY: help run test test-all lint format venv rendering wheel clean
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+OUT ?= out
+# Two test processes of one thread each use two cores fully; more threads only wait for one another.
+THREADS := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
+
+help:
+	@echo "make run       meta-train a model, adapt it from ten preferences, show the result (files in $(OUT)/)"
+	@echo "make test      the default test suite"
+	@echo "make test-all  the default suite and the slow tests"
+	@echo "make lint      ruff and mypy"
+	@echo "make format    let ruff format the code"
+	@echo "make venv      only set up $(VENV)"
+	@echo "make wheel     build the distribution in dist/"
+	@echo "make clean     remove what was built, and $(VENV)"
+
+run: $(STAMP) rendering
+	$(BIN)/python -m sb3_poem.demo --out $(OUT)
+
+test: $(STAMP) rendering
+	$(THREADS) $(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
+
+test-all: $(STAMP) rendering
+	$(THREADS) $(BIN)/python -m pytest -n 2 -m "not gpu" $(PYTEST_ARGS)
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(STAMP)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+venv: $(STAMP)
+
+# torch comes first and alone, so that nothing else decides which of its builds is installed.
+$(STAMP): setup.cfg pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' \
+		|| { echo "sb3_poem needs Python 3.10 or newer; name one with make PYTHON=..." >&2; exit 1; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet -c constraints.txt torch
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+	@touch $@
+
+# MuJoCo draws off screen through EGL or OSMesa. Nothing else needs either, so their absence is no error.
+rendering:
+	@if ! ldconfig -p 2>/dev/null | grep -qE 'lib(EGL|OSMesa)\.so'; then \
+		if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null \
+			&& apt-get update -qq && apt-get install -y -qq --no-install-recommends libegl1 libgl1 >/dev/null; then \
+			echo "Installed libegl1 and libgl1 for off-screen rendering."; \
+		else \
+			echo "Videos need off-screen OpenGL, which is missing here: apt-get install libegl1 libgl1 (or libosmesa6)." >&2; \
+		fi; \
+	fi
+
+wheel: $(STAMP)
+	$(BIN)/python -m build --outdir dist .
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
