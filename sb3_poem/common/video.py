@@ -1,0 +1,88 @@
+"""Frames to a file, and two clips side by side."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+Frame = np.ndarray  # (height, width, 3) uint8
+
+
+def _even(frame: Frame) -> Frame:
+    """H.264 with 4:2:0 colour needs even sides; repeat the last row or column where one is odd."""
+    height, width = frame.shape[:2]
+    return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+
+
+def write_video(frames: Sequence[Frame], path: str | Path, fps: float = 20.0) -> Path:
+    """
+    Write frames as MP4 (H.264) or GIF, by the file's suffix. Missing folders are made.
+
+    :param frames: (height, width, 3) uint8 each, all of one size
+    :param path: a file that ends in ``.mp4`` or ``.gif``
+    :param fps: frames per second
+    :return: the path
+    :raises ValueError: no frames, frames of other shapes, or another suffix
+    """
+    import imageio.v2 as imageio
+
+    path = Path(path)
+    if path.suffix not in (".mp4", ".gif"):
+        raise ValueError(f"path must end in .mp4 or .gif, got {str(path)!r}")
+    if len(frames) == 0:
+        raise ValueError(f"no frames to write to {str(path)!r}")
+    shapes = {np.shape(frame) for frame in frames}
+    if len(shapes) > 1 or any(len(shape) != 3 or shape[2] != 3 for shape in shapes):
+        raise ValueError(f"frames must all be (height, width, 3) of one size, got {sorted(shapes)}")
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".gif":
+        imageio.mimwrite(path, [np.asarray(frame) for frame in frames], duration=1000.0 / fps, loop=0)
+    else:
+        imageio.mimwrite(path, [_even(frame) for frame in frames], fps=fps, codec="libx264", macro_block_size=2)
+    return path
+
+
+def _with_captions(clips: Sequence[Sequence[Frame]], captions: Sequence[str]) -> list[list[Frame]]:
+    """Each clip under its line of text, in the largest type that fits them all."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    width = min(clip[0].shape[1] for clip in clips)
+    size = max(10, width // 20)
+    while size > 8 and max(ImageFont.load_default(size).getlength(caption) for caption in captions) > width:
+        size -= 1
+    font = ImageFont.load_default(size)
+
+    def captioned(frame: Frame, caption: str) -> Frame:
+        image = Image.new("RGB", (frame.shape[1], frame.shape[0] + 2 * size), "white")
+        image.paste(Image.fromarray(frame), (0, 2 * size))
+        ImageDraw.Draw(image).text((frame.shape[1] / 2, size), caption, fill="black", anchor="mm", font=font)
+        return np.asarray(image)
+
+    return [[captioned(frame, caption) for frame in clip] for clip, caption in zip(clips, captions, strict=True)]
+
+
+def side_by_side(
+    left: Sequence[Frame], right: Sequence[Frame], captions: tuple[str, str] | None = None, gap: int = 4
+) -> list[Frame]:
+    """
+    Two clips beside each other; the shorter one holds its last frame.
+
+    :param left: (height, width, 3) uint8 each
+    :param right: frames of the same height
+    :param captions: a line of text over each clip
+    :param gap: white pixels between them
+    :return: as many frames as the longer clip has
+    :raises ValueError: a clip is empty, or their heights differ
+    """
+    if len(left) == 0 or len(right) == 0:
+        raise ValueError(f"both clips need frames, got {len(left)} and {len(right)}")
+    if left[0].shape[0] != right[0].shape[0]:
+        raise ValueError(f"both clips need the same height, got {left[0].shape[0]} and {right[0].shape[0]}")
+    if captions is not None:
+        left, right = _with_captions((left, right), captions)
+    bar = np.full((left[0].shape[0], gap, 3), 255, dtype=np.uint8)
+    return [
+        np.concatenate([left[min(i, len(left) - 1)], bar, right[min(i, len(right) - 1)]], axis=1)
+        for i in range(max(len(left), len(right)))
+    ]
