@@ -1,0 +1,285 @@
+"""Task families: environments that share observations and actions, and differ in a hidden parameter, the *task*.
+
+:class:`TaskFamily` is the base class of a single environment. :mod:`poem_envs.vector` builds vectorised ones on the same contract.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, SupportsInt
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+from gymnasium.error import ResetNeeded
+
+# Rounding in float32 policies and files may leave a value just outside its bounds: up to here it is clipped, beyond it is an error.
+BOUNDS_TOLERANCE = 1e-6
+
+
+class TaskDefinition:
+    """The tasks of a family and their rewards: what its single and its vectorised environment have in common.
+
+    A subclass sets the attributes below and defines :meth:`_reward`; unless its tasks are uniform on ``task_space`` or
+    finitely many (``all_tasks``), it defines :meth:`_draw_tasks` too.
+    """
+
+    #: Where tasks live: a bounded box of shape ``(task_dim,)``.
+    task_space: spaces.Box
+    #: Every task of a finite family, ``(n, task_dim)``; None where there are infinitely many.
+    all_tasks: np.ndarray | None = None
+    #: Number of reward features, the last dimension of ``info["reward_features"]``.
+    reward_feature_dim: int
+    #: Whether tasks differ in the reward alone, so that one task's trajectories can be relabelled with another's rewards.
+    shared_dynamics: bool = True
+
+    def sample_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """Draw tasks from the family's own distribution.
+
+        :param n: how many, at least 1; of a finite family, at most all of them, which are drawn without replacement
+        :param rng: the generator to draw from; the environment's own one is left alone
+        :return: ``(n, task_dim)`` float64
+        :raises ValueError: if ``n`` is below 1 or above the number of tasks of a finite family
+        """
+        n = _checked_count(n)
+        if self.all_tasks is None:
+            return np.asarray(self._draw_tasks(n, rng), dtype=np.float64)
+        if n > len(self.all_tasks):
+            raise ValueError(
+                f"n={n} tasks were asked for, but {type(self).__name__} is a finite family of {len(self.all_tasks)}; "
+                f"ask for at most {len(self.all_tasks)}"
+            )
+        return np.asarray(rng.permutation(self.all_tasks)[:n], dtype=np.float64)
+
+    def compute_reward(self, tasks: npt.ArrayLike, features: npt.ArrayLike) -> np.ndarray:
+        """The rewards that steps with the given features earn in the given tasks.
+
+        A pure function: ``step`` returns exactly this for its own task and features, so that a trajectory logged in one
+        task can be relabelled for any other. Leading dimensions broadcast against each other.
+
+        :param tasks: ``(..., task_dim)``
+        :param features: ``(..., reward_feature_dim)``, as in ``info["reward_features"]``
+        :return: ``(...)`` float64
+        :raises ValueError: if a last dimension is not the expected one
+        """
+        tasks = np.asarray(tasks, dtype=np.float64)
+        features = np.asarray(features, dtype=np.float64)
+        task_dim = self.task_space.shape[0]
+        if tasks.shape[-1:] != (task_dim,):
+            raise ValueError(f"tasks has shape {tasks.shape}, but its last dimension must be task_dim={task_dim}")
+        if features.shape[-1:] != (self.reward_feature_dim,):
+            raise ValueError(
+                f"features has shape {features.shape}, but its last dimension must be "
+                f"reward_feature_dim={self.reward_feature_dim}"
+            )
+        return self._reward(tasks, features)
+
+    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
+        """The reward function. Only elementwise operations, so that one step and a batch give the same bits."""
+        raise NotImplementedError
+
+    def _draw_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """Draw from the distribution of an infinite family: uniform on ``task_space`` unless overridden."""
+        return rng.uniform(self.task_space.low, self.task_space.high, size=(n, *self.task_space.shape))
+
+    def _describe_episode(self, copy: int) -> str:
+        """Where a copy's episode is, for error messages. Defined by the environment classes."""
+        raise NotImplementedError
+
+    def _checked_tasks(self, tasks: npt.ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:
+        """Return ``tasks`` as a fresh float64 array, or raise a ValueError that says what is wrong with them."""
+        try:
+            array = np.array(tasks, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{name}={tasks!r} is not an array of numbers of shape {shape}") from error
+        if array.shape != shape:
+            raise ValueError(f"{name}={tasks!r} has shape {array.shape}, expected {shape}")
+        low, high = self.task_space.low, self.task_space.high
+        clipped = np.clip(array, low, high)
+        if not np.all(np.abs(array - clipped) <= BOUNDS_TOLERANCE):  # also true of NaN
+            raise ValueError(f"{name}={tasks!r} must be finite and inside {self.task_space} (from {low} to {high})")
+        if self.all_tasks is None:
+            return clipped
+        distance = np.abs(clipped[..., None, :] - self.all_tasks).max(axis=-1)
+        if not np.all(distance.min(axis=-1) <= BOUNDS_TOLERANCE):
+            raise ValueError(f"{name}={tasks!r} is not among this family's tasks, which are {self.all_tasks.tolist()}")
+        return self.all_tasks[distance.argmin(axis=-1)]
+
+
+class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray]):
+    """Base class of a single environment whose task is hidden.
+
+    A subclass sets ``observation_space``, ``action_space``, ``task_space`` and ``reward_feature_dim`` and defines three methods::
+
+        class Walk1D(TaskFamily):
+            observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float64)
+            action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+            task_space = spaces.Box(-1.0, 1.0, (1,), np.float64)
+            reward_feature_dim = 1
+
+            def _begin_episode(self, rng):                  # -> observation
+                self.x = rng.normal(0.0, 0.1, size=1)
+                return self.x.copy()
+
+            def _simulate(self, action):                    # -> observation, reward features, terminated
+                self.x = self.x + 0.1 * action
+                return self.x.copy(), self.x.copy(), False
+
+            def _reward(self, tasks, features):             # elementwise, broadcasting
+                return -np.abs(features[..., 0] - tasks[..., 0])
+
+    The base class checks actions and tasks, draws and keeps the task, computes the reward from the features and fills in the info.
+
+    **The task.** :meth:`set_task` chooses it, from the next reset on. As long as none was chosen, ``reset(seed=...)`` draws one from the
+    family's distribution, from a stream of its own that the seed determines; a reset without a seed keeps it.
+    Neither choice touches the random numbers of the episode itself, so two tasks see the same start.
+
+    **The info** of every step holds ``"reward_features"``, ``(reward_feature_dim,)`` float64: everything that rewards of this
+    family depend on (see :meth:`~TaskDefinition.compute_reward`).
+
+    :param render_mode: one of ``metadata["render_modes"]``, or None
+    :param render_task: whether rendering shows the hidden task, for a developer who debugs
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (Gymnasium declares it so)
+    render_task: bool = False
+
+    # Class attributes, so that a subclass need not call super().__init__.
+    _task: np.ndarray | None = None
+    _next_task: np.ndarray | None = None
+    _elapsed_steps: int = 0
+    _episode: int = 0
+    _reset_options: ClassVar[frozenset[str]] = frozenset({"task"})
+
+    def __init__(self, *, render_mode: str | None = None, render_task: bool = False) -> None:
+        check_render_mode(render_mode, self.metadata)
+        self.render_mode = render_mode
+        self.render_task = render_task
+
+    @property
+    def task(self) -> np.ndarray | None:
+        """The task in effect, ``(task_dim,)``; None before the first reset."""
+        return None if self._task is None else self._task.copy()
+
+    def set_task(self, task: npt.ArrayLike) -> None:
+        """Choose the task of the episodes that begin from the next reset on.
+
+        :param task: ``(task_dim,)``, inside ``task_space``
+        :raises ValueError: if it has another shape, is not finite, lies outside ``task_space`` or is not a member of a finite family
+        """
+        self._next_task = self._checked_tasks(task, self.task_space.shape, "task")
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin an episode.
+
+        :param seed: makes this and the following episodes reproducible
+        :param options: ``{"task": task}`` is short for :meth:`set_task` just before
+        :return: the observation and an empty info
+        """
+        options = check_options(options, self._reset_options)
+        if "task" in options:
+            self.set_task(options["task"])
+        super().reset(seed=seed)
+        self._episode = 1 if seed is not None else self._episode + 1
+        self._elapsed_steps = 0
+        if self._next_task is not None:
+            self._task = self._next_task
+        elif self._task is None or seed is not None:
+            self._task = self.sample_tasks(1, task_stream(self.np_random))[0]
+        observation = self._begin_episode(self.np_random)
+        if self.render_mode == "human":
+            self.render()
+        return observation, {}
+
+    def step(self, action: npt.ArrayLike) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Take one step.
+
+        :param action: inside ``action_space``; a tiny excess (1e-6) is clipped
+        :return: observation, reward, terminated, truncated (always False, time limits are a wrapper's), info
+        :raises ValueError: if the action has another shape, is not finite or lies outside ``action_space``
+        :raises gymnasium.error.ResetNeeded: before the first reset
+        """
+        if self._task is None:
+            raise ResetNeeded("step() was called before the first reset()")
+        assert isinstance(self.action_space, spaces.Box)
+        checked = checked_actions(action, self.action_space)
+        self._elapsed_steps += 1
+        observation, features, terminated = self._simulate(checked)
+        reward = float(self.compute_reward(self._task, features))
+        if self.render_mode == "human":
+            self.render()
+        return observation, reward, bool(terminated), False, {"reward_features": features}
+
+    def _begin_episode(self, rng: np.random.Generator) -> np.ndarray:
+        """Put the environment into a start state and return its observation, a new array."""
+        raise NotImplementedError
+
+    def _simulate(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+        """Apply a valid action; return new arrays of observation and reward features, and whether the episode ended early."""
+        raise NotImplementedError
+
+    def _describe_episode(self, copy: int = 0) -> str:
+        """Where an episode is, for error messages."""
+        return f"step {self._elapsed_steps} of episode {self._episode} since reset(seed={self.np_random_seed})"
+
+
+def task_stream(rng: np.random.Generator) -> np.random.Generator:
+    """A generator that ``rng``'s seed determines, without a draw from ``rng`` itself."""
+    return rng.spawn(1)[0]
+
+
+def check_render_mode(render_mode: str | None, metadata: dict[str, Any]) -> None:
+    """Raise a ValueError unless the environment can render so.
+
+    :param render_mode: what was asked for
+    :param metadata: the environment's own
+    """
+    modes = metadata["render_modes"]
+    if render_mode is not None and render_mode not in modes:
+        raise ValueError(f"render_mode={render_mode!r} is not supported, choose None or one of {modes}")
+
+
+def check_options(options: dict[str, Any] | None, known: frozenset[str]) -> dict[str, Any]:
+    """Return the options of a reset, or raise a ValueError that names an unknown one.
+
+    :param options: as the user gave them
+    :param known: the keys that mean something
+    """
+    unknown = set(options or {}) - known
+    if unknown:
+        raise ValueError(f"options={options!r} of reset holds unknown keys {sorted(unknown)}, known are {sorted(known)}")
+    return options or {}
+
+
+def checked_actions(actions: npt.ArrayLike, space: spaces.Box, num_envs: int | None = None) -> np.ndarray:
+    """Return actions as a new float64 array inside the bounds, or raise a ValueError that says what is wrong with them.
+
+    :param actions: ``space.shape``, or ``(num_envs, *space.shape)``
+    :param space: the bounds of one action
+    :param num_envs: number of environment copies; None for a single environment
+    """
+    shape = space.shape if num_envs is None else (num_envs, *space.shape)
+    try:
+        array = np.asarray(actions, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"action={actions!r} is not an array of numbers of shape {shape}") from error
+    if array.shape != shape:
+        raise ValueError(f"action={actions!r} has shape {array.shape}, expected {shape}")
+    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+    clipped = np.clip(array, low, high)
+    acceptable = np.abs(array - clipped) <= BOUNDS_TOLERANCE  # false for NaN
+    if not acceptable.all():
+        index = tuple(int(i) for i in np.argwhere(~acceptable)[0])
+        copy, component = ("", index) if num_envs is None else (f" of environment copy {index[0]}", index[1:])
+        bounds = f"[{low[component]:g}, {high[component]:g}]"
+        raise ValueError(
+            f"action{copy} is {array[index]} at component {', '.join(map(str, component))}, "
+            f"but it must be finite and inside {bounds}"
+        )
+    return clipped
+
+
+def _checked_count(n: SupportsInt) -> int:
+    if isinstance(n, bool) or int(n) != n or n < 1:
+        raise ValueError(f"n={n!r} must be a whole number, at least 1")
+    return int(n)

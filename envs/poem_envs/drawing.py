@@ -1,0 +1,98 @@
+"""A few antialiased shapes on a numpy image, and a window to show it: enough to render a toy without a graphics library."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+Colour = tuple[int, int, int]
+
+
+class Canvas:
+    """A white image onto which shapes are painted in plane coordinates (x right, y up).
+
+    :param width: of the image, pixels
+    :param height: of the image, pixels
+    :param centre: the point of the plane in the middle of the image
+    :param extent: length of the plane that the shorter side of the image shows
+    """
+
+    def __init__(self, width: int, height: int, centre: tuple[float, float], extent: float) -> None:
+        self._pixels = np.full((height, width, 3), 255.0)
+        self._per_unit = min(width, height) / extent
+        self._x = centre[0] + (np.arange(width) + 0.5 - width / 2) / self._per_unit
+        self._y = centre[1] - (np.arange(height)[:, None] + 0.5 - height / 2) / self._per_unit
+
+    def disc(self, x: float, y: float, radius: float, colour: Colour) -> None:
+        """Paint a filled circle.
+
+        :param x: of its centre
+        :param y: of its centre
+        :param radius: in units of the plane
+        :param colour: red, green, blue
+        """
+        self._paint(np.hypot(self._x - x, self._y - y) - radius, colour)
+
+    def upper_half_circle(self, radius: float, line_width: float, colour: Colour) -> None:
+        """Paint the line of the half-circle around the origin where y >= 0.
+
+        :param radius: in units of the plane
+        :param line_width: in units of the plane
+        :param colour: red, green, blue
+        """
+        line = np.abs(np.hypot(self._x, self._y) - radius) - line_width / 2
+        self._paint(np.maximum(line, -self._y), colour)
+
+    def image(self) -> np.ndarray:
+        """What was painted, ``(height, width, 3)`` uint8."""
+        return np.rint(self._pixels).astype(np.uint8)
+
+    def _paint(self, signed_distance: np.ndarray, colour: Colour) -> None:
+        coverage = np.clip(0.5 - signed_distance * self._per_unit, 0.0, 1.0)[..., None]
+        self._pixels += coverage * (np.array(colour, dtype=np.float64) - self._pixels)
+
+
+class ImageWindow:
+    """A window that shows images, through GLFW and OpenGL, which MuJoCo's package brings along.
+
+    :param width: pixels
+    :param height: pixels
+    :param title: of the window
+    """
+
+    def __init__(self, width: int, height: int, title: str) -> None:
+        import glfw
+
+        self._glfw = glfw
+        if not glfw.init():
+            raise RuntimeError("render_mode='human' needs a display; use 'rgb_array' on a machine without one")
+        glfw.window_hint(glfw.RESIZABLE, glfw.FALSE)
+        self._window: Any = glfw.create_window(width, height, title, None, None)
+        if not self._window:
+            raise RuntimeError("render_mode='human' could not open a window; use 'rgb_array' on a machine without a display")
+
+    def show(self, image: np.ndarray) -> None:
+        """Show an image.
+
+        :param image: ``(height, width, 3)`` uint8
+        """
+        from OpenGL import GL
+
+        glfw = self._glfw
+        glfw.make_context_current(self._window)
+        height, width, _ = image.shape
+        frame_width, frame_height = glfw.get_framebuffer_size(self._window)  # larger than the window on dense displays
+        GL.glViewport(0, 0, frame_width, frame_height)
+        GL.glPixelStorei(GL.GL_UNPACK_ALIGNMENT, 1)
+        GL.glRasterPos2f(-1.0, -1.0)
+        GL.glPixelZoom(frame_width / width, frame_height / height)
+        GL.glDrawPixels(width, height, GL.GL_RGB, GL.GL_UNSIGNED_BYTE, np.ascontiguousarray(image[::-1]))
+        glfw.swap_buffers(self._window)
+        glfw.poll_events()
+
+    def close(self) -> None:
+        """Close the window."""
+        if self._window is not None:
+            self._glfw.destroy_window(self._window)
+            self._window = None

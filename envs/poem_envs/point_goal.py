@@ -1,0 +1,153 @@
+"""A point in the plane with a hidden goal on the half-circle: the smallest task family."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+
+from poem_envs.drawing import Canvas, ImageWindow
+from poem_envs.vector import BatchFamily, BatchTaskFamily, TaskFamilyVector
+
+
+class _PointGoal(BatchFamily):
+    reward_feature_dim = 2
+    metadata: dict[str, Any]
+    _window: ImageWindow | None = None
+
+    def __init__(
+        self,
+        *,
+        step_length: float = 0.05,
+        reset_noise_scale: float = 0.02,
+        width: int = 480,
+        height: int = 480,
+        **kwargs: Any,
+    ) -> None:
+        self.step_length = step_length
+        self.reset_noise_scale = reset_noise_scale
+        self.width = width
+        self.height = height
+        self.task_space = spaces.Box(0.0, np.pi, (1,), np.float64)
+        super().__init__(
+            observation_space=spaces.Box(-np.inf, np.inf, (2,), np.float64),
+            action_space=spaces.Box(-1.0, 1.0, (2,), np.float32),
+            **kwargs,
+        )
+
+    def _allocate(self, n: int) -> None:
+        self._positions = np.zeros((n, 2))
+
+    def _begin_episodes(self, copies: np.ndarray, rngs: Sequence[np.random.Generator]) -> None:
+        for copy, rng in zip(copies, rngs, strict=True):
+            self._positions[copy] = self.reset_noise_scale * rng.standard_normal(2)
+
+    def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        self._positions += self.step_length * actions
+        return self._positions.copy(), np.zeros(len(actions), dtype=bool)
+
+    def _observations(self) -> np.ndarray:
+        return self._positions.copy()
+
+    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
+        angle = np.array(tasks[..., 0])  # contiguous: strided input may take another, differently rounded path
+        x = features[..., 0] - np.cos(angle)
+        y = features[..., 1] - np.sin(angle)
+        return -np.sqrt(x * x + y * y)
+
+    def _physics_state(self, copy: int) -> np.ndarray:
+        return self._positions[copy].copy()
+
+    def _set_physics_state(self, copy: int, state: np.ndarray) -> None:
+        self._positions[copy] = state
+
+    def _render_copy(self, copy: int, render_mode: str, task: np.ndarray | None) -> np.ndarray | None:
+        canvas = Canvas(self.width, self.height, centre=(0.0, 0.4), extent=2.7)
+        canvas.upper_half_circle(1.0, 0.015, (190, 190, 190))
+        canvas.disc(0.0, 0.0, 0.02, (190, 190, 190))
+        if task is not None:
+            canvas.disc(np.cos(task[0]), np.sin(task[0]), 0.07, (60, 160, 75))
+        canvas.disc(*self._positions[copy], 0.045, (31, 90, 180))
+        image = canvas.image()
+        if render_mode == "rgb_array":
+            return image
+        if self._window is None:
+            self._window = ImageWindow(self.width, self.height, "PointGoal")
+        self._window.show(image)
+        time.sleep(1.0 / self.metadata["render_fps"])
+        return None
+
+    def _release(self) -> None:
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_window": None}
+
+
+class PointGoalEnv(_PointGoal, BatchTaskFamily):
+    r"""
+    ## Description
+    A point starts near the origin of the plane and is to move to a goal on the upper unit half-circle that it cannot see.
+    It is the smallest environment on which meta-learning shows: where to go is in the task alone, and a policy for it takes seconds to
+    train. Use it for tests, documentation and first contact.
+
+    ## Task
+    The angle of the goal, uniform on [0, pi], hidden from the observation: `task_space` is `Box(0, pi, (1,), float64)`, and the goal lies
+    at `(cos(angle), sin(angle))`.
+
+    ## Action Space
+    The action space is a `Box(-1, 1, (2,), float32)`.
+
+    | Num | Action                 | Control Min | Control Max | Unit                  |
+    | --- | ---------------------- | ----------- | ----------- | --------------------- |
+    | 0   | movement in x direction | -1         | 1           | `step_length` a step  |
+    | 1   | movement in y direction | -1         | 1           | `step_length` a step  |
+
+    ## Observation Space
+    The observation space is a `Box(-Inf, Inf, (2,), float64)`.
+
+    | Num | Observation  | Min  | Max | Unit     |
+    | --- | ------------ | ---- | --- | -------- |
+    | 0   | x-coordinate | -Inf | Inf | position |
+    | 1   | y-coordinate | -Inf | Inf | position |
+
+    ## Rewards
+    Minus the Euclidean distance between goal and position after the move. The reward features are that position, `(x, y)`.
+
+    ## Starting State
+    $\mathcal{N}(0, reset\_noise\_scale^2)$ in either coordinate.
+
+    ## Episode End
+    There is no early end. `gymnasium.make` truncates episodes after 25 steps.
+
+    ## Arguments
+    ```python
+    import gymnasium as gym
+    env = gym.make("poem_envs:poem/PointGoal-v0", step_length=0.05)
+    ```
+
+    | Parameter           | Type      | Default | Description                                                          |
+    | ------------------- | --------- | ------- | -------------------------------------------------------------------- |
+    | `step_length`       | **float** | `0.05`  | Distance that the action 1 moves the point in one step               |
+    | `reset_noise_scale` | **float** | `0.02`  | Standard deviation of the start around the origin                    |
+    | `width`, `height`   | **int**   | `480`   | Size of the rendered image, pixels                                   |
+    | `render_mode`       | **str**   | `None`  | `"rgb_array"` or `"human"`                                           |
+    | `render_task`       | **bool**  | `False` | Whether rendering shows the goal                                     |
+
+    ## Version History
+    * v0: Initial version
+    """
+
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 10}  # noqa: RUF012
+
+
+class PointGoalVectorEnv(_PointGoal, TaskFamilyVector):
+    """The vectorised :class:`PointGoalEnv`: same arguments, and those of :class:`~poem_envs.vector.TaskFamilyVector`."""
+
+    metadata = {**PointGoalEnv.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012

@@ -1,0 +1,358 @@
+"""Families that simulate many copies at once: write the dynamics of a batch, get a single and a vectorised environment.
+
+Both run the same code, the single one as a batch of one, so their results agree bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+from gymnasium.error import ResetNeeded
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from poem_envs.core import (
+    TaskDefinition,
+    TaskFamily,
+    check_options,
+    check_render_mode,
+    checked_actions,
+    task_stream,
+)
+
+
+class BatchFamily(TaskDefinition):
+    """The dynamics of ``n`` independent copies of an environment, as a mixin for the two classes below.
+
+    A family writes this once, and combines it twice::
+
+        class _Walk1D(BatchFamily): ...                        # the methods below, and those of TaskDefinition
+        class Walk1DEnv(_Walk1D, BatchTaskFamily): ...         # one copy, a Gymnasium environment
+        class Walk1DVectorEnv(_Walk1D, TaskFamilyVector): ...  # n copies, a Gymnasium vector environment
+
+    Its constructor hands ``observation_space`` and ``action_space`` (of one copy) and all that it does not know to ``super().__init__``.
+    """
+
+    def _allocate(self, n: int) -> None:
+        """Make room for the states of ``n`` copies. Called once, by the constructor."""
+        raise NotImplementedError
+
+    def _begin_episodes(self, copies: np.ndarray, rngs: Sequence[np.random.Generator]) -> None:
+        """Put some copies into a start state.
+
+        :param copies: their numbers
+        :param rngs: a generator for each of them
+        """
+        raise NotImplementedError
+
+    def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Step all copies.
+
+        :param actions: ``(n, action_dim)`` float64, valid
+        :return: new arrays: reward features ``(n, reward_feature_dim)``, and whether each episode ended early ``(n,)``
+        """
+        raise NotImplementedError
+
+    def _observations(self) -> np.ndarray:
+        """The observations of all copies, ``(n, obs_dim)``, a new array."""
+        raise NotImplementedError
+
+    def _physics_state(self, copy: int) -> np.ndarray:
+        """All that determines how a copy goes on, ``(state_dim,)``, a new array."""
+        raise NotImplementedError
+
+    def _set_physics_state(self, copy: int, state: np.ndarray) -> None:
+        """Put a copy into a state that :meth:`_physics_state` returned."""
+        raise NotImplementedError
+
+    def _render_copy(self, copy: int, render_mode: str, task: np.ndarray | None) -> Any:
+        """Render one copy.
+
+        :param copy: its number
+        :param render_mode: as in Gymnasium
+        :param task: the hidden task, to be drawn; None if it is to stay hidden
+        """
+        raise NotImplementedError
+
+    def _release(self) -> None:
+        """Free threads, windows and the like. Called by ``close``, possibly more than once."""
+
+    def _checked_physics_state(self, state: npt.ArrayLike, copy: int) -> np.ndarray:
+        array = np.array(state, dtype=np.float64)
+        shape = self._physics_state(copy).shape
+        if array.shape != shape or not np.isfinite(array).all():
+            raise ValueError(f"state={state!r} must be finite and have shape {shape}, as get_physics_state() returns it")
+        return array
+
+
+class BatchTaskFamily(BatchFamily, TaskFamily):
+    """A single environment: a batch of one copy.
+
+    :param observation_space: of the environment
+    :param action_space: of the environment
+    :param render_mode: one of ``metadata["render_modes"]``, or None
+    :param render_task: whether rendering shows the hidden task
+    """
+
+    def __init__(
+        self,
+        *,
+        observation_space: spaces.Box,
+        action_space: spaces.Box,
+        render_mode: str | None = None,
+        render_task: bool = False,
+    ) -> None:
+        super().__init__(render_mode=render_mode, render_task=render_task)
+        self.observation_space = observation_space
+        self.action_space = action_space
+        self._allocate(1)
+
+    def _begin_episode(self, rng: np.random.Generator) -> np.ndarray:
+        self._begin_episodes(np.zeros(1, dtype=np.intp), [rng])
+        return self._observations()[0]
+
+    def _simulate(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+        features, terminated = self._advance(action[None])
+        return self._observations()[0], features[0], bool(terminated[0])
+
+    def get_physics_state(self) -> np.ndarray:
+        """The simulator's state, ``(state_dim,)``: enough to render this moment again, or to go on from it."""
+        return self._physics_state(0)
+
+    def set_physics_state(self, state: npt.ArrayLike) -> None:
+        """Put the simulator into a state of :meth:`get_physics_state`, say to render a recorded trajectory. The task stays.
+
+        :param state: ``(state_dim,)``
+        :raises ValueError: if it has another shape or is not finite
+        """
+        self._set_physics_state(0, self._checked_physics_state(state, 0))
+
+    def render(self) -> Any:
+        """Render the current state as ``render_mode`` says: an image ``(height, width, 3)`` for ``"rgb_array"``."""
+        if self.render_mode is None:
+            gym.logger.warn("render() was called without a render_mode; pass one to the constructor, say 'rgb_array'")
+            return None
+        return self._render_copy(0, self.render_mode, self._task if self.render_task else None)
+
+    def close(self) -> None:
+        """Free what rendering and simulation hold."""
+        self._release()
+
+
+class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """A vectorised task family, each copy with a task of its own.
+
+    - A copy whose episode ends is reset in the same step (``AutoresetMode.SAME_STEP``). ``infos["final_obs"]`` then holds
+      ``(num_envs, obs_dim)``: the observation that each copy's step led to, which differs from the returned one for copies that were
+      reset (``infos["_final_obs"]``, a mask). The key is there only if some copy was reset.
+    - ``infos["reward_features"]``, ``(num_envs, reward_feature_dim)``, is always that of the step just taken.
+    - ``reset(seed=s)`` seeds copy ``i`` with ``s + i``; results equal those of single environments bit for bit.
+
+    :param num_envs: number of copies
+    :param max_episode_steps: episodes are truncated after so many steps; None for never
+    :param observation_space: of one copy
+    :param action_space: of one copy
+    :param render_mode: ``"rgb_array"`` and the like; ``"human"`` for one copy only
+    :param render_task: whether rendering shows the hidden tasks
+    """
+
+    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+    _reset_options: ClassVar[frozenset[str]] = frozenset({"tasks"})
+
+    def __init__(
+        self,
+        *,
+        observation_space: spaces.Box,
+        action_space: spaces.Box,
+        num_envs: int = 1,
+        max_episode_steps: int | None = None,
+        render_mode: str | None = None,
+        render_task: bool = False,
+    ) -> None:
+        super().__init__()
+        if num_envs < 1:
+            raise ValueError(f"num_envs={num_envs!r} must be at least 1")
+        if max_episode_steps is not None and max_episode_steps < 1:
+            raise ValueError(f"max_episode_steps={max_episode_steps!r} must be at least 1, or None for no limit")
+        check_render_mode(render_mode, self.metadata)
+        if render_mode == "human" and num_envs > 1:
+            raise ValueError(
+                f"render_mode='human' opens a window for one environment, but num_envs={num_envs}; use 'rgb_array'"
+            )
+        self.num_envs = num_envs
+        self.max_episode_steps = max_episode_steps
+        self.render_mode = render_mode
+        self.render_task = render_task
+        self.single_observation_space = observation_space
+        self.single_action_space = action_space
+        self.observation_space = batch_space(observation_space, num_envs)
+        self.action_space = batch_space(action_space, num_envs)
+
+        self._tasks: np.ndarray | None = None  # (num_envs, task_dim)
+        self._next_tasks = np.full((num_envs, *self.task_space.shape), np.nan)
+        self._task_chosen = np.zeros(num_envs, dtype=bool)
+        self._rngs: list[np.random.Generator] = []
+        self._seeds: list[int] = []
+        self._elapsed_steps = np.zeros(num_envs, dtype=np.int64)
+        self._episodes = np.zeros(num_envs, dtype=np.int64)
+        self._allocate(num_envs)
+
+    @property
+    def tasks(self) -> np.ndarray | None:
+        """The tasks in effect, ``(num_envs, task_dim)``; None before the first reset."""
+        return None if self._tasks is None else self._tasks.copy()
+
+    def set_tasks(self, tasks: npt.ArrayLike, copies: Sequence[int] | np.ndarray | None = None) -> None:
+        """Choose the tasks of the episodes that begin from each copy's next reset on.
+
+        :param tasks: ``(num_envs, task_dim)``, or one row for each of ``copies``
+        :param copies: numbers of the copies to set; None for all
+        :raises ValueError: if a task has another shape, is not finite, lies outside ``task_space`` or is not a member of a finite family
+        """
+        index = np.arange(self.num_envs) if copies is None else np.asarray(copies, dtype=np.intp)
+        self._next_tasks[index] = self._checked_tasks(tasks, (len(index), *self.task_space.shape), "tasks")
+        self._task_chosen[index] = True
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin an episode in every copy.
+
+        :param seed: ``s`` seeds copy ``i`` with ``s + i``; or one seed (or None) for each copy
+        :param options: ``{"tasks": tasks}`` is short for :meth:`set_tasks` just before
+        :return: the observations ``(num_envs, obs_dim)`` and an empty info
+        """
+        options = check_options(options, self._reset_options)
+        seeds = self._seed_of_each_copy(seed)
+        if "tasks" in options:
+            self.set_tasks(options["tasks"])
+        if not self._rngs:
+            self._rngs, self._seeds = map(list, zip(*(seeding.np_random(s) for s in seeds), strict=True))
+            self._episodes[:] = 0
+        for copy, copy_seed in enumerate(seeds):
+            if copy_seed is not None:
+                self._rngs[copy], self._seeds[copy] = seeding.np_random(copy_seed)
+                self._episodes[copy] = 0
+        if self._tasks is None:
+            self._tasks = self._next_tasks.copy()
+            undecided = ~self._task_chosen
+        else:
+            undecided = ~self._task_chosen & np.array([s is not None for s in seeds])
+        for copy in np.flatnonzero(undecided):
+            self._tasks[copy] = self.sample_tasks(1, task_stream(self._rngs[copy]))[0]
+        self._begin(np.arange(self.num_envs))
+        if self.render_mode == "human":
+            self.render()
+        return self._observations(), {}
+
+    def step(self, actions: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Step every copy.
+
+        :param actions: ``(num_envs, action_dim)``; a tiny excess over the bounds (1e-6) is clipped
+        :return: observations ``(num_envs, obs_dim)``, rewards, terminations, truncations ``(num_envs,)`` and infos
+        :raises ValueError: if an action has another shape, is not finite or lies outside its space; it names the copy
+        :raises gymnasium.error.ResetNeeded: before the first reset
+        """
+        if self._tasks is None:
+            raise ResetNeeded("step() was called before the first reset()")
+        assert isinstance(self.single_action_space, spaces.Box)
+        checked = checked_actions(actions, self.single_action_space, self.num_envs)
+        self._elapsed_steps += 1
+        features, terminations = self._advance(checked)
+        rewards = self.compute_reward(self._tasks, features)
+        observations = self._observations()
+        if self.max_episode_steps is None:
+            truncations = np.zeros(self.num_envs, dtype=bool)
+        else:
+            truncations = self._elapsed_steps >= self.max_episode_steps
+        infos: dict[str, Any] = {"reward_features": features}
+        done = terminations | truncations
+        if done.any():
+            infos["final_obs"], infos["_final_obs"] = observations, done
+            self._begin(np.flatnonzero(done))
+            observations = self._observations()
+        if self.render_mode == "human":
+            self.render()
+        return observations, rewards, terminations, truncations, infos
+
+    def get_physics_state(self, copy: int) -> np.ndarray:
+        """The simulator's state of one copy, ``(state_dim,)``, which a single environment's ``set_physics_state`` takes.
+
+        :param copy: its number
+        """
+        return self._physics_state(copy)
+
+    def set_physics_state(self, copy: int, state: npt.ArrayLike) -> None:
+        """Put one copy into a state of :meth:`get_physics_state`. Its task and the number of its step stay.
+
+        :param copy: its number
+        :param state: ``(state_dim,)``
+        :raises ValueError: if it has another shape or is not finite
+        """
+        self._set_physics_state(copy, self._checked_physics_state(state, copy))
+
+    def render(self) -> tuple[Any, ...] | None:
+        """Render every copy as ``render_mode`` says, and return the images."""
+        if self.render_mode is None:
+            gym.logger.warn("render() was called without a render_mode; pass one to the constructor, say 'rgb_array'")
+            return None
+        return tuple(self.render_copy(copy) for copy in range(self.num_envs))
+
+    def render_copy(self, copy: int) -> Any:
+        """Render one copy.
+
+        :param copy: its number
+        :return: what :meth:`render` would hold for it
+        """
+        if self.render_mode is None:
+            raise ValueError("render_mode is None; pass one to the constructor, say 'rgb_array'")
+        task = self._tasks[copy] if self.render_task and self._tasks is not None else None
+        return self._render_copy(copy, self.render_mode, task)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Free what rendering and simulation hold."""
+        self._release()
+
+    @property
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
+        """The generator of each copy; empty before the first reset."""
+        return tuple(self._rngs)
+
+    @property
+    def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
+        """The seed of each copy's generator; empty before the first reset."""
+        return tuple(self._seeds)
+
+    def _seed_of_each_copy(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+        if seed is None:
+            return [None] * self.num_envs
+        if isinstance(seed, (int, np.integer)):
+            return [int(seed) + copy for copy in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise ValueError(
+                f"seed={seed!r} holds {len(seed)} seeds, expected one for each of num_envs={self.num_envs} copies"
+            )
+        return list(seed)
+
+    def _begin(self, copies: np.ndarray) -> None:
+        assert self._tasks is not None
+        chosen = copies[self._task_chosen[copies]]
+        self._tasks[chosen] = self._next_tasks[chosen]
+        self._elapsed_steps[copies] = 0
+        self._episodes[copies] += 1
+        self._begin_episodes(copies, [self._rngs[copy] for copy in copies])
+
+    def _describe_episode(self, copy: int) -> str:
+        return (
+            f"step {self._elapsed_steps[copy]} of episode {self._episodes[copy]} since reset(seed={self._seeds[copy]}) "
+            f"in environment copy {copy}"
+        )
