@@ -1,0 +1,112 @@
+"""Lockstep collection of one horizon of experience on every copy of a vectorised environment."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from sb3_poem.common.buffers import Segment
+from sb3_poem.common.family import FamilyEnv
+
+OnStep = Callable[[dict[str, Any]], bool]
+
+
+def check_finite(name: str, values: np.ndarray, task_ids: np.ndarray, episodes: np.ndarray, step: int) -> None:
+    """
+    :raises ValueError: if any copy's values are NaN or infinite; names the copy, its task and its episode
+    """
+    finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
+    if not finite.all():
+        copy = int(np.argmin(finite))
+        raise ValueError(
+            f"the environment returned {name} that are NaN or infinite: copy {copy}, training task {int(task_ids[copy])}, "
+            f"episode {int(episodes[copy])}, step {step}: {values[copy]}. Training stops here, before the networks see them."
+        )
+
+
+def collect_segment(
+    family: FamilyEnv,
+    act: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+    task_ids: np.ndarray,
+    tasks: np.ndarray,
+    latents: np.ndarray,
+    seed: int,
+    episode_counts: np.ndarray,
+    on_step: OnStep,
+) -> Segment | None:
+    """Run every copy for one horizon on its task; an episode that ends early is followed by another of the same task.
+
+    :param family: The environment
+    :param act: Maps observations (copies, obs_dim) to actions in the environment's units and in [-1, 1]
+    :param task_ids: (copies,) index of each copy's task
+    :param tasks: (copies, task_dim)
+    :param latents: (copies, latent_dim), noted in the segment
+    :param seed: Seed of the copies' resets
+    :param episode_counts: (copies,) episodes begun so far, counted on here; for messages
+    :param on_step: Given the local variables of a step; False ends the collection
+    :return: The experience, or None if ``on_step`` ended the collection
+    :raises ValueError: if the environment returns NaN or infinity
+    """
+    obs = family.reset(tasks, seed)
+    check_finite("observations", obs, task_ids, episode_counts, 0)
+    n, horizon = family.num_envs, family.horizon
+    assert family.env.action_space.shape is not None
+    action_dim = family.env.action_space.shape[0]
+    segment = Segment(
+        task_ids=task_ids,
+        observations=np.empty((n, horizon, obs.shape[1]), dtype=np.float32),
+        actions=np.empty((n, horizon, action_dim), dtype=np.float32),
+        next_observations=np.empty((n, horizon, obs.shape[1]), dtype=np.float32),
+        rewards=np.empty((n, horizon)),
+        terminated=np.zeros((n, horizon), dtype=np.float32),
+        features=np.empty((n, horizon, family.reward_feature_dim)),
+        first_episode=np.zeros((n, horizon), dtype=bool),
+        latents=latents,
+    )
+    in_first_episode = np.ones(n, dtype=bool)
+    for step in range(horizon):
+        actions, scaled_actions = act(obs)
+        check_finite("actions (of the policy)", actions, task_ids, episode_counts, step)
+        new_obs, rewards, dones, infos = family.env.step(actions)
+        assert isinstance(new_obs, np.ndarray)
+        if not on_step(locals()):
+            return None
+        next_obs = new_obs
+        if dones.any():
+            next_obs = new_obs.copy()
+            for copy in np.flatnonzero(dones):
+                next_obs[copy] = infos[copy]["terminal_observation"]
+                segment.terminated[copy, step] = not infos[copy].get("TimeLimit.truncated", False)
+        features = family.features_of(infos)
+        for name, values in (("observations", next_obs), ("rewards", rewards), ("reward features", features)):
+            check_finite(name, values, task_ids, episode_counts, step)
+        segment.observations[:, step] = obs
+        segment.actions[:, step] = scaled_actions
+        segment.next_observations[:, step] = next_obs
+        segment.rewards[:, step] = rewards
+        segment.features[:, step] = features
+        segment.first_episode[:, step] = in_first_episode
+        in_first_episode &= ~dones
+        episode_counts += dones
+        obs = new_obs
+    return segment
+
+
+def relabelled_returns(
+    compute_reward: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    tasks: np.ndarray,
+    features: np.ndarray,
+    mask: np.ndarray,
+) -> np.ndarray:
+    """Returns of trajectories under every task, without another environment step.
+
+    :param compute_reward: The family's reward function
+    :param tasks: (tasks, task_dim)
+    :param features: (trajectories, steps, feat_dim)
+    :param mask: (trajectories, steps), which steps count
+    :return: (tasks, trajectories)
+    """
+    returns = np.empty((len(tasks), len(features)))
+    for index, task in enumerate(tasks):  # one row at a time bounds the memory at trajectories x steps
+        returns[index] = (compute_reward(task, features) * mask).sum(axis=1)
+    return returns

@@ -1,0 +1,224 @@
+"""Policy of PEARLSAC: an actor, critics, a context encoder and a reward decoder that share one latent."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.sac.policies import SACPolicy
+from torch import nn
+
+from sb3_poem.common.networks import ContextEncoder, LatentActor, LatentCritic, RewardDecoder
+
+OBSERVATION_CLIP = 10.0
+
+
+class LatentPolicy(SACPolicy):
+    """Networks conditioned on a task latent z, with the statistics that standardise their inputs.
+
+    ``predict(obs, state=z)`` acts for latent ``z``; SB3's ``state`` slot carries it from step to step. Without a state the
+    prior's mean acts.
+
+    :param observation_space: Flat Box
+    :param action_space: Bounded Box
+    :param lr_schedule: Learning rate schedule
+    :param net_arch: Hidden widths of actor and critics, or a dict with keys ``pi``, ``qf``, ``encoder``, ``decoder``,
+        ``embedding`` for each
+    :param activation_fn: Activation of actor, critics and decoder
+    :param latent_dim: Dimension d of the latent
+    :param context_has_value: Whether a context transition carries Q(s, a)
+    :param n_critics: Number of critics
+    :param optimizer_class: Optimiser of all networks
+    :param optimizer_kwargs: Its arguments
+    """
+
+    encoder: ContextEncoder
+    decoder: RewardDecoder
+    obs_mean: th.Tensor
+    obs_std: th.Tensor
+    reward_mean: th.Tensor
+    reward_std: th.Tensor
+
+    def __init__(
+        self,
+        observation_space: spaces.Box,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: Sequence[int] | dict[str, Sequence[int]] | None = None,
+        activation_fn: type[nn.Module] = nn.ReLU,
+        latent_dim: int = 5,
+        context_has_value: bool = False,
+        n_critics: int = 2,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+    ) -> None:
+        BasePolicy.__init__(
+            self,
+            observation_space,
+            action_space,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+            squash_output=True,
+        )
+        self.net_arch = self._complete_net_arch(net_arch)  # type: ignore[assignment]
+        self.activation_fn = activation_fn
+        self.latent_dim = latent_dim
+        self.context_has_value = context_has_value
+        self.n_critics = n_critics
+        self._build(lr_schedule)
+
+    @staticmethod
+    def _complete_net_arch(net_arch: Sequence[int] | dict[str, Sequence[int]] | None) -> dict[str, list[int]]:
+        defaults: dict[str, Sequence[int]] = {
+            "pi": (256, 256),
+            "qf": (256, 256),
+            "encoder": (200, 200, 200),
+            "decoder": (128, 128),
+            "embedding": (64,),
+        }
+        if net_arch is None:
+            given: dict[str, Sequence[int]] = {}
+        elif isinstance(net_arch, dict):
+            given = net_arch
+        else:
+            given = {"pi": net_arch, "qf": net_arch}
+        unknown = set(given) - set(defaults)
+        if unknown:
+            raise ValueError(f"net_arch has unknown keys {sorted(unknown)}; known are {sorted(defaults)}")
+        return {key: list(given.get(key, default)) for key, default in defaults.items()}
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        arch: dict[str, list[int]] = self.net_arch  # type: ignore[assignment]
+        obs_dim, action_dim = int(self.observation_space.shape[0]), int(self.action_space.shape[0])  # type: ignore[index]
+        for name, shape, value in (
+            ("obs_mean", obs_dim, 0.0),
+            ("obs_std", obs_dim, 1.0),
+            ("reward_mean", 1, 0.0),
+            ("reward_std", 1, 1.0),
+        ):
+            self.register_buffer(name, th.full((shape,), value))
+        context_dim = 2 * obs_dim + action_dim + 1 + int(self.context_has_value)
+        self.encoder = ContextEncoder(context_dim, self.latent_dim, arch["encoder"])
+        self._build_embeddings(arch["embedding"])
+        self.decoder = RewardDecoder(obs_dim, action_dim, self.latent_dim, arch["decoder"], self.activation_fn)
+        self.actor = LatentActor(obs_dim, self.latent_dim, action_dim, arch["pi"], self.activation_fn)  # type: ignore[assignment]
+        critic_args = (obs_dim, action_dim, self.latent_dim, arch["qf"], self.activation_fn, self.n_critics)
+        self.critic = LatentCritic(*critic_args)  # type: ignore[assignment]
+        self.critic_target = LatentCritic(*critic_args)  # type: ignore[assignment]
+        self.critic_target.load_state_dict(self.critic.state_dict())
+        self.critic_target.requires_grad_(False)
+        trained = [parameter for parameter in self.parameters() if parameter.requires_grad]
+        self.optimizer = self.optimizer_class(trained, lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
+
+    def _build_embeddings(self, net_arch: list[int]) -> None:
+        """PEARL has one embedding: the latent itself."""
+
+    def policy_embedding(self, latents: th.Tensor) -> th.Tensor:
+        """z_pi of latents (..., latent_dim)."""
+        return latents
+
+    def reward_embedding(self, latents: th.Tensor) -> th.Tensor:
+        """z_r of latents (..., latent_dim)."""
+        return latents
+
+    def standardise(self, obs: th.Tensor) -> th.Tensor:
+        """Standardised observations, bounded so that a fall does not saturate the networks."""
+        return ((obs - self.obs_mean) / self.obs_std).clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP)
+
+    def scale_action_batch(self, actions: th.Tensor) -> th.Tensor:
+        """Actions in the environment's units -> [-1, 1]."""
+        low = th.as_tensor(self.action_space.low, device=actions.device)  # type: ignore[attr-defined]
+        high = th.as_tensor(self.action_space.high, device=actions.device)  # type: ignore[attr-defined]
+        return 2.0 * (actions - low) / (high - low) - 1.0
+
+    def decode_rewards(
+        self, obs: th.Tensor, actions: th.Tensor, next_obs: th.Tensor, reward_embedding: th.Tensor
+    ) -> th.Tensor:
+        """Predicted rewards (...) in the environment's units.
+
+        :param obs: (..., obs_dim), standardised
+        :param actions: (..., action_dim) in [-1, 1]
+        :param next_obs: (..., obs_dim), standardised
+        :param reward_embedding: (..., latent_dim)
+        """
+        return self.decoder(obs, actions, next_obs, reward_embedding) * self.reward_std + self.reward_mean
+
+    def act(self, obs: np.ndarray, latents: np.ndarray, noise: th.Tensor | None = None) -> np.ndarray:
+        """Actions in [-1, 1] for a batch.
+
+        :param obs: (n, obs_dim)
+        :param latents: (n, latent_dim)
+        :param noise: (n, action_dim) standard normal draws, None for the mean action
+        """
+        with th.no_grad():
+            obs_tensor = th.as_tensor(obs, dtype=th.float32, device=self.device)
+            embedding = self.policy_embedding(th.as_tensor(latents, dtype=th.float32, device=self.device))
+            actions, _ = self.actor(self.standardise(obs_tensor), embedding, noise)
+        return actions.cpu().numpy()
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | np.ndarray | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Actions for observations under task latents.
+
+        :param observation: (obs_dim,) or (n, obs_dim)
+        :param state: Latent (latent_dim,), or one for each observation (n, latent_dim); None is the prior's mean
+        :param episode_start: Not used: a latent outlives episodes
+        :param deterministic: Mean action instead of a sample
+        :return: actions in the environment's units, and the latents (n, latent_dim)
+        :raises ValueError: for observations that are not finite, or a state of another shape
+        """
+        self.set_training_mode(False)
+        obs = np.asarray(observation, dtype=np.float32)
+        single = obs.ndim == 1
+        obs = np.atleast_2d(obs)
+        if obs.shape[1:] != self.observation_space.shape:
+            raise ValueError(f"observation has shape {obs.shape[1:]}, but the policy takes {self.observation_space.shape}")
+        if not np.all(np.isfinite(obs)):
+            raise ValueError(f"observation {int(np.argwhere(~np.isfinite(obs))[0, 0])} holds NaN or infinity")
+        latents = np.zeros(self.latent_dim) if state is None else np.asarray(state, dtype=np.float64)
+        if latents.shape not in ((self.latent_dim,), (obs.shape[0], self.latent_dim), (1, self.latent_dim)):
+            raise ValueError(
+                f"state has shape {latents.shape}, but a latent is ({self.latent_dim},), "
+                f"or ({obs.shape[0]}, {self.latent_dim}) for these observations"
+            )
+        latents = np.array(np.broadcast_to(latents, (obs.shape[0], self.latent_dim)))
+        noise = None
+        if not deterministic:
+            noise = th.randn(obs.shape[0], int(np.prod(self.action_space.shape)), device=self.device)  # type: ignore[arg-type]
+        actions = self.unscale_action(self.act(obs, latents, noise))
+        actions = np.clip(actions, self.action_space.low, self.action_space.high)  # type: ignore[attr-defined]
+        return (actions[0] if single else actions), latents  # type: ignore[return-value]
+
+    def _predict(self, observation: th.Tensor, deterministic: bool = False) -> th.Tensor:
+        latents = np.zeros((observation.shape[0], self.latent_dim))
+        noise = None if deterministic else th.randn(observation.shape[0], *self.action_space.shape, device=self.device)  # type: ignore[misc]
+        return th.as_tensor(self.act(observation.cpu().numpy(), latents, noise), device=self.device)
+
+    def set_training_mode(self, mode: bool) -> None:
+        """Put all networks in training or evaluation mode."""
+        self.train(mode)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {
+            "observation_space": self.observation_space,
+            "action_space": self.action_space,
+            "lr_schedule": self._dummy_schedule,
+            "net_arch": self.net_arch,
+            "activation_fn": self.activation_fn,
+            "latent_dim": self.latent_dim,
+            "context_has_value": self.context_has_value,
+            "n_critics": self.n_critics,
+            "optimizer_class": self.optimizer_class,
+            "optimizer_kwargs": self.optimizer_kwargs,
+        }
+
+
+MlpPolicy = LatentPolicy

@@ -1,0 +1,227 @@
+"""POEM: meta-RL whose task embedding preserves the order of preferences."""
+
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+
+from sb3_poem.common.buffers import Segment
+from sb3_poem.common.collection import relabelled_returns
+from sb3_poem.pearl_sac.pearl_sac import PEARLSAC, MetaBatch
+from sb3_poem.poem_sac.losses import preference_loss
+from sb3_poem.poem_sac.policies import MlpPolicy, POEMPolicy
+
+SelfPOEMSAC = TypeVar("SelfPOEMSAC", bound="POEMSAC")
+
+SIMILARITIES = ("two-encoder", "inner")
+CONTEXTS = ("optimal", "pearl")
+PREFERENCE_SOURCES = ("auto", "relabel", "rollout")
+
+
+class POEMSAC(PEARLSAC):
+    """Preference-order-preserving embedding on soft actor-critic (POEM, Xu & Zhu, ICML 2025), Algorithm 1.
+
+    On top of :class:`PEARLSAC`: a reward embedding f_r and a policy embedding f_pi of the latent, whose inner product orders
+    policies as a task's preferences do (eq. 3); the preference loss that trains them (eqs. 6, 7); contexts of the
+    current policies with their action values (eq. 8); an encoder that learns from the actor as well.
+
+    Differences from the paper: twin target critics and a learned entropy coefficient, as SB3's SAC has them, instead of a
+    value network; a replay buffer that outlives the epoch for the critics and the actor, while contexts and preference labels are
+    the last epoch's only.
+
+    All arguments of :class:`PEARLSAC`, and:
+
+    :param preference_coef: Weight of the preference loss
+    :param similarity: "two-encoder": <f_r(z_i), f_pi(z_j)>; "inner": <z_i, z_j>, the ablation of Proposition 1
+    :param context: "optimal": (s, a, s', r, Q); "pearl": (s, a, s', r), the ablation
+    :param preference_source: Where J[i, j] comes from. "relabel": task i's reward function on task j's trajectories;
+        "rollout": task j's policy is run on task i, within random groups of tasks, and the steps are counted; "auto": relabel
+        where the family shares dynamics
+    :param preference_group_size: Tasks whose policies are run on each other with "rollout"
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy}
+    policy: POEMPolicy
+
+    def __init__(
+        self,
+        policy: str | type[POEMPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 3e-4,
+        buffer_size: int = 100_000,
+        learning_starts: int = 0,
+        batch_size: int = 128,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        gradient_steps: int = 1000,
+        ent_coef: str | float = "auto",
+        target_update_interval: int = 1,
+        target_entropy: str | float = "auto",
+        n_train_tasks: int | None = None,
+        meta_batch_size: int = 16,
+        context_size: int = 128,
+        trajectories_per_task: int = 1,
+        latent_dim: int = 5,
+        kl_coef: float = 1.0,
+        reward_coef: float = 0.2,
+        policy_coef: float = 0.5,
+        preference_coef: float = 6.0,
+        similarity: str = "two-encoder",
+        context: str = "optimal",
+        preference_source: str = "auto",
+        preference_group_size: int = 4,
+        relabel_fraction: float = 0.0,
+        reward_scale: float = 1.0,
+        horizon: int | None = None,
+        precision: str = "auto",
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        for name, value, known in (
+            ("similarity", similarity, SIMILARITIES),
+            ("context", context, CONTEXTS),
+            ("preference_source", preference_source, PREFERENCE_SOURCES),
+        ):
+            if value not in known:
+                raise ValueError(f"{name} must be one of {', '.join(map(repr, known))}, got {value!r}")
+        if preference_coef < 0:
+            raise ValueError(f"preference_coef must be at least 0, got {preference_coef}")
+        if preference_group_size < 2:
+            raise ValueError(f"preference_group_size must be at least 2, got {preference_group_size}")
+        self.preference_coef = preference_coef
+        self.similarity_metric = similarity
+        self.context_kind = context
+        self.preference_source = preference_source
+        self.preference_group_size = preference_group_size
+        self.context_has_value = context == "optimal"
+        self._groups: list[np.ndarray] | None = None
+        super().__init__(
+            policy,
+            env,
+            learning_rate=learning_rate,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
+            tau=tau,
+            gamma=gamma,
+            gradient_steps=gradient_steps,
+            ent_coef=ent_coef,
+            target_update_interval=target_update_interval,
+            target_entropy=target_entropy,
+            n_train_tasks=n_train_tasks,
+            meta_batch_size=meta_batch_size,
+            context_size=context_size,
+            trajectories_per_task=trajectories_per_task,
+            latent_dim=latent_dim,
+            kl_coef=kl_coef,
+            reward_coef=reward_coef,
+            policy_coef=policy_coef,
+            relabel_fraction=relabel_fraction,
+            reward_scale=reward_scale,
+            horizon=horizon,
+            precision=precision,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=_init_setup_model,
+        )
+
+    def _complete_policy_kwargs(self) -> None:
+        self.policy_kwargs["two_encoder"] = self.similarity_metric == "two-encoder"
+
+    def _draw_tasks(self) -> None:
+        super()._draw_tasks()
+        assert self._family is not None
+        if self.preference_source == "relabel" and not self._family.shared_dynamics:
+            raise ValueError(
+                f'preference_source must be "rollout" or "auto": the tasks of {self.env_id} do not share dynamics, '
+                "so a trajectory of one cannot be relabelled for another"
+            )
+
+    def similarity(self, task_latents: np.ndarray, policy_latents: np.ndarray) -> np.ndarray:
+        """S(z_i, z_j) = <f_r(z_i), f_pi(z_j)> (eq. 3): how well policy j fits task i.
+
+        :param task_latents: (m, latent_dim)
+        :param policy_latents: (n, latent_dim)
+        :return: (m, n)
+        """
+        with th.no_grad():
+            tasks, policies = (
+                th.as_tensor(np.atleast_2d(latents), dtype=th.float32, device=self.device)
+                for latents in (task_latents, policy_latents)
+            )
+            return self.policy.similarity(tasks, policies).double().cpu().numpy()
+
+    @property
+    def _relabels(self) -> bool:
+        return self.preference_source == "relabel" or (self.preference_source == "auto" and self.family.shared_dynamics)
+
+    def _measure_returns(self, epoch: Segment, callback: BaseCallback) -> np.ndarray | None:
+        assert self.train_tasks is not None
+        n_tasks = len(self.train_tasks)
+        if self._relabels:
+            returns = relabelled_returns(self.family.compute_reward, self.train_tasks, epoch.features, epoch.first_episode)
+            return returns.reshape(n_tasks, n_tasks, -1).mean(axis=2)
+        returns = super()._measure_returns(epoch, callback)
+        assert returns is not None
+        return self._measure_by_rollouts(returns, epoch, callback)
+
+    def _measure_by_rollouts(self, returns: np.ndarray, epoch: Segment, callback: BaseCallback) -> np.ndarray | None:
+        """Run the policies of random groups of tasks on each other's tasks; the transitions go to the tasks' buffers."""
+        assert self.train_tasks is not None
+        n_tasks, n_envs = len(returns), self.family.num_envs
+        order = self.generators.numpy.permutation(n_tasks)
+        self._groups = np.array_split(order, max(1, n_tasks // self.preference_group_size))
+        pairs = np.array([(i, j) for group in self._groups for i in group for j in group if i != j], dtype=np.int64)
+        own_latents = epoch.latents.reshape(n_tasks, -1, self.latent_dim)[:, 0]
+        slots = np.resize(np.arange(len(pairs)), -(-len(pairs) // n_envs) * n_envs)
+        for wave in slots.reshape(-1, n_envs):
+            task_ids, policy_ids = pairs[wave].T
+            segment = self._collect(callback, task_ids, self.train_tasks[task_ids], own_latents[policy_ids])
+            if segment is None:
+                return None
+            self.replay_buffer.extend(segment)
+            returns[task_ids, policy_ids] = (segment.rewards * segment.first_episode).sum(axis=1)
+        return returns
+
+    def _choose_tasks(self) -> np.ndarray:
+        if self._groups is None:
+            return super()._choose_tasks()
+        # returns are known within groups only, so a meta-batch is made of whole groups
+        count = max(1, min(self.meta_batch_size // self.preference_group_size, len(self._groups)))
+        chosen = self.generators.numpy.choice(len(self._groups), size=count, replace=False)
+        return np.concatenate([self._groups[index] for index in chosen])
+
+    def _critic_latents(self, latents: th.Tensor) -> th.Tensor:
+        """The paper's objective has no critic term: the encoder learns from the other losses."""
+        return latents.detach()
+
+    def _actor_embedding(self, latents: th.Tensor) -> th.Tensor:
+        """L_policy trains f_pi and the encoder (section 5.3)."""
+        return self.policy.policy_embedding(latents)
+
+    def _embedding_loss(self, batch: MetaBatch, latents: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+        loss, accuracy = preference_loss(self.policy.similarity(latents, latents), batch.returns)
+        return self.preference_coef * loss, {"preference_loss": loss, "preference_accuracy": accuracy}
+
+    def learn(  # type: ignore[override]
+        self: SelfPOEMSAC,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 1,
+        tb_log_name: str = "POEMSAC",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfPOEMSAC:
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
