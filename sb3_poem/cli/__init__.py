@@ -1,0 +1,138 @@
+"""
+The command line, ``sb3-poem``: train, enjoy and adapt.
+
+This file only reads the command; what a command needs is imported when it runs, so that ``sb3-poem --help`` is immediate.
+"""
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from sb3_poem import __version__
+
+ZOO_COMMANDS = {
+    "train": "meta-train an agent (rl_zoo3's train, with poem_sac and pearl_sac)",
+    "enjoy": "watch a trained agent (rl_zoo3's enjoy)",
+}
+EXAMPLES = """\
+examples:
+  sb3-poem train --env poem/HalfCheetahVel-v0 --eval-freq 50000 -P
+  sb3-poem adapt --model HalfCheetahVel --env poem/HalfCheetahVel-v0 --oracle return
+  sb3-poem adapt --model logs/poem_sac/poem-AntGoal-v0_1/poem-AntGoal-v0.zip --env poem/AntGoal-v0 --oracle human
+"""
+
+
+def _count(minimum: int) -> type[int]:
+    def count(text: str) -> int:
+        value = int(text)
+        if value < minimum:
+            raise argparse.ArgumentTypeError(f"must be at least {minimum}, got {value}")
+        return value
+
+    count.__name__ = "whole number"
+    return count  # type: ignore[return-value]
+
+
+def _add_adapt_arguments(parser: argparse.ArgumentParser) -> None:
+    model = parser.add_argument_group("what to adapt")
+    model.add_argument("--model", required=True, help="a model's .zip, a pretrained folder, or the name of a shipped model")
+    model.add_argument("--env", help="environment id (default: the one that the model was trained on)")
+    model.add_argument("--env-kwargs", nargs="+", metavar="KEY:VALUE", default=[], help="arguments of the environment")
+    model.add_argument("--device", default="cpu", help="PyTorch device (default: %(default)s)")
+
+    questions = parser.add_argument_group("the questions and who answers them")
+    questions.add_argument("--oracle", choices=("return", "boltzmann", "mistake", "human"), default="return")
+    questions.add_argument("--beta", type=float, help="inverse temperature of --oracle boltzmann (default: the paper's)")
+    questions.add_argument("--mistake-rate", type=float, default=0.2, help="of --oracle mistake (default: %(default)s)")
+    questions.add_argument("--queries", type=_count(1), default=10, help="questions per task (default: %(default)s)")
+    questions.add_argument("--inference", choices=("paper", "bayes"), default="bayes", help="default: %(default)s")
+    questions.add_argument("--candidates", choices=("prior", "aggregate"), help="default: the adapter's own")
+
+    tasks = parser.add_argument_group("test tasks")
+    tasks.add_argument("--tasks", type=_count(1), help="how many, drawn anew (default: 30; 1 with --oracle human)")
+    tasks.add_argument("--task", type=float, nargs="+", metavar="X", help="this one task instead, its numbers one by one")
+    tasks.add_argument("--episodes", type=_count(1), default=10, help="per task and evaluation (default: %(default)s)")
+    tasks.add_argument("--seed", type=_count(0), default=0, help="of the test tasks and of everything else (default: 0)")
+
+    output = parser.add_argument_group("output")
+    output.add_argument("--json", type=Path, metavar="FILE", help="write every task's returns, with versions and command")
+    output.add_argument("--plot", type=Path, metavar="FILE", help="write the return against the queries (PNG, PDF, SVG)")
+    output.add_argument("--video", type=Path, metavar="FILE", help="write one task before and after side by side (MP4, GIF)")
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of ``sb3-poem``; the zoo commands hand their own arguments on to rl_zoo3."""
+    parser = argparse.ArgumentParser(
+        prog="sb3-poem",
+        description="Meta-train agents on families of tasks, and adapt them to hidden tasks from preferences alone.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="{train,enjoy,adapt}")
+    for name, summary in ZOO_COMMANDS.items():
+        commands.add_parser(name, help=summary, add_help=False)
+    adapt = commands.add_parser(
+        "adapt",
+        help="adapt a trained agent to unseen tasks by preference queries",
+        description="Adapt a trained agent to unseen tasks by preference queries, and print what it earns after each.",
+    )
+    _add_adapt_arguments(adapt)
+    return parser
+
+
+def use_offscreen_rendering() -> None:
+    """Where there is no display, let MuJoCo draw through EGL or OSMesa, unless the user chose. Call before importing it."""
+    from ctypes.util import find_library
+
+    if sys.platform != "linux" or "MUJOCO_GL" in os.environ or has_display():
+        return
+    for backend, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
+        if find_library(library):
+            os.environ["MUJOCO_GL"] = backend
+            return
+
+
+def has_display() -> bool:
+    """Whether a window can be opened."""
+    return sys.platform != "linux" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+
+
+def _run(arguments: argparse.Namespace, others: list[str]) -> int:
+    use_offscreen_rendering()
+    if arguments.command in ZOO_COMMANDS:
+        from sb3_poem.cli.zoo import run_zoo
+
+        run_zoo(arguments.command, others)
+    else:
+        from sb3_poem.cli.adapt import run_adapt
+
+        run_adapt(arguments)
+    return 0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Run ``sb3-poem``.
+
+    :param argv: the arguments (default: those of this process)
+    :return: the exit status
+    """
+    parser = build_parser()
+    arguments, others = parser.parse_known_args(argv)
+    if others and arguments.command not in ZOO_COMMANDS:
+        parser.error(f"unrecognized arguments: {' '.join(others)}")
+    try:
+        return _run(arguments, others)
+    except KeyboardInterrupt:
+        print("Interrupted.", file=sys.stderr)
+        return 130
+    except (ValueError, TypeError, OSError) as error:
+        # The library says in these what the user gave and what would be right; a developer wants the place as well.
+        if os.environ.get("SB3_POEM_TRACEBACK"):
+            raise
+        print(f"sb3-poem {arguments.command}: error: {error}", file=sys.stderr)
+        print("(SB3_POEM_TRACEBACK=1 shows where it was raised)", file=sys.stderr)
+        return 1
