@@ -1,0 +1,284 @@
+"""SB3's face of a vectorised task family: all copies step in one call, ``infos`` are as with ``DummyVecEnv`` and ``Monitor``."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
+
+from poem_envs.core import TaskFamily
+from poem_envs.vector import TaskFamilyVector
+
+# What these do, the vectorised environment or TaskVecEnv does itself.
+ABSORBED_WRAPPERS: tuple[type[gym.Wrapper], ...] = (TimeLimit, OrderEnforcing, PassiveEnvChecker, Monitor)
+
+
+class TaskVecEnv(VecEnv):
+    """
+    Vectorised environment for task families that have a vectorised version (``vector_entry_point``).
+
+    It takes the place of ``DummyVecEnv`` where a class can be given (``make_vec_env(id, n, vec_env_cls=TaskVecEnv)``, rl_zoo3),
+    steps all copies at once, and gives the same observations, rewards and infos. ``infos[i]`` holds ``"reward_features"``, and as
+    ``Monitor`` and ``DummyVecEnv`` have them ``"TimeLimit.truncated"``, ``"terminal_observation"`` and ``"episode"``.
+    ``get_attr`` and ``env_method`` see each copy as a single :class:`poem_envs.TaskFamily`.
+
+    :param env_fns: One function a copy that returns an environment. Only the first is called: all copies are made alike, from
+        its registration and arguments. If its ``Monitor`` has a file, the episodes of all copies are written to that file.
+    :param nthread: Number of threads of a MuJoCo family; None for the family's default (all cores).
+    :raises ValueError: If the environment is no task family, has no vectorised version, was not made by ``gym.make``, is inside
+        a wrapper other than ``TimeLimit``, ``OrderEnforcing``, ``PassiveEnvChecker`` and ``Monitor``, or was given a task.
+    """
+
+    def __init__(self, env_fns: Sequence[Callable[[], gym.Env]], nthread: int | None = None) -> None:
+        if len(env_fns) < 1:
+            raise ValueError("env_fns is empty; pass one function for each copy")
+        env = env_fns[0]()
+        wrappers = _wrappers(env)
+        self.vector_env = _vectorised(env, wrappers, len(env_fns), nthread)
+        self._wrapper_types = tuple(type(wrapper) for wrapper in wrappers)
+        self._monitor = next((wrapper for wrapper in wrappers if isinstance(wrapper, Monitor)), None)
+        env.unwrapped.close()  # not env.close(): the monitor's file stays in use
+
+        self._views = [_CopyView(self.vector_env, index) for index in range(len(env_fns))]
+        super().__init__(len(env_fns), self.vector_env.single_observation_space, self.vector_env.single_action_space)
+        self.metadata = self.vector_env.metadata
+        self._actions: np.ndarray | None = None
+        self._last_reward_features: np.ndarray | None = None
+        self._returns = np.zeros(self.num_envs)
+        self._lengths = np.zeros(self.num_envs, dtype=np.int64)
+        self._start_time = time.time() if self._monitor is None else self._monitor.t_start
+
+    @classmethod
+    def from_id(cls, env_id: str, n_envs: int, nthread: int | None = None, **env_kwargs: Any) -> TaskVecEnv:
+        """
+        Make the copies of a registered family.
+
+        :param env_id: As for ``gym.make``
+        :param n_envs: Number of copies
+        :param nthread: See the class
+        :param env_kwargs: Arguments of the environment
+        """
+        return cls([functools.partial(gym.make, env_id, **env_kwargs)] * n_envs, nthread=nthread)
+
+    @property
+    def tasks(self) -> np.ndarray | None:
+        """The tasks in effect, ``(num_envs, task_dim)``; None before the first reset."""
+        return self.vector_env.tasks
+
+    @property
+    def last_reward_features(self) -> np.ndarray | None:
+        """``(num_envs, reward_feature_dim)``, those of the last step; None before the first."""
+        return self._last_reward_features
+
+    def set_tasks(self, tasks: npt.ArrayLike) -> None:
+        """
+        Choose each copy's task, from its next reset on.
+
+        :param tasks: ``(num_envs, task_dim)``
+        :raises ValueError: As :meth:`poem_envs.TaskFamilyVector.set_tasks`
+        """
+        self.vector_env.set_tasks(tasks)
+
+    def reset(self) -> VecEnvObs:
+        for index, options in enumerate(self._options):
+            if options:
+                unknown = set(options) - {"task"}
+                if unknown:
+                    raise ValueError(f"options={options!r} of reset holds unknown keys {sorted(unknown)}, known is 'task'")
+                self.vector_env.set_tasks([options["task"]], copies=[index])
+        observations, _ = self.vector_env.reset(seed=self._seeds)
+        self._reset_seeds()
+        self._reset_options()
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        self._returns[:] = 0.0
+        self._lengths[:] = 0
+        return observations
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        if self._actions is None:
+            raise RuntimeError("step_wait() was called without step_async(actions)")
+        actions, self._actions = self._actions, None
+        observations, rewards, terminations, truncations, vector_infos = self.vector_env.step(actions)
+        features = vector_infos["reward_features"]
+        self._last_reward_features = features
+        self._returns += rewards
+        self._lengths += 1
+        cut_short = truncations & ~terminations
+        infos: list[dict[str, Any]] = [
+            {"reward_features": row, "TimeLimit.truncated": cut} for row, cut in zip(features, cut_short.tolist(), strict=True)
+        ]
+        dones = terminations | truncations
+        for index in np.flatnonzero(dones).tolist():
+            infos[index]["terminal_observation"] = vector_infos["final_obs"][index]
+            infos[index]["episode"] = self._episode_info(index, infos[index])
+        self._returns[dones] = 0.0
+        self._lengths[dones] = 0
+        return observations, rewards.astype(np.float32), dones, infos
+
+    def close(self) -> None:
+        self.vector_env.close()
+        if self._monitor is not None and self._monitor.results_writer is not None:
+            self._monitor.results_writer.close()
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        if self.render_mode != "rgb_array":
+            warnings.warn(
+                f"The render mode is {self.render_mode}, but this method assumes it is `rgb_array` to obtain images.",
+                stacklevel=2,
+            )
+            return [None] * self.num_envs
+        images = self.vector_env.render()
+        assert images is not None
+        return images
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        return [getattr(self._views[index], attr_name) for index in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        if sorted(self._get_indices(indices)) != list(range(self.num_envs)):
+            raise ValueError(
+                f"indices={indices!r}: copies share their attributes, so {attr_name!r} can only be set for all of them"
+            )
+        if attr_name in ("task", "tasks"):
+            raise AttributeError(f"{attr_name!r} cannot be set; use set_tasks(tasks), which takes effect at the next reset")
+        setattr(self.vector_env, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        return [
+            getattr(self._views[index], method_name)(*method_args, **method_kwargs) for index in self._get_indices(indices)
+        ]
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
+        """
+        Whether the copies do what a wrapper does: those that the first environment was inside, and ``Monitor`` always.
+        """
+        wrapped = any(issubclass(kind, wrapper_class) for kind in [Monitor, *self._wrapper_types])
+        return [wrapped for _ in self._get_indices(indices)]
+
+    def _episode_info(self, index: int, info: dict[str, Any]) -> dict[str, Any]:
+        episode = {
+            "r": round(float(self._returns[index]), 6),
+            "l": int(self._lengths[index]),
+            "t": round(time.time() - self._start_time, 6),
+        }
+        if self._monitor is not None:
+            episode.update({key: info[key] for key in self._monitor.info_keywords})
+            if self._monitor.results_writer is not None:
+                self._monitor.results_writer.write_row(episode)
+        return episode
+
+    def __getstate__(self) -> dict[str, Any]:
+        if self._monitor is not None and self._monitor.results_writer is not None:
+            raise TypeError("a TaskVecEnv whose Monitor writes to a file cannot be pickled; make it without monitor_dir")
+        return {**self.__dict__, "_monitor": None}
+
+
+class _CopyView:
+    """One copy of a vectorised task family, with the attributes and methods of a single one."""
+
+    # What a vectorised environment has for all copies together must not pass for an attribute of one copy.
+    _HIDDEN = frozenset({"tasks", "set_tasks", "num_envs", "reset", "step", "close", "closed", "render_copy", "close_extras"})
+
+    def __init__(self, vector_env: TaskFamilyVector, index: int) -> None:
+        self._vector_env = vector_env
+        self._index = index
+
+    @property
+    def unwrapped(self) -> _CopyView:
+        return self
+
+    @property
+    def task(self) -> np.ndarray | None:
+        tasks = self._vector_env.tasks
+        return None if tasks is None else tasks[self._index]
+
+    @property
+    def observation_space(self) -> gym.Space:
+        return self._vector_env.single_observation_space
+
+    @property
+    def action_space(self) -> gym.Space:
+        return self._vector_env.single_action_space
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        return self._vector_env.np_random[self._index]
+
+    @property
+    def np_random_seed(self) -> int:
+        return self._vector_env.np_random_seed[self._index]
+
+    def set_task(self, task: npt.ArrayLike) -> None:
+        self._vector_env.set_tasks([np.asarray(task)], copies=[self._index])
+
+    def get_physics_state(self) -> np.ndarray:
+        return self._vector_env.get_physics_state(self._index)
+
+    def set_physics_state(self, state: npt.ArrayLike) -> None:
+        self._vector_env.set_physics_state(self._index, state)
+
+    def render(self) -> Any:
+        return self._vector_env.render_copy(self._index)
+
+    def get_wrapper_attr(self, name: str) -> Any:
+        return getattr(self, name)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or name in ("_vector_env", *self._HIDDEN):
+            raise AttributeError(f"a copy of a vectorised task family has no attribute {name!r}")
+        return getattr(self._vector_env, name)
+
+
+def _wrappers(env: gym.Env) -> list[gym.Wrapper]:
+    """The wrappers around an environment, outermost first."""
+    wrappers = []
+    while isinstance(env, gym.Wrapper):
+        wrappers.append(env)
+        env = env.env
+    return wrappers
+
+
+def _vectorised(env: gym.Env, wrappers: list[gym.Wrapper], num_envs: int, nthread: int | None) -> TaskFamilyVector:
+    """The vectorised version of a single environment, from its registration and arguments."""
+    bare, instead = env.unwrapped, "use DummyVecEnv instead of TaskVecEnv"
+    if not isinstance(bare, TaskFamily):
+        raise ValueError(f"{bare} is no task family (a subclass of poem_envs.TaskFamily); {instead}")
+    foreign = [type(wrapper).__name__ for wrapper in wrappers if type(wrapper) not in ABSORBED_WRAPPERS]
+    if foreign:
+        allowed = ", ".join(kind.__name__ for kind in ABSORBED_WRAPPERS)
+        raise ValueError(
+            f"the environment is wrapped in {', '.join(foreign)}, but only {allowed} can be vectorised; {instead}"
+        )
+    for monitor in wrappers:
+        if isinstance(monitor, Monitor) and (monitor.reset_keywords or not monitor.allow_early_resets):
+            raise ValueError(f"Monitor's reset_keywords and allow_early_resets=False are not supported; {instead}")
+    if bare.spec is None:
+        raise ValueError(f"{bare} was not made by gym.make, so that its arguments are unknown; register it, or {instead}")
+    if bare.spec.vector_entry_point is None:
+        raise ValueError(f"{bare.spec.id} is registered without a vector_entry_point; {instead}")
+    if bare._next_task is not None:
+        raise ValueError("the environment was given a task, which its copies would not get; call set_tasks on the TaskVecEnv")
+    limits = [wrapper._max_episode_steps for wrapper in wrappers if isinstance(wrapper, TimeLimit)]
+    spec = copy.deepcopy(bare.spec)
+    spec.max_episode_steps = min(limits, default=None)
+    kwargs: dict[str, Any] = {} if nthread is None else {"nthread": nthread}
+    vector_env = gym.make_vec(spec, num_envs, "vector_entry_point", **kwargs)
+    if not isinstance(vector_env, TaskFamilyVector):
+        raise ValueError(f"the vector_entry_point of {spec.id} is no poem_envs.TaskFamilyVector; {instead}")
+    vector_env.spec = spec  # a single environment's: make_vec's own adds what gym.make does not take
+    return vector_env
