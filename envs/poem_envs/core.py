@@ -1,6 +1,7 @@
 """Task families: environments that share observations and actions, and differ in a hidden parameter, the *task*.
 
-:class:`TaskFamily` is the base class of a single environment. :mod:`poem_envs.vector` builds vectorised ones on the same contract.
+:class:`TaskFamily` is the base class of a single environment; :mod:`poem_envs.vector` builds vectorised ones on the same
+contract.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 
-# Rounding in float32 policies and files may leave a value just outside its bounds: up to here it is clipped, beyond it is an error.
+# Rounding in float32 policies and files may leave a value just outside its bounds: up to this it is clipped, not refused.
 BOUNDS_TOLERANCE = 1e-6
 
 
@@ -109,7 +110,7 @@ class TaskDefinition:
 class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray]):
     """Base class of a single environment whose task is hidden.
 
-    A subclass sets ``observation_space``, ``action_space``, ``task_space`` and ``reward_feature_dim`` and defines three methods::
+    A subclass sets ``observation_space``, ``action_space``, ``task_space``, ``reward_feature_dim`` and defines three methods::
 
         class Walk1D(TaskFamily):
             observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float64)
@@ -128,10 +129,10 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray]):
             def _reward(self, tasks, features):             # elementwise, broadcasting
                 return -np.abs(features[..., 0] - tasks[..., 0])
 
-    The base class checks actions and tasks, draws and keeps the task, computes the reward from the features and fills in the info.
+    The base class checks actions and tasks, draws and keeps the task, computes the reward and fills in the info.
 
-    **The task.** :meth:`set_task` chooses it, from the next reset on. As long as none was chosen, ``reset(seed=...)`` draws one from the
-    family's distribution, from a stream of its own that the seed determines; a reset without a seed keeps it.
+    **The task.** :meth:`set_task` chooses it, from the next reset on. As long as none was chosen, ``reset(seed=...)`` draws
+    one from the family's distribution, from a stream of its own that the seed determines; a reset without a seed keeps it.
     Neither choice touches the random numbers of the episode itself, so two tasks see the same start.
 
     **The info** of every step holds ``"reward_features"``, ``(reward_feature_dim,)`` float64: everything that rewards of this
@@ -165,7 +166,7 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray]):
         """Choose the task of the episodes that begin from the next reset on.
 
         :param task: ``(task_dim,)``, inside ``task_space``
-        :raises ValueError: if it has another shape, is not finite, lies outside ``task_space`` or is not a member of a finite family
+        :raises ValueError: if it has another shape, is not finite, or lies outside ``task_space`` (or the finite family)
         """
         self._next_task = self._checked_tasks(task, self.task_space.shape, "task")
 

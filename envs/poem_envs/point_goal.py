@@ -71,7 +71,7 @@ class _PointGoal(BatchFamily):
         canvas.disc(0.0, 0.0, 0.02, (190, 190, 190))
         if task is not None:
             canvas.disc(np.cos(task[0]), np.sin(task[0]), 0.07, (60, 160, 75))
-        canvas.disc(*self._positions[copy], 0.045, (31, 90, 180))
+        canvas.disc(self._positions[copy, 0], self._positions[copy, 1], 0.045, (31, 90, 180))
         image = canvas.image()
         if render_mode == "rgb_array":
             return image
@@ -94,12 +94,12 @@ class PointGoalEnv(_PointGoal, BatchTaskFamily):
     r"""
     ## Description
     A point starts near the origin of the plane and is to move to a goal on the upper unit half-circle that it cannot see.
-    It is the smallest environment on which meta-learning shows: where to go is in the task alone, and a policy for it takes seconds to
-    train. Use it for tests, documentation and first contact.
+    It is the smallest environment on which meta-learning shows: where to go is in the task alone, and a policy for it takes
+    seconds to train. Use it for tests, documentation and first contact.
 
     ## Task
-    The angle of the goal, uniform on [0, pi], hidden from the observation: `task_space` is `Box(0, pi, (1,), float64)`, and the goal lies
-    at `(cos(angle), sin(angle))`.
+    The angle of the goal, uniform on [0, pi], hidden from the observation: `task_space` is `Box(0, pi, (1,), float64)`, and
+    the goal lies at `(cos(angle), sin(angle))`.
 
     ## Action Space
     The action space is a `Box(-1, 1, (2,), float32)`.

@@ -6,7 +6,7 @@ Both run the same code, the single one as a batch of one, so their results agree
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -36,8 +36,13 @@ class BatchFamily(TaskDefinition):
         class Walk1DEnv(_Walk1D, BatchTaskFamily): ...         # one copy, a Gymnasium environment
         class Walk1DVectorEnv(_Walk1D, TaskFamilyVector): ...  # n copies, a Gymnasium vector environment
 
-    Its constructor hands ``observation_space`` and ``action_space`` (of one copy) and all that it does not know to ``super().__init__``.
+    Its constructor hands ``observation_space`` and ``action_space`` (of one copy) and all that it does not know to
+    ``super().__init__``.
     """
+
+    if TYPE_CHECKING:  # the constructor of either class below
+
+        def __init__(self, **kwargs: Any) -> None: ...
 
     def _allocate(self, n: int) -> None:
         """Make room for the states of ``n`` copies. Called once, by the constructor."""
@@ -149,8 +154,8 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
     """A vectorised task family, each copy with a task of its own.
 
     - A copy whose episode ends is reset in the same step (``AutoresetMode.SAME_STEP``). ``infos["final_obs"]`` then holds
-      ``(num_envs, obs_dim)``: the observation that each copy's step led to, which differs from the returned one for copies that were
-      reset (``infos["_final_obs"]``, a mask). The key is there only if some copy was reset.
+      ``(num_envs, obs_dim)``: the observation that each copy's step led to, which differs from the returned one for copies
+      that were reset (``infos["_final_obs"]``, a mask). The key is there only if some copy was reset.
     - ``infos["reward_features"]``, ``(num_envs, reward_feature_dim)``, is always that of the step just taken.
     - ``reset(seed=s)`` seeds copy ``i`` with ``s + i``; results equal those of single environments bit for bit.
 
@@ -182,9 +187,7 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
             raise ValueError(f"max_episode_steps={max_episode_steps!r} must be at least 1, or None for no limit")
         check_render_mode(render_mode, self.metadata)
         if render_mode == "human" and num_envs > 1:
-            raise ValueError(
-                f"render_mode='human' opens a window for one environment, but num_envs={num_envs}; use 'rgb_array'"
-            )
+            raise ValueError(f"render_mode='human' shows one environment, but num_envs={num_envs}; use 'rgb_array'")
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps
         self.render_mode = render_mode
@@ -213,7 +216,7 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
 
         :param tasks: ``(num_envs, task_dim)``, or one row for each of ``copies``
         :param copies: numbers of the copies to set; None for all
-        :raises ValueError: if a task has another shape, is not finite, lies outside ``task_space`` or is not a member of a finite family
+        :raises ValueError: if a task has another shape, is not finite, or lies outside ``task_space`` (or the finite family)
         """
         index = np.arange(self.num_envs) if copies is None else np.asarray(copies, dtype=np.intp)
         self._next_tasks[index] = self._checked_tasks(tasks, (len(index), *self.task_space.shape), "tasks")
@@ -247,7 +250,7 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
             undecided = ~self._task_chosen
         else:
             undecided = ~self._task_chosen & np.array([s is not None for s in seeds])
-        for copy in np.flatnonzero(undecided):
+        for copy in np.flatnonzero(undecided).tolist():
             self._tasks[copy] = self.sample_tasks(1, task_stream(self._rngs[copy]))[0]
         self._begin(np.arange(self.num_envs))
         if self.render_mode == "human":
@@ -322,7 +325,7 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         """Free what rendering and simulation hold."""
         self._release()
 
-    @property
+    @property  # type: ignore[misc]
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
         """The generator of each copy; empty before the first reset."""
         return tuple(self._rngs)
@@ -338,9 +341,7 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         if isinstance(seed, (int, np.integer)):
             return [int(seed) + copy for copy in range(self.num_envs)]
         if len(seed) != self.num_envs:
-            raise ValueError(
-                f"seed={seed!r} holds {len(seed)} seeds, expected one for each of num_envs={self.num_envs} copies"
-            )
+            raise ValueError(f"seed={seed!r} holds {len(seed)} seeds, expected one for each of num_envs={self.num_envs}")
         return list(seed)
 
     def _begin(self, copies: np.ndarray) -> None:

@@ -1,4 +1,4 @@
-"""SB3's face of a vectorised task family: all copies step in one call, ``infos`` are as with ``DummyVecEnv`` and ``Monitor``."""
+"""SB3's face of a vectorised task family: all copies step in one call, infos are as with ``DummyVecEnv`` and ``Monitor``."""
 
 from __future__ import annotations
 
@@ -27,16 +27,18 @@ class TaskVecEnv(VecEnv):
     """
     Vectorised environment for task families that have a vectorised version (``vector_entry_point``).
 
-    It takes the place of ``DummyVecEnv`` where a class can be given (``make_vec_env(id, n, vec_env_cls=TaskVecEnv)``, rl_zoo3),
-    steps all copies at once, and gives the same observations, rewards and infos. ``infos[i]`` holds ``"reward_features"``, and as
-    ``Monitor`` and ``DummyVecEnv`` have them ``"TimeLimit.truncated"``, ``"terminal_observation"`` and ``"episode"``.
-    ``get_attr`` and ``env_method`` see each copy as a single :class:`poem_envs.TaskFamily`.
+    It takes the place of ``DummyVecEnv`` where a class can be given: ``make_vec_env(id, n, vec_env_cls=TaskVecEnv)``, rl_zoo3.
+    It steps all copies at once, and gives the same observations, rewards and infos. ``infos[i]`` holds
+    ``"reward_features"``, and as ``Monitor`` and ``DummyVecEnv`` have them ``"TimeLimit.truncated"``,
+    ``"terminal_observation"`` and ``"episode"``. ``get_attr`` and ``env_method`` see each copy as a single
+    :class:`poem_envs.TaskFamily`.
 
     :param env_fns: One function a copy that returns an environment. Only the first is called: all copies are made alike, from
         its registration and arguments. If its ``Monitor`` has a file, the episodes of all copies are written to that file.
     :param nthread: Number of threads of a MuJoCo family; None for the family's default (all cores).
-    :raises ValueError: If the environment is no task family, has no vectorised version, was not made by ``gym.make``, is inside
-        a wrapper other than ``TimeLimit``, ``OrderEnforcing``, ``PassiveEnvChecker`` and ``Monitor``, or was given a task.
+    :raises ValueError: If the environment is no task family, has no vectorised version, was not made by ``gym.make``, was
+        given a task already, or is inside a wrapper other than ``TimeLimit``, ``OrderEnforcing``, ``PassiveEnvChecker`` and
+        ``Monitor``.
     """
 
     def __init__(self, env_fns: Sequence[Callable[[], gym.Env]], nthread: int | None = None) -> None:
@@ -167,7 +169,7 @@ class TaskVecEnv(VecEnv):
         """
         Whether the copies do what a wrapper does: those that the first environment was inside, and ``Monitor`` always.
         """
-        wrapped = any(issubclass(kind, wrapper_class) for kind in [Monitor, *self._wrapper_types])
+        wrapped = issubclass(Monitor, wrapper_class) or any(issubclass(kind, wrapper_class) for kind in self._wrapper_types)
         return [wrapped for _ in self._get_indices(indices)]
 
     def _episode_info(self, index: int, info: dict[str, Any]) -> dict[str, Any]:
