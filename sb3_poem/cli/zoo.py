@@ -15,15 +15,11 @@ from rl_zoo3 import enjoy as zoo_enjoy
 from rl_zoo3 import train as zoo_train
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
-from stable_baselines3.common.base_class import BaseAlgorithm
 
 from poem_envs import TaskFamily
 from sb3_poem.cli import has_display
-from sb3_poem.pearl_sac import PEARLSAC
-from sb3_poem.poem_sac import POEMSAC
+from sb3_poem.cli.models import ALGORITHMS
 from sb3_poem.resources import config_file
-
-ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"poem_sac": POEMSAC, "pearl_sac": PEARLSAC}
 
 # What rl_zoo3 takes out of an entry for itself before the rest goes to the algorithm.
 ZOO_KEYS = frozenset(
@@ -88,9 +84,7 @@ class PoemExperimentManager(ExperimentManager):
     ):
         if algo in ALGORITHMS:
             if is_task_family(env_id) is False:
-                raise ValueError(
-                    f"--env {env_id} is no task family (a subclass of poem_envs.core.TaskFamily); {algo} needs one"
-                )
+                raise ValueError(f"--env {env_id} is no task family (a poem_envs.TaskFamily), and {algo} needs one")
             kwargs["config"] = kwargs.get("config") or str(config_file(algo))
         for folder in filter(None, (log_folder, tensorboard_log)):
             check_writable(folder)
@@ -138,7 +132,7 @@ def run_zoo(command: str, arguments: Sequence[str]) -> None:
     # rl_zoo3's programs read the process's own arguments.
     own_arguments = sys.argv
     sys.argv = [f"sb3-poem {command}", *defaults, *arguments]
-    zoo_train.ExperimentManager = PoemExperimentManager
+    zoo_train.ExperimentManager = PoemExperimentManager  # type: ignore[misc]
     try:
         zoo_train.train() if command == "train" else zoo_enjoy.enjoy()
     except AssertionError as error:
@@ -148,4 +142,4 @@ def run_zoo(command: str, arguments: Sequence[str]) -> None:
         raise ValueError(str(error)) from error
     finally:
         sys.argv = own_arguments
-        zoo_train.ExperimentManager = ExperimentManager
+        zoo_train.ExperimentManager = ExperimentManager  # type: ignore[misc]

@@ -1,0 +1,109 @@
+"""The command line, run as a user runs it, or in this process where that is slow."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from sb3_poem import cli, resources
+
+
+def sb3_poem(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "sb3_poem.cli", *arguments], capture_output=True, text=True, check=False)
+
+
+def test_help_is_immediate_and_names_every_command() -> None:
+    seconds = []
+    for _ in range(3):
+        start = time.perf_counter()
+        done = sb3_poem("--help")
+        seconds.append(time.perf_counter() - start)
+        assert done.returncode == 0, done.stderr
+        for command in ("train", "enjoy", "adapt"):
+            assert f"\n    {command} " in done.stdout
+    assert min(seconds) < 1.0, seconds
+
+
+def test_help_does_not_import_what_is_slow() -> None:
+    slow = {"torch", "mujoco", "rl_zoo3", "matplotlib"}
+    code = f"import sys, sb3_poem.cli; sb3_poem.cli.build_parser().format_help(); print({slow} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "required"),
+        (["dance"], "invalid choice"),
+        (["adapt"], "--model"),
+        (["adapt", "--model", "x", "--colour", "red"], "--colour"),
+        (["adapt", "--model", "x", "--queries", "0"], "at least 1"),
+        (["adapt", "--model", "x", "--tasks", "0"], "at least 1"),
+        (["adapt", "--model", "x", "--oracle", "coin"], "invalid choice"),
+    ],
+)
+def test_a_wrong_command_is_refused(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main(arguments)
+    assert stop.value.code == 2
+    assert words in capsys.readouterr().err
+
+
+def test_unknown_model_lists_the_shipped_ones(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["adapt", "--model", "HalfCheetahVell"]) == 1
+    error = capsys.readouterr().err
+    assert "HalfCheetahVell" in error
+    assert all(name in error for name in resources.pretrained_names())
+
+
+def test_missing_model_file_is_named(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert cli.main(["adapt", "--model", str(tmp_path / "missing.zip")]) == 1
+    assert "missing.zip: there is no such file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut off", b"not an archive at all" * 100])
+def test_truncated_or_foreign_model_file_is_refused(
+    content: bytes, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "model.zip"
+    path.write_bytes(content)
+    assert cli.main(["adapt", "--model", str(path)]) == 1
+    assert "truncated" in capsys.readouterr().err
+
+
+def test_shipped_files_of_other_names_are_not_found() -> None:
+    with pytest.raises(FileNotFoundError, match="poem_sac"):
+        resources.config_file("poem_zac")
+    with pytest.raises(FileNotFoundError, match="there are:"):
+        resources.pretrained_folder("Nobody")
+
+
+def without_display(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+
+
+@pytest.mark.parametrize(("libraries", "expected"), [({"EGL", "OSMesa"}, "egl"), ({"OSMesa"}, "osmesa"), (set(), None)])
+def test_rendering_without_a_display(monkeypatch: pytest.MonkeyPatch, libraries: set[str], expected: str | None) -> None:
+    without_display(monkeypatch)
+    monkeypatch.setattr("ctypes.util.find_library", lambda name: f"lib{name}.so" if name in libraries else None)
+    monkeypatch.setenv("MUJOCO_GL", "")  # so that monkeypatch restores it afterwards
+    monkeypatch.delenv("MUJOCO_GL")
+    cli.use_offscreen_rendering()
+    assert os.environ.get("MUJOCO_GL") == expected
+
+
+def test_the_users_choice_of_rendering_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    without_display(monkeypatch)
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    cli.use_offscreen_rendering()
+    assert os.environ["MUJOCO_GL"] == "osmesa"
+    monkeypatch.delenv("MUJOCO_GL")
+    monkeypatch.setenv("DISPLAY", ":0")
+    cli.use_offscreen_rendering()
+    assert "MUJOCO_GL" not in os.environ

@@ -1,0 +1,182 @@
+"""``sb3-poem train`` and ``enjoy``: rl_zoo3 with our algorithms, files and checks."""
+
+import sys
+from pathlib import Path
+
+import optuna
+import pytest
+import yaml
+from rl_zoo3 import ALGOS
+from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
+
+from sb3_poem import PEARLSAC, POEMSAC, cli, resources
+from sb3_poem.cli.zoo import check_keys, register_algorithms
+
+SMALL = {
+    "policy": "MlpPolicy",
+    "n_timesteps": 300,
+    "n_envs": 6,
+    "n_train_tasks": 6,
+    "gradient_steps": 3,
+    "meta_batch_size": 4,
+    "batch_size": 16,
+    "context_size": 16,
+    "policy_kwargs": "dict(net_arch=[16, 16])",
+}
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    path = tmp_path / "small.yml"
+    path.write_text(yaml.safe_dump({"poem/PointGoal-v0": SMALL}))
+    return path
+
+
+def train(*arguments: object) -> int:
+    return cli.main(["train", "--env", "poem/PointGoal-v0", "--seed", "0", "--verbose", "0", *map(str, arguments)])
+
+
+def test_algorithms_are_registered() -> None:
+    register_algorithms()
+    assert ALGOS["poem_sac"] is POEMSAC
+    assert ALGOS["pearl_sac"] is PEARLSAC
+    assert {"poem_sac", "pearl_sac"} <= set(HYPERPARAMS_SAMPLER) & set(HYPERPARAMS_CONVERTER)
+
+
+@pytest.mark.parametrize("algorithm", ["poem_sac", "pearl_sac"])
+def test_sampled_hyperparameters_are_arguments_of_the_algorithm(algorithm: str) -> None:
+    register_algorithms()
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    for _ in range(5):
+        trial = study.ask()
+        sampled = HYPERPARAMS_SAMPLER[algorithm](trial, 2, 1, {})
+        check_keys(list(sampled), algorithm, "the sampler")
+        assert HYPERPARAMS_CONVERTER[algorithm](trial.params) == sampled
+        assert 0.9 < sampled["gamma"] < 1.0
+        assert sampled["batch_size"] & (sampled["batch_size"] - 1) == 0
+
+
+@pytest.mark.parametrize("file", sorted(resources.shipped_folder("zoo_configs").glob("*.yml")), ids=lambda file: file.name)
+def test_shipped_hyperparameters_are_known_and_cover_the_environments(file: Path) -> None:
+    import gymnasium as gym
+
+    register_algorithms()
+    algorithm = "pearl_sac" if file.stem.startswith("pearl") else "poem_sac"
+    entries = yaml.safe_load(file.read_text())
+    assert {name for name in gym.registry if name.startswith("poem/")} <= set(entries)
+    for env_id, entry in entries.items():
+        check_keys(list(entry), algorithm, f"{file}, {env_id}")
+        assert entry["policy"] == "MlpPolicy"
+        assert float(entry["n_timesteps"]) > 0
+
+
+def test_train_then_enjoy_then_continue(config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    logs = tmp_path / "logs"
+    assert train("-c", config, "-f", logs, "--eval-freq", -1) == 0
+    run = logs / "poem_sac" / "poem-PointGoal-v0_1"
+    model = POEMSAC.load(run / "poem-PointGoal-v0.zip")
+    assert model.num_timesteps == 300
+    saved = yaml.load((run / "poem-PointGoal-v0" / "config.yml").read_text(), yaml.UnsafeLoader)
+    assert saved["n_train_tasks"] == len(model.task_latents) == 6
+
+    capsys.readouterr()
+    assert cli.main(["enjoy", "--env", "poem/PointGoal-v0", "-f", str(logs), "--no-render", "-n", "60"]) == 0
+    assert "2 Episodes" in capsys.readouterr().out
+
+    assert train("-c", config, "-f", logs, "--eval-freq", -1, "-i", run / "poem-PointGoal-v0.zip", "-n", 150) == 0
+    assert (logs / "poem_sac" / "poem-PointGoal-v0_2" / "poem-PointGoal-v0.zip").is_file()
+
+
+def test_our_vectorised_environment_collects(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from sb3_poem.common.vec_env import TaskVecEnv
+
+    made = []
+    create_envs = ExperimentManager.create_envs
+
+    def spy(self: ExperimentManager, *args: object, **kwargs: object) -> object:
+        made.append(create_envs(self, *args, **kwargs))  # type: ignore[arg-type]
+        return made[-1]
+
+    monkeypatch.setattr(ExperimentManager, "create_envs", spy)
+    assert train("-c", config, "-f", tmp_path / "logs", "--eval-freq", -1) == 0
+    assert type(made[0]) is TaskVecEnv
+    assert made[0].num_envs == 6
+
+
+def test_rl_zoo3_is_left_as_it_was(config: Path, tmp_path: Path) -> None:
+    from rl_zoo3 import train as zoo_train
+
+    arguments = sys.argv
+    assert train("-c", tmp_path / "missing.yml", "-f", tmp_path / "logs") == 1
+    assert zoo_train.ExperimentManager is ExperimentManager
+    assert sys.argv is arguments
+
+
+def write_entry(path: Path, **changes: object) -> Path:
+    path.write_text(yaml.safe_dump({"poem/PointGoal-v0": {**SMALL, **changes}}))
+    return path
+
+
+def test_unknown_key_is_named_with_file_algorithm_and_near_matches(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = write_entry(tmp_path / "typo.yml", latent_dims=3)
+    assert train("-c", config, "-f", tmp_path / "logs") == 1
+    error = capsys.readouterr().err
+    for word in ("'latent_dims'", str(config), "poem_sac", "'latent_dim'", "poem/PointGoal-v0"):
+        assert word in error
+    assert not list((tmp_path / "logs").rglob("*.csv")), "nothing may have started"
+
+
+def test_unknown_key_on_the_command_line_is_named(config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert train("-c", config, "-f", tmp_path / "logs", "-params", "gama:0.9") == 1
+    error = capsys.readouterr().err
+    assert "'gama' in -params" in error
+    assert "'gamma'" in error
+
+
+def test_a_key_of_poem_is_unknown_to_pearl(config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_entry(config, preference_coef=1.0)
+    assert train("--algo", "pearl_sac", "-c", config, "-f", tmp_path / "logs") == 1
+    assert "pearl_sac has no such hyperparameter" in capsys.readouterr().err
+
+
+def test_a_key_that_is_a_flag_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = write_entry(tmp_path / "seed.yml", seed=3)
+    assert train("-c", config, "-f", tmp_path / "logs") == 1
+    assert "--seed" in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_training(
+    config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("in the way")
+    for flags in (["-f", tmp_path / "file" / "logs"], ["-f", tmp_path / "logs", "-tb", tmp_path / "file" / "tb"]):
+        assert train("-c", config, *flags) == 1
+        assert f"cannot write to the folder '{flags[-1]}'" in capsys.readouterr().err
+
+
+def test_broken_yaml_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "broken.yml").write_text("poem/PointGoal-v0: {policy: [")
+    assert train("-c", tmp_path / "broken.yml", "-f", tmp_path / "logs") == 1
+    assert f"{tmp_path / 'broken.yml'} is not valid YAML" in capsys.readouterr().err
+
+
+def test_an_environment_that_is_no_task_family_is_refused(
+    config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train("--env", "Pendulum-v1", "-c", config, "-f", tmp_path / "logs") == 1
+    assert "Pendulum-v1 is no task family" in capsys.readouterr().err
+
+
+def test_algorithms_of_rl_zoo3_still_work(tmp_path: Path) -> None:
+    arguments = ["--algo", "ppo", "--env", "Pendulum-v1", "-n", "256", "--eval-freq", "-1", "--verbose", "0"]
+    settings = ["-params", "n_envs:1", "n_steps:128", "-f", str(tmp_path)]
+    assert cli.main(["train", *arguments, *settings]) == 0
+    assert (tmp_path / "ppo" / "Pendulum-v1_1" / "Pendulum-v1.zip").is_file()
+
+
+def test_enjoy_without_a_display_says_what_to_do(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert cli.main(["enjoy", "--env", "poem/PointGoal-v0"]) == 1
+    assert "--no-render" in capsys.readouterr().err
