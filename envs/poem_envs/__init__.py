@@ -21,3 +21,5 @@ def _register(name: str, module: str, max_episode_steps: int) -> None:
 
 
 _register("PointGoal", "point_goal", max_episode_steps=25)
+_register("HalfCheetahVel", "half_cheetah", max_episode_steps=200)
+_register("HalfCheetahFwdBack", "half_cheetah", max_episode_steps=200)

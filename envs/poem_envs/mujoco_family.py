@@ -1,0 +1,231 @@
+"""MuJoCo task families: one robot, one reward, any number of copies stepped by MuJoCo's own threads."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+
+from poem_envs.mujoco_integrator import Integrator
+from poem_envs.mujoco_rendering import StateRenderer
+from poem_envs.vector import BatchFamily, BatchTaskFamily, TaskFamilyVector
+
+DEFAULT_SIZE = 480
+RENDER_MODES = ["human", "rgb_array", "depth_array", "rgbd_tuple"]
+
+
+class MujocoFamily(BatchFamily):
+    """The dynamics of a MuJoCo robot, for :class:`MujocoTaskEnv` and :class:`MujocoTaskVectorEnv`.
+
+    A robot sets the class attributes and defines :meth:`_reward_features`, :meth:`_draw_start` where its start is another, and
+    :meth:`_unhealthy` where it can fall. A family on top of it defines tasks, reward, and how a task is shown
+    (:meth:`_task_markers`).
+
+    **A control step** sets MuJoCo's solver warm start (``qacc_warmstart``) to zero and makes ``frame_skip`` physics steps.
+    Gymnasium's environments let the warm start run on between control steps; it is no part of MuJoCo's physics state
+    (``mjSTATE_FULLPHYSICS``), and ``mujoco.rollout`` starts each call at zero. So ours makes the next state a function
+    of state and action alone, the same in one environment as in many. It moves a step's result by the solver's tolerance;
+    apart from it the dynamics are Gymnasium's bit for bit.
+
+    **Velocities** of the reward are differences of positions over the control step, ``(after - before) / dt``, both taken from
+    the integrated state. Gymnasium's Ant and Humanoid read body positions, which MuJoCo updates one physics step late.
+
+    :param xml_file: model file; a bare name is one of Gymnasium's
+    :param frame_skip: physics steps in a control step
+    :param reset_noise_scale: scale of the random start around the model's initial pose
+    :param width: of rendered images, pixels
+    :param height: of rendered images, pixels
+    :param camera_id: camera of the model to render from; None for one that follows the robot
+    :param camera_name: the same by name
+    :param default_camera_config: attributes of the following camera, such as ``{"distance": 4.0}``, over the robot's own
+    :param max_geom: as in Gymnasium
+    :param visual_options: as in Gymnasium
+    :raises OSError: if there is no such model file
+    """
+
+    #: Number of positions at the head of ``qpos`` that the observation leaves out.
+    hidden_qpos: int
+    #: The following camera: attributes of ``mujoco.MjvCamera``.
+    camera_config: dict[str, Any] = {"distance": 4.0}  # noqa: RUF012 (never changed)
+
+    metadata: dict[str, Any]
+    _nthread: int = 0
+    _integrator: Integrator | None = None
+    _renderer: StateRenderer | None = None
+
+    def __init__(
+        self,
+        *,
+        xml_file: str,
+        frame_skip: int = 5,
+        reset_noise_scale: float = 0.1,
+        width: int = DEFAULT_SIZE,
+        height: int = DEFAULT_SIZE,
+        camera_id: int | None = None,
+        camera_name: str | None = None,
+        default_camera_config: dict[str, Any] | None = None,
+        max_geom: int = 1000,
+        visual_options: dict[int, bool] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        self.model = mujoco.MjModel.from_xml_path(_model_path(xml_file))
+        if self.model.na:
+            raise ValueError(f"xml_file={xml_file!r} has actuators with activations, which these environments do not handle")
+        self.frame_skip = frame_skip
+        self.reset_noise_scale = reset_noise_scale
+        initial = mujoco.MjData(self.model)
+        self.init_qpos, self.init_qvel = initial.qpos.copy(), initial.qvel.copy()
+        self._render_arguments: dict[str, Any] = {
+            "width": width,
+            "height": height,
+            "camera_id": camera_id,
+            "camera_name": camera_name,
+            "camera_config": {**self.camera_config, **(default_camera_config or {})},
+            "max_geom": max_geom,
+            "visual_options": visual_options,
+        }
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.dt)}
+        low, high = self.model.actuator_ctrlrange.astype(np.float32).T
+        super().__init__(
+            observation_space=spaces.Box(-np.inf, np.inf, (self._observation_dim(),), np.float64),
+            action_space=spaces.Box(low, high, dtype=np.float32),
+            **kwargs,
+        )
+
+    @property
+    def dt(self) -> float:
+        """Seconds in a control step."""
+        return self.model.opt.timestep * self.frame_skip
+
+    @property
+    def _qpos(self) -> np.ndarray:
+        """Positions of all copies, ``(n, nq)``, a view."""
+        return self._states[:, 1 : 1 + self.model.nq]
+
+    def _draw_start(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Draw an episode's first ``qpos`` and ``qvel``: unless overridden, as Gymnasium's HalfCheetah and Ant do."""
+        scale = self.reset_noise_scale
+        qpos = self.init_qpos + rng.uniform(low=-scale, high=scale, size=self.model.nq)
+        qvel = self.init_qvel + scale * rng.standard_normal(self.model.nv)
+        return qpos, qvel
+
+    def _reward_features(self, qpos_before: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """What the reward of the step just taken depends on.
+
+        :param qpos_before: ``(n, nq)``, where ``self._qpos`` are the positions after
+        :param actions: ``(n, nu)``
+        :return: ``(n, reward_feature_dim)``, a new array
+        """
+        raise NotImplementedError
+
+    def _unhealthy(self) -> np.ndarray:
+        """Which copies end their episode now, ``(n,)``: none unless overridden."""
+        return np.zeros(len(self._states), dtype=bool)
+
+    def _task_markers(self, task: np.ndarray, position: np.ndarray) -> list[dict[str, Any]]:
+        """Shapes that show a task, as ``MujocoRenderer``'s ``add_marker`` takes them.
+
+        :param task: ``(task_dim,)``
+        :param position: of the robot's root, ``(3,)``
+        """
+        raise NotImplementedError
+
+    def _observation_dim(self) -> int:
+        return self.model.nq - self.hidden_qpos + self.model.nv
+
+    def _allocate(self, n: int) -> None:
+        self._states = np.zeros((n, 1 + self.model.nq + self.model.nv))  # time, qpos, qvel: MuJoCo's mjSTATE_FULLPHYSICS
+
+    def _begin_episodes(self, copies: np.ndarray, rngs: Sequence[np.random.Generator]) -> None:
+        for copy, rng in zip(copies, rngs, strict=True):
+            self._states[copy] = np.concatenate(([0.0], *self._draw_start(rng)))
+
+    def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if self._integrator is None:
+            self._integrator = Integrator(self.model, self.frame_skip, len(self._states), self._nthread)
+        after = self._integrator.advance(self._states, actions)
+        self._check_divergence(after)
+        qpos_before = self._qpos.copy()
+        self._states[:] = after
+        return self._reward_features(qpos_before, actions), self._unhealthy()
+
+    def _check_divergence(self, after: np.ndarray) -> None:
+        # A simulation that blows up is reset by MuJoCo within the step, with no more than a warning; its clock tells.
+        late = np.abs(after[:, 0] - self._states[:, 0] - self.dt) > 0.5 * self.model.opt.timestep
+        diverged = late | ~np.isfinite(after).all(axis=1)
+        if diverged.any():
+            copy = int(np.flatnonzero(diverged)[0])
+            raise RuntimeError(
+                f"the simulation of {type(self).__name__} diverged at {self._describe_episode(copy)}: MuJoCo met a state "
+                f"that is not finite or too large; the state before had max|qpos|={np.abs(self._qpos[copy]).max():.3g} and "
+                f"max|qvel|={np.abs(self._states[copy, 1 + self.model.nq :]).max():.3g}"
+            )
+
+    def _observations(self) -> np.ndarray:
+        return self._states[:, 1 + self.hidden_qpos :].copy()
+
+    def _physics_state(self, copy: int) -> np.ndarray:
+        return self._states[copy].copy()
+
+    def _set_physics_state(self, copy: int, state: np.ndarray) -> None:
+        self._states[copy] = state
+
+    def _render_copy(self, copy: int, render_mode: str, task: np.ndarray | None) -> Any:
+        if self._renderer is None:
+            self._renderer = StateRenderer(self.model, **self._render_arguments)
+        markers = [] if task is None else self._task_markers(task, self._qpos[copy, :3])
+        return self._renderer.render(self._states[copy], render_mode, markers)
+
+    def _release(self) -> None:
+        if self._integrator is not None:
+            self._integrator.close()
+            self._integrator = None
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_integrator": None, "_renderer": None}  # threads and windows are made anew when needed
+
+
+class MujocoTaskEnv(MujocoFamily, BatchTaskFamily):
+    """A single MuJoCo environment with a hidden task; see :class:`MujocoFamily`."""
+
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES}  # noqa: RUF012 (Gymnasium declares it so)
+
+
+class MujocoTaskVectorEnv(MujocoFamily, TaskFamilyVector):
+    """Many copies of a MuJoCo environment, stepped together in threads; see :class:`MujocoFamily`.
+
+    :param nthread: number of threads; None for as many as this process may use cores
+    """
+
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+
+    def __init__(self, *, nthread: int | None = None, **kwargs: Any) -> None:
+        if nthread is not None and nthread < 1:
+            raise ValueError(f"nthread={nthread!r} must be at least 1, or None for all cores")
+        self._nthread = available_cores() if nthread is None else nthread
+        super().__init__(**kwargs)
+
+
+def available_cores() -> int:
+    """The number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _model_path(xml_file: str) -> str:
+    path = os.path.expanduser(xml_file)
+    if not path.startswith((".", os.sep)):
+        path = os.path.join(os.path.dirname(gymnasium.__file__), "envs", "mujoco", "assets", path)
+    if not os.path.exists(path):
+        raise OSError(f"xml_file={xml_file!r} does not exist; give a path, or the bare name of one of Gymnasium's models")
+    return path
