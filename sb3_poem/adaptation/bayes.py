@@ -1,0 +1,310 @@
+"""Inferring a latent from answers by Bayes' rule, with weighted particles that are moved before they thin out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from sb3_poem.adaptation.decisions import DECISIONS, decide
+from sb3_poem.adaptation.inference import Answer, LatentInference, Shown, latent_of, preference_log_likelihood
+from sb3_poem.adaptation.noise import PROBIT_SLOPE, BoltzmannNoise, ExactNoise, NoiseModel
+from sb3_poem.adaptation.preference import Preference
+from sb3_poem.adaptation.queries import most_informative_pair, worst_case_pair
+from sb3_poem.adaptation.queries import random_pair as draw_random_pair
+from sb3_poem.adaptation.slice_sampling import elliptical_slice_moves, fit_gaussian, systematic_resample
+from sb3_poem.common.trajectory import Trajectory
+
+LIKELIHOODS = ("decoder", "similarity")
+
+# Policies that a question may compare: the posterior's own, and as many from the prior. The pair that splits a narrow
+# posterior best usually lies outside it (to tell 1.0 from 1.1 show 0.8 and 1.3), where the two can also be told apart.
+QUERY_POLICIES = 64
+# Particles that a question's gain is averaged over.
+QUERY_PARTICLES = 128
+# Smallest resolvable difference of S, as a share of the spread of its differences over random triples. A Gaussian error
+# of that size turns over 3 % of random preferences, which is what well-trained models were seen to get wrong.
+SIMILARITY_RESOLUTION = 0.1
+# Steps over which the decoder's residuals stay correlated: a return's error grows with their number, not with that of the
+# steps.
+ERROR_CORRELATION = 10.0
+MOVE_SWEEPS = 2
+MOVE_TRIES = 6
+# Latent-trajectory evaluations of the decoder that one answer may spend on moving particles, in units of the number of
+# particles.
+DECODER_MOVE_BUDGET = 4
+DECODER_TRIES = 2
+
+
+class BayesInference(LatentInference):
+    """
+    Posterior weights proportional to the prior times the likelihood of the answers under the oracle's own noise model;
+    questions by expected information gain; the latent of highest expected fitness.
+
+    *Likelihood from the decoder*: the reward decoder predicts, for every particle, the returns of the two trajectories
+    that were shown; the noise model turns the difference into the probability of the answer. The predicted difference is
+    trusted only as far as the decoder's own residual allows.
+
+    *Likelihood from S*: S(z, z_left) - S(z, z_right) takes the place of the returns' difference. S has an order but no
+    unit: for error-free answers every positive multiple of it makes the same predictions. What scale it has comes from
+    training, where it is the log-odds of being right about error-free labels. So the model's doubt is one logistic unit
+    of S while training is young. Once training separates nearly all pairs, however, the cross-entropy is lowered by
+    scaling S up without end, and its odds turn overconfident. So the unit is never taken smaller than a fixed share of
+    the spread of S.
+
+    *Thinning*: when half of the particles carry no weight they are resampled and moved by elliptical slice sampling around
+    the posterior's own mean and covariance. The moves are bounded; those that need the decoder also in its evaluations.
+
+    :param model: A trained model.
+    :param n_candidates: Number of particles.
+    :param epsilon: Tolerated error of eq. 9, used by query_rule="worst-case" alone.
+    :param candidates: "prior" or "aggregate".
+    :param query_rule: "information-gain", "worst-case" or "random".
+    :param rng: The generator.
+    :param likelihood: "decoder" or "similarity"; None takes the decoder where the model has one.
+    :param decision: See :data:`sb3_poem.adaptation.decisions.DECISIONS`.
+    :param noise_model: How the oracle errs; None stands for an error-free one.
+    :param library: Trajectories to ask about instead of new rollouts (for instance those of the training policies on this
+        robot): the decoder tells beforehand what each is worth to every particle.
+    :raises ValueError: If an option is unknown, or needs what the model does not have.
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        n_candidates: int = 100,
+        epsilon: float = 0.1,
+        candidates: str = "prior",
+        query_rule: str = "information-gain",
+        rng: np.random.Generator | None = None,
+        likelihood: str | None = None,
+        decision: str = "expected-fitness",
+        noise_model: NoiseModel | None = None,
+        library: Sequence[Trajectory] | None = None,
+    ) -> None:
+        super().__init__(model, n_candidates, epsilon, candidates, query_rule, rng or np.random.default_rng())
+        self.has_similarity = hasattr(model, "similarity")
+        self.likelihood = _check_likelihood(model, likelihood)
+        if decision not in DECISIONS:
+            raise ValueError(f"`decision` must be one of {DECISIONS}, but is {decision!r}")
+        self.decision = decision
+        self.noise_model: NoiseModel = ExactNoise() if noise_model is None else noise_model
+        self.library = None if library is None else list(library)
+        self._check_options()
+        self.particles = self.prior.sample(n_candidates, self.rng)
+        self.log_likelihoods = np.zeros(n_candidates)
+        self.log_weights = np.zeros(n_candidates)
+        self._explorers = self.prior.sample(QUERY_POLICIES // 2, self.rng)
+        self._spread, self._unit = self._similarity_scale()
+        # Sums over answers that tie S to the decoder's returns: S dS, S dR, |R| and their number.
+        self._calibration = np.zeros(4)
+        self._library_returns: np.ndarray | None = None
+
+    @property
+    def weights(self) -> np.ndarray:
+        """(n_candidates,) posterior weights, summing to one."""
+        weights = np.exp(self.log_weights - self.log_weights.max())
+        return weights / weights.sum()
+
+    @property
+    def effective_size(self) -> float:
+        """How many equally weighted particles the weighted ones are worth."""
+        return float(1.0 / np.square(self.weights).sum())
+
+    def ask_latents(self) -> tuple[np.ndarray, np.ndarray]:
+        """See :class:`LatentInference`."""
+        if self.library is not None:
+            first, second = self.ask_library()
+            return self.library[first].latent.copy(), self.library[second].latent.copy()
+        policies = self._query_policies()
+        if self.query_rule == "random":
+            first, second = draw_random_pair(len(policies), self.rng)
+            return policies[first], policies[second]
+        particles, weights = self._query_particles()
+        similarities = self.model.similarity(particles, policies)
+        if self.query_rule == "worst-case":
+            first, second = worst_case_pair(similarities, self.epsilon, weights)
+        else:
+            slope, magnitude, noise = self._return_unit()
+            first, second = most_informative_pair(
+                slope * similarities, weights, noise, slope * self._unit * PROBIT_SLOPE, magnitude
+            )
+        return policies[first], policies[second]
+
+    def ask_library(self) -> tuple[int, int]:
+        """
+        The two trajectories of the library to compare next.
+
+        :return: Two different indices.
+        :raises RuntimeError: If there is no library.
+        """
+        if self.library is None:
+            raise RuntimeError("there is no library to ask about; pass `library`")
+        if self.query_rule == "random":
+            return draw_random_pair(len(self.library), self.rng)
+        if self._library_returns is None:
+            self._library_returns = self.model.predicted_returns(self.particles, self.library)
+        returns = self._library_returns
+        steps = float(np.mean([len(trajectory) for trajectory in self.library]))
+        magnitude = float(2.0 * np.abs(returns).mean())
+        return most_informative_pair(returns, self.weights, self.noise_model, self._decoder_error(2.0 * steps), magnitude)
+
+    def tell(self, preference: Preference, left: Shown, right: Shown) -> None:
+        """See :class:`LatentInference`."""
+        if self.likelihood == "decoder" and not (isinstance(left, Trajectory) and isinstance(right, Trajectory)):
+            raise ValueError(
+                'likelihood="decoder" needs the two trajectories that were shown, not their latents alone; '
+                'pass them, or choose likelihood="similarity"'
+            )
+        answer = Answer(preference, left, right)
+        new = self._answer_log_likelihoods(self.particles, [answer], calibrate=True)
+        self.answers.append(answer)
+        self.log_likelihoods = self.log_likelihoods + new
+        self.log_weights = self.log_weights + new
+        if self.effective_size < self.n_candidates / 2:
+            self._rejuvenate()
+
+    def estimate(self) -> np.ndarray:
+        """See :class:`LatentInference`."""
+        training = getattr(self.model, "task_latents", None)
+        return decide(self.decision, self.model if self.has_similarity else None, self.particles, self.weights, training)
+
+    def _check_options(self) -> None:
+        if self.likelihood == "similarity" and isinstance(self.noise_model, BoltzmannNoise) and self.noise_model.beta:
+            raise ValueError(
+                f"a Boltzmann oracle of fixed beta ({self.noise_model.beta}) needs returns, which S does not give: "
+                'choose likelihood="decoder"'
+            )
+        if self.library is not None:
+            if len(self.library) < 2:
+                raise ValueError(f"`library` must hold at least 2 trajectories, but holds {len(self.library)}")
+            if not hasattr(self.model, "predicted_returns"):
+                raise ValueError("`library` needs a model with a reward decoder (predicted_returns)")
+            if self.query_rule == "worst-case":
+                raise ValueError('query_rule="worst-case" compares candidates by S; with a library use "information-gain"')
+        elif not self.has_similarity and self.query_rule != "random":
+            raise ValueError(
+                f'query_rule="{self.query_rule}" needs a model with a similarity S or a `library` of trajectories, '
+                f'and {type(self.model).__name__} has no similarity; choose query_rule="random" or pass a library'
+            )
+
+    def _similarity_scale(self) -> tuple[float, float]:
+        """The spread of S's differences, and the unit in which a difference counts as one logistic unit of doubt."""
+        if not self.has_similarity:
+            return 1.0, 1.0
+        similarities = self.model.similarity(self.particles, self.particles)
+        # Twice the variance within a row is the mean squared difference of two of its entries.
+        spread = float(np.sqrt(2.0 * similarities.var(axis=1).mean()))
+        return max(spread, 1e-12), max(1.0, SIMILARITY_RESOLUTION * spread / PROBIT_SLOPE)
+
+    def _return_unit(self) -> tuple[float, float, NoiseModel]:
+        """Slope from S to returns, the returns' typical magnitude, and the noise model that fits this unit."""
+        cross, square, magnitude, count = self._calibration
+        if count and cross > 0:
+            return float(cross / square), float(magnitude / count), self.noise_model
+        # No trajectory has tied S to returns yet (or none can). Noise models that only ask for the sign need no unit, and
+        # the paper's temperature is relative: it is told that returns are as large as their spread. A fixed one has to
+        # wait.
+        fixed = isinstance(self.noise_model, BoltzmannNoise) and self.noise_model.beta is not None
+        return 1.0, 2.0 * self._spread, ExactNoise() if fixed else self.noise_model
+
+    def _decoder_error(self, steps: np.ndarray | float) -> Any:
+        return self.model.predicted_rewards_error * np.sqrt(steps * ERROR_CORRELATION)
+
+    def _answer_log_likelihoods(self, latents: np.ndarray, answers: Sequence[Answer], calibrate: bool = False) -> np.ndarray:
+        """(m,) log P(answers | latent)."""
+        shown = [item for answer in answers for item in (answer.left, answer.right)]
+        error: np.ndarray | float
+        magnitude: np.ndarray | float
+        if self.likelihood == "decoder":
+            values = self.model.predicted_returns(latents, shown)  # (m, 2 k)
+            left, right = values[:, 0::2], values[:, 1::2]
+            steps = np.array([len(item) for item in shown], dtype=np.float64)
+            error, magnitude = self._decoder_error(steps[0::2] + steps[1::2]), np.abs(left) + np.abs(right)
+            if calibrate and self.has_similarity:
+                self._calibrate(latents, shown, values)
+        else:
+            values = self.model.similarity(latents, np.stack([latent_of(item) for item in shown]))
+            left, right = values[:, 0::2], values[:, 1::2]
+            error, magnitude = self._unit * PROBIT_SLOPE, 2.0 * self._spread
+        probability = self.noise_model.probability_left(left - right, error, magnitude)
+        return preference_log_likelihood(np.log(probability), np.log1p(-probability), [a.preference for a in answers])
+
+    def _calibrate(self, latents: np.ndarray, shown: Sequence[Shown], returns: np.ndarray) -> None:
+        similarities = self.model.similarity(latents, np.stack([latent_of(item) for item in shown]))
+        s = similarities[:, 0] - similarities[:, 1]
+        magnitude = np.abs(returns).sum(axis=1).mean()
+        self._calibration += [s @ (returns[:, 0] - returns[:, 1]), s @ s, magnitude, 1.0]
+
+    def _query_policies(self) -> np.ndarray:
+        """(QUERY_POLICIES, d): draws of the posterior and of the prior."""
+        posterior = self.particles[systematic_resample(self.weights, QUERY_POLICIES // 2, self.rng)]
+        return np.concatenate([posterior, self._explorers])
+
+    def _query_particles(self) -> tuple[np.ndarray, np.ndarray]:
+        if self.n_candidates <= QUERY_PARTICLES:
+            return self.particles, self.weights
+        chosen = systematic_resample(self.weights, QUERY_PARTICLES, self.rng)
+        return self.particles[chosen], np.full(QUERY_PARTICLES, 1.0 / QUERY_PARTICLES)
+
+    def _rejuvenate(self) -> None:
+        """Resample, and move what is now double, at bounded cost."""
+        mean, factor = fit_gaussian(self.particles, self.weights)
+        chosen = np.sort(systematic_resample(self.weights, self.n_candidates, self.rng))
+        self.particles, self.log_likelihoods = self.particles[chosen], self.log_likelihoods[chosen]
+        self.log_weights = np.zeros(self.n_candidates)
+        self._library_returns = None
+        sweeps, tries, moved = self._move_plan(np.concatenate([[False], chosen[1:] == chosen[:-1]]))
+        for _ in range(sweeps):
+            particles, log_likelihoods = elliptical_slice_moves(
+                self.particles[moved],
+                self.log_likelihoods[moved],
+                lambda latents: self._answer_log_likelihoods(latents, self.answers),
+                self.prior.log_density,
+                mean,
+                factor,
+                tries,
+                self.rng,
+            )
+            self.particles[moved], self.log_likelihoods[moved] = particles, log_likelihoods
+
+    def _move_plan(self, copies: np.ndarray) -> tuple[int, int, np.ndarray]:
+        """Sweeps, tries, and which particles move: all by S, as many as the budget buys by the decoder."""
+        if self.likelihood == "similarity":
+            return MOVE_SWEEPS, MOVE_TRIES, np.arange(self.n_candidates)
+        cost = 2 * len(self.answers) * DECODER_TRIES
+        affordable = max(4, DECODER_MOVE_BUDGET * self.n_candidates // cost)
+        doubles_first = np.concatenate([np.flatnonzero(copies), np.flatnonzero(~copies)])
+        return 1, DECODER_TRIES, np.sort(doubles_first[:affordable])
+
+    def _arrays(self) -> dict[str, np.ndarray]:
+        return {
+            "particles": self.particles,
+            "log_likelihoods": self.log_likelihoods,
+            "log_weights": self.log_weights,
+            "explorers": self._explorers,
+            "scale": np.array([self._spread, self._unit]),
+            "calibration": self._calibration,
+        }
+
+    def _set_arrays(self, arrays: dict[str, np.ndarray]) -> None:
+        self.particles = arrays["particles"]
+        self.log_likelihoods = arrays["log_likelihoods"]
+        self.log_weights = arrays["log_weights"]
+        self._explorers = arrays["explorers"]
+        self._spread, self._unit = (float(value) for value in arrays["scale"])
+        self._calibration = arrays["calibration"].copy()
+        self._library_returns = None
+
+
+def _check_likelihood(model: Any, likelihood: str | None) -> str:
+    available = {"decoder": hasattr(model, "predicted_returns"), "similarity": hasattr(model, "similarity")}
+    if likelihood is None:
+        likelihood = "decoder" if available["decoder"] else "similarity"
+    if likelihood not in LIKELIHOODS:
+        raise ValueError(f"`likelihood` must be one of {LIKELIHOODS}, but is {likelihood!r}")
+    if not available[likelihood]:
+        needed = {"decoder": "predicted_returns (a reward decoder)", "similarity": "similarity (POEMSAC)"}[likelihood]
+        raise ValueError(f'likelihood="{likelihood}" needs a model with {needed}; {type(model).__name__} has none')
+    return likelihood

@@ -1,0 +1,89 @@
+"""A person at a terminal answers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from sb3_poem.adaptation.noise import MistakeNoise, NoiseModel
+from sb3_poem.adaptation.preference import Preference
+from sb3_poem.common.trajectory import Trajectory
+
+PROMPT = "Which is better? [l]eft, [r]ight, or [e]qual (can't tell): "
+ANSWERS = {
+    **dict.fromkeys(("l", "left", "1"), Preference.LEFT),
+    **dict.fromkeys(("r", "right", "2"), Preference.RIGHT),
+    **dict.fromkeys(("e", "equal", "=", "can't tell", "cant tell", "?"), Preference.EQUAL),
+}
+
+
+class HumanOracle:
+    """
+    Shows both trajectories side by side in a video file, and asks at the terminal.
+
+    The n-th question's file is ``query-001.gif`` and so on (or ``.mp4``) within the folder. The prompt takes l, left or 1; r,
+    right or 2; e, equal, = or ?; upper or lower case; anything else is asked again.
+
+    :param folder: Where the videos go; it is made if missing.
+    :param video_format: "gif" (any viewer plays it) or "mp4" (smaller).
+    :param fps: Frames per second.
+    :param mistake_rate: How often a person is taken to err, for the Bayesian rule.
+    :param read: Reads a line after showing a prompt; ``input`` by default.
+    :param write: Shows a line; ``print`` by default.
+    :raises ValueError: If the format is unknown.
+    """
+
+    needs_frames = True
+
+    def __init__(
+        self,
+        folder: str | Path = "preference_queries",
+        video_format: str = "gif",
+        fps: float = 20.0,
+        mistake_rate: float = 0.05,
+        read: Callable[[str], str] = input,
+        write: Callable[[str], None] = print,
+    ) -> None:
+        if video_format not in ("gif", "mp4"):
+            raise ValueError(f'`video_format` must be "gif" or "mp4", but is {video_format!r}')
+        self.folder = Path(folder)
+        self.video_format = video_format
+        self.fps = fps
+        self.noise_model: NoiseModel = MistakeNoise(mistake_rate)
+        self.n_asked = 0
+        self._read = read
+        self._write = write
+
+    def __call__(self, left: Trajectory, right: Trajectory) -> Preference:
+        """
+        Write the video, and ask until an answer is understood.
+
+        :param left: A trajectory with frames.
+        :param right: Another.
+        :return: The answer.
+        :raises ValueError: If a trajectory has no frames.
+        :raises RuntimeError: If the terminal is closed.
+        """
+        path = self._write_video(left, right)
+        self._write(f"Query {self.n_asked}: {path}")
+        while True:
+            try:
+                line = self._read(PROMPT)
+            except EOFError:
+                raise RuntimeError("no answer can be read: standard input is closed") from None
+            answer = ANSWERS.get(line.strip().lower())
+            if answer is not None:
+                return answer
+            self._write(f"{line.strip()!r} is no answer; type l, r or e.")
+
+    def _write_video(self, left: Trajectory, right: Trajectory) -> Path:
+        from sb3_poem.common.video import side_by_side, write_video
+
+        if not left.frames or not right.frames:
+            raise ValueError(
+                'the trajectories have no frames to show: make the environment with render_mode="rgb_array", '
+                "and let the adapter know this oracle (PreferenceAdapter(..., oracle=HumanOracle()))"
+            )
+        self.n_asked += 1
+        path = self.folder / f"query-{self.n_asked:03d}.{self.video_format}"
+        return write_video(side_by_side(left.frames, right.frames, ("LEFT", "RIGHT")), path, self.fps)

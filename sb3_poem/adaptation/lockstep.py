@@ -1,0 +1,126 @@
+"""Adaptation to many tasks at once: their rollouts fill a vector environment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sb3_poem.adaptation.environments import check_model_fits
+from sb3_poem.adaptation.options import AdaptationOptions, inference_rng, rollout_seed
+from sb3_poem.adaptation.preference import Preference, as_preference
+from sb3_poem.common.rollouts import rollout_latents
+from sb3_poem.common.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
+
+OracleFactory = Callable[..., Callable[[Trajectory, Trajectory], Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class TaskAdaptations:
+    """
+    Many tasks, adapted.
+
+    :param tasks: (n_tasks, task_dim).
+    :param record_at: Numbers of answers at which estimates were kept, ascending.
+    :param latents: (n_tasks, len(record_at), latent_dim).
+    :param preferences: A task's answers in order.
+    """
+
+    tasks: np.ndarray
+    record_at: tuple[int, ...]
+    latents: np.ndarray
+    preferences: list[list[Preference]]
+
+
+def adapt_tasks(
+    model: Any,
+    vec_env: VecEnv,
+    tasks: np.ndarray,
+    oracle_factory: OracleFactory,
+    *,
+    n_queries: int = 10,
+    record_at: Sequence[int] | None = None,
+    seed: int = 0,
+    library: Sequence[Trajectory] | None = None,
+    progress_bar: bool = False,
+    **options: Any,
+) -> TaskAdaptations:
+    """
+    Adapt a model to each of many tasks, with all rollouts of a question in lockstep.
+
+    Task i is adapted as ``PreferenceAdapter(model, env, seed=seed + i, ...)`` would alone: with the same candidates, questions
+    and reset seeds. (Matrix products may round otherwise in a batch than alone, in the last bits.) The tasks are set in
+    ``vec_env`` for the rollouts, and known to the oracles; inference never sees them.
+
+    :param model: A trained model.
+    :param vec_env: A vector environment of the task family, of any number of copies; twice the number of tasks is best.
+    :param tasks: (n_tasks, task_dim).
+    :param oracle_factory: Called as ``oracle_factory(env=vec_env, task=task, seed=seed + i)``, gives task i's oracle. The
+        oracles' classes will do, and ``functools.partial(MistakeOracle, 0.1)``.
+    :param n_queries: Answers per task.
+    :param record_at: Numbers of answers at which to keep the estimate; None keeps 0, 1, ..., n_queries.
+    :param seed: Task i takes seed + i.
+    :param library: See :class:`PreferenceAdapter`.
+    :param progress_bar: Whether to show one.
+    :param options: Further options of :class:`PreferenceAdapter`: ``inference``, ``query_rule``, ``n_candidates``,
+        ``epsilon``, ``candidates``, ``likelihood``, ``decision``, ``noise_model``, ``deterministic``.
+    :return: The estimates.
+    :raises ValueError: If an argument is out of its range, or the model belongs to another environment.
+    """
+    from tqdm import tqdm
+
+    tasks = np.asarray(tasks, dtype=np.float64)
+    if tasks.ndim != 2 or len(tasks) < 1:
+        raise ValueError(f"`tasks` must have shape (n_tasks, task_dim) with at least one task, but has shape {tasks.shape}")
+    kept = _check_record_at(record_at, n_queries)
+    check_model_fits(model, vec_env)
+    oracles = [oracle_factory(env=vec_env, task=task, seed=seed + i) for i, task in enumerate(tasks)]
+    if options.get("noise_model") is None:
+        options["noise_model"] = getattr(oracles[0], "noise_model", None)
+    settings = AdaptationOptions(n_queries=n_queries, **options)
+    inferences = [settings.make_inference(model, inference_rng(seed + i), library) for i in range(len(tasks))]
+
+    preferences: list[list[Preference]] = [[] for _ in tasks]
+    latents = np.empty((len(tasks), len(kept), model.latent_dim))
+    for query in tqdm(range(n_queries + 1), unit="query", disable=not progress_bar):
+        if query in kept:
+            latents[:, kept.index(query)] = [inference.estimate() for inference in inferences]
+        if query == n_queries or query >= kept[-1]:
+            break
+        pairs = [inference.ask_latents() for inference in inferences] if library is None else None
+        shown: list[Trajectory]
+        if pairs is not None:
+            seeds = [rollout_seed(seed + i, query) for i in range(len(tasks))]
+            shown = rollout_latents(
+                model,
+                vec_env,
+                np.concatenate(pairs),
+                np.repeat(tasks, 2, axis=0),
+                np.repeat(seeds, 2).tolist(),
+                settings.deterministic,
+            )
+        else:
+            assert library is not None
+            shown = [library[index] for inference in inferences for index in inference.ask_library()]  # type: ignore[attr-defined]
+        for i, (inference, oracle) in enumerate(zip(inferences, oracles, strict=True)):
+            left, right = shown[2 * i], shown[2 * i + 1]
+            answer = as_preference(oracle(left, right))
+            inference.tell(answer, left, right)
+            preferences[i].append(answer)
+    return TaskAdaptations(tasks, kept, latents, preferences)
+
+
+def _check_record_at(record_at: Sequence[int] | None, n_queries: int) -> tuple[int, ...]:
+    if n_queries < 1:
+        raise ValueError(f"`n_queries` must be at least 1, but is {n_queries}")
+    if record_at is None:
+        return tuple(range(n_queries + 1))
+    kept = tuple(sorted({int(k) for k in record_at}))
+    if not kept or kept[0] < 0 or kept[-1] > n_queries:
+        raise ValueError(f"`record_at` must hold numbers from 0 to n_queries={n_queries}, but is {tuple(record_at)}")
+    return kept

@@ -1,0 +1,111 @@
+"""How to adapt: the options that one task and many tasks share, and the seeds that make both agree."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sb3_poem.adaptation.bayes import BayesInference
+from sb3_poem.adaptation.inference import LatentInference, PaperInference
+from sb3_poem.adaptation.noise import NoiseModel, noise_model_from_dict
+from sb3_poem.common.trajectory import Trajectory
+
+INFERENCES = ("bayes", "paper")
+
+
+@dataclass(frozen=True)
+class AdaptationOptions:
+    """How to adapt; the arguments are explained at :class:`PreferenceAdapter`."""
+
+    n_queries: int = 10
+    inference: str = "bayes"
+    query_rule: str | None = None
+    n_candidates: int = 100
+    epsilon: float = 0.1
+    candidates: str = "prior"
+    likelihood: str | None = None
+    decision: str = "expected-fitness"
+    noise_model: NoiseModel | None = None
+    deterministic: bool = True
+
+    def __post_init__(self) -> None:
+        if self.n_queries < 1:
+            raise ValueError(f"`n_queries` must be at least 1, but is {self.n_queries}")
+        if self.inference not in INFERENCES:
+            raise ValueError(f"`inference` must be one of {INFERENCES}, but is {self.inference!r}")
+
+    def make_inference(
+        self, model: Any, rng: np.random.Generator, library: Sequence[Trajectory] | None = None
+    ) -> LatentInference:
+        """
+        The inference that these options describe.
+
+        :param model: A trained model.
+        :param rng: Its generator.
+        :param library: See :class:`PreferenceAdapter`.
+        :return: The inference.
+        :raises ValueError: If an option is out of its range, or needs what the model does not have.
+        """
+        if self.inference == "paper":
+            if library is not None:
+                raise ValueError('a `library` needs inference="bayes": Algorithm 2 compares its own candidates')
+            if not hasattr(model, "similarity"):
+                raise ValueError(f'inference="paper" needs a model with a similarity S; {type(model).__name__} has none')
+            return PaperInference(
+                model, self.n_candidates, self.epsilon, self.candidates, self.query_rule or "worst-case", rng
+            )
+        return BayesInference(
+            model,
+            self.n_candidates,
+            self.epsilon,
+            self.candidates,
+            self.query_rule or "information-gain",
+            rng,
+            self.likelihood,
+            self.decision,
+            self.noise_model,
+            library,
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready."""
+        data = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        data["noise_model"] = None if self.noise_model is None else self.noise_model.to_dict()
+        return data
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> AdaptationOptions:
+        """
+        Read what :meth:`to_dict` wrote.
+
+        :param data: The dictionary.
+        :return: The options.
+        """
+        arguments = dict(data)
+        if arguments.get("noise_model") is not None:
+            arguments["noise_model"] = noise_model_from_dict(arguments["noise_model"])
+        return cls(**arguments)
+
+
+def inference_rng(seed: int) -> np.random.Generator:
+    """
+    The generator of an adaptation's inference.
+
+    :param seed: The adaptation's seed.
+    :return: A generator.
+    """
+    return np.random.default_rng([seed, 0])
+
+
+def rollout_seed(seed: int, query: int) -> int:
+    """
+    The reset seed of a question's two rollouts, which is the same for both.
+
+    :param seed: The adaptation's seed.
+    :param query: The question's number, from 0.
+    :return: A non-negative 31-bit integer.
+    """
+    return int(np.random.SeedSequence([seed, 1, query]).generate_state(1)[0] >> 1)

@@ -1,0 +1,207 @@
+"""Who answers. Oracles alone may know the task; an adapter never does."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Any, cast
+
+import gymnasium as gym
+import numpy as np
+
+from sb3_poem.adaptation.noise import BoltzmannNoise, ExactNoise, MistakeNoise, NoiseModel
+from sb3_poem.adaptation.preference import Preference
+from sb3_poem.common.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
+
+
+class TaskOracle(ABC):
+    """
+    An oracle that computes true returns from the trajectories' reward features.
+
+    :param env: A task family: a ``gym.Env``, or an SB3 ``VecEnv`` of them. It can be given later by :meth:`bind`.
+    :param task: (task_dim,) the task by whose reward to judge; None takes the one in effect in ``env`` (in a ``VecEnv``,
+        in its first copy) whenever a question is asked.
+    :param seed: Seeds the oracle's own noise, if it has any.
+    """
+
+    needs_frames = False
+
+    def __init__(self, env: gym.Env | VecEnv | None = None, task: np.ndarray | None = None, seed: int | None = None) -> None:
+        self.env = env
+        self.task = None if task is None else np.asarray(task, dtype=np.float64)
+        self.rng = np.random.default_rng(seed)
+
+    @property
+    @abstractmethod
+    def noise_model(self) -> NoiseModel:
+        """How this oracle errs, for the Bayesian rule."""
+
+    @abstractmethod
+    def _compare(self, left: float, right: float) -> Preference:
+        """Answer from the two true returns."""
+
+    def bind(self, env: gym.Env | VecEnv, task: np.ndarray | None = None) -> TaskOracle:
+        """
+        Give the oracle its environment, and perhaps its task.
+
+        :param env: See the class.
+        :param task: See the class; None leaves the task as it is.
+        :return: The oracle itself.
+        """
+        self.env = env
+        if task is not None:
+            self.task = np.asarray(task, dtype=np.float64)
+        return self
+
+    def __call__(self, left: Trajectory, right: Trajectory) -> Preference:
+        """
+        Compare two trajectories.
+
+        :param left: One.
+        :param right: The other.
+        :return: Which is better.
+        :raises ValueError: If a trajectory has no reward features.
+        :raises RuntimeError: If no environment was given.
+        """
+        return self._compare(self.true_return(left), self.true_return(right))
+
+    def true_return(self, trajectory: Trajectory) -> float:
+        """
+        The undiscounted return of a trajectory under the task.
+
+        :param trajectory: It, with its reward features.
+        :return: The sum of its rewards.
+        :raises ValueError: If it has no reward features, or its return is not finite.
+        :raises RuntimeError: If no environment was given.
+        """
+        if self.env is None:
+            raise RuntimeError(f"{type(self).__name__} has no environment: pass `env` or call bind(env)")
+        if trajectory.reward_features is None:
+            raise ValueError(
+                f"{type(self).__name__} computes returns from reward features, but the trajectory has none: its environment "
+                'gave no info["reward_features"]. Use an oracle that does not need them, such as HumanOracle.'
+            )
+        task = _current_task(self.env) if self.task is None else self.task
+        value = float(np.sum(compute_reward(self.env, task, trajectory.reward_features)))
+        if not np.isfinite(value):
+            raise ValueError(f"the true return of a trajectory is {value}; its reward features are not finite")
+        return value
+
+
+class ReturnOracle(TaskOracle):
+    """The larger true return wins; equal returns are EQUAL. See :class:`TaskOracle`."""
+
+    @property
+    def noise_model(self) -> NoiseModel:
+        """No error."""
+        return ExactNoise()
+
+    def _compare(self, left: float, right: float) -> Preference:
+        return _better(left, right)
+
+
+class BoltzmannOracle(TaskOracle):
+    """
+    Left wins with probability 1 / (1 + exp(-beta (R_left - R_right))) (C.6 of Xu & Zhu 2025).
+
+    With the paper's beta the exponent's magnitude is at most 1, so an answer is right at most 73 % of the time, and ten
+    answers carry less than two bits.
+
+    :param beta: Inverse temperature; None is the paper's 1 / (|R_left| + |R_right|).
+    :param env: See :class:`TaskOracle`.
+    :param task: See :class:`TaskOracle`.
+    :param seed: Seeds the answers.
+    :raises ValueError: If beta is not positive.
+    """
+
+    def __init__(
+        self,
+        beta: float | None = None,
+        env: gym.Env | VecEnv | None = None,
+        task: np.ndarray | None = None,
+        seed: int | None = None,
+    ) -> None:
+        super().__init__(env, task, seed)
+        self._noise_model = BoltzmannNoise(beta)
+
+    @property
+    def noise_model(self) -> NoiseModel:
+        """Boltzmann, with this beta."""
+        return self._noise_model
+
+    def _compare(self, left: float, right: float) -> Preference:
+        beta = self._noise_model.beta
+        if beta is None:
+            magnitude = abs(left) + abs(right)
+            beta = 1.0 / magnitude if magnitude > 0 else 0.0
+        probability = 0.5 * (1.0 + np.tanh(0.5 * beta * (left - right)))
+        return Preference.LEFT if self.rng.random() < probability else Preference.RIGHT
+
+
+class MistakeOracle(TaskOracle):
+    """
+    The right answer, flipped with a fixed probability. Equal returns stay EQUAL.
+
+    :param rate: The probability, in [0, 1]; 1 always lies. The noise model knows rates up to 0.5.
+    :param env: See :class:`TaskOracle`.
+    :param task: See :class:`TaskOracle`.
+    :param seed: Seeds the mistakes.
+    :raises ValueError: If the rate is out of its range.
+    """
+
+    def __init__(
+        self,
+        rate: float = 0.2,
+        env: gym.Env | VecEnv | None = None,
+        task: np.ndarray | None = None,
+        seed: int | None = None,
+    ) -> None:
+        if not 0.0 <= rate <= 1.0:
+            raise ValueError(f"`rate` must lie in [0, 1], but is {rate}")
+        super().__init__(env, task, seed)
+        self.rate = rate
+
+    @property
+    def noise_model(self) -> NoiseModel:
+        """Mistakes at this rate."""
+        return MistakeNoise(min(self.rate, 0.5))
+
+    def _compare(self, left: float, right: float) -> Preference:
+        if self.rng.random() < self.rate:
+            left, right = right, left
+        return _better(left, right)
+
+
+def compute_reward(env: gym.Env | VecEnv, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
+    """
+    A task family's own reward.
+
+    :param env: A ``gym.Env`` or an SB3 ``VecEnv``.
+    :param tasks: (..., task_dim).
+    :param features: (..., feat_dim), broadcasts against the tasks.
+    :return: Rewards (...).
+    :raises ValueError: If the environment is no task family.
+    """
+    return np.asarray(_call(env, "compute_reward", tasks, features), dtype=np.float64)
+
+
+def _current_task(env: gym.Env | VecEnv) -> np.ndarray:
+    task = env.get_wrapper_attr("task") if isinstance(env, gym.Env) else env.get_attr("task", indices=[0])[0]
+    return np.asarray(task, dtype=np.float64)
+
+
+def _call(env: gym.Env | VecEnv, method: str, *args: Any) -> Any:
+    try:
+        if isinstance(env, gym.Env):
+            return env.get_wrapper_attr(method)(*args)
+        return cast(Any, env).env_method(method, *args, indices=[0])[0]
+    except AttributeError as error:
+        raise ValueError(f"the environment is no task family: it has no `{method}` ({error})") from error
+
+
+def _better(left: float, right: float) -> Preference:
+    if left == right:
+        return Preference.EQUAL
+    return Preference.LEFT if left > right else Preference.RIGHT

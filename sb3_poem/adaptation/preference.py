@@ -1,0 +1,55 @@
+"""Questions and answers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+from sb3_poem.common.trajectory import Trajectory
+
+
+class Preference(Enum):
+    """The answer to "which of the two trajectories is better?"."""
+
+    LEFT = "left"
+    RIGHT = "right"
+    EQUAL = "equal"
+
+
+@dataclass(frozen=True, eq=False)
+class Query:
+    """
+    A question: which is better?
+
+    :param left: A trajectory on the new task.
+    :param right: Another one.
+    """
+
+    left: Trajectory
+    right: Trajectory
+
+
+def as_preference(answer: Any) -> Preference:
+    """
+    Read an answer: a :class:`Preference`, or one of the words "left", "right" and "equal".
+
+    Numbers and booleans are refused, because their meaning is a convention that differs between programs, and a preference
+    read the wrong way round is worse than none.
+
+    :param answer: What an oracle returned.
+    :return: The preference.
+    :raises ValueError: If it is another word.
+    :raises TypeError: If it is anything else.
+    """
+    if isinstance(answer, Preference):
+        return answer
+    if isinstance(answer, str):
+        try:
+            return Preference(answer)
+        except ValueError:
+            raise ValueError(f'an answer must be "left", "right" or "equal", but is {answer!r}') from None
+    raise TypeError(
+        "an answer must be Preference.LEFT, Preference.RIGHT or Preference.EQUAL (or the word), "
+        f"but is {answer!r} of type {type(answer).__name__}"
+    )

@@ -1,0 +1,91 @@
+"""Where candidate latents come from before the first answer."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+
+SOURCES = ("prior", "aggregate")
+
+
+class Prior(Protocol):
+    """A distribution over latents that can be drawn from and evaluated."""
+
+    def sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """(n, d) draws."""
+
+    def log_density(self, latents: np.ndarray) -> np.ndarray:
+        """(m,) log density at (m, d), up to a constant."""
+
+
+class GaussianPrior:
+    """
+    N(0, I), Algorithm 2's own prior.
+
+    :param dim: The latents' dimension d.
+    """
+
+    def __init__(self, dim: int) -> None:
+        self.dim = dim
+
+    def sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """(n, d) draws."""
+        return rng.standard_normal((n, self.dim))
+
+    def log_density(self, latents: np.ndarray) -> np.ndarray:
+        """(m,) log density at (m, d), up to a constant."""
+        return -0.5 * np.square(latents).sum(axis=1)
+
+
+class AggregatePrior:
+    """
+    The mixture of the training tasks' posteriors. A model can draw from it but does not give its density, which moving
+    particles needs; so this *is* a mixture of Gaussians around draws of the model, with a small common width.
+
+    :param centres: (M, d) draws of the model's aggregate posterior.
+    :param bandwidth: Width of each Gaussian as a share of the draws' distance to their neighbours.
+    """
+
+    def __init__(self, centres: np.ndarray, bandwidth: float = 0.5) -> None:
+        self.centres = np.asarray(centres, dtype=np.float64)
+        distances = np.linalg.norm(self.centres[:, None, :] - self.centres[None, :, :], axis=2)
+        np.fill_diagonal(distances, np.inf)
+        # The median draw's distance to its nearest neighbour: narrow enough to change the mixture little, wide enough
+        # that the density has no holes between neighbours.
+        nearest = float(np.median(distances.min(axis=1))) / np.sqrt(self.centres.shape[1])
+        self.width = max(bandwidth * nearest, 1e-6)
+
+    def sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """(n, d) draws."""
+        chosen = self.centres[rng.integers(len(self.centres), size=n)]
+        return chosen + self.width * rng.standard_normal(chosen.shape)
+
+    def log_density(self, latents: np.ndarray) -> np.ndarray:
+        """(m,) log density at (m, d), up to a constant."""
+        squared = (
+            np.square(latents).sum(axis=1)[:, None]
+            - 2.0 * latents @ self.centres.T
+            + np.square(self.centres).sum(axis=1)[None, :]
+        )
+        exponents = -0.5 * squared / self.width**2
+        peak = exponents.max(axis=1)
+        return peak + np.log(np.exp(exponents - peak[:, None]).mean(axis=1))
+
+
+def make_prior(model: Any, source: str, rng: np.random.Generator, n_centres: int = 512) -> Prior:
+    """
+    The prior of a model.
+
+    :param model: A trained model.
+    :param source: "prior" or "aggregate".
+    :param rng: Draws the centres of the aggregate mixture.
+    :param n_centres: How many.
+    :return: The prior.
+    :raises ValueError: If the source is unknown.
+    """
+    if source == "prior":
+        return GaussianPrior(model.latent_dim)
+    if source == "aggregate":
+        return AggregatePrior(model.sample_latents(n_centres, rng, source="aggregate"))
+    raise ValueError(f"`candidates` must be one of {SOURCES}, but is {source!r}")

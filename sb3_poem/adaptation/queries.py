@@ -1,0 +1,105 @@
+"""Which pair of policies to compare next. Everything here works on a matrix of similarities; nothing loops over pairs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sb3_poem.adaptation.noise import NoiseModel
+
+QUERY_RULES = ("worst-case", "information-gain", "random")
+
+
+def tolerance(epsilon: float) -> float:
+    """
+    How far S(z, z') may fall below S(z, z'') while eq. 9 still holds. The appendix's proof has the opposite sign, which would
+    shrink the half-space and exclude the true latent; eq. 9 itself widens it.
+
+    :param epsilon: The tolerated error, in [0, 0.5).
+    :return: log((1 + 2 epsilon) / (1 - 2 epsilon)) >= 0.
+    """
+    return float(np.log1p(2.0 * epsilon) - np.log1p(-2.0 * epsilon))
+
+
+def worst_case_sizes(similarities: np.ndarray, epsilon: float, weights: np.ndarray | None = None) -> np.ndarray:
+    """
+    For each pair of policies, the larger of the two sets of latents that may survive the answer (eq. 10's objective).
+
+    :param similarities: (m, n) S(z_i, z_j) of m latents and n policies.
+    :param epsilon: The tolerated error of eq. 9.
+    :param weights: (m,) a latent's weight; None counts each as one.
+    :return: (n (n - 1) / 2,), in the order of ``numpy.triu_indices(n, 1)``.
+    """
+    first, second = np.triu_indices(similarities.shape[1], 1)
+    difference = similarities[:, first] - similarities[:, second]  # (m, pairs)
+    slack = tolerance(epsilon)
+    survives_first, survives_second = difference >= -slack, difference <= slack
+    if weights is None:
+        return np.maximum(np.count_nonzero(survives_first, axis=0), np.count_nonzero(survives_second, axis=0))
+    return np.maximum(weights @ survives_first, weights @ survives_second)
+
+
+def worst_case_pair(similarities: np.ndarray, epsilon: float, weights: np.ndarray | None = None) -> tuple[int, int]:
+    """
+    The pair of policies after whose worse answer the fewest latents survive (eq. 10). Of equally good pairs the first.
+
+    :param similarities: (m, n).
+    :param epsilon: The tolerated error of eq. 9.
+    :param weights: (m,) a latent's weight; None counts each as one.
+    :return: Two different policy indices.
+    """
+    return _pair(int(np.argmin(worst_case_sizes(similarities, epsilon, weights))), similarities.shape[1])
+
+
+def information_gains(probabilities: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """
+    Expected information gain of a question: the entropy of the answer minus its mean entropy under each latent.
+
+    Of two policies that do the same, every latent says 1/2, so the gain is 0: a resolution limit within the probabilities
+    is what keeps questions apart that nobody could answer.
+
+    :param probabilities: (m, pairs) P(LEFT) under each latent.
+    :param weights: (m,) summing to one.
+    :return: (pairs,) in nats.
+    """
+    return _entropy(weights @ probabilities) - weights @ _entropy(probabilities)
+
+
+def most_informative_pair(
+    values: np.ndarray, weights: np.ndarray, noise: NoiseModel, error: float, magnitude: float
+) -> tuple[int, int]:
+    """
+    The pair of policies whose comparison is expected to tell most.
+
+    :param values: (m, n) predicted fitness of n policies under m latents, in the unit of ``error``.
+    :param weights: (m,) summing to one.
+    :param noise: The oracle's noise model.
+    :param error: Standard deviation of a predicted difference.
+    :param magnitude: Typical sum of both returns' absolute values, same unit.
+    :return: Two different policy indices.
+    """
+    n = values.shape[1]
+    first, second = np.triu_indices(n, 1)
+    probabilities = noise.probability_left(values[:, first] - values[:, second], error, magnitude)
+    return _pair(int(np.argmax(information_gains(probabilities, weights))), n)
+
+
+def random_pair(n: int, rng: np.random.Generator) -> tuple[int, int]:
+    """
+    Two different policies, uniformly.
+
+    :param n: How many there are, at least 2.
+    :param rng: The generator.
+    :return: Two different indices.
+    """
+    first, second = rng.choice(n, size=2, replace=False)
+    return int(first), int(second)
+
+
+def _pair(index: int, n: int) -> tuple[int, int]:
+    first, second = np.triu_indices(n, 1)
+    return int(first[index]), int(second[index])
+
+
+def _entropy(probability: np.ndarray) -> np.ndarray:
+    p = np.clip(probability, 1e-12, 1.0 - 1e-12)
+    return -(p * np.log(p) + (1.0 - p) * np.log1p(-p))

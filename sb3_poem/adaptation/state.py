@@ -1,0 +1,75 @@
+"""Adaptation state as JSON: arrays bit for bit, generators, and files that are whole or absent."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+def generator_state(rng: np.random.Generator) -> dict[str, Any]:
+    """
+    A generator's state as JSON-ready data.
+
+    :param rng: A PCG64 generator, as ``numpy.random.default_rng`` makes it.
+    :return: The state.
+    """
+    return dict(rng.bit_generator.state)
+
+
+def generator_from_state(state: dict[str, Any]) -> np.random.Generator:
+    """
+    Read what :func:`generator_state` wrote.
+
+    :param state: The state.
+    :return: A generator that continues where the other one stood.
+    :raises ValueError: If it is no such state.
+    """
+    rng = np.random.default_rng(0)
+    try:
+        rng.bit_generator.state = state
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"not the state of a PCG64 generator: {error}") from error
+    return rng
+
+
+def write_json_atomically(path: str | os.PathLike[str], data: dict[str, Any]) -> None:
+    """
+    Write JSON so that the file is either the old one or the whole new one, whatever happens in between.
+
+    :param path: The file; its folder must exist.
+    :param data: What to write.
+    """
+    path = Path(path)
+    text = json.dumps(data, indent=1, allow_nan=False)
+    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
+    try:
+        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """
+    Read a JSON object.
+
+    :param path: The file.
+    :return: The object.
+    :raises ValueError: If the file is truncated, or is no JSON object.
+    """
+    try:
+        data = json.loads(Path(path).read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{os.fspath(path)} is not a saved adaptation: {error}") from error
+    if not isinstance(data, dict):
+        raise ValueError(f"{os.fspath(path)} is not a saved adaptation: it holds a {type(data).__name__}, not an object")
+    return data

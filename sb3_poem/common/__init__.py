@@ -1,0 +1,1 @@
+"""What the algorithms share: environments in lockstep, trajectories, buffers, encoders, callbacks."""

@@ -1,0 +1,124 @@
+"""Small worlds whose truth is known, with the model that solves them: no training, no networks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from scipy.special import ndtr
+
+from sb3_poem.common.trajectory import Trajectory
+
+TOP_SPEED = 3.0
+HORIZON = 20
+STEP_WEIGHT = 200.0 / HORIZON  # returns as over HalfCheetahVel's 200 steps
+
+
+class SpeedEnv(gym.Env):
+    """
+    A cart that moves at the speed it is told to; its task is a goal speed in [0, 3], its reward -10 |speed - goal|, and 20 steps an
+    episode. Observations (place, speed) do not hold the goal.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
+    observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+    task_space = spaces.Box(0.0, TOP_SPEED, (1,), np.float64)
+    all_tasks = None
+    shared_dynamics = True
+    reward_feature_dim = 1
+
+    def __init__(self, end_at: float = np.inf, render_mode: str | None = None) -> None:
+        self.end_at = end_at
+        self.render_mode = render_mode
+        self._next_task = self.task = np.array([1.5])
+
+    def sample_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        return rng.uniform(0.0, TOP_SPEED, size=(n, 1))
+
+    def set_task(self, task: np.ndarray) -> None:
+        self._next_task = np.array(task, dtype=np.float64)
+
+    @staticmethod
+    def compute_reward(tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
+        return -STEP_WEIGHT * np.abs(features[..., 0] - tasks[..., 0])
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.task = self._next_task
+        self._time = 0
+        self._place = self.np_random.normal()
+        return np.array([self._place, 0.0]), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        speed = 0.5 * TOP_SPEED * (float(action[0]) + 1.0)
+        self._place += 0.05 * speed
+        self._time += 1
+        features = np.array([speed])
+        reward = float(self.compute_reward(self.task, features))
+        truncated = self._time >= HORIZON
+        return np.array([self._place, speed]), reward, self._place > self.end_at, truncated, {"reward_features": features}
+
+    def render(self) -> np.ndarray:
+        return np.full((16, 16, 3), min(255, int(abs(self._place) * 40)), dtype=np.uint8)
+
+
+class Blinded(gym.Wrapper):
+    """Rewards are NaN, and the reward features are gone: what an adapter may see."""
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict]:
+        observation, _, terminated, truncated, _ = self.env.step(action)
+        return observation, float("nan"), terminated, truncated, {}
+
+
+class SpeedModel:
+    """
+    The perfect model of :class:`SpeedEnv`: the first entry of z is the normal score of the speed, the others do nothing.
+
+    S(z, z') = 2 g(z) v(z') - v(z')^2, which is g^2 less than -(g - v)^2: for every task it orders speeds as their returns do.
+    """
+
+    observation_space = SpeedEnv.observation_space
+    action_space = SpeedEnv.action_space
+    horizon = HORIZON
+    env_id = None
+    seed = 0
+
+    def __init__(self, latent_dim: int = 5, scale: float = 10.0, error: float = 0.05) -> None:
+        self.latent_dim = latent_dim
+        self.scale = scale
+        self.predicted_rewards_error = error
+        self.task_latents = np.random.default_rng(0).standard_normal((30, latent_dim))
+
+    @staticmethod
+    def speed(latents: np.ndarray) -> np.ndarray:
+        return TOP_SPEED * ndtr(np.asarray(latents)[..., 0])
+
+    def similarity(self, task_latents: np.ndarray, policy_latents: np.ndarray) -> np.ndarray:
+        goal, speed = self.speed(task_latents), self.speed(policy_latents)
+        reward_embedding = np.stack([goal, np.ones_like(goal)], axis=1)
+        policy_embedding = np.stack([2.0 * speed, -(speed**2)], axis=1)
+        return self.scale * reward_embedding @ policy_embedding.T
+
+    def predicted_returns(self, latents: np.ndarray, trajectories: Sequence[Trajectory]) -> np.ndarray:
+        goals = self.speed(latents)
+        columns = [
+            -STEP_WEIGHT * np.abs(trajectory.observations[None, 1:, 1] - goals[:, None]).sum(axis=1)
+            for trajectory in trajectories
+        ]
+        return np.stack(columns, axis=1)
+
+    def sample_latents(self, n: int, rng: np.random.Generator, source: str = "prior") -> np.ndarray:
+        if source == "prior":
+            return rng.standard_normal((n, self.latent_dim))
+        centres = self.task_latents[rng.integers(len(self.task_latents), size=n)]
+        return centres + 0.1 * rng.standard_normal(centres.shape)
+
+    def predict(
+        self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[np.ndarray, Any]:
+        actions = 2.0 * self.speed(state) / TOP_SPEED - 1.0
+        return np.clip(actions[..., None], -1.0, 1.0).astype(np.float32), state
