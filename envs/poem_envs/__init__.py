@@ -23,3 +23,8 @@ def _register(name: str, module: str, max_episode_steps: int) -> None:
 _register("PointGoal", "point_goal", max_episode_steps=25)
 _register("HalfCheetahVel", "half_cheetah", max_episode_steps=200)
 _register("HalfCheetahFwdBack", "half_cheetah", max_episode_steps=200)
+_register("AntVel", "ant", max_episode_steps=200)
+_register("AntFwdBack", "ant", max_episode_steps=200)
+_register("AntDir2D", "ant", max_episode_steps=200)
+_register("AntGoal", "ant", max_episode_steps=200)
+_register("HumanoidDir2D", "humanoid", max_episode_steps=200)

@@ -1,0 +1,126 @@
+"""Humanoid with a hidden direction."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from gymnasium import spaces
+
+from poem_envs.ant import speed_towards
+from poem_envs.mujoco_family import MujocoFamily, MujocoTaskEnv, MujocoTaskVectorEnv
+from poem_envs.mujoco_rendering import arrow
+
+
+class _Humanoid(MujocoFamily):
+    hidden_qpos = 2
+    reward_feature_dim = 3
+    camera_config = {"distance": 5.0, "elevation": -20.0, "lookat": np.array([0.0, 0.0, 1.2])}  # noqa: RUF012
+    _torso = 1  # its subtree is the whole robot
+    _forward_data: mujoco.MjData | None = None
+
+    def __init__(
+        self,
+        *,
+        xml_file: str = "humanoid.xml",
+        ctrl_cost_weight: float = 0.1,
+        terminate_when_unhealthy: bool = True,
+        healthy_z_range: tuple[float, float] = (1.0, 2.0),
+        reset_noise_scale: float = 1e-2,
+        **kwargs: Any,
+    ) -> None:
+        self.ctrl_cost_weight = ctrl_cost_weight
+        self.terminate_when_unhealthy = terminate_when_unhealthy
+        self.healthy_z_range = healthy_z_range
+        super().__init__(xml_file=xml_file, reset_noise_scale=reset_noise_scale, **kwargs)
+
+    def _observation_dim(self) -> int:
+        return super()._observation_dim() + self._derived_dim()
+
+    def _derived_dim(self) -> int:
+        return (10 + 6 + 6) * self.model.nbody + self.model.nv
+
+    def _allocate(self, n: int) -> None:
+        super()._allocate(n)
+        self._derived = np.zeros((n, self._derived_dim()))  # cinert, cvel, qfrc_actuator, cfrc_ext
+        self._centre_of_mass = np.zeros((n, 2))
+
+    def _draw_start(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        scale = self.reset_noise_scale
+        qpos = self.init_qpos + rng.uniform(low=-scale, high=scale, size=self.model.nq)
+        qvel = self.init_qvel + rng.uniform(low=-scale, high=scale, size=self.model.nv)
+        return qpos, qvel
+
+    def _begin_episodes(self, copies: np.ndarray, rngs: Sequence[np.random.Generator]) -> None:
+        super()._begin_episodes(copies, rngs)
+        self._derive(copies, np.zeros((len(copies), self.model.nu)))
+
+    def _set_physics_state(self, copy: int, state: np.ndarray) -> None:
+        super()._set_physics_state(copy, state)
+        self._derive(np.array([copy]), np.zeros((1, self.model.nu)))
+
+    def _reward_features(self, qpos_before: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        before = self._centre_of_mass.copy()
+        self._derive(np.arange(len(actions)), actions)
+        velocity = (self._centre_of_mass - before) / self.dt
+        return np.column_stack([velocity, np.square(actions).sum(axis=1)])
+
+    def _unhealthy(self) -> np.ndarray:
+        if not self.terminate_when_unhealthy:
+            return super()._unhealthy()
+        lowest, highest = self.healthy_z_range
+        height = self._qpos[:, 2]
+        return ~((lowest < height) & (height < highest))
+
+    def _observations(self) -> np.ndarray:
+        return np.concatenate([super()._observations(), self._derived], axis=1)
+
+    def _derive(self, copies: np.ndarray, controls: np.ndarray) -> None:
+        """Compute what the observation and the reward take from the simulator, at the copies' current states.
+
+        :param copies: their numbers
+        :param controls: the actions that are applied, ``(len(copies), nu)``
+        """
+        model = self.model
+        if self._forward_data is None:
+            self._forward_data = mujoco.MjData(model)
+        data = self._forward_data
+        derived = [data.cinert.reshape(-1), data.cvel.reshape(-1), data.qfrc_actuator, data.cfrc_ext.reshape(-1)]
+        ctrl, warm_start, centre_of_mass = data.ctrl, data.qacc_warmstart, data.subtree_com[self._torso, :2]
+        for copy, control in zip(copies.tolist(), controls, strict=True):
+            mujoco.mj_setState(model, data, self._states[copy], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+            ctrl[:] = control
+            warm_start[:] = 0.0
+            mujoco.mj_forward(model, data)
+            mujoco.mj_rnePostConstraint(model, data)
+            np.concatenate(derived, out=self._derived[copy])
+            self._centre_of_mass[copy] = centre_of_mass
+
+    def _task_markers(self, task: np.ndarray, position: np.ndarray) -> list[dict[str, Any]]:
+        direction = (float(np.cos(task[0])), float(np.sin(task[0])))
+        return [arrow(np.array([position[0], position[1], 2.0]), direction, length=1.0)]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "_forward_data": None}
+
+
+class _HumanoidDir2D(_Humanoid):
+    def __init__(self, *, forward_reward_weight: float = 1.25, healthy_reward: float = 5.0, **kwargs: Any) -> None:
+        self.forward_reward_weight = forward_reward_weight
+        self.healthy_reward = healthy_reward
+        self.task_space = spaces.Box(-np.pi / 2, np.pi / 2, (1,), np.float64)
+        super().__init__(**kwargs)
+
+    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
+        forward = self.forward_reward_weight * speed_towards(tasks, features)
+        return forward - self.ctrl_cost_weight * features[..., 2] + self.healthy_reward
+
+
+class HumanoidDir2DEnv(_HumanoidDir2D, MujocoTaskEnv):
+    r""" """
+
+
+class HumanoidDir2DVectorEnv(_HumanoidDir2D, MujocoTaskVectorEnv):
+    """The vectorised :class:`HumanoidDir2DEnv`: same arguments, and those of a vectorised MuJoCo family."""
