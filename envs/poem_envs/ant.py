@@ -142,7 +142,83 @@ def speed_towards(angles: np.ndarray, velocities: np.ndarray) -> np.ndarray:
 
 
 class AntVelEnv(_AntVel, MujocoTaskEnv):
-    r""" """
+    r"""
+    ## Description
+    The Ant, a quadruped with eight hinges, is to run forward (in x direction) at a speed that it cannot see. The
+    dynamics are those of Gymnasium's `Ant-v5`, but for the solver's warm start, which every step begins at zero (see
+    :class:`~poem_envs.mujoco_family.MujocoFamily`).
+
+    ## Task
+    The goal speed in m/s, uniform on [0, 3], hidden from the observation: `task_space` is `Box(0, 3, (1,), float64)`.
+
+    ## Action Space
+    The action space is a `Box(-1, 1, (8,), float32)`: torques at the hinge joints, scaled by each motor's gear.
+
+    | Num | Action                          | Control Min | Control Max | XML name | Joint | Type (Unit)  |
+    | --- | ------------------------------- | ----------- | ----------- | -------- | ----- | ------------ |
+    | 0   | torque on the back right hip    | -1          | 1           | hip_4    | hinge | torque (N m) |
+    | 1   | torque on the back right ankle  | -1          | 1           | ankle_4  | hinge | torque (N m) |
+    | 2   | torque on the front left hip    | -1          | 1           | hip_1    | hinge | torque (N m) |
+    | 3   | torque on the front left ankle  | -1          | 1           | ankle_1  | hinge | torque (N m) |
+    | 4   | torque on the front right hip   | -1          | 1           | hip_2    | hinge | torque (N m) |
+    | 5   | torque on the front right ankle | -1          | 1           | ankle_2  | hinge | torque (N m) |
+    | 6   | torque on the back left hip     | -1          | 1           | hip_3    | hinge | torque (N m) |
+    | 7   | torque on the back left ankle   | -1          | 1           | ankle_3  | hinge | torque (N m) |
+
+    ## Observation Space
+    The observation space is a `Box(-Inf, Inf, (27,), float64)`: positions without x and y, then velocities, all unbounded.
+    Contact forces, which Gymnasium's Ant-v5 appends, are left out.
+
+    | Num      | Observation                                         | XML name            | Joint | Type (Unit) |
+    | -------- | --------------------------------------------------- | ------------------- | ----- | ----------- |
+    | 0        | z-coordinate of the torso                           | root                | free  | m           |
+    | 1 - 4    | orientation of the torso, a quaternion (w, x, y, z) | root                | free  | -           |
+    | 5, 6     | angles of the front left hip and ankle              | hip_1, ankle_1      | hinge | rad         |
+    | 7, 8     | angles of the front right hip and ankle             | hip_2, ankle_2      | hinge | rad         |
+    | 9, 10    | angles of the back left hip and ankle               | hip_3, ankle_3      | hinge | rad         |
+    | 11, 12   | angles of the back right hip and ankle              | hip_4, ankle_4      | hinge | rad         |
+    | 13 - 15  | velocity of the torso in x, y, z                    | root                | free  | m/s         |
+    | 16 - 18  | angular velocity of the torso about x, y, z         | root                | free  | rad/s       |
+    | 19 - 26  | angular velocities of the hinges, as 5 - 12         | hip_1, ..., ankle_4 | hinge | rad/s       |
+    | excluded | x- and y-coordinate of the torso                    | root                | free  | m           |
+
+    ## Rewards
+    $offset - w_{forward} |v_x - v_{goal}| - w_{ctrl} \|action\|_2^2 + healthy$, where $v_x$ is the change of the
+    torso's x-coordinate over the step, divided by its duration `dt` = 0.05 s. Gymnasium's Ant-v5 takes the position
+    that lags by a physics step; here both ends are the integrated state. Every step earns `forward_reward_offset` and
+    `healthy_reward`, the last of an early end too. The reward features are $(v_x, v_y, \|action\|_2^2)$.
+
+    ## Starting State
+    The model's initial pose, 0.75 m above the floor, plus noise: uniform on [-`reset_noise_scale`, `reset_noise_scale`]
+    in every position, and normal with standard deviation `reset_noise_scale` in every velocity.
+
+    ## Episode End
+    An episode terminates when the torso's z-coordinate leaves `healthy_z_range`, unless
+    `terminate_when_unhealthy=False`. `gymnasium.make` truncates episodes after 200 steps.
+
+    ## Arguments
+    ```python
+    import gymnasium as gym
+    env = gym.make("poem_envs:poem/AntVel-v0", ctrl_cost_weight=0.005)
+    ```
+
+    | Parameter                  | Type      | Default      | Description                                             |
+    | -------------------------- | --------- | ------------ | ------------------------------------------------------- |
+    | `forward_reward_weight`    | **float** | `1.0`        | Weight of the speed term                                |
+    | `forward_reward_offset`    | **float** | `1.0`        | Added to the reward of every step                       |
+    | `healthy_reward`           | **float** | `0.05`       | Added to the reward of every step                       |
+    | `ctrl_cost_weight`         | **float** | `0.005`      | Weight of the action cost                               |
+    | `terminate_when_unhealthy` | **bool**  | `True`       | Whether leaving the healthy range ends the episode      |
+    | `healthy_z_range`          | **tuple** | `(0.2, 1.0)` | Lowest and highest healthy z-coordinate of the torso, m |
+    | `reset_noise_scale`        | **float** | `0.1`        | Scale of the noise of the starting state                |
+
+    Further arguments (`xml_file="ant.xml"`, `frame_skip=5`, `render_mode`, cameras, size of images) are those of
+    :class:`~poem_envs.mujoco_family.MujocoFamily`. `render_task=True` shows the hidden task: an arrow, half a metre
+    long for each m/s.
+
+    ## Version History
+    * v0: Initial version
+    """
 
 
 class AntVelVectorEnv(_AntVel, MujocoTaskVectorEnv):
@@ -150,7 +226,43 @@ class AntVelVectorEnv(_AntVel, MujocoTaskVectorEnv):
 
 
 class AntFwdBackEnv(_AntFwdBack, MujocoTaskEnv):
-    r""" """
+    r"""
+    ## Description
+    The Ant is to run as fast as it can forward or backward (in x direction), and cannot see which.
+
+    ## Task
+    The direction as an angle, 0 (forward) or pi (backward), hidden from the observation: `all_tasks` holds these two,
+    and `task_space` is `Box(0, pi, (1,), float64)`.
+
+    ## Action Space, Observation Space, Starting State, Episode End
+    As :class:`AntVelEnv`.
+
+    ## Rewards
+    $w_{forward} \cdot (v_x \cos(angle) + v_y \sin(angle)) - w_{ctrl} \|action\|_2^2 + healthy$, where $v$ is the change
+    of the torso's position over the step, divided by its duration `dt` = 0.05 s. Every step earns `healthy_reward`, the
+    last of an early end too. The reward features are $(v_x, v_y, \|action\|_2^2)$.
+
+    ## Arguments
+    ```python
+    import gymnasium as gym
+    env = gym.make("poem_envs:poem/AntFwdBack-v0", ctrl_cost_weight=0.5)
+    ```
+
+    | Parameter                  | Type      | Default      | Description                                             |
+    | -------------------------- | --------- | ------------ | ------------------------------------------------------- |
+    | `forward_reward_weight`    | **float** | `1.0`        | Weight of the speed term                                |
+    | `healthy_reward`           | **float** | `1.0`        | Added to the reward of every step                       |
+    | `ctrl_cost_weight`         | **float** | `0.5`        | Weight of the action cost                               |
+    | `terminate_when_unhealthy` | **bool**  | `True`       | Whether leaving the healthy range ends the episode      |
+    | `healthy_z_range`          | **tuple** | `(0.2, 1.0)` | Lowest and highest healthy z-coordinate of the torso, m |
+    | `reset_noise_scale`        | **float** | `0.1`        | Scale of the noise of the starting state                |
+
+    Further arguments (`xml_file="ant.xml"`, `frame_skip=5`, `render_mode`, cameras, size of images) are those of
+    :class:`~poem_envs.mujoco_family.MujocoFamily`. `render_task=True` shows the hidden task: an arrow.
+
+    ## Version History
+    * v0: Initial version
+    """
 
 
 class AntFwdBackVectorEnv(_AntFwdBack, MujocoTaskVectorEnv):
@@ -158,7 +270,43 @@ class AntFwdBackVectorEnv(_AntFwdBack, MujocoTaskVectorEnv):
 
 
 class AntDir2DEnv(_AntDir2D, MujocoTaskEnv):
-    r""" """
+    r"""
+    ## Description
+    The Ant is to run as fast as it can in a direction of the plane that it cannot see.
+
+    ## Task
+    The direction as an angle, uniform on [-pi/2, pi/2], 0 being the x direction, hidden from the observation:
+    `task_space` is `Box(-pi/2, pi/2, (1,), float64)`.
+
+    ## Action Space, Observation Space, Starting State, Episode End
+    As :class:`AntVelEnv`.
+
+    ## Rewards
+    $w_{forward} \cdot (v_x \cos(angle) + v_y \sin(angle)) - w_{ctrl} \|action\|_2^2 + healthy$, where $v$ is the change
+    of the torso's position over the step, divided by its duration `dt` = 0.05 s. Every step earns `healthy_reward`, the
+    last of an early end too. The reward features are $(v_x, v_y, \|action\|_2^2)$.
+
+    ## Arguments
+    ```python
+    import gymnasium as gym
+    env = gym.make("poem_envs:poem/AntDir2D-v0", ctrl_cost_weight=0.5)
+    ```
+
+    | Parameter                  | Type      | Default      | Description                                             |
+    | -------------------------- | --------- | ------------ | ------------------------------------------------------- |
+    | `forward_reward_weight`    | **float** | `1.0`        | Weight of the speed term                                |
+    | `healthy_reward`           | **float** | `1.0`        | Added to the reward of every step                       |
+    | `ctrl_cost_weight`         | **float** | `0.5`        | Weight of the action cost                               |
+    | `terminate_when_unhealthy` | **bool**  | `True`       | Whether leaving the healthy range ends the episode      |
+    | `healthy_z_range`          | **tuple** | `(0.2, 1.0)` | Lowest and highest healthy z-coordinate of the torso, m |
+    | `reset_noise_scale`        | **float** | `0.1`        | Scale of the noise of the starting state                |
+
+    Further arguments (`xml_file="ant.xml"`, `frame_skip=5`, `render_mode`, cameras, size of images) are those of
+    :class:`~poem_envs.mujoco_family.MujocoFamily`. `render_task=True` shows the hidden task: an arrow.
+
+    ## Version History
+    * v0: Initial version
+    """
 
 
 class AntDir2DVectorEnv(_AntDir2D, MujocoTaskVectorEnv):
@@ -166,7 +314,49 @@ class AntDir2DVectorEnv(_AntDir2D, MujocoTaskVectorEnv):
 
 
 class AntGoalEnv(_AntGoal, MujocoTaskEnv):
-    r""" """
+    r"""
+    ## Description
+    The Ant is to walk to a place that it cannot see, and to stay there.
+
+    ## Task
+    The goal's x- and y-coordinate in m, uniform on the disc of radius 3 around the origin, hidden from the observation:
+    `task_space` is `Box(-3, 3, (2,), float64)`.
+
+    ## Action Space, Starting State
+    As :class:`AntVelEnv`.
+
+    ## Observation Space
+    The observation space is a `Box(-Inf, Inf, (29,), float64)`: the x- and y-coordinate of the torso, then the 27
+    elements of :class:`AntVelEnv`. Where the ant is belongs to it, since the goal is a place.
+
+    ## Rewards
+    $-w_{distance} (|x - x_{goal}| + |y - y_{goal}|) - w_{ctrl} \|action\|_2^2$, with the torso's position after the
+    step. The reward features are $(x, y, \|action\|_2^2)$.
+
+    ## Episode End
+    There is no early end unless `terminate_when_unhealthy=True`, which works as in :class:`AntVelEnv`. `gymnasium.make`
+    truncates episodes after 200 steps.
+
+    ## Arguments
+    ```python
+    import gymnasium as gym
+    env = gym.make("poem_envs:poem/AntGoal-v0", ctrl_cost_weight=0.1)
+    ```
+
+    | Parameter                  | Type      | Default      | Description                                             |
+    | -------------------------- | --------- | ------------ | ------------------------------------------------------- |
+    | `distance_reward_weight`   | **float** | `1.0`        | Weight of the distance term                             |
+    | `ctrl_cost_weight`         | **float** | `0.1`        | Weight of the action cost                               |
+    | `terminate_when_unhealthy` | **bool**  | `False`      | Whether leaving the healthy range ends the episode      |
+    | `healthy_z_range`          | **tuple** | `(0.2, 1.0)` | Lowest and highest healthy z-coordinate of the torso, m |
+    | `reset_noise_scale`        | **float** | `0.1`        | Scale of the noise of the starting state                |
+
+    Further arguments (`xml_file="ant.xml"`, `frame_skip=5`, `render_mode`, cameras, size of images) are those of
+    :class:`~poem_envs.mujoco_family.MujocoFamily`. `render_task=True` shows the hidden task: a pole at the goal.
+
+    ## Version History
+    * v0: Initial version
+    """
 
 
 class AntGoalVectorEnv(_AntGoal, MujocoTaskVectorEnv):

@@ -119,7 +119,77 @@ class _HumanoidDir2D(_Humanoid):
 
 
 class HumanoidDir2DEnv(_HumanoidDir2D, MujocoTaskEnv):
-    r""" """
+    r"""
+    ## Description
+    The Humanoid, a robot with 17 hinges, is to run in a direction of the plane that it cannot see, and not to fall. The
+    positions and velocities follow Gymnasium's `Humanoid-v4`, but for the solver's warm start, which every step begins
+    at zero (see :class:`~poem_envs.mujoco_family.MujocoFamily`).
+
+    ## Task
+    The direction as an angle, uniform on [-pi/2, pi/2], 0 being the x direction, hidden from the observation:
+    `task_space` is `Box(-pi/2, pi/2, (1,), float64)`.
+
+    ## Action Space
+    The action space is a `Box(-0.4, 0.4, (17,), float32)`: torques at the hinge joints, scaled by each motor's gear.
+
+    | Num     | Action                                         | Control Min | Control Max | Type (Unit)  |
+    | ------- | ---------------------------------------------- | ----------- | ----------- | ------------ |
+    | 0 - 2   | torques on the abdomen (y, z, x)               | -0.4        | 0.4         | torque (N m) |
+    | 3 - 6   | torques on the right hip (x, z, y) and knee    | -0.4        | 0.4         | torque (N m) |
+    | 7 - 10  | torques on the left hip (x, z, y) and knee     | -0.4        | 0.4         | torque (N m) |
+    | 11 - 13 | torques on the right shoulder (1, 2) and elbow | -0.4        | 0.4         | torque (N m) |
+    | 14 - 16 | torques on the left shoulder (1, 2) and elbow  | -0.4        | 0.4         | torque (N m) |
+
+    ## Observation Space
+    The observation space is a `Box(-Inf, Inf, (376,), float64)`, in the layout of Gymnasium's Humanoid-v4.
+
+    | Num       | Observation                                                                   |
+    | --------- | ----------------------------------------------------------------------------- |
+    | 0 - 21    | positions `qpos` without x and y: height, orientation, 17 hinge angles        |
+    | 22 - 44   | velocities `qvel`: of the torso (3), angular (3), of the hinges (17)          |
+    | 45 - 184  | `cinert`: mass and inertia of the 14 bodies about the centre of mass, 10 each |
+    | 185 - 268 | `cvel`: velocity of the 14 bodies about the centre of mass, 6 each            |
+    | 269 - 291 | `qfrc_actuator`: generalised forces of the actuators                          |
+    | 292 - 375 | `cfrc_ext`: external forces and torques on the 14 bodies, 6 each              |
+
+    `cinert` to `cfrc_ext` are those of the state that the observation shows, under the action just applied. Gymnasium
+    reads what MuJoCo computed at the start of the last physics step, and has no `cfrc_ext` at a reset.
+
+    ## Rewards
+    $w_{forward} \cdot (v_x \cos(angle) + v_y \sin(angle)) - w_{ctrl} \|action\|_2^2 + healthy$, where $v$ is the change
+    of the centre of mass over the step, divided by its duration `dt` = 0.015 s; Gymnasium's Humanoid-v4 takes centres
+    that lag by a physics step. Every step earns `healthy_reward`, the last of an early end too. The reward features are
+    $(v_x, v_y, \|action\|_2^2)$.
+
+    ## Starting State
+    The model's initial pose, standing, plus noise: uniform on [-`reset_noise_scale`, `reset_noise_scale`] in every
+    position and velocity.
+
+    ## Episode End
+    An episode terminates when the torso's z-coordinate is not strictly inside `healthy_z_range`, unless
+    `terminate_when_unhealthy=False`. `gymnasium.make` truncates episodes after 200 steps.
+
+    ## Arguments
+    ```python
+    import gymnasium as gym
+    env = gym.make("poem_envs:poem/HumanoidDir2D-v0", ctrl_cost_weight=0.1)
+    ```
+
+    | Parameter                  | Type      | Default      | Description                                             |
+    | -------------------------- | --------- | ------------ | ------------------------------------------------------- |
+    | `forward_reward_weight`    | **float** | `1.25`       | Weight of the speed term                                |
+    | `ctrl_cost_weight`         | **float** | `0.1`        | Weight of the action cost                               |
+    | `healthy_reward`           | **float** | `5.0`        | Added to the reward of every step                       |
+    | `terminate_when_unhealthy` | **bool**  | `True`       | Whether falling ends the episode                        |
+    | `healthy_z_range`          | **tuple** | `(1.0, 2.0)` | Lowest and highest healthy z-coordinate of the torso, m |
+    | `reset_noise_scale`        | **float** | `0.01`       | Scale of the noise of the starting state                |
+
+    Further arguments (`xml_file="humanoid.xml"`, `frame_skip=5`, `render_mode`, cameras, size of images) are those of
+    :class:`~poem_envs.mujoco_family.MujocoFamily`. `render_task=True` shows the hidden task: an arrow.
+
+    ## Version History
+    * v0: Initial version
+    """
 
 
 class HumanoidDir2DVectorEnv(_HumanoidDir2D, MujocoTaskVectorEnv):

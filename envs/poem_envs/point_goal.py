@@ -104,10 +104,10 @@ class PointGoalEnv(_PointGoal, BatchTaskFamily):
     ## Action Space
     The action space is a `Box(-1, 1, (2,), float32)`.
 
-    | Num | Action                 | Control Min | Control Max | Unit                  |
-    | --- | ---------------------- | ----------- | ----------- | --------------------- |
-    | 0   | movement in x direction | -1         | 1           | `step_length` a step  |
-    | 1   | movement in y direction | -1         | 1           | `step_length` a step  |
+    | Num | Action                  | Control Min | Control Max | Unit                 |
+    | --- | ----------------------- | ----------- | ----------- | -------------------- |
+    | 0   | movement in x direction | -1          | 1           | `step_length` a step |
+    | 1   | movement in y direction | -1          | 1           | `step_length` a step |
 
     ## Observation Space
     The observation space is a `Box(-Inf, Inf, (2,), float64)`.
@@ -132,13 +132,13 @@ class PointGoalEnv(_PointGoal, BatchTaskFamily):
     env = gym.make("poem_envs:poem/PointGoal-v0", step_length=0.05)
     ```
 
-    | Parameter           | Type      | Default | Description                                                          |
-    | ------------------- | --------- | ------- | -------------------------------------------------------------------- |
-    | `step_length`       | **float** | `0.05`  | Distance that the action 1 moves the point in one step               |
-    | `reset_noise_scale` | **float** | `0.02`  | Standard deviation of the start around the origin                    |
-    | `width`, `height`   | **int**   | `480`   | Size of the rendered image, pixels                                   |
-    | `render_mode`       | **str**   | `None`  | `"rgb_array"` or `"human"`                                           |
-    | `render_task`       | **bool**  | `False` | Whether rendering shows the goal                                     |
+    | Parameter           | Type      | Default | Description                                            |
+    | ------------------- | --------- | ------- | ------------------------------------------------------ |
+    | `step_length`       | **float** | `0.05`  | Distance that the action 1 moves the point in one step |
+    | `reset_noise_scale` | **float** | `0.02`  | Standard deviation of the start around the origin      |
+    | `width`, `height`   | **int**   | `480`   | Size of the rendered image, pixels                     |
+    | `render_mode`       | **str**   | `None`  | `"rgb_array"` or `"human"`                             |
+    | `render_task`       | **bool**  | `False` | Whether rendering shows the goal                       |
 
     ## Version History
     * v0: Initial version
