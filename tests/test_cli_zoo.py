@@ -161,6 +161,14 @@ def test_broken_yaml_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert f"{tmp_path / 'broken.yml'} is not valid YAML" in capsys.readouterr().err
 
 
+def test_a_number_that_yaml_reads_as_text_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "text.yml").write_text(yaml.safe_dump({"poem/PointGoal-v0": SMALL}) + "  learning_rate: 1e-3\n")
+    assert train("-c", tmp_path / "text.yml", "-f", tmp_path / "logs") == 1
+    error = capsys.readouterr().err
+    assert "learning_rate in " in error
+    assert "write 0.001" in error
+
+
 def test_an_environment_that_is_no_task_family_is_refused(
     config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -40,6 +40,7 @@ def _add_adapt_arguments(parser: argparse.ArgumentParser) -> None:
     model.add_argument("--model", required=True, help="a model's .zip, a pretrained folder, or the name of a shipped model")
     model.add_argument("--env", help="environment id (default: the one that the model was trained on)")
     model.add_argument("--env-kwargs", nargs="+", metavar="KEY:VALUE", default=[], help="arguments of the environment")
+    model.add_argument("--gym-packages", nargs="+", metavar="MODULE", default=[], help="modules that register environments")
     model.add_argument("--device", default="cpu", help="PyTorch device (default: %(default)s)")
 
     questions = parser.add_argument_group("the questions and who answers them")

@@ -2,9 +2,7 @@
 
 import difflib
 import inspect
-import os
 import sys
-import tempfile
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,6 +17,7 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from poem_envs import TaskFamily
 from sb3_poem.cli import has_display
 from sb3_poem.cli.models import ALGORITHMS
+from sb3_poem.cli.outputs import check_writable
 from sb3_poem.resources import config_file
 
 # What rl_zoo3 takes out of an entry for itself before the rest goes to the algorithm.
@@ -55,18 +54,19 @@ def check_keys(keys: Sequence[str], algorithm: str, source: str) -> None:
             raise ValueError(f"Unknown key {key!r} in {source}: {algorithm} has no such hyperparameter, {hint}")
 
 
-def check_writable(folder: str) -> None:
+def check_numbers(entry: dict[str, Any], source: str) -> None:
     """
-    Make a folder and a file in it, so that a run does not find out at its end that it cannot save.
-
-    :raises OSError: if that fails; the message names the folder
+    :param entry: hyperparameters
+    :param source: where they were read, for the message
+    :raises ValueError: if a number was read as text, as YAML reads 1e-3 (but 1.0e-3 as a number)
     """
-    try:
-        os.makedirs(folder, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise OSError(f"cannot write to the folder {folder!r}: {error.strerror or error}") from error
+    for key, value in entry.items():
+        if isinstance(value, str):
+            try:
+                number = float(value)
+            except ValueError:
+                continue
+            raise ValueError(f"{key} in {source} is the text {value!r} to YAML; write {number!r}")
 
 
 def is_task_family(env_id: str) -> bool | None:
@@ -101,8 +101,10 @@ class PoemExperimentManager(ExperimentManager):
             raise ValueError(f"{self.config} is not valid YAML: {error}") from error
         if self.algo in ALGORITHMS:
             custom = set(self.custom_hyperparams or ())
+            source = f"{self.config}, entry {self.env_name.gym_id!r}"
             check_keys(sorted(custom), self.algo, "-params")
-            check_keys(sorted(set(hyperparams) - custom), self.algo, f"{self.config}, entry {self.env_name.gym_id!r}")
+            check_keys(sorted(set(hyperparams) - custom), self.algo, source)
+            check_numbers({key: value for key, value in hyperparams.items() if key not in custom}, source)
         return hyperparams, saved
 
 

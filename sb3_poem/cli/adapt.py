@@ -1,0 +1,248 @@
+"""``sb3-poem adapt``: adapt a model to unseen tasks by preference queries, and say what it earns."""
+
+import argparse
+import ast
+import importlib
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from rich.console import Console
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from sb3_poem.adaptation import (
+    AdaptationEvaluation,
+    BoltzmannOracle,
+    HumanOracle,
+    MistakeOracle,
+    Preference,
+    PreferenceAdapter,
+    ReturnOracle,
+    TaskOracle,
+    evaluate_adaptation,
+    evaluate_latents,
+    known_task_return,
+)
+from sb3_poem.adaptation.evaluation import evaluation_seed
+from sb3_poem.adaptation.oracles import compute_reward
+from sb3_poem.adaptation.state import write_json_atomically
+from sb3_poem.cli.models import load_model
+from sb3_poem.cli.outputs import check_output
+from sb3_poem.cli.report import Report, describe_task
+from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.rollouts import rollout_latents
+from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.common.video import side_by_side, write_video
+
+DEFAULT_TASKS = 30
+# Copies that step in lockstep; those of a family without a vector version step in turn.
+VECTORISED_COPIES, SINGLE_COPIES = 60, 8
+# Episodes per latent when looking for a task's best: the fewer, the more luck counts in the limit.
+SELECTION_EPISODES = 3
+# Test tasks come from a stream of their own, so that no seed gives the tasks that a model was trained on.
+TEST_TASK_STREAM = 0x7E57
+
+
+def run_adapt(arguments: argparse.Namespace) -> None:
+    """
+    Run the command.
+
+    :param arguments: as ``sb3_poem.cli`` parsed them
+    :raises ValueError: if they do not fit the model or the environment
+    :raises OSError: if the model cannot be read, or a file not be written
+    """
+    check_output("--json", arguments.json, (".json",))
+    check_output("--plot", arguments.plot, (".png", ".pdf", ".svg"))
+    check_output("--video", arguments.video, (".mp4", ".gif"))
+    for package in arguments.gym_packages:
+        importlib.import_module(package)
+    console = Console()
+    adaptation = Adaptation(arguments, console)
+    evaluation = adaptation.ask_person() if arguments.oracle == "human" else adaptation.ask_oracle()
+    if evaluation is not None:
+        adaptation.report(evaluation)
+    adaptation.env.close()
+
+
+def parse_env_kwargs(pairs: list[str]) -> dict[str, Any]:
+    """
+    Read ``KEY:VALUE`` arguments; a value is a Python literal, or else a string.
+
+    :raises ValueError: if there is no colon
+    """
+    kwargs = {}
+    for pair in pairs:
+        key, colon, text = pair.partition(":")
+        if not colon or not key.isidentifier():
+            raise ValueError(f"--env-kwargs {pair}: must have the form KEY:VALUE")
+        try:
+            kwargs[key] = ast.literal_eval(text)
+        except (ValueError, SyntaxError):
+            kwargs[key] = text
+    return kwargs
+
+
+class Adaptation:
+    """A model, the environment with its test tasks, and how the arguments say to adapt the one to the other."""
+
+    def __init__(self, arguments: argparse.Namespace, console: Console) -> None:
+        self.arguments = arguments
+        self.console = console
+        self.seed: int = arguments.seed
+        self.model = load_model(arguments.model, arguments.device)
+        env_id = arguments.env or self.model.env_id
+        if env_id is None:
+            raise ValueError(f"--env is needed: {arguments.model} does not say on which environment it was trained")
+        self.env_id: str = env_id
+        self.env_kwargs = parse_env_kwargs(arguments.env_kwargs)
+        self.env = self._make_env()
+        family = FamilyEnv(self.env)
+        family.check_same_family(self.model.task_space, self.model.reward_feature_dim)
+        self.options: dict[str, Any] = {"inference": arguments.inference}
+        if arguments.candidates is not None:
+            self.options["candidates"] = arguments.candidates
+        self.tasks = self._choose_tasks(family)
+
+    def _make_env(self) -> VecEnv:
+        if gym.spec(self.env_id).vector_entry_point is not None:
+            return TaskVecEnv.from_id(self.env_id, VECTORISED_COPIES, **self.env_kwargs)
+        return DummyVecEnv([partial(gym.make, self.env_id, **self.env_kwargs)] * SINGLE_COPIES)
+
+    def _choose_tasks(self, family: FamilyEnv) -> np.ndarray:
+        """The test tasks, (n_tasks, task_dim). Those of a finite family are repeated in turn: each is one adaptation more."""
+        arguments = self.arguments
+        if arguments.task is not None:
+            if arguments.tasks not in (None, 1):
+                raise ValueError(f"--task is one task, but --tasks asks for {arguments.tasks}")
+            if len(arguments.task) != family.task_dim:
+                raise ValueError(f"--task needs {family.task_dim} numbers for {self.env_id}, got {len(arguments.task)}")
+            return np.array([arguments.task], dtype=np.float64)
+        human = arguments.oracle == "human"
+        if human and arguments.tasks not in (None, 1):
+            raise ValueError(f"--oracle human answers for one task, but --tasks asks for {arguments.tasks}")
+        count = arguments.tasks or (1 if human else DEFAULT_TASKS)
+        rng = np.random.default_rng([TEST_TASK_STREAM, self.seed])
+        if family.all_tasks is None:
+            return family.sample_tasks(count, rng)
+        return np.resize(family.sample_tasks(len(family.all_tasks), rng), (count, family.task_dim))
+
+    def ask_oracle(self) -> AdaptationEvaluation:
+        """Let a program that knows the tasks answer."""
+        arguments = self.arguments
+        factories: dict[str, Callable[..., TaskOracle]] = {
+            "return": ReturnOracle,
+            "boltzmann": partial(BoltzmannOracle, arguments.beta),
+            "mistake": partial(MistakeOracle, arguments.mistake_rate),
+        }
+        return evaluate_adaptation(
+            self.model,
+            self.env,
+            self.tasks,
+            factories[arguments.oracle],
+            record_at=range(arguments.queries + 1),
+            n_episodes=arguments.episodes,
+            seed=self.seed,
+            progress_bar=True,
+            **self.options,
+        )
+
+    def ask_person(self) -> AdaptationEvaluation | None:
+        """
+        Let a person answer, who judges by their own wish. Returns are measured only if ``--task`` says what the wish was.
+        """
+        arguments = self.arguments
+        env = DummyVecEnv([partial(self._make_rendering_env, show_task=False)])
+        if arguments.task is not None:
+            env.env_method("set_task", self.tasks[0])
+        adapter = PreferenceAdapter(
+            self.model, env, oracle=HumanOracle(), n_queries=arguments.queries, seed=self.seed, **self.options
+        )
+        assert adapter.oracle is not None
+        latents, answers = [adapter.policy().latent], []
+        while not adapter.done:
+            query = adapter.ask()
+            answer = adapter.oracle(query.left, query.right)
+            adapter.tell(answer)
+            answers.append(answer)
+            latents.append(adapter.policy().latent)
+        env.close()
+        if arguments.task is not None:
+            return self._evaluate(np.array(latents), answers)
+        if arguments.json is not None:
+            write_json_atomically(arguments.json, adapter.state_dict())
+            self.console.print(f"Wrote {arguments.json}")
+        if arguments.video is not None:
+            self._film(self.tasks[0], latents[0], latents[-1])
+        return None
+
+    def _evaluate(self, latents: np.ndarray, answers: list[Preference]) -> AdaptationEvaluation:
+        """Measure the latents (n_records, latent_dim) that one task went through."""
+        tasks = np.repeat(self.tasks, len(latents), axis=0)
+        with self.console.status("Measuring the returns"):
+            returns = evaluate_latents(
+                self.model, self.env, latents, tasks, self.arguments.episodes, evaluation_seed(self.seed)
+            )
+        return AdaptationEvaluation(self.tasks, tuple(range(len(latents))), latents[None], returns[None], [answers])
+
+    def report(self, evaluation: AdaptationEvaluation) -> None:
+        """Print and write what was asked for."""
+        arguments = self.arguments
+        with self.console.status("Looking for the best policy of every task, as if it were known"):
+            known = known_task_return(
+                self.model,
+                self.env,
+                self.tasks,
+                n_episodes=arguments.episodes,
+                seed=self.seed,
+                selection_episodes=min(arguments.episodes, SELECTION_EPISODES),
+            )
+        settings = {
+            "model": arguments.model,
+            "env_id": self.env_id,
+            "env_kwargs": self.env_kwargs,
+            "oracle": arguments.oracle,
+            "beta": arguments.beta if arguments.oracle == "boltzmann" else None,
+            "mistake_rate": arguments.mistake_rate if arguments.oracle == "mistake" else None,
+            **self.options,
+            "episodes": arguments.episodes,
+            "seed": self.seed,
+        }
+        title = f"{self.env_id}, {len(self.tasks)} task{'s' * (len(self.tasks) > 1)}, {arguments.oracle} oracle"
+        Report(title, settings, evaluation, known).write(self.console, arguments.json, arguments.plot)
+        if arguments.video is not None:
+            self._film(self.tasks[0], evaluation.latents[0, 0], evaluation.latents[0, -1])
+
+    def _make_rendering_env(self, show_task: bool) -> gym.Env:
+        options = {"render_task": True} if show_task else {}
+        env = gym.make(self.env_id, render_mode="rgb_array", **self.env_kwargs, **options)
+        if "rgb_array" not in env.metadata.get("render_modes", ()):
+            raise ValueError(f"{self.env_id} cannot be filmed: it has no render mode 'rgb_array'")
+        return env
+
+    def _film(self, task: np.ndarray, before: np.ndarray, after: np.ndarray) -> Path:
+        """Film one task before the first and after the last answer, from the same start."""
+        path: Path = self.arguments.video
+        env = DummyVecEnv([partial(self._make_rendering_env, show_task=self.arguments.oracle != "human")])
+        with self.console.status("Filming"):
+            clips = rollout_latents(
+                self.model,
+                env,
+                np.stack([before, after]),
+                np.stack([task, task]),
+                [evaluation_seed(self.seed)] * 2,
+                frames=True,
+            )
+            captions = ["before the first answer", f"after {self.arguments.queries} answers"]
+            if self.arguments.oracle != "human" or self.arguments.task is not None:
+                for i, clip in enumerate(clips):
+                    assert clip.reward_features is not None
+                    captions[i] += f": {compute_reward(env, task, clip.reward_features).sum():.1f}"
+            fps = float(env.get_attr("metadata")[0].get("render_fps", 20))
+            frames = side_by_side(clips[0].frames or [], clips[1].frames or [], (captions[0], captions[1]))
+            write_video(frames, path, fps)
+        env.close()
+        self.console.print(f"Wrote {path} (task {describe_task(task)})")
+        return path

@@ -1,0 +1,38 @@
+"""Files that a command will write, checked before it spends its time."""
+
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+
+def check_writable(folder: str | Path) -> None:
+    """
+    Make a folder and a file in it, so that a run does not find out at its end that it cannot save.
+
+    :param folder: where something will be written
+    :raises OSError: if that fails; the message names the folder
+    """
+    try:
+        os.makedirs(folder, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise OSError(f"cannot write to the folder {str(folder)!r}: {error.strerror or error}") from error
+
+
+def check_output(flag: str, path: Path | None, suffixes: Sequence[str]) -> None:
+    """
+    Check a file that a flag named, if it did.
+
+    :param flag: the flag, for the message
+    :param path: the file
+    :param suffixes: what its name may end in
+    :raises ValueError: if its suffix is none of these
+    :raises OSError: if its folder cannot be written
+    """
+    if path is None:
+        return
+    if path.suffix not in suffixes:
+        raise ValueError(f"{flag} {path}: the name must end in {' or '.join(suffixes)}")
+    check_writable(path.parent)
