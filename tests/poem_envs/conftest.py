@@ -1,0 +1,27 @@
+"""What the tests of all families share."""
+
+import numpy as np
+import pytest
+
+ALL_IDS = [
+    "poem/PointGoal-v0",
+    "poem/HalfCheetahVel-v0",
+    "poem/HalfCheetahFwdBack-v0",
+    "poem/AntVel-v0",
+    "poem/AntFwdBack-v0",
+    "poem/AntDir2D-v0",
+    "poem/AntGoal-v0",
+    "poem/HumanoidDir2D-v0",
+]
+
+
+@pytest.fixture(params=ALL_IDS)
+def env_id(request: pytest.FixtureRequest) -> str:
+    """Every registered family in turn."""
+    return request.param
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """A generator for actions and tasks."""
+    return np.random.default_rng(20250101)

@@ -1,0 +1,92 @@
+"""The base class, on a family that only has a single environment, and what importing the package costs."""
+
+import subprocess
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from poem_envs import TaskFamily
+
+
+class Walk1D(TaskFamily):
+    """The example of TaskFamily's docstring."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+    task_space = spaces.Box(-1.0, 1.0, (1,), np.float64)
+    reward_feature_dim = 1
+
+    def _begin_episode(self, rng):
+        self.x = rng.normal(0.0, 0.1, size=1)
+        return self.x.copy()
+
+    def _simulate(self, action):
+        self.x = self.x + 0.1 * action
+        return self.x.copy(), self.x.copy(), bool(abs(self.x[0]) > 2)
+
+    def _reward(self, tasks, features):
+        return -np.abs(features[..., 0] - tasks[..., 0])
+
+
+def test_a_minimal_family_passes_the_checkers():
+    check_env(Walk1D())
+    gym.utils.env_checker.check_env(Walk1D(), skip_render_check=True)
+
+
+def test_a_minimal_family_earns_what_it_says():
+    env = Walk1D()
+    start, _ = env.reset(seed=0, options={"task": [0.5]})
+    observation, reward, terminated, truncated, info = env.step(np.array([0.3]))
+    assert observation == pytest.approx(start + 0.03)
+    assert reward == pytest.approx(-abs(start[0] + 0.03 - 0.5))
+    assert info["reward_features"] == observation
+    assert not terminated
+    assert not truncated
+
+
+def test_a_minimal_family_in_sb3s_own_vec_env():
+    vec_env = DummyVecEnv([Walk1D, Walk1D])
+    tasks = vec_env.env_method("sample_tasks", 2, np.random.default_rng(0), indices=[0])[0]
+    for copy, task in enumerate(tasks):
+        vec_env.env_method("set_task", task, indices=[copy])
+    start = vec_env.reset()
+    assert np.array_equal(np.array(vec_env.get_attr("task")), tasks)
+    _, rewards, _, infos = vec_env.step(np.zeros((2, 1), dtype=np.float32))
+    assert rewards == pytest.approx(-np.abs(start - tasks)[:, 0])
+    features = np.stack([info["reward_features"] for info in infos])
+    assert vec_env.env_method("compute_reward", tasks, features, indices=[0])[0] == pytest.approx(rewards)
+
+
+def run_python(code):
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+
+
+def test_the_import_is_light_and_quick():
+    code = """
+import time
+start = time.perf_counter()
+import poem_envs
+seconds = time.perf_counter() - start
+import sys, gymnasium
+heavy = sorted({"mujoco", "torch", "stable_baselines3", "glfw", "imageio"} & set(sys.modules))
+print(seconds, heavy, sum(id.startswith("poem/") for id in gymnasium.registry))
+"""
+    runs = [run_python(code).split(maxsplit=1) for _ in range(2)]
+    assert {rest.strip() for _, rest in runs} == {"[] 8"}
+    assert min(float(seconds) for seconds, _ in runs) < 1.0
+
+
+def test_gymnasium_imports_the_package_by_its_name_in_an_id():
+    code = """
+import gymnasium
+env = gymnasium.make("poem_envs:poem/AntGoal-v0")
+print(env.reset(seed=0)[0].shape)
+envs = gymnasium.make_vec("poem_envs:poem/AntGoal-v0", num_envs=2)
+print(envs.reset(seed=0)[0].shape)
+"""
+    assert run_python(code).split("\n")[:2] == ["(29,)", "(2, 29)"]

@@ -1,0 +1,315 @@
+"""The contract of a task family, on every registered one."""
+
+import copy
+import pickle
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env as gymnasium_check_env
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+
+import poem_envs  # noqa: F401 (registers)
+
+
+def make(env_id, **kwargs):
+    return gym.make(env_id, **kwargs).unwrapped
+
+
+def random_actions(env, n, rng):
+    low, high = env.action_space.low, env.action_space.high
+    return rng.uniform(low, high, size=(n, *env.action_space.shape)).astype(np.float32)
+
+
+def run(env, actions, **reset_arguments):
+    """Observations, rewards and features of an episode, ended early or not."""
+    observation, _ = env.reset(**reset_arguments)
+    observations, rewards, features = [observation], [], []
+    for action in actions:
+        observation, reward, terminated, _, info = env.step(action)
+        observations.append(observation)
+        rewards.append(reward)
+        features.append(info["reward_features"])
+        if terminated:
+            break
+    return np.array(observations), np.array(rewards), np.array(features)
+
+
+def two_tasks(env, rng):
+    first, second = env.sample_tasks(2, rng)
+    assert not np.array_equal(first, second)
+    return first, second
+
+
+def test_checkers_find_nothing(env_id):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # Gymnasium's own MuJoCo environments raise these: unbounded observations, and Humanoid's torques up to 0.4.
+        warnings.filterwarnings("ignore", message=".*A Box observation space m.*imum value is -?infinity")
+        warnings.filterwarnings("ignore", message=".*recommend.*symmetric and normalized")
+        gymnasium_check_env(make(env_id), skip_render_check=True)
+        sb3_check_env(make(env_id))
+
+
+def test_spaces_and_horizon(env_id):
+    env = gym.make(env_id)
+    horizon = 25 if "PointGoal" in env_id else 200
+    dims = {"Point": (2, 2), "HalfC": (17, 6), "AntGo": (29, 8), "AntVe": (27, 8), "AntFw": (27, 8), "AntDi": (27, 8)}
+    obs_dim, action_dim = dims.get(env_id.removeprefix("poem/")[:5], (376, 17))
+    assert env.spec.max_episode_steps == horizon
+    assert env.observation_space.shape == (obs_dim,)
+    assert env.observation_space.dtype == np.float64
+    assert env.action_space.shape == (action_dim,)
+    assert env.action_space.dtype == np.float32
+    assert env.unwrapped.task_space.shape == ((2,) if env_id == "poem/AntGoal-v0" else (1,))
+    assert env.unwrapped.shared_dynamics
+
+
+@pytest.mark.parametrize(
+    ("env_id", "low", "high"),
+    [
+        ("poem/PointGoal-v0", 0, np.pi),
+        ("poem/HalfCheetahVel-v0", 0, 3),
+        ("poem/AntVel-v0", 0, 3),
+        ("poem/AntDir2D-v0", -np.pi / 2, np.pi / 2),
+        ("poem/HumanoidDir2D-v0", -np.pi / 2, np.pi / 2),
+    ],
+)
+def test_tasks_are_uniform_on_the_documented_interval(env_id, low, high, rng):
+    tasks = make(env_id).sample_tasks(4000, rng)
+    assert tasks.shape == (4000, 1)
+    assert tasks.dtype == np.float64
+    ranks = np.sort(tasks[:, 0] - low) / (high - low)
+    assert np.abs(ranks - (np.arange(4000) + 0.5) / 4000).max() < 0.03  # Kolmogorov-Smirnov, far beyond its 1 % point
+
+
+def test_ant_goals_are_uniform_on_the_disc(rng):
+    goals = make("poem/AntGoal-v0").sample_tasks(4000, rng)
+    radius, angle = np.hypot(*goals.T), np.arctan2(goals[:, 1], goals[:, 0])
+    for ranks in (np.sort((radius / 3) ** 2), np.sort(angle / (2 * np.pi) + 0.5)):
+        assert np.abs(ranks - (np.arange(4000) + 0.5) / 4000).max() < 0.03
+
+
+@pytest.mark.parametrize(
+    ("env_id", "members"), [("poem/HalfCheetahFwdBack-v0", {1.0, -1.0}), ("poem/AntFwdBack-v0", {0.0, np.pi})]
+)
+def test_finite_families(env_id, members, rng):
+    env = make(env_id)
+    assert set(env.all_tasks[:, 0]) == members
+    drawn = [tuple(env.sample_tasks(2, rng)[:, 0]) for _ in range(20)]
+    assert all(set(tasks) == members for tasks in drawn)
+    assert len(set(drawn)) == 2  # in either order
+    assert {env.sample_tasks(1, rng)[0, 0] for _ in range(40)} == members
+    with pytest.raises(ValueError, match=r"n=3 .*finite family of 2"):
+        env.sample_tasks(3, rng)
+    with pytest.raises(ValueError, match="not among this family's tasks"):
+        env.set_task([0.5])
+    env.set_task(env.all_tasks[1] * (1 - 1e-9))  # rounding on the way is forgiven
+    env.reset()
+    assert env.task == env.all_tasks[1]
+
+
+def test_sampling_depends_on_the_given_generator_alone(env_id):
+    env = make(env_id)
+    env.reset(seed=1)
+    before = copy.deepcopy(env.np_random.bit_generator.state)
+    first = env.sample_tasks(2, np.random.default_rng(5))
+    assert np.array_equal(first, env.sample_tasks(2, np.random.default_rng(5)))
+    assert env.np_random.bit_generator.state == before
+    for n in (0, -1, 1.5, True):
+        with pytest.raises(ValueError, match="n="):
+            env.sample_tasks(n, np.random.default_rng(5))
+
+
+def test_a_task_takes_effect_at_the_next_reset(env_id, rng):
+    env = make(env_id)
+    assert env.task is None
+    first, second = two_tasks(env, rng)
+    env.set_task(first)
+    assert env.task is None
+    env.reset(seed=0)
+    assert np.array_equal(env.task, first)
+    env.set_task(second)
+    action = random_actions(env, 1, rng)[0]
+    _, reward, _, _, info = env.step(action)
+    assert np.array_equal(env.task, first)
+    assert reward == env.compute_reward(first, info["reward_features"])
+    env.reset()
+    assert np.array_equal(env.task, second)
+    env.reset(options={"task": first})
+    assert np.array_equal(env.task, first)
+    env.reset(seed=3)
+    assert np.array_equal(env.task, first)  # a chosen task stays chosen
+
+
+def test_the_task_cannot_be_changed_from_outside(env_id, rng):
+    env = make(env_id)
+    first, _ = two_tasks(env, rng)
+    handed_in = first.copy()
+    env.reset(options={"task": handed_in})
+    handed_in[:] = 99
+    env.task[:] = 99
+    assert np.array_equal(env.task, first)
+
+
+def test_a_seed_determines_an_unchosen_task(env_id):
+    env, other = make(env_id), make(env_id)
+    env.reset(seed=7)
+    task = env.task
+    env.reset()
+    assert np.array_equal(env.task, task)  # kept without a seed
+    env.reset(seed=8)
+    env.reset(seed=7)
+    other.reset(seed=7)
+    assert np.array_equal(env.task, task)
+    assert np.array_equal(other.task, task)
+    drawn = []
+    for seed in range(10):
+        env.reset(seed=seed)
+        drawn.append(tuple(env.task))
+    assert len(set(drawn)) > 1
+
+
+@pytest.mark.parametrize("wrong", [np.zeros(3), np.full(1, 99.0), np.array([np.nan]), np.zeros((1, 1)), "fast", None])
+def test_wrong_tasks(env_id, wrong):
+    env = make(env_id)
+    env.reset(seed=0)
+    before = env.task
+    with pytest.raises(ValueError, match=r"task=|task has shape"):
+        env.set_task(wrong)
+    if wrong is not None:
+        with pytest.raises(ValueError, match="task"):
+            env.reset(options={"task": wrong})
+    env.reset()
+    assert np.array_equal(env.task, before)
+
+
+def test_observations_hide_the_task(env_id, rng):
+    env = make(env_id)
+    first, second = two_tasks(env, rng)
+    actions = random_actions(env, 25, rng)
+    seen, rewards, features = run(env, actions, seed=11, options={"task": first})
+    seen_again, other_rewards, other_features = run(env, actions, seed=11, options={"task": second})
+    assert np.array_equal(seen, seen_again)
+    assert np.array_equal(features, other_features)
+    assert not np.array_equal(rewards, other_rewards)
+
+
+def test_relabelling_is_exact(env_id, rng):
+    """Rewards of one task, computed from the features logged in another, equal those experienced, to the last bit."""
+    env = make(env_id)
+    tasks = env.sample_tasks(2, rng)
+    actions = random_actions(env, 25, rng)
+    results = [run(env, actions, seed=4, options={"task": task}) for task in tasks]
+    experienced = np.stack([rewards for _, rewards, _ in results])
+    relabelled = env.compute_reward(tasks[:, None], results[0][2])
+    assert np.array_equal(experienced, relabelled)
+
+
+def test_compute_reward_broadcasts_to_the_same_bits(env_id, rng):
+    env = make(env_id)
+    tasks = np.concatenate([env.sample_tasks(2, rng) for _ in range(20)])
+    features = rng.normal(0, 2, size=(7, 5, env.reward_feature_dim))
+    together = env.compute_reward(tasks[:, None, None], features)
+    assert together.shape == (40, 7, 5)
+    assert together.dtype == np.float64
+    one_by_one = [[[float(env.compute_reward(t, f)) for f in row] for row in features] for t in tasks]
+    assert np.array_equal(together, one_by_one)
+    strided = env.compute_reward(tasks[::2], np.asfortranarray(features)[0, 0])
+    assert np.array_equal(strided, together[::2, 0, 0])
+
+
+def test_compute_reward_refuses_wrong_dimensions(env_id):
+    env = make(env_id)
+    task_dim, feature_dim = env.task_space.shape[0], env.reward_feature_dim
+    with pytest.raises(ValueError, match="task_dim"):
+        env.compute_reward(np.zeros(task_dim + 1), np.zeros(feature_dim))
+    with pytest.raises(ValueError, match="reward_feature_dim"):
+        env.compute_reward(np.zeros(task_dim), np.zeros((3, feature_dim + 1)))
+
+
+def test_episodes_are_reproducible(env_id, rng):
+    actions = random_actions(make(env_id), 25, rng)
+    env, other = make(env_id), make(env_id)
+    run(other, actions, seed=1)
+    first, second = run(env, actions, seed=9), run(other, actions, seed=9)
+    for one, two in zip(first, second, strict=True):
+        assert np.array_equal(one, two)
+    assert not np.array_equal(run(env, actions)[0][0], first[0][0])  # without a seed the random numbers go on
+
+
+def test_wrong_actions(env_id):
+    env = make(env_id)
+    high = env.action_space.high.astype(np.float64)
+    with pytest.raises(ResetNeeded):
+        env.step(np.zeros_like(high))
+    env.reset(seed=0)
+    state = env.get_physics_state()
+    for value in (np.nan, np.inf, 2.0):
+        wrong = np.zeros_like(high)
+        wrong[1] = value
+        with pytest.raises(ValueError, match=rf"action is {value} at component 1.*inside \[-"):
+            env.step(wrong)
+    with pytest.raises(ValueError, match="action has shape"):
+        env.step(np.zeros(len(high) + 1))
+    with pytest.raises(ValueError, match="action='left'"):
+        env.step("left")
+    assert np.array_equal(env.get_physics_state(), state)
+    env.step(high + 9e-7)
+    clipped = env.get_physics_state()
+    env.set_physics_state(state)
+    env.step(high)
+    assert np.array_equal(env.get_physics_state(), clipped)
+
+
+def test_unknown_reset_options(env_id):
+    with pytest.raises(ValueError, match=r"unknown keys \['goal'\]"):
+        make(env_id).reset(options={"goal": 1})
+
+
+def test_unknown_render_mode(env_id):
+    with pytest.raises(ValueError, match="render_mode='ascii'"):
+        make(env_id).__class__(render_mode="ascii")
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_copies_go_on_alike(env_id, duplicate, rng):
+    env = make(env_id)
+    actions = random_actions(env, 8, rng)
+    run(env, actions, seed=2)
+    twin = duplicate(env)
+    for action in actions:
+        mine, theirs = env.step(action), twin.step(action)
+        assert np.array_equal(mine[0], theirs[0])
+        assert mine[1:4] == theirs[1:4]
+    assert np.array_equal(env.reset()[0], twin.reset()[0])
+    assert np.array_equal(env.task, twin.task)
+
+
+def test_a_state_can_be_restored(env_id, rng):
+    env = make(env_id)
+    actions = random_actions(env, 6, rng)
+    env.reset(seed=0)
+    states, rewards = [env.get_physics_state()], []
+    for action in actions:
+        rewards.append(env.step(action)[1])
+        states.append(env.get_physics_state())
+    other = make(env_id)
+    other.reset(options={"task": env.task})
+    for before, after, action, reward in zip(states, states[1:], actions, rewards, strict=False):
+        other.set_physics_state(before)
+        assert other.step(action)[1] == reward
+        assert np.array_equal(other.get_physics_state(), after)
+    with pytest.raises(ValueError, match="state="):
+        env.set_physics_state(states[0][1:])
+    with pytest.raises(ValueError, match="state="):
+        env.set_physics_state(np.full_like(states[0], np.nan))
+
+
+def test_closing_twice(env_id):
+    env = make(env_id)
+    env.reset(seed=0)
+    env.close()
+    env.close()
