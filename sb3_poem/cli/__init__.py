@@ -84,21 +84,30 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def use_offscreen_rendering() -> None:
-    """Where there is no display, let MuJoCo draw through EGL or OSMesa, unless the user chose. Call before importing it."""
+def offscreen_backend() -> str | None:
+    """What MuJoCo could draw with where there is no display: ``"egl"``, ``"osmesa"``, or None."""
     from ctypes.util import find_library
 
-    if sys.platform != "linux" or "MUJOCO_GL" in os.environ or has_display():
-        return
-    for backend, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
-        if find_library(library):
+    backends = (("egl", "EGL"), ("osmesa", "OSMesa"))
+    return next((backend for backend, library in backends if find_library(library)), None)
+
+
+def use_offscreen_rendering() -> None:
+    """Where there is no display, let MuJoCo draw off screen, unless the user chose. Call before importing it."""
+    if not has_display() and "MUJOCO_GL" not in os.environ:
+        backend = offscreen_backend()
+        if backend is not None:
             os.environ["MUJOCO_GL"] = backend
-            return
 
 
 def has_display() -> bool:
     """Whether a window can be opened."""
     return sys.platform != "linux" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+
+
+def can_draw() -> bool:
+    """Whether videos can be made here, as far as can be told without trying."""
+    return has_display() or offscreen_backend() is not None
 
 
 def _run(arguments: argparse.Namespace, others: list[str]) -> int:

@@ -28,7 +28,6 @@ from sb3_poem.adaptation import (
 )
 from sb3_poem.adaptation.evaluation import evaluation_seed
 from sb3_poem.adaptation.oracles import compute_reward
-from sb3_poem.adaptation.state import write_json_atomically
 from sb3_poem.cli.models import load_model
 from sb3_poem.cli.outputs import check_output
 from sb3_poem.cli.report import Report, describe_task
@@ -151,7 +150,8 @@ class Adaptation:
 
     def ask_person(self) -> AdaptationEvaluation | None:
         """
-        Let a person answer, who judges by their own wish. Returns are measured only if ``--task`` says what the wish was.
+        Let a person answer, who judges by their own wish. Returns are measured only if ``--task`` says what the wish was;
+        if not, ``--json`` holds the answers and the posterior, from which :meth:`PreferenceAdapter.load` continues.
         """
         arguments = self.arguments
         env = DummyVecEnv([partial(self._make_rendering_env, show_task=False)])
@@ -168,12 +168,11 @@ class Adaptation:
             adapter.tell(answer)
             answers.append(answer)
             latents.append(adapter.policy().latent)
+            if arguments.json is not None and arguments.task is None:
+                adapter.save(arguments.json)
         env.close()
         if arguments.task is not None:
             return self._evaluate(np.array(latents), answers)
-        if arguments.json is not None:
-            write_json_atomically(arguments.json, adapter.state_dict())
-            self.console.print(f"Wrote {arguments.json}")
         if arguments.video is not None:
             self._film(self.tasks[0], latents[0], latents[-1])
         return None
