@@ -10,6 +10,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import gymnasium
+
 from sb3_poem import __version__
 
 ZOO_COMMANDS = {
@@ -139,7 +141,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("Interrupted.", file=sys.stderr)
         return 130
-    except (ValueError, TypeError, OSError) as error:
+    except (ValueError, TypeError, OSError, gymnasium.error.Error) as error:
         # The library says in these what the user gave and what would be right; a developer wants the place as well.
         if os.environ.get("SB3_POEM_TRACEBACK"):
             raise

@@ -56,6 +56,8 @@ def run_adapt(arguments: argparse.Namespace) -> None:
     check_output("--json", arguments.json, (".json",))
     check_output("--plot", arguments.plot, (".png", ".pdf", ".svg"))
     check_output("--video", arguments.video, (".mp4", ".gif"))
+    if arguments.oracle == "human" and arguments.task is None and arguments.plot is not None:
+        raise ValueError("--plot needs returns, and with --oracle human only --task says by which goal to measure them")
     for package in arguments.gym_packages:
         importlib.import_module(package)
     console = Console()
@@ -99,7 +101,10 @@ class Adaptation:
         self.env_kwargs = parse_env_kwargs(arguments.env_kwargs)
         self.env = self._make_env()
         family = FamilyEnv(self.env)
-        family.check_same_family(self.model.task_space, self.model.reward_feature_dim)
+        try:
+            family.check_same_family(self.model.task_space, self.model.reward_feature_dim)
+        except ValueError as error:
+            raise ValueError(f"--env {env_id}, but {arguments.model} was trained on {self.model.env_id}: {error}") from error
         self.options: dict[str, Any] = {"inference": arguments.inference}
         if arguments.candidates is not None:
             self.options["candidates"] = arguments.candidates
@@ -221,10 +226,11 @@ class Adaptation:
             raise ValueError(f"{self.env_id} cannot be filmed: it has no render mode 'rgb_array'")
         return env
 
-    def _film(self, task: np.ndarray, before: np.ndarray, after: np.ndarray) -> Path:
+    def _film(self, task: np.ndarray, before: np.ndarray, after: np.ndarray) -> None:
         """Film one task before the first and after the last answer, from the same start."""
         path: Path = self.arguments.video
-        env = DummyVecEnv([partial(self._make_rendering_env, show_task=self.arguments.oracle != "human")])
+        task_matters = self.arguments.oracle != "human" or self.arguments.task is not None
+        env = DummyVecEnv([partial(self._make_rendering_env, show_task=task_matters)])
         with self.console.status("Filming"):
             clips = rollout_latents(
                 self.model,
@@ -235,7 +241,7 @@ class Adaptation:
                 frames=True,
             )
             captions = ["before the first answer", f"after {self.arguments.queries} answers"]
-            if self.arguments.oracle != "human" or self.arguments.task is not None:
+            if task_matters:
                 for i, clip in enumerate(clips):
                     assert clip.reward_features is not None
                     captions[i] += f": {compute_reward(env, task, clip.reward_features).sum():.1f}"
@@ -243,5 +249,4 @@ class Adaptation:
             frames = side_by_side(clips[0].frames or [], clips[1].frames or [], (captions[0], captions[1]))
             write_video(frames, path, fps)
         env.close()
-        self.console.print(f"Wrote {path} (task {describe_task(task)})")
-        return path
+        self.console.print(f"Wrote {path}" + (f" (task {describe_task(task)})" if task_matters else ""))
