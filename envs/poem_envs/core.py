@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import sys
 from collections.abc import Callable
-from typing import Any, ClassVar, SupportsInt
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -118,7 +118,7 @@ class TaskDefinition:
             raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
         low, high = self.task_space.low, self.task_space.high
         clipped = np.clip(array, low, high)
-        inside = (np.abs(array - clipped) <= BOUNDS_TOLERANCE).all(axis=-1)  # false for NaN
+        inside = np.all(np.abs(array - clipped) <= BOUNDS_TOLERANCE, axis=-1)  # false for NaN
         if not inside.all():
             raise ValueError(f"{_first(array, ~inside, name)} must be finite and inside task_space, from {low} to {high}")
         if self.all_tasks is None:
@@ -290,7 +290,7 @@ def checked_actions(actions: npt.ArrayLike, space: spaces.Box, num_envs: int | N
     except (TypeError, ValueError) as error:
         raise ValueError(f"action={actions!r} is not an array of numbers of shape {shape}") from error
     if array.shape != shape:
-        raise ValueError(f"action={actions!r} has shape {array.shape}, expected {shape}")
+        raise ValueError(f"action has shape {array.shape}, expected {shape}")
     low, high = space.low.astype(np.float64), space.high.astype(np.float64)
     clipped = np.clip(array, low, high)
     acceptable = np.abs(array - clipped) <= BOUNDS_TOLERANCE  # false for NaN
@@ -305,7 +305,7 @@ def checked_actions(actions: npt.ArrayLike, space: spaces.Box, num_envs: int | N
     return clipped
 
 
-def _first(tasks: np.ndarray, wrong: np.ndarray, name: str) -> str:
+def _first(tasks: np.ndarray, wrong: npt.ArrayLike, name: str) -> str:
     """Describe the first wrong task of one or many."""
     if tasks.ndim == 1:
         return f"{name}={tasks.tolist()}"
@@ -313,7 +313,7 @@ def _first(tasks: np.ndarray, wrong: np.ndarray, name: str) -> str:
     return f"{name}[{row}]={tasks[row].tolist()}"
 
 
-def _checked_count(n: SupportsInt) -> int:
-    if isinstance(n, bool) or int(n) != n or n < 1:
+def _checked_count(n: int) -> int:
+    if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1:
         raise ValueError(f"n={n!r} must be a whole number, at least 1")
     return int(n)

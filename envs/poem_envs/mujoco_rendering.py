@@ -68,6 +68,7 @@ class StateRenderer:
         if render_mode != "human":
             _choose_headless_backend()
         viewer = self._renderer._get_viewer(render_mode)
+        viewer.make_context_current()  # another environment may have rendered since
         _close_at_exit(self)
         if self._follows:
             viewer.cam.lookat[:2] = self._data.xpos[1, :2]

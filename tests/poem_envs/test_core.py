@@ -33,6 +33,7 @@ class Walk1D(TaskFamily):
         return -np.abs(features[..., 0] - tasks[..., 0])
 
 
+@pytest.mark.filterwarnings("ignore:.*A Box observation space m.*imum value is")
 def test_a_minimal_family_passes_the_checkers():
     check_env(Walk1D())
     gym.utils.env_checker.check_env(Walk1D(), skip_render_check=True)
