@@ -19,7 +19,8 @@ if TYPE_CHECKING:
         Query,
         ReturnOracle,
     )
-    from sb3_poem.common.callbacks import AdaptationEvalCallback, TrainingCheckpointCallback
+    from sb3_poem.adaptation.callback import AdaptationEvalCallback
+    from sb3_poem.common.callbacks import TrainingCheckpointCallback
     from sb3_poem.common.vec_env import TaskVecEnv
     from sb3_poem.pearl_sac import PEARLSAC
     from sb3_poem.poem_sac import POEMSAC
@@ -37,7 +38,7 @@ _HOME = {
     "MistakeOracle": "sb3_poem.adaptation",
     "HumanOracle": "sb3_poem.adaptation",
     "TaskVecEnv": "sb3_poem.common.vec_env",
-    "AdaptationEvalCallback": "sb3_poem.common.callbacks",
+    "AdaptationEvalCallback": "sb3_poem.adaptation.callback",
     "TrainingCheckpointCallback": "sb3_poem.common.callbacks",
 }
 

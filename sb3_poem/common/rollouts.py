@@ -38,7 +38,7 @@ def rollout_latents(
     :param vec_env: Any SB3 vector environment. ``last_reward_features`` is read where it has it, else
         ``info["reward_features"]``.
     :param latents: (n, latent_dim), any n.
-    :param tasks: (n, task_dim) to set before each rollout; None leaves the environment's own tasks alone.
+    :param tasks: (n, task_dim) to set before each rollout; None keeps the environment's own tasks as they are.
     :param seed: One seed a rollout, or one integer s: then rollout i takes s + i.
     :param deterministic: Whether the policies act by their mode. If not, the actions' noise follows the seeds too.
     :param frames: Whether to render every step; the environment needs ``render_mode="rgb_array"``.
@@ -190,9 +190,12 @@ def _wave(
     """At most ``num_envs`` rollouts; spare copies repeat the last one, and are not read."""
     n, copies = len(latents), vec_env.num_envs
     padded = np.minimum(np.arange(copies), n - 1)
-    if tasks is not None:
+    copy_seeds = [seeds[i] for i in padded]
+    if tasks is None:
+        seed_episodes(vec_env, copy_seeds)
+    else:
         set_tasks(vec_env, tasks[padded])
-    seed_copies(vec_env, [seeds[i] for i in padded])
+        seed_copies(vec_env, copy_seeds)
     latents = latents[padded]
     observations = _finite(_flat_observations(vec_env.reset()), np.arange(copies) < n, first, 0, "an observation")
 
@@ -268,6 +271,32 @@ def seed_copies(vec_env: VecEnv, seeds: Sequence[int]) -> None:
     base = vec_env.unwrapped
     base.seed(seeds[0])
     base._seeds = list(seeds)  # SB3's own list of "seeds to be used in the next call to env.reset()"
+
+
+def seed_episodes(vec_env: VecEnv, seeds: Sequence[int]) -> None:
+    """
+    Seed every copy's next episode without touching its task.
+
+    A task family that was never given a task draws one whenever it is reset with a seed; a reset without a seed keeps the
+    task. So a family's generators are replaced, and its next reset needs no seed: the episode is the same as after a seeded
+    reset, and the task stays. Nobody looks at the task for that, except where copies have no generators to replace
+    (``TaskVecEnv``): there their tasks are handed back to them unread. Any other environment is seeded as usual.
+
+    :param vec_env: Any SB3 vector environment.
+    :param seeds: One a copy.
+    """
+    if hasattr(vec_env, "set_tasks"):
+        family: Any = vec_env
+        if family.tasks is None:  # nobody has chosen yet, so that the first seeds do
+            seed_copies(vec_env, seeds)
+            vec_env.reset()
+        family.set_tasks(family.tasks)
+        seed_copies(vec_env, seeds)
+    elif vec_env.has_attr("set_task"):
+        for copy, seed in enumerate(seeds):
+            vec_env.set_attr("np_random", np.random.default_rng(seed), indices=[copy])
+    else:
+        seed_copies(vec_env, seeds)
 
 
 def _flat_observations(observations: Any) -> np.ndarray:

@@ -1,6 +1,9 @@
 """Soft actor-critic with a probabilistic task context: what POEM and its baselines share."""
 
+import io
+import pathlib
 import time
+import zipfile
 from collections.abc import Iterable
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
@@ -10,13 +13,17 @@ import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.common.buffers import ContextStore, Segment, TaskBatch, TaskReplayBuffer
+from sb3_poem.common.checkpoint import read_checkpoint, restore_stores, save_checkpoint
 from sb3_poem.common.collection import collect_segment
 from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.files import write_atomically
 from sb3_poem.common.precision import autocast_dtype
+from sb3_poem.common.pretrained import from_pretrained, save_pretrained
 from sb3_poem.common.random import Generators
 from sb3_poem.pearl_sac.policies import LatentPolicy, MlpPolicy
 
@@ -70,7 +77,7 @@ class PEARLSAC(SAC):
     :param policy_coef: Weight of the actor's loss
     :param relabel_fraction: Share of each task's batch that comes from other tasks' buffers, with rewards relabelled. Needs
         a family with shared dynamics
-    :param reward_scale: Factor on the rewards that the critics learn
+    :param reward_scale: Factor on the rewards that the critics learn; "auto" divides by the deviation of the first epoch's
     :param horizon: Steps of an episode; None takes the environment's time limit
     :param precision: "auto" (bfloat16 where the processor has it), "bf16", or "fp32"
     :param stats_window_size: Episodes that the rollout logging averages over
@@ -87,6 +94,14 @@ class PEARLSAC(SAC):
     policy: LatentPolicy
     replay_buffer: TaskReplayBuffer
     context_has_value: bool = False
+    #: Constructor argument -> attribute, for what :meth:`save_pretrained` keeps
+    saved_arguments: ClassVar[dict[str, str]] = {
+        name: name
+        for name in (
+            "batch_size buffer_size tau gamma gradient_steps n_train_tasks meta_batch_size context_size trajectories_per_task "
+            "latent_dim kl_coef reward_coef policy_coef relabel_fraction reward_scale horizon precision seed"
+        ).split()
+    }
 
     def __init__(
         self,
@@ -111,7 +126,7 @@ class PEARLSAC(SAC):
         reward_coef: float = 1.0,
         policy_coef: float = 1.0,
         relabel_fraction: float = 0.0,
-        reward_scale: float = 1.0,
+        reward_scale: float | str = "auto",
         horizon: int | None = None,
         precision: str = "auto",
         stats_window_size: int = 100,
@@ -137,6 +152,8 @@ class PEARLSAC(SAC):
         ):
             if not value >= low:
                 raise ValueError(f"{name} must be at least {low}, got {value}")
+        if reward_scale != "auto" and not (isinstance(reward_scale, (int, float)) and reward_scale > 0):
+            raise ValueError(f'reward_scale must be a positive number or "auto", got {reward_scale!r}')
         if not 0.0 <= relabel_fraction <= 1.0:
             raise ValueError(f"relabel_fraction must lie in [0, 1], got {relabel_fraction}")
         autocast_dtype(precision, "cpu")  # refuses an unknown name now rather than at the first step
@@ -177,7 +194,7 @@ class PEARLSAC(SAC):
             target_entropy=target_entropy,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
-            policy_kwargs=policy_kwargs,
+            policy_kwargs=dict(policy_kwargs or {}),  # ours to complete, not the caller's
             verbose=verbose,
             seed=seed,
             device=device,
@@ -239,10 +256,11 @@ class PEARLSAC(SAC):
         self.latent_variances = np.ones((count, self.latent_dim))
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """Change the environment, to one of the same family.
+        """Change the environment, to one of the same family with any number of copies.
 
         :raises ValueError: if the environment is of another family
         """
+        self.n_envs = env.num_envs if isinstance(env, VecEnv) else 1  # experience is kept per task, not per copy
         super().set_env(env, force_reset)
         assert self.env is not None
         family = FamilyEnv(self.env, None)
@@ -319,8 +337,8 @@ class PEARLSAC(SAC):
         """Collect one epoch: ``trajectories_per_task`` horizons of every training task under its own latest latent."""
         assert self.train_tasks is not None and self.latent_means is not None and self.latent_variances is not None
         self.policy.set_training_mode(False)
+        callback.on_rollout_start()  # between two epochs: evaluations and checkpoints belong here
         self._dump_pending_logs(log_interval)
-        callback.on_rollout_start()
         started, steps_before = time.perf_counter(), self.num_timesteps
         n_tasks, n_envs = len(self.train_tasks), env.num_envs
         wanted = np.repeat(np.arange(n_tasks), self.trajectories_per_task)
@@ -351,9 +369,7 @@ class PEARLSAC(SAC):
         callback.on_rollout_end()
         return RolloutReturn(collected, 0, continue_training=True)
 
-    def _collect(
-        self, callback: BaseCallback, task_ids: np.ndarray, tasks: np.ndarray, latents: np.ndarray
-    ) -> Segment | None:
+    def _collect(self, callback: BaseCallback, task_ids: np.ndarray, tasks: np.ndarray, latents: np.ndarray) -> Segment | None:
         family, noise_shape = self.family, (len(latents), int(self.action_space.shape[0]))  # type: ignore[index]
 
         def act(obs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -457,6 +473,7 @@ class PEARLSAC(SAC):
         for name, values in history.items():
             self.logger.record(f"train/{name}", th.stack(values).mean().item())
         self._record_latent_statistics()
+        self._measure_decoder()
 
     def _optimise(self, loss: th.Tensor) -> None:
         if not th.isfinite(loss):
@@ -582,7 +599,8 @@ class PEARLSAC(SAC):
             next_actions, next_log_prob = policy.actor(next_obs, _rows(policy.policy_embedding(z), n), noise)  # type: ignore[operator]
             next_values = policy.critic_target(_flat(next_obs), _flat(next_actions), _flat(_rows(z, n))).min(dim=0).values  # type: ignore[operator]
             next_values = next_values - alpha * _flat(next_log_prob[..., None]).squeeze(-1)
-            targets = self.reward_scale * batch.rewards.reshape(-1)
+            scale = 1.0 / policy.reward_std if self.reward_scale == "auto" else self.reward_scale
+            targets = scale * batch.rewards.reshape(-1)
             targets = targets + self.gamma * (1.0 - batch.terminated.reshape(-1)) * next_values
         values = policy.critic(_flat(obs), _flat(batch.actions), _flat(_rows(self._critic_latents(latents), n)))  # type: ignore[operator]
         return 0.5 * (values - targets).pow(2).mean(dim=1).sum(), alpha
@@ -599,12 +617,22 @@ class PEARLSAC(SAC):
         return (alpha * log_prob - values).mean(), log_prob
 
     def _decoder_loss(self, batch: MetaBatch, latents: th.Tensor) -> th.Tensor:
-        """Squared error of the decoder (eq. 4), relative to the variance of the epoch's rewards."""
+        """Squared error of the decoder, relative to the variance of the epoch's rewards.
+
+        On context transitions (eq. 4); with relabelling on the batch of transitions instead, which holds other tasks' policies
+        too: adaptation asks the decoder about trajectories of any policy.
+        """
         policy = self.policy
-        obs_dim, action_dim = policy.obs_mean.shape[0], int(self.action_space.shape[0])  # type: ignore[index]
-        obs, actions, next_obs = batch.context[..., : 2 * obs_dim + action_dim].split([obs_dim, action_dim, obs_dim], dim=-1)
-        embedding = _rows(policy.reward_embedding(latents), batch.context.shape[1])
-        error = policy.decode_rewards(obs, actions, next_obs, embedding) - batch.context_rewards
+        if self.relabel_fraction > 0:
+            data = batch.transitions
+            obs, next_obs = policy.standardise(data.observations), policy.standardise(data.next_observations)
+            actions, rewards = data.actions, data.rewards
+        else:
+            widths = [policy.obs_mean.shape[0], int(self.action_space.shape[0]), policy.obs_mean.shape[0]]  # type: ignore[index]
+            obs, actions, next_obs = batch.context[..., : sum(widths)].split(widths, dim=-1)
+            rewards = batch.context_rewards
+        embedding = _rows(policy.reward_embedding(latents), rewards.shape[1])
+        error = policy.decode_rewards(obs, actions, next_obs, embedding) - rewards
         return error.pow(2).mean() / self._reward_variance()
 
     def _reward_variance(self) -> th.Tensor:
@@ -621,6 +649,25 @@ class PEARLSAC(SAC):
             picks = th.randperm(steps, generator=self.generators.torch, device=self.device)[: self.context_size]
             mean, variance = self.policy.encoder(self.context.transitions[:, picks])
         self.latent_means, self.latent_variances = mean.double().cpu().numpy(), variance.double().cpu().numpy()
+
+    def _measure_decoder(self) -> None:
+        """Residual deviation of the decoder, per step, on transitions of all training policies, in units of reward."""
+        assert self.train_tasks is not None
+        n_tasks, per_task = len(self.train_tasks), 64
+        generator, device, policy = self.generators.torch, self.device, self.policy
+        if self.family.shared_dynamics:
+            sources = th.randint(n_tasks, (n_tasks, per_task), generator=generator, device=device)
+        else:
+            sources = th.arange(n_tasks, device=device)[:, None].expand(-1, per_task)
+        data = self.replay_buffer.sample_rows(sources, generator)
+        rewards = self.family.compute_reward(self.train_tasks[:, None, :], data.features.cpu().numpy())
+        with th.no_grad():
+            latents = th.as_tensor(self.task_latents, dtype=th.float32, device=device)
+            obs, next_obs = policy.standardise(data.observations), policy.standardise(data.next_observations)
+            embedding = _rows(policy.reward_embedding(latents), per_task)
+            predicted = policy.decode_rewards(obs, data.actions, next_obs, embedding).cpu().numpy()
+        self.predicted_rewards_error = float(np.sqrt(np.mean((predicted - rewards) ** 2)))
+        self.logger.record("train/decoder_error", self.predicted_rewards_error)
 
     def _record_latent_statistics(self) -> None:
         """Log the information in the latents, and how far their aggregate is from the prior."""
@@ -660,6 +707,84 @@ class PEARLSAC(SAC):
         if self._logs_pending and log_interval and self.epoch % log_interval == 0:
             self.dump_logs()
             self._logs_pending = False
+
+    def resume(
+        self: SelfPEARLSAC, callback: MaybeCallback = None, log_interval: int | None = 1, progress_bar: bool = False
+    ) -> SelfPEARLSAC:
+        """Finish the ``learn`` that a checkpoint interrupted, up to its own ``total_timesteps``."""
+        remaining = max(0, self._total_timesteps - self.num_timesteps)
+        return self.learn(remaining, callback, log_interval=log_interval, reset_num_timesteps=False, progress_bar=progress_bar)
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """As SB3's, but a file is written completely or not at all."""
+        if isinstance(path, io.BufferedIOBase):
+            super().save(path, exclude, include)
+            return
+        archive = io.BytesIO()
+        super().save(archive, exclude, include)  # type: ignore[arg-type]
+        path = pathlib.Path(path)
+        write_atomically(path if path.suffix else path.with_suffix(".zip"), archive.getbuffer())
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls: type[SelfPEARLSAC], path: str | pathlib.Path | io.BufferedIOBase, env: GymEnv | str | None = None, **kwargs: Any
+    ) -> SelfPEARLSAC:
+        """As SB3's; ``env`` may be a registered id too.
+
+        :raises ValueError: if the file is truncated or holds another algorithm's model, or env is of another family
+        """
+        try:
+            data, _, _ = load_from_zip_file(path, device="cpu", load_data=True)
+        except (zipfile.BadZipFile, RuntimeError, EOFError, ValueError) as error:
+            raise ValueError(f"{path} is truncated, or no model saved by {cls.__name__}: {error}") from error
+        if data is None or "train_tasks" not in data or ("preference_coef" in data) != hasattr(cls, "similarity"):
+            raise ValueError(f"{path} holds a model of another algorithm, not of {cls.__name__}")
+        if isinstance(path, io.BufferedIOBase):
+            path.seek(0)
+        env = env if env is None else cls._vectorise(env, len(data["train_tasks"]))
+        return super().load(path, env=env, **kwargs)  # type: ignore[arg-type]
+
+    def save_checkpoint(self, path: str | pathlib.Path) -> None:
+        """Write everything to one file, from which :meth:`load_checkpoint` continues bit for bit. Between two epochs only.
+
+        :raises OSError: if it cannot be written; a previous checkpoint stays whole
+        """
+        save_checkpoint(self, path)
+
+    @classmethod
+    def load_checkpoint(
+        cls: type[SelfPEARLSAC], path: str | pathlib.Path, env: GymEnv | str | None = None, device: th.device | str = "auto"
+    ) -> SelfPEARLSAC:
+        """Read a checkpoint; :meth:`resume` then continues the run.
+
+        :param path: A file that :meth:`save_checkpoint` or :class:`TrainingCheckpointCallback` wrote
+        :param env: An environment like the run's own: the same family and number of copies
+        :param device: "auto", "cpu", "cuda"
+        :raises ValueError: if the file is truncated or holds another algorithm's run, or env is of another family
+        """
+        state = read_checkpoint(path, cls.__name__)
+        model = cls.load(io.BytesIO(state["model"].numpy().tobytes()), env, device=device)
+        restore_stores(model, state)
+        return model
+
+    def save_pretrained(self, folder: str | pathlib.Path, card: dict[str, Any] | None = None) -> None:
+        """Write safetensors, JSON and a model card; see :func:`sb3_poem.common.pretrained.save_pretrained`."""
+        save_pretrained(self, folder, card)
+
+    @classmethod
+    def from_pretrained(
+        cls: type[SelfPEARLSAC],
+        folder: str | pathlib.Path,
+        env: GymEnv | str | None = None,
+        device: th.device | str = "auto",
+    ) -> SelfPEARLSAC:
+        """Read what :meth:`save_pretrained` wrote; see :func:`sb3_poem.common.pretrained.from_pretrained`."""
+        return from_pretrained(cls, folder, env, device)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_family", "context", "_amp_dtype", "_logs_pending"]

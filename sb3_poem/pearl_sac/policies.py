@@ -60,7 +60,9 @@ class LatentPolicy(SACPolicy):
             observation_space,
             action_space,
             optimizer_class=optimizer_class,
-            optimizer_kwargs=optimizer_kwargs,
+            optimizer_kwargs={"fused": True}
+            if optimizer_kwargs is None and optimizer_class is th.optim.Adam
+            else optimizer_kwargs,
             squash_output=True,
         )
         self.net_arch = self._complete_net_arch(net_arch)  # type: ignore[assignment]

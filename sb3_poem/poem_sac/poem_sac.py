@@ -45,6 +45,14 @@ class POEMSAC(PEARLSAC):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy}
     policy: POEMPolicy
+    saved_arguments: ClassVar[dict[str, str]] = {
+        **PEARLSAC.saved_arguments,
+        "preference_coef": "preference_coef",
+        "similarity": "similarity_metric",
+        "context": "context_kind",
+        "preference_source": "preference_source",
+        "preference_group_size": "preference_group_size",
+    }
 
     def __init__(
         self,
@@ -74,7 +82,7 @@ class POEMSAC(PEARLSAC):
         preference_source: str = "auto",
         preference_group_size: int = 4,
         relabel_fraction: float = 0.0,
-        reward_scale: float = 1.0,
+        reward_scale: float | str = "auto",
         horizon: int | None = None,
         precision: str = "auto",
         stats_window_size: int = 100,
@@ -202,10 +210,6 @@ class POEMSAC(PEARLSAC):
         count = max(1, min(self.meta_batch_size // self.preference_group_size, len(self._groups)))
         chosen = self.generators.numpy.choice(len(self._groups), size=count, replace=False)
         return np.concatenate([self._groups[index] for index in chosen])
-
-    def _critic_latents(self, latents: th.Tensor) -> th.Tensor:
-        """The paper's objective has no critic term: the encoder learns from the other losses."""
-        return latents.detach()
 
     def _actor_embedding(self, latents: th.Tensor) -> th.Tensor:
         """L_policy trains f_pi and the encoder (section 5.3)."""

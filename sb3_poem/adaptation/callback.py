@@ -1,0 +1,107 @@
+"""Evaluation on held-out tasks during training."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_poem.adaptation.evaluation import evaluate_adaptation, evaluate_latents, known_task_return, preference_order
+from sb3_poem.common.callbacks import EpochCallback
+from sb3_poem.common.vec_env import TaskVecEnv
+
+
+class AdaptationEvalCallback(EpochCallback):
+    """
+    Adapts the model to held-out tasks from preferences while it trains, logs how well that goes, and keeps the best model.
+
+    Logs ``eval/return_after_<k>_queries`` for each k, ``eval/known_task_return`` (the best of many latents for each task),
+    ``eval/preference_accuracy`` and ``eval/kendall_tau`` of Property 1, ``eval/coverage_loss`` (the return that is lost by
+    replacing each training task's latent by the nearest of 1,000 prior draws). It has its own generators: training is the same with it and
+    without it. Evaluation steps do not count as training steps.
+
+    :param every: Epochs between two evaluations
+    :param n_tasks: Held-out tasks; a finite family is evaluated on all its tasks
+    :param record_at: Numbers of answers after which the adapted policy is measured
+    :param n_episodes: Episodes of each task and measurement
+    :param best_model_save_path: Folder for ``best_model.zip``, the model of the highest return after the most answers
+    :param seed: Seed of the held-out tasks and of everything else here
+    :param adaptation_kwargs: Options of :func:`sb3_poem.adaptation.adapt_tasks`, for instance ``inference``
+    :param verbose: 1 prints each result
+    :raises ValueError: for a number of tasks or episodes below 1
+    """
+
+    def __init__(
+        self,
+        every: int = 5,
+        n_tasks: int = 30,
+        record_at: Sequence[int] = (0, 1, 2, 5, 10),
+        n_episodes: int = 2,
+        best_model_save_path: str | Path | None = None,
+        seed: int = 1_000_003,
+        adaptation_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+    ) -> None:
+        super().__init__(every, verbose)
+        if n_tasks < 1 or n_episodes < 1:
+            raise ValueError(f"n_tasks and n_episodes must be at least 1, got {n_tasks} and {n_episodes}")
+        self.n_tasks = n_tasks
+        self.record_at = tuple(record_at)
+        self.n_episodes = n_episodes
+        self.best_model_save_path = None if best_model_save_path is None else Path(best_model_save_path)
+        self.seed = seed
+        self.adaptation_kwargs = dict(adaptation_kwargs or {})
+        self.best_return = -np.inf
+        self.last_evaluation: dict[str, float] = {}
+        self._env: TaskVecEnv | None = None
+
+    def _make_env(self) -> tuple[TaskVecEnv, np.ndarray]:
+        family = self.model.family
+        if self._env is None:
+            spec = family.env.get_attr("spec", indices=[0])[0]
+            self._env = TaskVecEnv.from_id(spec.id, 2 * self.n_tasks, **spec.kwargs)
+        if family.all_tasks is not None and len(family.all_tasks) <= self.n_tasks:
+            return self._env, family.all_tasks
+        return self._env, family.sample_tasks(self.n_tasks, np.random.default_rng(self.seed))
+
+    def _on_epoch(self) -> None:
+        env, tasks = self._make_env()
+        options = {"seed": self.seed, "n_episodes": self.n_episodes}
+        result = evaluate_adaptation(self.model, env, tasks, record_at=self.record_at, **options, **self.adaptation_kwargs)
+        known = known_task_return(self.model, env, tasks, **options)  # type: ignore[arg-type]
+        metrics = {f"return_after_{k}_queries": result.after(k) for k in self.record_at}
+        metrics["known_task_return"] = known.mean_return
+        metrics["coverage_loss"] = self._coverage_loss(env)
+        if hasattr(self.model, "similarity"):
+            metrics["preference_accuracy"], metrics["kendall_tau"] = preference_order(self.model, known)
+        for name, value in metrics.items():
+            self.logger.record(f"eval/{name}", value)
+        self.last_evaluation = metrics
+        if self.verbose > 0:
+            listing = ", ".join(f"{name} {value:.3f}" for name, value in metrics.items())
+            print(f"Evaluation after {self.model.num_timesteps} steps: {listing}")
+        score = result.after(max(self.record_at))
+        if score > self.best_return:
+            self.best_return = score
+            if self.best_model_save_path is not None:
+                self.model.save(self.best_model_save_path / "best_model.zip")
+
+    def _coverage_loss(self, env: TaskVecEnv) -> float:
+        """How far the prior is from what the policy was trained on, in return."""
+        assert self.model.train_tasks is not None
+        rng = np.random.default_rng(self.seed)
+        count = min(self.n_tasks, len(self.model.train_tasks))
+        chosen = rng.choice(len(self.model.train_tasks), size=count, replace=False)
+        own, tasks = self.model.task_latents[chosen], self.model.train_tasks[chosen]
+        draws = rng.standard_normal((1000, self.model.latent_dim))
+        nearest = draws[((own[:, None, :] - draws[None, :, :]) ** 2).sum(axis=2).argmin(axis=1)]
+        returns = [evaluate_latents(self.model, env, latents, tasks, 1, self.seed).mean() for latents in (own, nearest)]
+        return float(returns[0] - returns[1])
+
+    def _on_training_end(self) -> None:
+        super()._on_training_end()
+        if self._env is not None:
+            self._env.close()
+            self._env = None

@@ -1,0 +1,66 @@
+"""Callbacks of training."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stable_baselines3.common.callbacks import BaseCallback
+
+if TYPE_CHECKING:
+    from sb3_poem.pearl_sac.pearl_sac import PEARLSAC
+
+
+class EpochCallback(BaseCallback):
+    """Calls :meth:`_on_epoch` between two epochs: after the gradient steps of one, before the collection of the next.
+
+    :param every: Epochs between two calls; the end of training is always one
+    :param verbose: 0 no output, 1 info
+    :raises ValueError: if ``every`` is below 1
+    """
+
+    model: "PEARLSAC"
+
+    def __init__(self, every: int = 1, verbose: int = 0) -> None:
+        super().__init__(verbose)
+        if every < 1:
+            raise ValueError(f"every must be at least 1 epoch, got {every}")
+        self.every = every
+        self._last_epoch = 0
+
+    def _on_training_start(self) -> None:
+        self._last_epoch = self.model.epoch
+
+    def _on_rollout_start(self) -> None:
+        if self.model.epoch - self._last_epoch >= self.every:
+            self._run()
+
+    def _on_training_end(self) -> None:
+        if self.model.epoch > self._last_epoch:
+            self._run()
+
+    def _run(self) -> None:
+        self._last_epoch = self.model.epoch
+        self._on_epoch()
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_epoch(self) -> None:
+        """What to do; override."""
+
+
+class TrainingCheckpointCallback(EpochCallback):
+    """Writes a checkpoint from which ``load_checkpoint`` and ``resume`` continue bit for bit, always to the same file.
+
+    :param path: The file; it is replaced atomically
+    :param every: Epochs between two checkpoints; the end of training writes one too
+    :param verbose: 1 reports each write
+    """
+
+    def __init__(self, path: str | Path, every: int = 1, verbose: int = 0) -> None:
+        super().__init__(every, verbose)
+        self.path = Path(path)
+
+    def _on_epoch(self) -> None:
+        self.model.save_checkpoint(self.path)
+        if self.verbose > 0:
+            print(f"Checkpoint of {self.model.num_timesteps} steps: {self.path}")

@@ -1,0 +1,39 @@
+"""Writing files so that what was there before survives a failure."""
+
+import contextlib
+import os
+import tempfile
+from pathlib import Path
+
+
+def write_atomically(path: str | Path, content: bytes | memoryview) -> None:
+    """Write a file completely or not at all: a crash, a kill or a full disk leaves the previous file whole.
+
+    :param path: Where; missing folders are made
+    :param content: What
+    :raises OSError: if the folder cannot be written or the disk is full; names the path
+    """
+    path = Path(path)
+    temporary: str | None = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except OSError as error:
+        if temporary is not None:
+            with contextlib.suppress(OSError):
+                os.unlink(temporary)
+        raise OSError(
+            error.errno, f"could not write {path} ({error.strerror}); what was there before, if anything, is untouched"
+        ) from error
+    with contextlib.suppress(OSError):  # not every file system lets a folder be synchronised
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)

@@ -1,0 +1,145 @@
+"""Models as a folder of safetensors, JSON and a model card: nothing in it can run code."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from safetensors import SafetensorError
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as tensors_to_bytes
+
+from sb3_poem.common.files import write_atomically
+
+if TYPE_CHECKING:
+    from sb3_poem.pearl_sac.pearl_sac import PEARLSAC
+
+Model = TypeVar("Model", bound="PEARLSAC")
+
+FORMAT = "sb3_poem pretrained 1"
+WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
+SPACES = ("observation_space", "action_space", "task_space")
+ARRAYS = ("train_tasks", "latent_means", "latent_variances")
+# rebuilt from the critics: half of their size for nothing otherwise
+DERIVED = "critic_target."
+
+
+def save_pretrained(model: "PEARLSAC", folder: str | Path, card: dict[str, Any] | None = None) -> None:
+    """Write a model so that :func:`from_pretrained` can read it.
+
+    :param model: A trained model
+    :param folder: Where; made if missing
+    :param card: What the model card should say: ``command``, ``seed``, ``commit``, ``machine``, ``results`` (any JSON)
+    :raises OSError: if the folder cannot be written
+    """
+    folder = Path(folder)
+    tensors = {f"policy.{name}": value for name, value in model.policy.state_dict().items() if not name.startswith(DERIVED)}
+    tensors |= {name: th.as_tensor(getattr(model, name)) for name in ARRAYS}
+    config: dict[str, Any] = {
+        "format": FORMAT,
+        "algorithm": type(model).__name__,
+        "env_id": model.env_id,
+        "arguments": {name: getattr(model, attribute) for name, attribute in model.saved_arguments.items()},
+        "net_arch": model.policy.net_arch,
+        "reward_feature_dim": model.reward_feature_dim,
+        "predicted_rewards_error": model.predicted_rewards_error,
+        "num_timesteps": model.num_timesteps,
+        "n_updates": model._n_updates,
+        "card": card or {},
+    }
+    for name in SPACES:
+        space = getattr(model, name)
+        tensors[f"{name}.low"], tensors[f"{name}.high"] = th.as_tensor(space.low), th.as_tensor(space.high)
+        config[name] = {"dtype": str(space.dtype)}
+    tensors = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    write_atomically(folder / WEIGHTS, tensors_to_bytes(tensors))
+    write_atomically(folder / CONFIG, (json.dumps(config, indent=2, default=_to_json) + "\n").encode())
+    write_atomically(folder / CARD, _card_text(config).encode())
+
+
+def _to_json(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    raise TypeError(f"{value!r} of type {type(value).__name__} cannot be written as JSON")
+
+
+def _card_text(config: dict[str, Any]) -> str:
+    card = config["card"]
+    lines = [
+        f"# {config['algorithm']} on `{config['env_id']}`",
+        "",
+        f"Trained with sb3_poem for {config['num_timesteps']:,} environment steps and {config['n_updates']:,} gradient steps.",
+        "",
+        "```python",
+        f"model = sb3_poem.{config['algorithm']}.from_pretrained(<this folder>)",
+        "```",
+        "",
+    ]
+    for key in ("command", "seed", "commit", "machine"):
+        if key in card:
+            lines.append(f"- {key}: `{card[key]}`")
+    if "results" in card:
+        lines += ["", "Results:", "", "```json", json.dumps(card["results"], indent=2, default=_to_json), "```"]
+    return "\n".join(lines) + "\n"
+
+
+def read_config(folder: str | Path) -> dict[str, Any]:
+    """The ``config.json`` of a pretrained folder.
+
+    :raises FileNotFoundError: if the folder or its configuration does not exist
+    :raises ValueError: if it is truncated or of another program
+    """
+    path = Path(folder) / CONFIG
+    if not path.is_file():
+        raise FileNotFoundError(f"{folder} is no folder of a pretrained model: it has no {CONFIG}")
+    try:
+        config = json.loads(path.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is truncated, or no configuration of sb3_poem: {error}") from error
+    if not isinstance(config, dict) or config.get("format") != FORMAT:
+        raise ValueError(f"{path} is not of this version of sb3_poem (expected format {FORMAT!r})")
+    return config
+
+
+def from_pretrained(algorithm: type[Model], folder: str | Path, env: Any = None, device: th.device | str = "auto") -> Model:
+    """Read a model that :func:`save_pretrained` wrote.
+
+    :param algorithm: Class of the model
+    :param folder: The folder
+    :param env: An environment of the model's family, if it shall be trained on
+    :param device: "auto", "cpu", "cuda"
+    :raises FileNotFoundError: if the folder does not hold a model
+    :raises ValueError: if a file is truncated or foreign, the model is of another algorithm, or env of another family
+    """
+    config = read_config(folder)
+    if config["algorithm"] != algorithm.__name__:
+        raise ValueError(f"{folder} holds a {config['algorithm']}; load it with {config['algorithm']}.from_pretrained")
+    weights = Path(folder) / WEIGHTS
+    try:
+        tensors = load_tensors(weights.read_bytes())
+    except SafetensorError as error:
+        raise ValueError(f"{weights} is truncated, or no safetensors file: {error}") from error
+    try:
+        model = algorithm("MlpPolicy", None, device=device, _init_setup_model=False, **config["arguments"])  # type: ignore[arg-type]
+        for name in SPACES:
+            low, high = tensors[f"{name}.low"].numpy(), tensors[f"{name}.high"].numpy()
+            setattr(model, name, spaces.Box(low, high, dtype=np.dtype(config[name]["dtype"]).type))
+        for name in ARRAYS:
+            setattr(model, name, tensors[name].numpy())
+        for name in ("env_id", "reward_feature_dim", "predicted_rewards_error", "num_timesteps"):
+            setattr(model, name, config[name])
+        model._n_updates, model.n_envs = config["n_updates"], 1
+        model._statistics_known = True
+        model.target_entropy = -float(np.prod(model.action_space.shape))  # type: ignore[arg-type]
+        model.policy_kwargs["net_arch"] = config["net_arch"]
+        model._setup_model()
+        state = {name.removeprefix("policy."): value for name, value in tensors.items() if name.startswith("policy.")}
+        state |= {f"{DERIVED}{name.removeprefix('critic.')}": v for name, v in state.items() if name.startswith("critic.")}
+        model.policy.load_state_dict(state)
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise ValueError(f"{folder} does not hold a complete {algorithm.__name__}: {error}") from error
+    if env is not None:
+        model.set_env(algorithm._vectorise(env, len(model.train_tasks)))  # type: ignore[arg-type]
+    return model
