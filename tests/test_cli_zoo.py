@@ -1,8 +1,10 @@
 """``sb3-poem train`` and ``enjoy``: rl_zoo3 with our algorithms, files and checks."""
 
 import sys
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 import optuna
 import pytest
 import yaml
@@ -11,7 +13,10 @@ from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 
 from sb3_poem import PEARLSAC, POEMSAC, cli, resources
-from sb3_poem.cli.zoo import check_keys, register_algorithms
+from sb3_poem.cli import experiment
+from sb3_poem.cli.hyperparams import check_keys
+from sb3_poem.cli.hyperparams_opt import SAMPLERS
+from sb3_poem.cli.zoo import register_algorithms
 
 SMALL = {
     "policy": "MlpPolicy",
@@ -86,6 +91,68 @@ def test_train_then_enjoy_then_continue(config: Path, tmp_path: Path, capsys: py
 
     assert train("-c", config, "-f", logs, "--eval-freq", -1, "-i", run / "poem-PointGoal-v0.zip", "-n", 150) == 0
     assert (logs / "poem_sac" / "poem-PointGoal-v0_2" / "poem-PointGoal-v0.zip").is_file()
+
+
+def test_evaluation_is_by_adaptation_and_keeps_the_best(
+    config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(experiment, "AdaptationEvalCallback", partial(experiment.AdaptationEvalCallback, n_tasks=2))
+    flags = ["-c", config, "-f", tmp_path / "logs", "--eval-freq", 150, "--eval-episodes", 1, "--log-interval", 1]
+    assert train(*flags, "--verbose", 1) == 0
+    shown = capsys.readouterr().out
+    assert shown.count("Evaluation after") == 2
+    for name in ("return_after_0_queries", "return_after_10_queries", "known_task_return", "preference_accuracy"):
+        assert name in shown
+    assert POEMSAC.load(tmp_path / "logs/poem_sac/poem-PointGoal-v0_1/best_model.zip").num_timesteps in (150, 300)
+
+
+def test_a_checkpoint_continues_bit_for_bit(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def parameters(run: int) -> dict[str, np.ndarray]:
+        model = POEMSAC.load(tmp_path / f"logs/poem_sac/poem-PointGoal-v0_{run}/poem-PointGoal-v0.zip")
+        assert model.num_timesteps == 600
+        return {name: value.numpy() for name, value in model.policy.state_dict().items()}
+
+    class KilledError(Exception):
+        pass
+
+    write_entry(config, n_timesteps=600)
+    flags = ["-c", config, "-f", tmp_path / "logs", "--eval-freq", -1, "--save-freq", 150]
+    assert train(*flags) == 0
+
+    save_checkpoint, saved = POEMSAC.save_checkpoint, []
+
+    def save_then_die(self: POEMSAC, path: Path) -> None:
+        save_checkpoint(self, path)
+        saved.append(path)
+        if len(saved) == 2:
+            raise KilledError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(POEMSAC, "save_checkpoint", save_then_die)
+        with pytest.raises(KilledError):
+            train(*flags)
+    assert not (saved[-1].parent / "poem-PointGoal-v0.zip").exists()
+
+    assert train(*flags, "-i", saved[-1]) == 0
+    whole, resumed = parameters(1), parameters(3)
+    assert whole.keys() == resumed.keys()
+    for name, value in whole.items():
+        np.testing.assert_array_equal(value, resumed[name], err_msg=name)
+
+
+def test_hyperparameters_are_searched(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def sample(trial: optuna.Trial, *_: object) -> dict[str, float]:
+        return {"kl_coef": trial.suggest_float("kl_coef", 0.1, 1.0)}
+
+    monkeypatch.setitem(SAMPLERS, "poem_sac", sample)
+    monkeypatch.setattr(experiment, "TrialAdaptationCallback", partial(experiment.TrialAdaptationCallback, n_tasks=2))
+    write_entry(config, n_timesteps=150)
+    flags = ["-optimize", "--n-trials", 2, "--n-evaluations", 1, "--eval-episodes", 1, "--no-optim-plots"]
+    assert train("-c", config, "-f", tmp_path / "logs", *flags) == 0
+    (report,) = (tmp_path / "logs" / "poem_sac").glob("report_*.csv")
+    lines = report.read_text().splitlines()
+    assert len(lines) == 3
+    assert "params_kl_coef" in lines[0]
 
 
 def test_our_vectorised_environment_collects(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,201 @@
+"""rl_zoo3's experiments on task families."""
+
+import inspect
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import optuna
+import yaml
+from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
+from rl_zoo3.utils import get_callback_list
+from stable_baselines3.common.vec_env import VecEnv
+
+from poem_envs import TaskFamily
+from sb3_poem.adaptation.callback import AdaptationEvalCallback
+from sb3_poem.cli.hyperparams import check_keys, check_numbers
+from sb3_poem.cli.models import ALGORITHMS
+from sb3_poem.cli.outputs import check_writable
+from sb3_poem.common.callbacks import TrainingCheckpointCallback
+from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.pearl_sac import PEARLSAC
+from sb3_poem.resources import config_file
+
+CHECKPOINT = "checkpoint.zip"
+
+
+def make_experiment(args: Any, algo: str, env_id: str, log_folder: str, *rest: Any, **kwargs: Any) -> ExperimentManager:
+    """
+    The experiment that fits the algorithm; takes what rl_zoo3's ``train`` gives to its ``ExperimentManager``.
+
+    :raises ValueError: if one of our algorithms is given an environment that is no task family
+    :raises OSError: if a folder that a flag names cannot be written
+    """
+    for folder in (log_folder, args.tensorboard_log, args.optimization_log_path):
+        if folder:
+            check_writable(folder)
+    kind = PoemExperiment if algo in ALGORITHMS else FamilyExperiment
+    return kind(args, algo, env_id, log_folder, *rest, **kwargs)
+
+
+def is_task_family(env_id: str) -> bool | None:
+    """Whether an environment is a task family; None if its entry point is a function, which does not tell."""
+    entry_point = gym.spec(env_id).entry_point
+    creator = gym.envs.registration.load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+    return issubclass(creator, TaskFamily) if inspect.isclass(creator) else None
+
+
+def is_checkpoint(path: str) -> bool:
+    """Whether a file is a checkpoint of a training run, rather than a model that ``save`` wrote."""
+    if not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return any(Path(name).name == "data.pkl" for name in archive.namelist())
+
+
+class FamilyExperiment(ExperimentManager):
+    """Steps all copies of a task family at once, whatever the algorithm, unless ``--vec-env subproc`` asks otherwise."""
+
+    def __init__(self, args: Any, algo: str, env_id: str, *rest: Any, **kwargs: Any) -> None:
+        super().__init__(args, algo, env_id, *rest, **kwargs)
+        if args.vec_env == "dummy" and is_task_family(env_id) and gym.spec(env_id).vector_entry_point is not None:
+            self.vec_env_class = TaskVecEnv
+
+
+class PoemExperiment(FamilyExperiment):
+    """
+    A meta-training run: with our hyperparameter files, evaluated by adaptation to held-out tasks, and resumable.
+
+    ``--eval-freq`` and ``--eval-episodes`` set up an :class:`AdaptationEvalCallback`. ``--save-freq`` writes, beside the
+    models, ``checkpoint.zip``, from which ``-i`` continues bit for bit.
+    """
+
+    def __init__(self, args: Any, algo: str, env_id: str, *rest: Any, **kwargs: Any) -> None:
+        if is_task_family(env_id) is False:
+            raise ValueError(f"--env {env_id} is no task family (a poem_envs.TaskFamily), and {algo} needs one")
+        kwargs["config"] = kwargs.get("config") or str(config_file(algo))
+        super().__init__(args, algo, env_id, *rest, **kwargs)
+        self.steps_per_evaluation = self.eval_freq
+        self.steps_per_checkpoint = self.save_freq
+        # rl_zoo3's own evaluation would run the policy without telling it the task.
+        self.eval_freq = -1
+        self.resumes = False
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        try:
+            hyperparams, saved = super().read_hyperparameters()
+        except yaml.YAMLError as error:
+            raise ValueError(f"{self.config} is not valid YAML: {error}") from error
+        custom = set(self.custom_hyperparams or ())
+        source = f"{self.config}, entry {self.env_name.gym_id!r}"
+        check_keys(sorted(custom), self.algo, "-params")
+        check_keys(sorted(set(hyperparams) - custom), self.algo, source)
+        check_numbers({key: value for key, value in hyperparams.items() if key not in custom}, source)
+        return hyperparams, saved
+
+    def setup_experiment(self) -> tuple[Any, dict[str, Any]] | None:
+        results = super().setup_experiment()
+        if results is not None:
+            assert isinstance(results[0], PEARLSAC)
+            self._add_callbacks(results[0])
+        return results
+
+    def _add_callbacks(self, model: PEARLSAC) -> None:
+        """Those which count in epochs, whose length the model knows."""
+        if self.steps_per_evaluation > 0:
+            self.callbacks.append(
+                AdaptationEvalCallback(
+                    every=self._epochs(model, self.steps_per_evaluation),
+                    n_episodes=self.n_eval_episodes,
+                    best_model_save_path=self.save_path,
+                    verbose=self.verbose,
+                )
+            )
+        if self.steps_per_checkpoint > 0:
+            path = Path(self.save_path) / CHECKPOINT
+            self.callbacks.append(TrainingCheckpointCallback(path, self._epochs(model, self.steps_per_checkpoint)))
+
+    @staticmethod
+    def _epochs(model: PEARLSAC, steps: int) -> int:
+        """How many epochs take about so many environment steps, at least 1."""
+        assert model.train_tasks is not None
+        assert model.horizon is not None
+        return max(1, round(steps / (len(model.train_tasks) * model.trajectories_per_task * model.horizon)))
+
+    def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> Any:
+        if not is_checkpoint(self.trained_agent):
+            return super()._load_pretrained_agent(hyperparams, env)
+        model = ALGORITHMS[self.algo].load_checkpoint(self.trained_agent, env, device=self.device)
+        model.tensorboard_log, model.verbose = self.tensorboard_log, self.verbose
+        self.resumes = True
+        print(f"Resuming {self.trained_agent} after {model.num_timesteps} steps, with its own hyperparameters")
+        return model
+
+    def learn(self, model: Any) -> None:
+        if not self.resumes:
+            super().learn(model)
+            return
+        try:
+            model.resume(self.callbacks, log_interval={-1: 1, -2: None}.get(self.log_interval, self.log_interval))
+        except KeyboardInterrupt:
+            pass  # as rl_zoo3 has it: what was learned is saved
+        finally:
+            model.env.close()
+
+    def objective(self, trial: optuna.Trial) -> float:
+        """
+        What ``-optimize`` maximises: the return on held-out tasks after the most answers.
+
+        :raises optuna.TrialPruned: if the trial is not worth finishing, or its hyperparameters made it fail
+        """
+        sampled = HYPERPARAMS_SAMPLER[self.algo](trial, self.n_actions, self.n_envs, {})
+        model = ALGORITHMS[self.algo](
+            env=self.create_envs(self.n_envs, no_log=True), device=self.device, **{**self._hyperparams, **sampled}
+        )
+        folder = self.optimization_log_path and Path(self.optimization_log_path) / f"trial_{trial.number}"
+        evaluation = TrialAdaptationCallback(
+            trial,
+            every=self._epochs(model, self.n_timesteps // self.n_evaluations),
+            n_episodes=self.n_eval_episodes,
+            best_model_save_path=folder,
+        )
+        try:
+            model.learn(self.n_timesteps, [*get_callback_list({"callback": self.specified_callbacks}), evaluation])
+        except ValueError as error:
+            # Some random hyperparameters diverge, which the model reports.
+            print(f"Trial {trial.number} failed: {error}")
+            raise optuna.TrialPruned from error
+        finally:
+            assert model.env is not None
+            model.env.close()
+        if evaluation.is_pruned:
+            raise optuna.TrialPruned
+        return evaluation.last_return
+
+
+class TrialAdaptationCallback(AdaptationEvalCallback):
+    """
+    Reports each evaluation to Optuna, and ends the training of a trial that is not worth finishing.
+
+    :param trial: the trial
+    :param kwargs: see :class:`AdaptationEvalCallback`
+    """
+
+    def __init__(self, trial: optuna.Trial, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.trial = trial
+        self.is_pruned = False
+        self.last_return = float("nan")
+        self._reports = 0
+
+    def _on_epoch(self) -> None:
+        super()._on_epoch()
+        self.last_return = self.last_evaluation[f"return_after_{max(self.record_at)}_queries"]
+        self._reports += 1
+        self.trial.report(self.last_return, self._reports)
+        self.is_pruned = self.trial.should_prune()
+
+    def _on_step(self) -> bool:
+        return not self.is_pruned
