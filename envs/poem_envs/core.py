@@ -255,12 +255,16 @@ def task_stream(rng: np.random.Generator) -> np.random.Generator:
 
 
 def check_render_mode(render_mode: str | None, metadata: dict[str, Any]) -> None:
-    """Raise a ValueError unless the environment can render so.
+    """Raise an error unless the environment can render so.
 
     :param render_mode: what was asked for
     :param metadata: the environment's own
+    :raises ValueError: if it can render, but not so
+    :raises TypeError: if it cannot render at all; upon that SB3's ``make_vec_env``, which always asks, makes it without
     """
     modes = metadata["render_modes"]
+    if render_mode is not None and not modes:
+        raise TypeError(f"render_mode={render_mode!r} is not supported: this environment cannot be rendered")
     if render_mode is not None and render_mode not in modes:
         raise ValueError(f"render_mode={render_mode!r} is not supported, choose None or one of {modes}")
 

@@ -342,7 +342,7 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
             return [int(seed) + copy for copy in range(self.num_envs)]
         if len(seed) != self.num_envs:
             raise ValueError(f"seed={seed!r} holds {len(seed)} seeds, expected one for each of num_envs={self.num_envs}")
-        return list(seed)
+        return [None if s is None else int(s) for s in seed]
 
     def _begin(self, copies: np.ndarray) -> None:
         assert self._tasks is not None

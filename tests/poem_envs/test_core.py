@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from poem_envs import TaskFamily
@@ -61,6 +62,14 @@ def test_a_minimal_family_in_sb3s_own_vec_env():
     assert rewards == pytest.approx(-np.abs(start - tasks)[:, 0])
     features = np.stack([info["reward_features"] for info in infos])
     assert vec_env.env_method("compute_reward", tasks, features, indices=[0])[0] == pytest.approx(rewards)
+
+
+@pytest.mark.filterwarnings("ignore:.*is being initialised with render_mode='rgb_array'")
+def test_a_minimal_family_in_make_vec_env():
+    gym.register("test/Walk1D-v0", entry_point=Walk1D, max_episode_steps=10)
+    vec_env = make_vec_env("test/Walk1D-v0", 2, seed=0)
+    assert vec_env.reset().shape == (2, 1)
+    assert vec_env.render_mode is None
 
 
 def run_python(code):
