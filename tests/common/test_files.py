@@ -1,0 +1,89 @@
+"""Atomic writes, on disks that fill up and processes that die."""
+
+import errno
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sb3_poem.common.files import write_atomically
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """A file that was there before, alone in its folder."""
+    path = tmp_path / "folder" / "model.zip"
+    path.parent.mkdir()
+    path.write_bytes(b"before")
+    return path
+
+
+def assert_untouched(path: Path) -> None:
+    assert path.read_bytes() == b"before"
+    assert os.listdir(path.parent) == [path.name]
+
+
+@pytest.mark.parametrize("content", [b"after", memoryview(b"after"), b"", bytes(range(256)) * 10_000])
+def test_replaces_the_file(path: Path, content: bytes | memoryview) -> None:
+    write_atomically(path, content)
+    assert path.read_bytes() == bytes(content)
+    assert os.listdir(path.parent) == [path.name]
+
+
+def test_makes_folders_and_takes_strings(tmp_path: Path) -> None:
+    write_atomically(str(tmp_path / "a" / "b" / "c.bin"), b"x")
+    assert (tmp_path / "a" / "b" / "c.bin").read_bytes() == b"x"
+
+
+@pytest.mark.parametrize("call", ["fsync", "replace"])
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO, errno.EROFS])
+def test_a_failure_leaves_the_previous_file_whole(path: Path, call: str, code: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*args: object) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(os, call, fail)
+    with pytest.raises(OSError, match=r"could not write .*model\.zip .*untouched") as caught:
+        write_atomically(path, b"after")
+    assert caught.value.errno == code
+    assert os.strerror(code) in str(caught.value)
+    assert_untouched(path)
+
+
+def test_an_interrupt_leaves_the_previous_file_whole(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*args: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        write_atomically(path, b"after")
+    assert_untouched(path)
+
+
+def test_a_full_disk_leaves_the_previous_file_whole(path: Path) -> None:
+    """The kernel stops the write half-way, as it does on a full disk."""
+    program = """
+import resource, signal, sys
+from sb3_poem.common.files import write_atomically
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
+try:
+    write_atomically(sys.argv[1], b"x" * 3_000_000)
+except OSError as error:
+    print(error.errno, error)
+"""
+    result = subprocess.run([sys.executable, "-c", program, str(path)], capture_output=True, text=True, check=True)
+    assert result.stdout.startswith(f"{errno.EFBIG} "), result
+    assert str(path) in result.stdout
+    assert_untouched(path)
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(OSError, match=r"could not write .*file/model\.zip"):
+        write_atomically(tmp_path / "file" / "model.zip", b"x")
+    (tmp_path / "model.zip").mkdir()
+    with pytest.raises(OSError, match=r"could not write .*model\.zip"):
+        write_atomically(tmp_path / "model.zip", b"x")
+    assert sorted(os.listdir(tmp_path)) == ["file", "model.zip"]

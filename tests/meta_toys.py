@@ -1,0 +1,148 @@
+"""Small families and small models for the tests of the meta-training algorithms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from poem_envs import TaskFamily
+from sb3_poem.pearl_sac.pearl_sac import PEARLSAC
+
+POINT_GOAL = "poem/PointGoal-v0"
+POINT_GOAL_STEPS = 25
+N_TASKS = 12
+EPOCH = N_TASKS * POINT_GOAL_STEPS  # steps
+
+ARCH = {"pi": [32], "qf": [32], "encoder": [32], "decoder": [32], "embedding": [16]}
+SMALL: dict[str, Any] = {
+    "n_train_tasks": N_TASKS,
+    "gradient_steps": 5,
+    "batch_size": 16,
+    "context_size": 25,
+    "meta_batch_size": 6,
+    "policy_kwargs": {"net_arch": ARCH},
+    "seed": 0,
+    "device": "cpu",
+}
+
+Model = TypeVar("Model", bound=PEARLSAC)
+
+
+def small(algorithm: type[Model], env: Any = POINT_GOAL, **arguments: Any) -> Model:
+    """A model that trains an epoch in a tenth of a second."""
+    return algorithm("MlpPolicy", env, **{**SMALL, **arguments})
+
+
+class Walk(TaskFamily):
+    """
+    A point on the line; its task is where it should be. Rewards need the place and the effort. Further out than ``edge`` the
+    episode ends.
+    """
+
+    observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = spaces.Box(np.array([-2.0], np.float32), np.array([4.0], np.float32))  # not [-1, 1], and not symmetric
+    task_space = spaces.Box(-1.0, 1.0, (1,), np.float64)
+    reward_feature_dim = 2
+
+    def __init__(self, edge: float = np.inf) -> None:
+        super().__init__()
+        self.edge = edge
+
+    def _begin_episode(self, rng: np.random.Generator) -> np.ndarray:
+        self._place, self._time = rng.normal(0.0, 0.1), 0
+        return self._observation()
+
+    def _observation(self) -> np.ndarray:
+        return np.array([self._place, 0.1 * self._time])
+
+    def _simulate(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+        self._place += 0.1 * (float(action[0]) + self._wind())
+        self._time += 1
+        return self._observation(), np.array([self._place, float(action[0])]), abs(self._place) > self.edge
+
+    def _wind(self) -> float:
+        return 0.0
+
+    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
+        return -np.abs(features[..., 0] - tasks[..., 0]) - 0.01 * features[..., 1] ** 2
+
+
+class TwoWalks(Walk):
+    """A finite family: left or right."""
+
+    all_tasks = np.array([[-1.0], [1.0]])
+
+
+class WindyWalk(Walk):
+    """Tasks differ in their dynamics too, so that rewards cannot be relabelled."""
+
+    shared_dynamics = False
+
+    def _wind(self) -> float:
+        assert self._task is not None
+        return float(self._task[0])
+
+
+class OtherWalk(Walk):
+    """Spaces as :class:`Walk`'s, but other tasks."""
+
+    task_space = spaces.Box(-3.0, 3.0, (1,), np.float64)
+
+
+class Poisoned(gym.Wrapper):
+    """Returns NaN once: in place of ``what``, at a step (from 0) of an episode (from 0)."""
+
+    def __init__(self, env: gym.Env, what: str, episode: int, step: int) -> None:
+        super().__init__(env)
+        self.what, self.episode, self.at = what, episode, step
+        self._episode, self._step = -1, -1
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        self._episode, self._step = self._episode + 1, -1
+        return self.env.reset(**kwargs)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        self._step += 1
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        if (self._episode, self._step) == (self.episode, self.at):
+            if self.what == "observations":
+                obs = np.array([obs[0], np.nan])
+            elif self.what == "rewards":
+                reward = float("nan")
+            else:
+                info["reward_features"] = np.array([np.inf, 0.0])
+        return obs, reward, terminated, truncated, info
+
+
+def walks(n: int, family: type[Walk] = Walk, steps: int = 10, **kwargs: Any) -> DummyVecEnv:
+    """Copies of a walk that is cut after some steps. Not registered, so that a model needs ``horizon=steps``."""
+    return DummyVecEnv([lambda: gym.wrappers.TimeLimit(family(**kwargs), steps) for _ in range(n)])
+
+
+def parameters(model: PEARLSAC) -> dict[str, th.Tensor]:
+    """Copies of all that training changes in the networks and their optimisers."""
+    result = {f"policy.{name}": value.clone() for name, value in model.policy.state_dict().items()}
+    optimizers = {"optimizer": model.policy.optimizer, "ent_coef_optimizer": model.ent_coef_optimizer}
+    for name, optimizer in optimizers.items():
+        if optimizer is not None:
+            for index, state in optimizer.state_dict()["state"].items():
+                result |= {f"{name}.{index}.{key}": th.as_tensor(value).clone() for key, value in state.items()}
+    if model.log_ent_coef is not None:
+        result["log_ent_coef"] = model.log_ent_coef.detach().clone()
+    return result
+
+
+def differing(first: Mapping[str, th.Tensor], second: Mapping[str, th.Tensor]) -> list[str]:
+    """Names under which two sets of parameters differ in any bit; NaN equals itself."""
+    names = first.keys() | second.keys()
+    return sorted(
+        name
+        for name in names
+        if name not in first or name not in second or not th.equal(first[name].nan_to_num(1e30), second[name].nan_to_num(1e30))
+    )
