@@ -24,13 +24,15 @@ def write_atomically(path: str | Path, content: bytes | memoryview) -> None:
             os.fsync(file.fileno())
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
+        temporary = None
     except OSError as error:
-        if temporary is not None:
-            with contextlib.suppress(OSError):
-                os.unlink(temporary)
         raise OSError(
             error.errno, f"could not write {path} ({error.strerror}); what was there before, if anything, is untouched"
         ) from error
+    finally:  # an interrupt from the keyboard leaves nothing behind either
+        if temporary is not None:
+            with contextlib.suppress(OSError):
+                os.unlink(temporary)
     with contextlib.suppress(OSError):  # not every file system lets a folder be synchronised
         folder = os.open(path.parent, os.O_RDONLY)
         try:
