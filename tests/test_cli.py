@@ -1,9 +1,9 @@
 """The command line, run as a user runs it, or in this process where that is slow."""
 
 import os
+import resource
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -15,12 +15,18 @@ def sb3_poem(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-m", "sb3_poem.cli", *arguments], capture_output=True, text=True, check=False)
 
 
+def processor_seconds_of_children() -> float:
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
+
+
 def test_help_is_immediate_and_names_every_command() -> None:
     seconds = []
     for _ in range(3):
-        start = time.perf_counter()
+        # Not the clock's time, which other tests share.
+        start = processor_seconds_of_children()
         done = sb3_poem("--help")
-        seconds.append(time.perf_counter() - start)
+        seconds.append(processor_seconds_of_children() - start)
         assert done.returncode == 0, done.stderr
         for command in ("train", "enjoy", "adapt"):
             assert f"\n    {command} " in done.stdout

@@ -93,31 +93,31 @@ def test_pretrained_folder_and_the_other_algorithm(model: tuple[POEMSAC, str], t
     assert adapt(str(tmp_path / "folder"), *flags) == 0
     pearl = PEARLSAC("MlpPolicy", ENV_ID, policy_kwargs={"net_arch": [16, 16]}, **SMALL).learn(300)
     pearl.save(tmp_path / "pearl.zip")
-    assert adapt(str(tmp_path / "pearl"), *flags) == 0
+    assert adapt(str(tmp_path / "pearl"), *flags, "--query-rule", "random") == 0
 
 
 def test_a_person_answers_with_a_task(model: tuple[POEMSAC, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "stdin", io.StringIO("left\nwhat?\nr\n"))
-    flags = ["--oracle", "human", "--queries", 2, "--task", 1.25, "--episodes", 1, "--json", tmp_path / "result.json"]
+    monkeypatch.setattr(sys, "stdin", io.StringIO("what?\nr\n"))
+    flags = ["--oracle", "human", "--queries", 1, "--task", 1.25, "--episodes", 1, "--json", tmp_path / "result.json"]
     assert adapt(model[1], *flags) == 0
     result = json.loads((tmp_path / "result.json").read_text())
-    assert result["answers"] == [["left", "right"]]
+    assert result["answers"] == [["right"]]
     assert result["tasks"] == [[1.25]]
-    assert np.shape(result["task_returns"]) == (1, 3)
+    assert np.shape(result["task_returns"]) == (1, 2)
 
 
 def test_a_person_answers_by_their_own_wish(
     model: tuple[POEMSAC, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "stdin", io.StringIO("e\nl\n"))
+    monkeypatch.setattr(sys, "stdin", io.StringIO("l\n"))
     state, video = tmp_path / "state.json", tmp_path / "video.gif"
-    assert adapt(model[1], "--oracle", "human", "--queries", 2, "--json", state, "--video", video) == 0
+    assert adapt(model[1], "--oracle", "human", "--queries", 1, "--json", state, "--video", video) == 0
     assert video.is_file()
     adapter = PreferenceAdapter.load(state, model[0], ENV_ID)
     assert adapter.done
-    assert [answer.preference.value for answer in adapter.answers] == ["equal", "left"]
+    assert [answer.preference.value for answer in adapter.answers] == ["left"]
 
 
 @pytest.mark.parametrize(

@@ -51,6 +51,8 @@ def _add_adapt_arguments(parser: argparse.ArgumentParser) -> None:
     questions.add_argument("--mistake-rate", type=float, default=0.2, help="of --oracle mistake (default: %(default)s)")
     questions.add_argument("--queries", type=_count(1), default=10, help="questions per task (default: %(default)s)")
     questions.add_argument("--inference", choices=("paper", "bayes"), default="bayes", help="default: %(default)s")
+    rules = ("worst-case", "information-gain", "random")
+    questions.add_argument("--query-rule", choices=rules, help="how questions are chosen (default: the inference rule's own)")
     questions.add_argument("--candidates", choices=("prior", "aggregate"), help="default: the adapter's own")
 
     tasks = parser.add_argument_group("test tasks")
