@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -37,7 +38,7 @@ class Walk1D(TaskFamily):
 @pytest.mark.filterwarnings("ignore:.*A Box observation space m.*imum value is")
 def test_a_minimal_family_passes_the_checkers():
     check_env(Walk1D())
-    gym.utils.env_checker.check_env(Walk1D(), skip_render_check=True)
+    gymnasium_check_env(Walk1D(), skip_render_check=True)
 
 
 def test_a_minimal_family_earns_what_it_says():
