@@ -25,7 +25,7 @@ class FamilyEnv:
             )
         if not isinstance(env.observation_space, spaces.Box) or len(env.observation_space.shape) != 1:
             raise ValueError(f"env must have a flat Box observation space, got {env.observation_space}")
-        if not isinstance(env.action_space, spaces.Box) or not np.all(np.isfinite(env.action_space.low)):
+        if not isinstance(env.action_space, spaces.Box) or not env.action_space.is_bounded():
             raise ValueError(f"env must have a bounded Box action space, got {env.action_space}")
         self.env = env
         self.task_space: spaces.Box = self._get("task_space")
@@ -39,6 +39,8 @@ class FamilyEnv:
             raise ValueError("horizon is unknown: register the environment with max_episode_steps, or pass horizon=<steps>")
         if horizon is not None and limit is not None and horizon != limit:
             raise ValueError(f"horizon is {horizon}, but the environment ends episodes after {limit} steps; leave it out")
+        if horizon is not None and horizon < 1:
+            raise ValueError(f"horizon must be at least 1 step, got {horizon}")
         self.horizon = int(horizon if limit is None else limit)
 
     @property
@@ -50,15 +52,14 @@ class FamilyEnv:
         return int(self.task_space.shape[0])
 
     def _get(self, name: str) -> Any:
-        try:
+        if self.env.has_attr(name):  # asking for what is not there would end a worker of SubprocVecEnv
             return self.env.get_attr(name, indices=[0])[0]
-        except AttributeError as error:
-            if name == "spec":
-                return None
-            raise ValueError(
-                f"env is no task family: it has no attribute {name!r}. A task family subclasses poem_envs.TaskFamily, "
-                f"which provides {', '.join(REQUIRED_ATTRIBUTES)}, sample_tasks, set_task and compute_reward."
-            ) from error
+        if name == "spec":
+            return None
+        raise ValueError(
+            f"env is no task family: it has no attribute {name!r}. A task family subclasses poem_envs.TaskFamily, "
+            f"which provides {', '.join(REQUIRED_ATTRIBUTES)}, sample_tasks, set_task and compute_reward."
+        )
 
     def sample_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draw (n, task_dim) tasks from the family's distribution."""
