@@ -1,0 +1,160 @@
+"""Collection against a plain loop over single environments, and relabelling against environments of the other tasks."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from meta_toys import POINT_GOAL, Poisoned, Walk, walks
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from sb3_poem.common.buffers import Segment
+from sb3_poem.common.collection import collect_segment, relabelled_returns
+from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.vec_env import TaskVecEnv
+
+
+def random_policy(env: VecEnv, seed: int = 0):  # type: ignore[no-untyped-def]
+    rng, space = np.random.default_rng(seed), env.action_space
+
+    def act(obs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        scaled = rng.uniform(-1.0, 1.0, (len(obs), *space.shape)).astype(np.float32)
+        return space.low + 0.5 * (scaled + 1.0) * (space.high - space.low), scaled
+
+    return act
+
+
+def collect(env: VecEnv, tasks: np.ndarray, horizon: int | None = None, seed: int = 3, on_step=lambda _: True):  # type: ignore[no-untyped-def]
+    family, n = FamilyEnv(env, horizon), env.num_envs
+    counts = np.zeros(n, dtype=int)
+    latents = np.arange(2.0 * n).reshape(n, 2)
+    return collect_segment(family, random_policy(env), np.arange(n), tasks, latents, seed, counts, on_step), counts
+
+
+def unscaled(segment: Segment, env: VecEnv) -> np.ndarray:
+    low, high = env.action_space.low, env.action_space.high
+    return low + 0.5 * (segment.actions + 1.0) * (high - low)
+
+
+@pytest.mark.parametrize("edge", [np.inf, 0.35])
+def test_a_segment_is_what_single_environments_give(edge: float) -> None:
+    env, tasks = walks(3, steps=10, edge=edge), np.array([[-0.5], [0.0], [1.0]])
+    segment, counts = collect(env, tasks, horizon=25)
+    assert segment.actions.min() < -0.9
+    assert np.abs(segment.actions).max() <= 1.0
+    ended_early = 0
+    for copy, task in enumerate(tasks):
+        single, actions = gym.wrappers.TimeLimit(Walk(edge=edge), 10), unscaled(segment, env)[copy]
+        obs, _ = single.reset(seed=3 + copy, options={"task": task})
+        first, episodes = True, 0
+        for step, action in enumerate(actions):
+            np.testing.assert_allclose(segment.observations[copy, step], obs, atol=1e-6)
+            obs, reward, terminated, truncated, info = single.step(action)
+            np.testing.assert_allclose(segment.next_observations[copy, step], obs, atol=1e-6)
+            assert segment.rewards[copy, step] == pytest.approx(reward, abs=1e-6)
+            assert segment.terminated[copy, step] == terminated
+            assert segment.first_episode[copy, step] == first
+            np.testing.assert_allclose(segment.features[copy, step], info["reward_features"], atol=1e-12)
+            ended_early += terminated
+            if terminated or truncated:
+                first = False
+                episodes += 1
+                obs, _ = single.reset()
+        assert counts[copy] == episodes
+    assert (ended_early > 0) == np.isfinite(edge)
+    assert np.array_equal(segment.latents, np.arange(6.0).reshape(3, 2))
+    assert segment.task_ids.tolist() == [0, 1, 2]
+
+
+def test_the_vectorised_and_the_single_environment_give_the_same_segment() -> None:
+    tasks = np.array([[0.1], [2.0], [3.0]])
+    ours, _ = collect(TaskVecEnv.from_id(POINT_GOAL, 3), tasks)
+    theirs, _ = collect(make_vec_env(POINT_GOAL, 3), tasks)
+    for name in Segment.__dataclass_fields__:
+        assert np.array_equal(getattr(ours, name), getattr(theirs, name)), name
+
+
+def test_a_false_step_ends_the_collection() -> None:
+    env, seen = walks(2), []
+
+    def on_step(step_locals: dict) -> bool:
+        seen.append(sorted(step_locals["infos"][0])[0])
+        return len(seen) < 4
+
+    segment, _ = collect(env, np.zeros((2, 1)), horizon=10, on_step=on_step)
+    assert segment is None
+    assert len(seen) == 4
+
+
+@pytest.mark.parametrize("what", ["observations", "rewards", "reward features"])
+def test_poison_is_named(what: str) -> None:
+    """The second copy fails at step 4 of its second episode."""
+    env = DummyVecEnv(
+        [
+            lambda: gym.wrappers.TimeLimit(Walk(), 6),
+            lambda: Poisoned(gym.wrappers.TimeLimit(Walk(), 6), what, episode=1, step=4),
+        ]
+    )
+    with pytest.raises(
+        ValueError,
+        match=rf"returned {what} that are NaN or infinite: copy 1, training task 1, episode 1, step 10: .*Training stops",
+    ):
+        collect(env, np.zeros((2, 1)), horizon=20)
+
+
+def test_actions_that_are_not_finite_do_not_reach_the_environment() -> None:
+    env = walks(2)
+    family = FamilyEnv(env, 10)
+
+    def act(obs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        bad = np.array([[0.0], [np.nan]], dtype=np.float32)
+        return bad, bad
+
+    with pytest.raises(ValueError, match=r"actions \(of the policy\) that are NaN or infinite: copy 1, training task 7"):
+        collect_segment(
+            family, act, np.array([5, 7]), np.zeros((2, 1)), np.zeros((2, 1)), 0, np.zeros(2, dtype=int), lambda _: True
+        )
+
+
+# ---------------------------------------------------------------- relabelling
+
+
+def true_returns(make_env, tasks: np.ndarray, actions: np.ndarray, seeds: list[int]) -> np.ndarray:  # type: ignore[no-untyped-def]
+    """(tasks, trajectories): what the first episode earns when an environment of each task is stepped."""
+    returns = np.zeros((len(tasks), len(actions)))
+    for i, task in enumerate(tasks):
+        for j, trajectory in enumerate(actions):
+            env = make_env()
+            env.reset(seed=seeds[j], options={"task": task})
+            for action in trajectory:
+                _, reward, terminated, truncated, _ = env.step(action)
+                returns[i, j] += reward
+                if terminated or truncated:
+                    break
+            env.close()
+    return returns
+
+
+@pytest.mark.parametrize(("env_id", "steps"), [(POINT_GOAL, 25), ("poem/AntVel-v0", 60), ("poem/HumanoidDir2D-v0", 60)])
+def test_relabelled_returns_are_what_the_other_tasks_environments_return(env_id: str, steps: int) -> None:
+    kwargs = {"max_episode_steps": steps}
+    env = TaskVecEnv.from_id(env_id, 3, **kwargs)
+    tasks = FamilyEnv(env).sample_tasks(3, np.random.default_rng(0))
+    segment, _ = collect(env, tasks, seed=11)
+    relabelled = relabelled_returns(FamilyEnv(env).compute_reward, tasks, segment.features, segment.first_episode)
+    truth = true_returns(lambda: gym.make(env_id, **kwargs), tasks, unscaled(segment, env), [11, 12, 13])
+    assert segment.first_episode.all() == (env_id == POINT_GOAL)  # the others fall
+    assert np.ptp(truth, axis=0).min() > 1e-3  # the tasks do differ
+    np.testing.assert_allclose(relabelled, truth, rtol=1e-6, atol=1e-6)
+    own = (segment.rewards * segment.first_episode).sum(axis=1)
+    np.testing.assert_allclose(np.diagonal(relabelled), own, rtol=1e-6, atol=1e-6)
+
+
+def test_relabelling_counts_the_marked_steps_only() -> None:
+    env, tasks = walks(3, steps=8, edge=0.35), np.array([[-1.0], [0.0], [1.0]])
+    segment, _ = collect(env, tasks, horizon=8)
+    assert (~segment.first_episode).any()
+    relabelled = relabelled_returns(FamilyEnv(env, 8).compute_reward, tasks, segment.features, segment.first_episode)
+    truth = true_returns(lambda: gym.wrappers.TimeLimit(Walk(edge=0.35), 8), tasks, unscaled(segment, env), [3, 4, 5])
+    np.testing.assert_allclose(relabelled, truth, rtol=1e-6)

@@ -1,0 +1,120 @@
+"""What an environment must be to meta-train on it."""
+
+from __future__ import annotations
+
+import functools
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from meta_toys import POINT_GOAL, OtherWalk, TwoWalks, Walk, WindyWalk, walks
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
+
+from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.vec_env import TaskVecEnv
+
+
+def test_reads_a_family() -> None:
+    family = FamilyEnv(make_vec_env(POINT_GOAL, 2))
+    assert (family.env_id, family.horizon, family.num_envs) == (POINT_GOAL, 25, 2)
+    assert (family.task_dim, family.reward_feature_dim, family.shared_dynamics) == (1, 2, True)
+    assert family.all_tasks is None
+    assert FamilyEnv(walks(1, TwoWalks), 10).all_tasks.tolist() == [[-1.0], [1.0]]
+    assert not FamilyEnv(walks(1, WindyWalk), 10).shared_dynamics
+
+
+@pytest.mark.parametrize("wrap", [lambda env: env, VecMonitor, lambda env: VecMonitor(VecMonitor(env))])
+@pytest.mark.parametrize("make", [lambda: make_vec_env(POINT_GOAL, 3), lambda: TaskVecEnv.from_id(POINT_GOAL, 3)])
+def test_tasks_reach_the_copies_and_features_come_back(make, wrap) -> None:  # type: ignore[no-untyped-def]
+    env = wrap(make())
+    family, tasks = FamilyEnv(env), np.array([[0.5], [1.0], [3.0]])
+    first = family.reset(tasks, seed=4)
+    assert np.array_equal(env.get_attr("task"), tasks)
+    _, rewards, _, infos = env.step(np.ones((3, 2), dtype=np.float32))
+    features = family.features_of(infos)
+    goals = np.stack([np.cos(tasks[:, 0]), np.sin(tasks[:, 0])], axis=1)
+    np.testing.assert_allclose(rewards, -np.linalg.norm(features - goals, axis=1), rtol=1e-6)
+    np.testing.assert_allclose(family.compute_reward(tasks, features), rewards, rtol=1e-6)
+    assert np.array_equal(family.reset(tasks, seed=4), first)
+    assert not np.array_equal(family.reset(tasks, seed=5), first)
+
+
+def test_sampling_leaves_the_environments_generator_alone() -> None:
+    family = FamilyEnv(make_vec_env(POINT_GOAL, 1))
+    assert np.array_equal(family.sample_tasks(4, np.random.default_rng(0)), family.sample_tasks(4, np.random.default_rng(0)))
+
+
+# ---------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize("vec_env_class", [DummyVecEnv, functools.partial(SubprocVecEnv, start_method="fork")])
+def test_an_environment_that_is_no_family(vec_env_class) -> None:  # type: ignore[no-untyped-def]
+    env = vec_env_class([functools.partial(gym.make, "Pendulum-v1")])
+    try:
+        with pytest.raises(ValueError, match=r"env is no task family: it has no attribute 'task_space'.*TaskFamily"):
+            FamilyEnv(env)
+    finally:
+        env.close()
+
+
+def test_vec_normalize_is_refused_wherever_it_sits() -> None:
+    env = VecNormalize(make_vec_env(POINT_GOAL, 1))
+    for wrapped in (env, VecMonitor(env)):
+        with pytest.raises(ValueError, match="must not be wrapped in VecNormalize"):
+            FamilyEnv(wrapped)
+
+
+class Changed(gym.Wrapper):
+    """Spaces that no model of ours takes."""
+
+    def __init__(self, observation_space: spaces.Space | None = None, action_space: spaces.Space | None = None) -> None:
+        super().__init__(Walk())
+        self.observation_space = observation_space or self.env.observation_space
+        self.action_space = action_space or self.env.action_space
+
+
+@pytest.mark.parametrize("space", [spaces.Box(0, 1, (2, 2)), spaces.Discrete(3), spaces.Dict(a=spaces.Box(0, 1, (1,)))])
+def test_observations_must_be_flat(space: spaces.Space) -> None:
+    with pytest.raises(ValueError, match="flat Box observation space"):
+        FamilyEnv(DummyVecEnv([lambda: Changed(observation_space=space)]), 10)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [spaces.Discrete(3), spaces.Box(-np.inf, np.inf, (1,)), spaces.Box(0.0, np.inf, (1,)), spaces.Box(-np.inf, 0.0, (1,))],
+)
+def test_actions_must_be_bounded(space: spaces.Space) -> None:
+    with pytest.raises(ValueError, match="bounded Box action space"):
+        FamilyEnv(DummyVecEnv([lambda: Changed(action_space=space)]), 10)
+
+
+def test_the_horizon_must_be_known_and_agree() -> None:
+    with pytest.raises(ValueError, match=r"horizon is unknown: .*max_episode_steps, or pass horizon"):
+        FamilyEnv(walks(1))
+    assert FamilyEnv(walks(1), 10).horizon == 10
+    with pytest.raises(ValueError, match="horizon is 30, but the environment ends episodes after 25 steps"):
+        FamilyEnv(make_vec_env(POINT_GOAL, 1), 30)
+    assert FamilyEnv(make_vec_env(POINT_GOAL, 1), 25).horizon == 25
+
+
+@pytest.mark.parametrize("horizon", [0, -5])
+def test_the_horizon_must_be_positive(horizon: int) -> None:
+    with pytest.raises(ValueError, match=rf"horizon must be at least 1.*{horizon}"):
+        FamilyEnv(walks(1), horizon)
+
+
+def test_frame_stacking_is_no_flat_family() -> None:
+    """Stacked observations are flat as well, so this works; what matters is that tasks still arrive."""
+    family = FamilyEnv(VecFrameStack(make_vec_env(POINT_GOAL, 2), 2))
+    assert family.reset(np.array([[0.5], [1.0]]), seed=0).shape == (2, 4)
+
+
+def test_another_family_is_told_apart() -> None:
+    family = FamilyEnv(walks(1), 10)
+    family.check_same_family(Walk.task_space, 2)
+    with pytest.raises(ValueError, match=r"trained for tasks in .*Pass an environment of the model's own family"):
+        family.check_same_family(OtherWalk.task_space, 2)
+    with pytest.raises(ValueError, match="own family"):
+        family.check_same_family(Walk.task_space, 3)
