@@ -35,13 +35,14 @@ class FamilyEnv:
         spec = self._get("spec")
         self.env_id: str | None = None if spec is None else spec.id
         limit = None if spec is None else spec.max_episode_steps
-        if horizon is None and limit is None:
+        steps = horizon if limit is None else limit
+        if steps is None:
             raise ValueError("horizon is unknown: register the environment with max_episode_steps, or pass horizon=<steps>")
-        if horizon is not None and limit is not None and horizon != limit:
+        if horizon is not None and horizon != steps:
             raise ValueError(f"horizon is {horizon}, but the environment ends episodes after {limit} steps; leave it out")
-        if horizon is not None and horizon < 1:
-            raise ValueError(f"horizon must be at least 1 step, got {horizon}")
-        self.horizon = int(horizon if limit is None else limit)
+        if steps < 1:
+            raise ValueError(f"horizon must be at least 1 step, got {steps}")
+        self.horizon = int(steps)
 
     @property
     def num_envs(self) -> int:
