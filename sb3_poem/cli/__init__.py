@@ -115,14 +115,18 @@ def can_draw() -> bool:
 
 
 def _run(arguments: argparse.Namespace, others: list[str]) -> int:
-    use_offscreen_rendering()
-    if arguments.command in ZOO_COMMANDS:
-        from sb3_poem.cli.zoo import run_zoo
+    from rich.console import Console
 
+    use_offscreen_rendering()
+    # PyTorch and its company take seconds.
+    loading = Console(stderr=True).status("Loading")
+    if arguments.command in ZOO_COMMANDS:
+        with loading:
+            from sb3_poem.cli.zoo import run_zoo
         run_zoo(arguments.command, others)
     else:
-        from sb3_poem.cli.adapt import run_adapt
-
+        with loading:
+            from sb3_poem.cli.adapt import run_adapt
         run_adapt(arguments)
     return 0
 

@@ -93,7 +93,8 @@ class Adaptation:
         self.arguments = arguments
         self.console = console
         self.seed: int = arguments.seed
-        self.model = load_model(arguments.model, arguments.device)
+        with console.status("Reading the model"):
+            self.model = load_model(arguments.model, arguments.device)
         env_id = arguments.env or self.model.env_id
         if env_id is None:
             raise ValueError(f"--env is needed: {arguments.model} does not say on which environment it was trained")
