@@ -9,11 +9,17 @@ import numpy as np
 
 from sb3_poem.adaptation.decisions import DECISIONS, decide
 from sb3_poem.adaptation.inference import Answer, LatentInference, Shown, latent_of, preference_log_likelihood
+from sb3_poem.adaptation.moves import (
+    WIDENING,
+    elliptical_slice_moves,
+    fit_gaussian,
+    kernel_neighbours,
+    systematic_resample,
+)
 from sb3_poem.adaptation.noise import PROBIT_SLOPE, BoltzmannNoise, ExactNoise, NoiseModel
 from sb3_poem.adaptation.preference import Preference
 from sb3_poem.adaptation.queries import most_informative_pair, worst_case_pair
 from sb3_poem.adaptation.queries import random_pair as draw_random_pair
-from sb3_poem.adaptation.slice_sampling import elliptical_slice_moves, fit_gaussian, systematic_resample
 from sb3_poem.common.trajectory import Trajectory
 
 LIKELIHOODS = ("decoder", "similarity")
@@ -26,15 +32,21 @@ QUERY_PARTICLES = 128
 # Smallest resolvable difference of S, as a share of the spread of its differences over random triples. A Gaussian error
 # of that size turns over 3 % of random preferences, which is what well-trained models were seen to get wrong.
 SIMILARITY_RESOLUTION = 0.1
+# The same for choosing a question. It only has to keep apart policies that do the same; a coarser one would not tell a pair
+# that halves a narrow posterior from one that lies beside it.
+QUERY_RESOLUTION = 0.02
 # Steps over which the decoder's residuals stay correlated: a return's error grows with their number, not with that of the
 # steps.
 ERROR_CORRELATION = 10.0
+# Moves by S: sweeps over all particles, and tries in each.
 MOVE_SWEEPS = 2
 MOVE_TRIES = 6
-# Latent-trajectory evaluations of the decoder that one answer may spend on moving particles, in units of the number of
-# particles.
-DECODER_MOVE_BUDGET = 4
+# Moves by the decoder: tries of a particle, and the decoder's evaluations (latents times steps) that one answer may spend
+# on them. As many as the answer's own two trajectories take over HalfCheetah's 200 steps with 100 particles.
 DECODER_TRIES = 2
+DECODER_MOVE_STEPS = 40_000
+# Width of the kernel that replaces a copy of a particle by a neighbour, as a share of the particles' own spread.
+KERNEL_WIDTH = 0.3
 
 
 class BayesInference(LatentInference):
@@ -54,7 +66,10 @@ class BayesInference(LatentInference):
     the spread of S.
 
     *Thinning*: when half of the particles carry no weight they are resampled and moved by elliptical slice sampling around
-    the posterior's own mean and covariance. The moves are bounded; those that need the decoder also in its evaluations.
+    the posterior's own mean and covariance. Moves are bounded. One by the decoder evaluates all trajectories that were ever
+    shown, so only as many particles move as a budget allows; the copies that are left over are replaced by neighbours,
+    drawn from a kernel that keeps the particles' mean and covariance (Liu & West 2001). A pool of fixed draws would be
+    empty after a few answers; this one has as many different particles after fifty, in any dimension.
 
     :param model: A trained model.
     :param n_candidates: Number of particles.
@@ -62,7 +77,7 @@ class BayesInference(LatentInference):
     :param candidates: "prior" or "aggregate".
     :param query_rule: "information-gain", "worst-case" or "random".
     :param rng: The generator.
-    :param likelihood: "decoder" or "similarity"; None takes the decoder where the model has one.
+    :param likelihood: "decoder" or "similarity"; None takes the decoder where the model has one and knows its error.
     :param decision: See :data:`sb3_poem.adaptation.decisions.DECISIONS`.
     :param noise_model: How the oracle errs; None stands for an error-free one.
     :param library: Trajectories to ask about instead of new rollouts (for instance those of the training policies on this
@@ -93,9 +108,7 @@ class BayesInference(LatentInference):
         self.library = None if library is None else list(library)
         self._check_options()
         self.particles = self.prior.sample(n_candidates, self.rng)
-        self.log_likelihoods = np.zeros(n_candidates)
         self.log_weights = np.zeros(n_candidates)
-        self._explorers = self.prior.sample(QUERY_POLICIES // 2, self.rng)
         self._spread, self._unit = self._similarity_scale()
         # Sums over answers that tie S to the decoder's returns: S dS, S dR, |R| and their number.
         self._calibration = np.zeros(4)
@@ -127,9 +140,8 @@ class BayesInference(LatentInference):
             first, second = worst_case_pair(similarities, self.epsilon, weights)
         else:
             slope, magnitude, noise = self._return_unit()
-            first, second = most_informative_pair(
-                slope * similarities, weights, noise, slope * self._unit * PROBIT_SLOPE, magnitude
-            )
+            error = QUERY_RESOLUTION * self._spread
+            first, second = most_informative_pair(slope * similarities, weights, noise, slope * error, magnitude)
         return policies[first], policies[second]
 
     def ask_library(self) -> tuple[int, int]:
@@ -158,10 +170,8 @@ class BayesInference(LatentInference):
                 'pass them, or choose likelihood="similarity"'
             )
         answer = Answer(preference, left, right)
-        new = self._answer_log_likelihoods(self.particles, [answer], calibrate=True)
+        self.log_weights = self.log_weights + self._answer_log_likelihoods(self.particles, [answer], calibrate=True)
         self.answers.append(answer)
-        self.log_likelihoods = self.log_likelihoods + new
-        self.log_weights = self.log_weights + new
         if self.effective_size < self.n_candidates / 2:
             self._rejuvenate()
 
@@ -240,7 +250,7 @@ class BayesInference(LatentInference):
     def _query_policies(self) -> np.ndarray:
         """(QUERY_POLICIES, d): draws of the posterior and of the prior."""
         posterior = self.particles[systematic_resample(self.weights, QUERY_POLICIES // 2, self.rng)]
-        return np.concatenate([posterior, self._explorers])
+        return np.concatenate([posterior, self.prior.sample(QUERY_POLICIES // 2, self.rng)])
 
     def _query_particles(self) -> tuple[np.ndarray, np.ndarray]:
         if self.n_candidates <= QUERY_PARTICLES:
@@ -249,62 +259,74 @@ class BayesInference(LatentInference):
         return self.particles[chosen], np.full(QUERY_PARTICLES, 1.0 / QUERY_PARTICLES)
 
     def _rejuvenate(self) -> None:
-        """Resample, and move what is now double, at bounded cost."""
+        """Resample, and replace what is now double, at bounded cost."""
         mean, factor = fit_gaussian(self.particles, self.weights)
-        chosen = np.sort(systematic_resample(self.weights, self.n_candidates, self.rng))
-        self.particles, self.log_likelihoods = self.particles[chosen], self.log_likelihoods[chosen]
+        chosen = systematic_resample(self.weights, self.n_candidates, self.rng)
+        copies = np.flatnonzero(np.concatenate([[False], chosen[1:] == chosen[:-1]]))
+        self.particles = self.particles[chosen]
         self.log_weights = np.zeros(self.n_candidates)
         self._library_returns = None
-        sweeps, tries, moved = self._move_plan(np.concatenate([[False], chosen[1:] == chosen[:-1]]))
+        if self.likelihood == "similarity":
+            self._move(np.arange(self.n_candidates), MOVE_SWEEPS, MOVE_TRIES, mean, factor)
+            return
+        # One evaluation more than tries: where a particle stands now has to be weighed, too.
+        steps = sum(len(item) for answer in self.answers for item in (answer.left, answer.right))
+        affordable = DECODER_MOVE_STEPS // (steps * (DECODER_TRIES + 1))
+        order = self.rng.permutation(len(copies))
+        self._move(copies[order[:affordable]], 1, DECODER_TRIES, mean, factor)
+        left_over = copies[order[affordable:]]
+        log_prior = self.prior.log_density if self.prior.has_holes else None
+        self.particles[left_over] = kernel_neighbours(
+            self.particles[left_over], mean, factor, KERNEL_WIDTH, log_prior, self.rng
+        )
+
+    def _move(self, moved: np.ndarray, sweeps: int, tries: int, mean: np.ndarray, factor: np.ndarray) -> None:
+        if not len(moved):
+            return
+        particles = self.particles[moved]
+        log_likelihoods = self._answer_log_likelihoods(particles, self.answers)
         for _ in range(sweeps):
             particles, log_likelihoods = elliptical_slice_moves(
-                self.particles[moved],
-                self.log_likelihoods[moved],
+                particles,
+                log_likelihoods,
                 lambda latents: self._answer_log_likelihoods(latents, self.answers),
                 self.prior.log_density,
                 mean,
-                factor,
+                WIDENING * factor,
                 tries,
                 self.rng,
             )
-            self.particles[moved], self.log_likelihoods[moved] = particles, log_likelihoods
-
-    def _move_plan(self, copies: np.ndarray) -> tuple[int, int, np.ndarray]:
-        """Sweeps, tries, and which particles move: all by S, as many as the budget buys by the decoder."""
-        if self.likelihood == "similarity":
-            return MOVE_SWEEPS, MOVE_TRIES, np.arange(self.n_candidates)
-        cost = 2 * len(self.answers) * DECODER_TRIES
-        affordable = max(4, DECODER_MOVE_BUDGET * self.n_candidates // cost)
-        doubles_first = np.concatenate([np.flatnonzero(copies), np.flatnonzero(~copies)])
-        return 1, DECODER_TRIES, np.sort(doubles_first[:affordable])
+        self.particles[moved] = particles
 
     def _arrays(self) -> dict[str, np.ndarray]:
         return {
             "particles": self.particles,
-            "log_likelihoods": self.log_likelihoods,
             "log_weights": self.log_weights,
-            "explorers": self._explorers,
             "scale": np.array([self._spread, self._unit]),
             "calibration": self._calibration,
         }
 
     def _set_arrays(self, arrays: dict[str, np.ndarray]) -> None:
         self.particles = arrays["particles"]
-        self.log_likelihoods = arrays["log_likelihoods"]
         self.log_weights = arrays["log_weights"]
-        self._explorers = arrays["explorers"]
         self._spread, self._unit = (float(value) for value in arrays["scale"])
         self._calibration = arrays["calibration"].copy()
         self._library_returns = None
 
 
 def _check_likelihood(model: Any, likelihood: str | None) -> str:
-    available = {"decoder": hasattr(model, "predicted_returns"), "similarity": hasattr(model, "similarity")}
+    error = float(getattr(model, "predicted_rewards_error", np.nan))
+    decoder_is_known = hasattr(model, "predicted_returns") and np.isfinite(error)
     if likelihood is None:
-        likelihood = "decoder" if available["decoder"] else "similarity"
+        likelihood = "decoder" if decoder_is_known else "similarity"
     if likelihood not in LIKELIHOODS:
         raise ValueError(f"`likelihood` must be one of {LIKELIHOODS}, but is {likelihood!r}")
-    if not available[likelihood]:
-        needed = {"decoder": "predicted_returns (a reward decoder)", "similarity": "similarity (POEMSAC)"}[likelihood]
-        raise ValueError(f'likelihood="{likelihood}" needs a model with {needed}; {type(model).__name__} has none')
+    name = type(model).__name__
+    if likelihood == "similarity" and not hasattr(model, "similarity"):
+        raise ValueError(f'likelihood="similarity" needs a model with `similarity` (POEMSAC); {name} has none')
+    if likelihood == "decoder" and not decoder_is_known:
+        raise ValueError(
+            f'likelihood="decoder" needs a model with `predicted_returns` and a finite `predicted_rewards_error`, which is '
+            f"{error} for this {name}: it is known once the model has been trained"
+        )
     return likelihood

@@ -10,7 +10,14 @@ import numpy as np
 
 from sb3_poem.adaptation.preference import Preference
 from sb3_poem.adaptation.priors import SOURCES, make_prior
-from sb3_poem.adaptation.queries import QUERY_RULES, information_gains, tolerance, worst_case_pair
+from sb3_poem.adaptation.queries import (
+    QUERY_RULES,
+    information_gains,
+    pair_at,
+    pair_differences,
+    tolerance,
+    worst_case_pair,
+)
 from sb3_poem.adaptation.queries import random_pair as draw_random_pair
 from sb3_poem.adaptation.state import generator_from_state, generator_state
 from sb3_poem.common.trajectory import Trajectory, decode_array, encode_array
@@ -265,10 +272,9 @@ class PaperInference(LatentInference):
         return self._satisfied(self._differences(latents))
 
     def _most_informative(self, similarities: np.ndarray) -> tuple[int, int]:
-        first, second = np.triu_indices(self.n_candidates, 1)
-        probabilities = _sigmoid(similarities[:, first] - similarities[:, second])  # eq. 7
-        best = int(np.argmax(information_gains(probabilities, np.full(self.n_candidates, 1.0 / self.n_candidates))))
-        return int(first[best]), int(second[best])
+        probabilities = np.exp(log_sigmoid(pair_differences(similarities)))  # eq. 7
+        gains = information_gains(probabilities, np.full(self.n_candidates, 1.0 / self.n_candidates))
+        return pair_at(int(np.argmax(gains)), self.n_candidates)
 
     def _differences(self, latents: np.ndarray) -> np.ndarray:
         """(m, k) S(z, z_left) - S(z, z_right) of every answered question."""
@@ -283,37 +289,33 @@ class PaperInference(LatentInference):
 
     def _log_likelihoods(self, differences: np.ndarray) -> np.ndarray:
         answers = [answer.preference for answer in self.answers]
-        return preference_log_likelihood(-np.logaddexp(0.0, -differences), -np.logaddexp(0.0, differences), answers)
+        return preference_log_likelihood(log_sigmoid(differences), log_sigmoid(-differences), answers)
 
     def _draw_candidates(self) -> np.ndarray:
         """Lines 3 to 9, bounded. The last question's candidates take part in the fall-back alone: line 3 starts afresh."""
+        rest = [(self.candidates, self._differences(self.candidates))]
         found: list[np.ndarray] = []
         n_found, drawn, batch = 0, 0, max(1024, self.n_candidates)
-        rest, rest_scores = self.candidates, self._scores(self.candidates)
         while n_found < self.n_candidates and drawn < self.max_draws:
-            batch = min(batch, self.max_draws - drawn)
-            latents = self.prior.sample(batch, self.rng)
-            drawn += batch
-            scores = self._scores(latents)
-            accepted = scores[:, 0] == len(self.answers)
-            found.append(latents[accepted])
-            n_found += int(np.count_nonzero(accepted))
-            rest, rest_scores = self._best(
-                np.concatenate([rest, latents[~accepted]]), np.concatenate([rest_scores, scores[~accepted]])
-            )
+            latents = self.prior.sample(min(batch, self.max_draws - drawn), self.rng)
+            drawn += len(latents)
             batch *= 2
-        candidates = np.concatenate([*found, rest])[: self.n_candidates]
-        return candidates
+            differences = self._differences(latents)
+            accepted = self._satisfied(differences) == len(self.answers)
+            found.append(latents[accepted])
+            rest.append((latents[~accepted], differences[~accepted]))
+            n_found += int(np.count_nonzero(accepted))
+        if n_found < self.n_candidates:
+            latents, differences = (np.concatenate(parts) for parts in zip(*rest, strict=True))
+            found.append(latents[self._best(differences, self.n_candidates - n_found)])
+        return np.concatenate(found)[: self.n_candidates]
 
-    def _scores(self, latents: np.ndarray) -> np.ndarray:
-        """(m, 2): answers satisfied, log-likelihood."""
-        differences = self._differences(latents)
-        return np.column_stack([self._satisfied(differences), self._log_likelihoods(differences)])
-
-    def _best(self, latents: np.ndarray, scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The N_z best by answers satisfied, then by likelihood, best first."""
-        order = np.lexsort((-scores[:, 1], -scores[:, 0]))[: self.n_candidates]
-        return latents[order], scores[order]
+    def _best(self, differences: np.ndarray, n: int) -> np.ndarray:
+        """Rows of the n latents that satisfy most answers, and among equals are the likeliest; best first."""
+        satisfied = self._satisfied(differences)
+        contenders = np.flatnonzero(satisfied >= np.partition(satisfied, len(satisfied) - n)[len(satisfied) - n])
+        likelihoods = self._log_likelihoods(differences[contenders])
+        return contenders[np.lexsort((-likelihoods, -satisfied[contenders]))[:n]]
 
     def _arrays(self) -> dict[str, np.ndarray]:
         return {"candidates": self.candidates, "fresh": np.array(self._fresh)}
@@ -343,5 +345,11 @@ def check_inference_options(n_candidates: int, epsilon: float, candidates: str, 
         raise ValueError(f"`query_rule` must be one of {QUERY_RULES}, but is {query_rule!r}")
 
 
-def _sigmoid(x: np.ndarray) -> np.ndarray:
-    return 1.0 / (1.0 + np.exp(-np.clip(x, -500.0, 500.0)))
+def log_sigmoid(x: np.ndarray) -> np.ndarray:
+    """
+    log(1 / (1 + exp(-x))) without overflow.
+
+    :param x: Any shape.
+    :return: The same shape.
+    """
+    return np.minimum(x, 0.0) - np.log1p(np.exp(-np.abs(x)))

@@ -41,8 +41,9 @@ class NoiseModel(Protocol):
         """JSON-ready; :func:`noise_model_from_dict` reads it."""
 
 
-def _logistic(x: np.ndarray) -> np.ndarray:
-    return 1.0 / (1.0 + np.exp(-np.clip(x, -500.0, 500.0)))
+def _logistic(x: np.ndarray, slope: np.ndarray | float) -> np.ndarray:
+    with np.errstate(over="ignore"):  # to infinity, which is as good as 500
+        return 1.0 / (1.0 + np.exp(-np.clip(x * slope, -500.0, 500.0)))
 
 
 def _with_lapse(probability: np.ndarray) -> np.ndarray:
@@ -66,7 +67,7 @@ class ExactNoise(_Serialisable):
 
     def probability_left(self, difference: np.ndarray, error: np.ndarray | float, magnitude: np.ndarray | float) -> np.ndarray:
         """See :class:`NoiseModel`."""
-        return _with_lapse(_logistic(PROBIT_SLOPE * difference / np.maximum(error, 1e-12)))
+        return _with_lapse(_logistic(difference, PROBIT_SLOPE / np.maximum(error, 1e-12)))
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ class BoltzmannNoise(_Serialisable):
         """See :class:`NoiseModel`."""
         beta = 1.0 / np.maximum(magnitude, 1e-12) if self.beta is None else self.beta
         shrink = np.sqrt(1.0 + np.pi / 8.0 * (beta * np.asarray(error)) ** 2)
-        return _with_lapse(_logistic(beta * difference / shrink))
+        return _with_lapse(_logistic(difference, beta / shrink))
 
 
 _KINDS: dict[str, type] = {cls.kind: cls for cls in (ExactNoise, MistakeNoise, BoltzmannNoise)}

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from sb3_poem.adaptation.bayes import BayesInference
+from sb3_poem.adaptation.bayes import LIKELIHOODS, BayesInference
+from sb3_poem.adaptation.decisions import DECISIONS
 from sb3_poem.adaptation.inference import LatentInference, PaperInference
 from sb3_poem.adaptation.noise import NoiseModel, noise_model_from_dict
 from sb3_poem.common.trajectory import Trajectory
@@ -36,6 +37,10 @@ class AdaptationOptions:
             raise ValueError(f"`n_queries` must be at least 1, but is {self.n_queries}")
         if self.inference not in INFERENCES:
             raise ValueError(f"`inference` must be one of {INFERENCES}, but is {self.inference!r}")
+        if self.likelihood is not None and self.likelihood not in LIKELIHOODS:
+            raise ValueError(f"`likelihood` must be one of {LIKELIHOODS} or None, but is {self.likelihood!r}")
+        if self.decision not in DECISIONS:
+            raise ValueError(f"`decision` must be one of {DECISIONS}, but is {self.decision!r}")
 
     def make_inference(
         self, model: Any, rng: np.random.Generator, library: Sequence[Trajectory] | None = None

@@ -10,7 +10,9 @@ SOURCES = ("prior", "aggregate")
 
 
 class Prior(Protocol):
-    """A distribution over latents that can be drawn from and evaluated."""
+    """A distribution over latents that can be drawn from and evaluated; it may have holes of little density."""
+
+    has_holes: bool
 
     def sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """(n, d) draws."""
@@ -25,6 +27,8 @@ class GaussianPrior:
 
     :param dim: The latents' dimension d.
     """
+
+    has_holes = False
 
     def __init__(self, dim: int) -> None:
         self.dim = dim
@@ -46,6 +50,8 @@ class AggregatePrior:
     :param centres: (M, d) draws of the model's aggregate posterior.
     :param bandwidth: Width of each Gaussian as a share of the draws' distance to their neighbours.
     """
+
+    has_holes = True
 
     def __init__(self, centres: np.ndarray, bandwidth: float = 0.5) -> None:
         self.centres = np.asarray(centres, dtype=np.float64)
@@ -73,7 +79,7 @@ class AggregatePrior:
         return peak + np.log(np.exp(exponents - peak[:, None]).mean(axis=1))
 
 
-def make_prior(model: Any, source: str, rng: np.random.Generator, n_centres: int = 512) -> Prior:
+def make_prior(model: Any, source: str, rng: np.random.Generator, n_centres: int = 256) -> Prior:
     """
     The prior of a model.
 

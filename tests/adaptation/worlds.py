@@ -19,8 +19,8 @@ STEP_WEIGHT = 200.0 / HORIZON  # returns as over HalfCheetahVel's 200 steps
 
 class SpeedEnv(gym.Env):
     """
-    A cart that moves at the speed it is told to; its task is a goal speed in [0, 3], its reward -10 |speed - goal|, and 20 steps an
-    episode. Observations (place, speed) do not hold the goal.
+    A cart that moves at the speed it is told to; its task is a goal speed in [0, 3], its reward -10 |speed - goal|, and
+    20 steps an episode. Observations (place, speed) do not hold the goal.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012

@@ -1,4 +1,4 @@
-"""Moving particles without losing the posterior: resampling, and elliptical slice sampling of many at once."""
+"""Moving particles without losing the posterior: resampling, elliptical slice sampling of many at once, and kernels."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-# The reference Gaussian is this much wider than the particles, so that the ratio of target to reference does not grow in
+# A slice's reference Gaussian is this much wider than the particles, so that the ratio of target to reference does not grow in
 # the tails.
 WIDENING = 1.3
 
@@ -34,18 +34,50 @@ def fit_gaussian(particles: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray
 
     :param particles: (n, d).
     :param weights: (n,) summing to one.
-    :return: Mean (d,), and a lower-triangular factor (d, d) of the widened covariance.
+    :return: Mean (d,), and a lower-triangular factor (d, d) of the covariance.
     """
     mean = weights @ particles
     centred = particles - mean
-    covariance = (weights[:, None] * centred).T @ centred
     dim = particles.shape[1]
     effective = 1.0 / np.square(weights).sum()
+    # Unbiased: what a fit loses of the spread, the next one would lose again, answer for answer.
+    covariance = (weights[:, None] * centred).T @ centred / max(1.0 - 1.0 / effective, 0.1)
     shrinkage = (dim + 1.0) / (dim + 1.0 + effective)
     diagonal = np.diag(covariance)
     floor = 1e-8 + 1e-4 * diagonal.max()
     covariance = (1.0 - shrinkage) * covariance + np.diag(shrinkage * diagonal + floor)
-    return mean, WIDENING * np.linalg.cholesky(covariance)
+    return mean, np.linalg.cholesky(covariance)
+
+
+def kernel_neighbours(
+    particles: np.ndarray,
+    mean: np.ndarray,
+    factor: np.ndarray,
+    width: float,
+    log_prior: Callable[[np.ndarray], np.ndarray] | None,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """
+    A neighbour of each particle, without a look at the likelihood.
+
+    The kernel shrinks towards the mean as much as it spreads, so that the particles' mean and covariance stay (Liu & West
+    2001). Where the prior has holes (between the modes of a mixture, off the surface on which its latents lie) there should
+    be no particles however the likelihood looks: then a step is taken with the ratio of the prior's densities.
+
+    :param particles: (n, d).
+    :param mean: (d,) of all particles.
+    :param factor: (d, d) lower triangular factor of their covariance.
+    :param width: Of the kernel, as a share of the particles' spread, in (0, 1).
+    :param log_prior: Maps (m, d) to (m,), up to a constant; None where the prior has no holes.
+    :param rng: The generator.
+    :return: (n, d).
+    """
+    noise = rng.standard_normal(particles.shape) @ factor.T
+    proposals = mean + np.sqrt(1.0 - width**2) * (particles - mean) + width * noise
+    if log_prior is None:
+        return proposals
+    accepted = np.log(1.0 - rng.random(len(particles))) < log_prior(proposals) - log_prior(particles)
+    return np.where(accepted[:, None], proposals, particles)
 
 
 def elliptical_slice_moves(

@@ -1,0 +1,377 @@
+"""Ask and tell: the protocol, what it may see, and that it resumes exactly."""
+
+import json
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import DummyVecEnv
+from worlds import Blinded, SpeedEnv, SpeedModel
+
+from sb3_poem.adaptation import (
+    BoltzmannNoise,
+    ExactNoise,
+    MistakeNoise,
+    MistakeOracle,
+    Preference,
+    PreferenceAdapter,
+    ReturnOracle,
+    adapt_tasks,
+)
+
+GOAL = np.array([2.2])
+RULES = [{"inference": "bayes"}, {"inference": "bayes", "likelihood": "similarity"}, {"inference": "paper"}]
+
+
+def make_env(goal=GOAL, **kwargs):
+    env = SpeedEnv(**kwargs)
+    env.set_task(goal)
+    return env
+
+
+def outside_oracle(left, right):
+    """Knows the goal, and sees observations only."""
+    left_miss, right_miss = (np.abs(trajectory.observations[1:, 1] - GOAL).sum() for trajectory in (left, right))
+    return Preference.LEFT if left_miss < right_miss else Preference.RIGHT
+
+
+def adapter(env=None, seed=0, **kwargs):
+    return PreferenceAdapter(SpeedModel(), make_env() if env is None else env, seed=seed, **kwargs)
+
+
+def answer(a, times, oracle=outside_oracle):
+    for _ in range(times):
+        query = a.ask()
+        a.tell(oracle(query.left, query.right))
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_ten_answers_find_the_goal(rule):
+    a = adapter(**rule)
+    while not a.done:
+        query = a.ask()
+        assert query.left.frames is None
+        # common random numbers: both start alike
+        np.testing.assert_array_equal(query.left.observations[0], query.right.observations[0])
+        a.tell(outside_oracle(query.left, query.right))
+    policy = a.policy()
+    assert SpeedModel.speed(policy.latent) == pytest.approx(GOAL[0], abs=0.3)
+    assert a.n_answers == 10
+
+
+def test_the_policy_follows_sb3s_protocol():
+    env = make_env()
+    policy = PreferenceAdapter(SpeedModel(), env, oracle=ReturnOracle(), seed=1).adapt()
+    speed = SpeedModel.speed(policy.latent)
+    mean, _ = evaluate_policy(policy, env, n_eval_episodes=3, warn=False)
+    assert mean == pytest.approx(-200 * abs(speed - GOAL[0]), abs=1e-3)
+    mean, _ = evaluate_policy(policy, DummyVecEnv([make_env] * 2), n_eval_episodes=3, warn=False)
+    assert mean == pytest.approx(-200 * abs(speed - GOAL[0]), abs=1e-3)
+    single, _ = policy.predict(np.zeros(2))
+    batch, state = policy.predict(np.zeros((4, 2)), state=None, episode_start=np.ones(4, bool), deterministic=True)
+    assert single.shape == (1,)
+    assert batch.shape == (4, 1)
+    assert state.shape == (4, 5)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_it_never_reads_rewards(rule):
+    """NaN rewards and no reward features, with an oracle outside: the same policy, bit for bit."""
+    seeing, blind = adapter(**rule), adapter(Blinded(make_env()), **rule)
+    for a in (seeing, blind):
+        answer(a, 10)
+    assert blind.answers[0].left.reward_features is None
+    np.testing.assert_array_equal(seeing.policy().latent, blind.policy().latent)
+
+
+def test_it_neither_reads_nor_sets_the_task():
+    class Guarded(gym.Wrapper):
+        """The task must not be touched, and a reset with a seed would draw another one."""
+
+        def set_task(self, task):
+            raise AssertionError("the task was set")
+
+        @property
+        def task(self):
+            raise AssertionError("the task was read")
+
+        def compute_reward(self, tasks, features):
+            raise AssertionError("rewards were computed")
+
+        def reset(self, *, seed=None, options=None):
+            assert seed is None, "a seeded reset of a family draws its task anew"
+            return self.env.reset(options=options)
+
+    env = make_env()
+    env.reset()
+    a = adapter(Guarded(env))
+    answer(a, 3)
+    np.testing.assert_array_equal(env.task, GOAL)
+
+
+@pytest.mark.parametrize("rule", [*RULES, {"query_rule": "random"}, {"candidates": "aggregate"}])
+def test_equal_seeds_give_equal_policies(rule):
+    first, second, third = adapter(**rule), adapter(**rule), adapter(seed=1, **rule)
+    for a in (first, second, third):
+        answer(a, 5)
+    np.testing.assert_array_equal(first.policy().latent, second.policy().latent)
+    assert not np.array_equal(first.policy().latent, third.policy().latent)
+
+
+def test_without_a_seed_one_is_drawn_and_kept():
+    first = adapter(seed=None)
+    second = adapter(seed=first.seed)
+    answer(first, 2)
+    answer(second, 2)
+    np.testing.assert_array_equal(first.policy().latent, second.policy().latent)
+    assert adapter(seed=None).seed != first.seed
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("pending", [False, True])
+def test_a_saved_adaptation_continues_exactly(tmp_path, rule, pending):
+    whole = adapter(noise_model=MistakeNoise(0.1), **rule)
+    answer(whole, 8)
+
+    first = adapter(noise_model=MistakeNoise(0.1), n_queries=8, **rule)
+    answer(first, 3)
+    query = first.ask() if pending else None
+    path = tmp_path / "adaptation.json"
+    first.save(path)
+    assert [p.name for p in tmp_path.iterdir()] == ["adaptation.json"]
+    assert [item["preference"] for item in json.loads(path.read_text())["answers"]] == [
+        a.preference.value for a in first.answers
+    ]
+
+    second = PreferenceAdapter.load(path, SpeedModel(), make_env())
+    assert second.n_answers == 3
+    assert second.options == first.options
+    np.testing.assert_array_equal(second.policy().latent, first.policy().latent)
+    if pending:
+        np.testing.assert_array_equal(second.pending.left.observations, query.left.observations)
+        np.testing.assert_array_equal(second.ask().right.latent, query.right.latent)
+    answer(second, 5)
+    assert second.done
+    np.testing.assert_array_equal(second.policy().latent, whole.policy().latent)
+    third = PreferenceAdapter.from_json(second.to_json(), SpeedModel(), make_env())
+    np.testing.assert_array_equal(third.policy().latent, whole.policy().latent)
+
+
+def test_saving_replaces_the_file_only_once_the_new_one_is_whole(tmp_path, monkeypatch):
+    import os
+
+    a = adapter()
+    path = tmp_path / "adaptation.json"
+    a.save(path)
+    before = path.read_bytes()
+    answer(a, 1)
+
+    def full_disk(descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        a.save(path)
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["adaptation.json"]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "is not a saved adaptation"),
+        ('{"format": "sb3_poem.Pref', "is not a saved adaptation"),
+        ("[1]", "holds a list"),
+        ('{"format": "optuna"}', "`format` is 'optuna'"),
+        ('{"format": "sb3_poem.PreferenceAdapter", "version": 99}', "version 99"),
+        ('{"format": "sb3_poem.PreferenceAdapter", "version": 1}', "incomplete"),
+    ],
+)
+def test_foreign_and_truncated_files_are_refused(tmp_path, content, message):
+    path = tmp_path / "adaptation.json"
+    path.write_text(content)
+    with pytest.raises(ValueError, match=message):
+        PreferenceAdapter.load(path, SpeedModel(), make_env())
+
+
+def test_another_models_file_is_refused():
+    text = adapter().to_json()
+    with pytest.raises(ValueError, match="latent_dim=5, but the model has 4"):
+        PreferenceAdapter.from_json(text, SpeedModel(latent_dim=4), make_env())
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_undo_takes_the_last_answer_back(rule):
+    plain, corrected = adapter(**rule), adapter(**rule)
+    answer(plain, 4)
+    answer(corrected, 2)
+    query = corrected.ask()
+    before = corrected.policy().latent
+    corrected.tell("equal")
+    assert corrected.undo() is query
+    np.testing.assert_array_equal(corrected.policy().latent, before)
+    assert corrected.n_answers == 2
+    assert corrected.ask() is query
+    answer(corrected, 2)
+    np.testing.assert_array_equal(corrected.policy().latent, plain.policy().latent)
+
+
+def test_undo_has_its_limits():
+    a = adapter()
+    with pytest.raises(RuntimeError, match="nothing to undo"):
+        a.undo()
+    answer(a, 1)
+    a.ask()
+    with pytest.raises(RuntimeError, match="before the next question"):
+        a.undo()
+
+
+def test_the_protocol_is_kept():
+    a = adapter(n_queries=2)
+    with pytest.raises(RuntimeError, match=r"no question has been asked; call ask\(\) first"):
+        a.tell("left")
+    query = a.ask()
+    assert a.ask() is query  # the pending question, not another
+    with pytest.raises(ValueError, match='"left", "right" or "equal", but is \'better\''):
+        a.tell("better")
+    for nonsense in (None, 0, True, 1.0, ["left"]):
+        with pytest.raises(TypeError, match="an answer must be Preference"):
+            a.tell(nonsense)
+    assert a.pending is query  # a refused answer leaves the question waiting
+    a.tell(Preference.LEFT)
+    with pytest.raises(RuntimeError, match="has its answer already"):
+        a.tell("left")
+    a.ask()
+    a.tell("right")
+    assert a.done
+    with pytest.raises(RuntimeError, match="all 2 questions have been answered"):
+        a.ask()
+    a.policy()
+
+
+def test_an_oracle_that_returns_something_else():
+    with pytest.raises(TypeError, match="an answer must be Preference"):
+        adapter(oracle=lambda left, right: 1).adapt()
+    with pytest.raises(ValueError, match="adapt\\(\\) needs an oracle"):
+        adapter().adapt()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"n_queries": 0}, "`n_queries` must be at least 1, but is 0"),
+        ({"inference": "map"}, "`inference` must be one of .*bayes.*paper.*, but is 'map'"),
+        ({"query_rule": "best"}, "`query_rule` must be one of"),
+        ({"candidates": "uniform"}, "`candidates` must be one of"),
+        ({"likelihood": "exact"}, "`likelihood` must be one of"),
+        ({"decision": "best"}, "`decision` must be one of"),
+        ({"epsilon": 0.5}, "`epsilon` must lie in"),
+        ({"n_candidates": 1}, "`n_candidates` must be at least 2"),
+        ({"seed": -1}, "`seed` must not be negative"),
+        ({"inference": "paper", "library": []}, "`library` needs"),
+    ],
+)
+@pytest.mark.parametrize("inference", ["bayes", "paper"])
+def test_bad_arguments(inference, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        adapter(**{"inference": inference, **arguments})
+
+
+def test_a_model_for_another_environment_is_refused():
+    class Other(SpeedEnv):
+        observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float64)
+
+    with pytest.raises(ValueError, match="does not belong to this environment: its observation_space"):
+        adapter(Other())
+    with pytest.raises(TypeError, match=r"`env` must be a gymnasium\.Env, an id, or an SB3 VecEnv"):
+        adapter(3)
+
+
+def test_an_id_and_a_vector_environment_will_do():
+    gym.register("test/Speed-v0", SpeedEnv)
+    try:
+        from_id = PreferenceAdapter(SpeedModel(), "test/Speed-v0", seed=0)
+        answer(from_id, 2)
+        from_id.close()
+        # Other copies of a vector environment may hold other tasks: the first is watched.
+        many = adapter(DummyVecEnv([make_env, partial(make_env, np.array([0.1]))]), oracle=ReturnOracle(), n_queries=2)
+        one = adapter(make_env(), oracle=ReturnOracle(), n_queries=2)
+        np.testing.assert_array_equal(many.adapt().latent, one.adapt().latent)
+        first = from_id.answers[0].left.observations
+        np.testing.assert_array_equal(first, one.answers[0].left.observations)
+    finally:
+        del gym.registry["test/Speed-v0"]
+
+
+def test_the_oracles_noise_model_is_taken():
+    assert adapter(oracle=MistakeOracle(0.3)).options.noise_model == MistakeNoise(0.3)
+    assert adapter(oracle=MistakeOracle(0.3), noise_model=BoltzmannNoise()).options.noise_model == BoltzmannNoise()
+    assert adapter(oracle=outside_oracle).inference.noise_model == ExactNoise()
+
+
+def test_a_library_needs_no_rollouts():
+    model = SpeedModel()
+    source = PreferenceAdapter(model, make_env(np.array([0.3])), seed=3, query_rule="random")
+    answer(source, 10)
+    library = [trajectory for item in source.answers for trajectory in (item.left, item.right)]
+
+    class NoSteps(SpeedEnv):
+        def step(self, action):
+            raise AssertionError("a rollout")
+
+    a = PreferenceAdapter(model, NoSteps(), library=library, seed=0, n_queries=4)
+    answer(a, 4)
+    assert all(item.left in library for item in a.answers)
+    with pytest.raises(ValueError, match="pass the same `library`"):
+        PreferenceAdapter.from_json(a.to_json(), model, make_env())
+    resumed = PreferenceAdapter.from_json(a.to_json(), model, make_env(), library=library)
+    np.testing.assert_array_equal(resumed.policy().latent, a.policy().latent)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_many_tasks_in_lockstep_as_each_alone(rule):
+    tasks = np.array([[0.4], [1.3], [2.7]])
+    model = SpeedModel()
+    together = adapt_tasks(model, DummyVecEnv([SpeedEnv] * 4), tasks, partial(MistakeOracle, 0.2), n_queries=5, seed=7, **rule)
+    assert together.latents.shape == (3, 6, 5)
+    assert together.record_at == (0, 1, 2, 3, 4, 5)
+    for i, task in enumerate(tasks):
+        oracle = MistakeOracle(0.2, task=task, seed=7 + i)
+        alone = PreferenceAdapter(model, make_env(task), oracle=oracle, seed=7 + i, n_queries=5, **rule)
+        np.testing.assert_array_equal(together.latents[i, 0], alone.policy().latent)
+        for query in range(1, 6):
+            answer(alone, 1, oracle)
+            np.testing.assert_array_equal(together.latents[i, query], alone.policy().latent)
+        assert together.preferences[i] == [item.preference for item in alone.answers]
+
+
+def test_lockstep_options():
+    env, model, tasks = DummyVecEnv([SpeedEnv] * 2), SpeedModel(), np.array([[0.4]])
+    result = adapt_tasks(model, env, tasks, ReturnOracle, n_queries=4, record_at=[2, 0])
+    assert result.record_at == (0, 2)
+    assert result.latents.shape == (1, 2, 5)
+    assert len(result.preferences[0]) == 2  # nothing is asked that nobody will look at
+    for arguments, message in [
+        ({"record_at": [5]}, "`record_at` must hold numbers from 0 to n_queries=4"),
+        ({"record_at": []}, "`record_at` must hold"),
+        ({"n_queries": 0}, "`n_queries` must be at least 1"),
+        ({"inference": "map"}, "`inference` must be one of"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            adapt_tasks(model, env, tasks, ReturnOracle, **{"n_queries": 4, **arguments})
+    with pytest.raises(ValueError, match="`tasks` must have shape"):
+        adapt_tasks(model, env, np.zeros(3), ReturnOracle)
+
+
+def test_lockstep_with_a_library():
+    model, tasks = SpeedModel(), np.array([[0.4], [2.1]])
+    source = PreferenceAdapter(model, make_env(), seed=3, query_rule="random")
+    answer(source, 10)
+    library = [trajectory for item in source.answers for trajectory in (item.left, item.right)]
+    together = adapt_tasks(model, DummyVecEnv([SpeedEnv]), tasks, ReturnOracle, n_queries=4, library=library)
+    for i, task in enumerate(tasks):
+        alone = PreferenceAdapter(model, make_env(task), oracle=ReturnOracle(task=task), seed=i, n_queries=4, library=library)
+        np.testing.assert_array_equal(together.latents[i, -1], alone.adapt().latent)

@@ -1,0 +1,149 @@
+"""Whatever the oracle says, every step is bounded and a usable policy comes out."""
+
+import time
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from stable_baselines3.common.vec_env import DummyVecEnv
+from worlds import HORIZON, SpeedEnv, SpeedModel
+
+from sb3_poem.adaptation import BoltzmannNoise, ExactNoise, MistakeNoise, Preference, PreferenceAdapter
+from sb3_poem.adaptation.bayes import DECODER_MOVE_STEPS
+from sb3_poem.adaptation.options import AdaptationOptions
+from sb3_poem.common.trajectory import Trajectory
+
+LEFT, RIGHT, EQUAL = Preference
+
+
+class RandomModel(SpeedModel):
+    """
+    Random networks: S is asymmetric, of any scale, and keeps no property; the decoder has nothing to do with it.
+    It counts its work.
+    """
+
+    def __init__(self, seed: int, latent_dim: int = 5, scale: float = 3.0):
+        super().__init__(latent_dim=latent_dim)
+        rng = np.random.default_rng(seed)
+        self.weights = [rng.normal(size=(latent_dim, 16)) for _ in range(2)]
+        self.scale = scale
+        self.similarity_rows = self.decoder_steps = 0
+
+    def similarity(self, task_latents, policy_latents):
+        self.similarity_rows += len(task_latents) + len(policy_latents)
+        embeddings = [np.tanh(z @ w) for z, w in zip((task_latents, policy_latents), self.weights, strict=True)]
+        return self.scale * embeddings[0] @ embeddings[1].T
+
+    def predicted_returns(self, latents, trajectories):
+        self.decoder_steps += len(latents) * sum(len(trajectory) for trajectory in trajectories)
+        features = np.stack([np.tanh(t.observations[:-1].sum(axis=0) + t.latent[:2]) for t in trajectories])
+        return 10.0 * np.tanh(latents @ self.weights[0][:, :2]) @ features.T
+
+
+def liar(left, right):
+    difference = np.abs(left.observations[1:, 1] - 2.2).sum() - np.abs(right.observations[1:, 1] - 2.2).sum()
+    return LEFT if difference > 0 else RIGHT
+
+
+def always(preference):
+    return lambda left, right: preference
+
+
+class Contradicts:
+    """Left, right, left, right, ..."""
+
+    def __init__(self):
+        self.said = RIGHT
+
+    def __call__(self, left, right):
+        self.said = LEFT if self.said is RIGHT else RIGHT
+        return self.said
+
+
+rules = st.sampled_from(
+    [
+        {"inference": "paper"},
+        {"inference": "paper", "epsilon": 0.0},
+        {"inference": "paper", "query_rule": "information-gain", "candidates": "aggregate"},
+        {"inference": "bayes"},
+        {"inference": "bayes", "likelihood": "similarity"},
+        {"inference": "bayes", "candidates": "aggregate", "query_rule": "worst-case"},
+        {"inference": "bayes", "candidates": "aggregate", "likelihood": "similarity", "decision": "posterior-mean"},
+        {"inference": "bayes", "query_rule": "random", "decision": "most-likely"},
+    ]
+)
+
+
+@given(
+    answers=st.lists(st.sampled_from(list(Preference)), min_size=1, max_size=12),
+    rule=rules,
+    noise=st.sampled_from([ExactNoise(), MistakeNoise(0.2), BoltzmannNoise()]),
+    seed=st.integers(0, 2**31 - 1),
+    dim=st.sampled_from([1, 5, 32]),
+    scale=st.sampled_from([1e-6, 3.0, 1e6]),
+)
+@settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck))
+def test_any_answers_end_in_a_finite_latent_with_bounded_work(answers, rule, noise, seed, dim, scale):
+    model = RandomModel(seed, dim, scale)
+    options = AdaptationOptions(noise_model=noise, **rule)
+    inference = options.make_inference(model, np.random.default_rng(seed))
+    for number, preference in enumerate(answers, 1):
+        model.similarity_rows = model.decoder_steps = 0
+        left, right = inference.ask_latents()
+        assert not np.array_equal(left, right)
+        shown = [Trajectory(np.ones((6, 2)), np.zeros((5, 1)), z) for z in (left, right)]
+        inference.tell(preference, *shown)
+        latent = inference.estimate()
+        assert latent.shape == (dim,)
+        assert np.all(np.isfinite(latent))
+        # Bounded whatever the answers are, and in the number of answers at most linear.
+        assert model.similarity_rows <= 40_000 + 200 * number
+        assert model.decoder_steps <= 2 * 100 * 5 + DECODER_MOVE_STEPS
+
+
+@pytest.mark.parametrize(
+    "oracle", [liar, always(LEFT), always(EQUAL), Contradicts()], ids=["lies", "left", "equal", "contradicts"]
+)
+@pytest.mark.parametrize(
+    "rule", [{"inference": "bayes"}, {"inference": "bayes", "likelihood": "similarity"}, {"inference": "paper"}]
+)
+def test_a_usable_policy_comes_out(oracle, rule):
+    env = SpeedEnv()
+    adapter = PreferenceAdapter(SpeedModel(), env, seed=0, oracle=oracle, **rule)
+    policy = adapter.adapt()
+    assert adapter.done
+    actions, _ = policy.predict(np.zeros((3, 2)))
+    assert env.action_space.contains(actions[0])
+
+
+def test_a_random_oracle_over_many_queries():
+    rng = np.random.default_rng(0)
+    adapter = PreferenceAdapter(SpeedModel(), DummyVecEnv([SpeedEnv]), seed=0, n_queries=50)
+    policy = adapter.adapt(lambda left, right: list(Preference)[rng.integers(3)])
+    assert np.all(np.isfinite(policy.latent))
+
+
+@pytest.mark.parametrize(
+    "rule",
+    [{"inference": "bayes"}, {"inference": "bayes", "likelihood": "similarity"}, {"inference": "paper", "epsilon": 0.0}],
+    ids=["decoder", "similarity", "paper"],
+)
+@pytest.mark.parametrize("preference", [LEFT, EQUAL])
+def test_ask_and_tell_take_less_than_50_ms(rule, preference):
+    """At N_z = 100, d = 5, k = 10, apart from rollouts; in processor time, as other programs share the machine."""
+    model, best = RandomModel(0), np.inf
+    for seed in range(2):
+        inference = AdaptationOptions(**rule).make_inference(model, np.random.default_rng(seed))
+        slowest = 0.0
+        for _ in range(10):
+            start = time.process_time()
+            left, right = inference.ask_latents()
+            asked = time.process_time()
+            shown = [Trajectory(np.ones((HORIZON + 1, 2)), np.zeros((HORIZON, 1)), z) for z in (left, right)]
+            shown_at = time.process_time()
+            inference.tell(preference, *shown)
+            inference.estimate()
+            slowest = max(slowest, asked - start, time.process_time() - shown_at)
+        best = min(best, slowest)
+    assert best < 0.05

@@ -1,0 +1,293 @@
+"""The Bayesian rule against the posterior on a grid."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+from worlds import HORIZON, STEP_WEIGHT, SpeedModel
+
+from sb3_poem.adaptation.bayes import ERROR_CORRELATION, SIMILARITY_RESOLUTION, BayesInference
+from sb3_poem.adaptation.decisions import decide, expected_fitness
+from sb3_poem.adaptation.inference import Snapshot, preference_log_likelihood
+from sb3_poem.adaptation.moves import (
+    elliptical_slice_moves,
+    fit_gaussian,
+    kernel_neighbours,
+    systematic_resample,
+)
+from sb3_poem.adaptation.noise import LAPSE, BoltzmannNoise, ExactNoise, MistakeNoise
+from sb3_poem.adaptation.preference import Preference
+from sb3_poem.adaptation.priors import AggregatePrior, GaussianPrior
+from sb3_poem.common.trajectory import Trajectory
+
+LEFT, RIGHT, EQUAL = Preference
+
+
+def at_speed(model, speed, latent=None):
+    """An episode at a constant speed."""
+    observations = np.column_stack([np.zeros(HORIZON + 1), np.full(HORIZON + 1, speed)])
+    z = np.zeros(model.latent_dim) if latent is None else latent
+    return Trajectory(observations, np.zeros((HORIZON, 1)), z)
+
+
+def make(model=None, seed=0, **kwargs):
+    return BayesInference(model or SpeedModel(), rng=np.random.default_rng(seed), **kwargs)
+
+
+def logistic(x):
+    return 1 / (1 + np.exp(-x))
+
+
+ANSWERS = [(LEFT, 2.0, 1.0), (RIGHT, 2.6, 1.4), (EQUAL, 2.5, 1.3)]
+
+
+@pytest.mark.parametrize(
+    ("noise", "probability"),
+    [
+        (ExactNoise(), lambda d, m, e: LAPSE / 2 + (1 - LAPSE) * logistic(1.702 * d / e)),
+        (MistakeNoise(0.1), lambda d, m, e: 0.1 + 0.8 * (LAPSE / 2 + (1 - LAPSE) * logistic(1.702 * d / e))),
+        (
+            BoltzmannNoise(),
+            lambda d, m, e: LAPSE / 2 + (1 - LAPSE) * logistic(d / m / math.sqrt(1 + math.pi / 8 * (e / m) ** 2)),
+        ),
+    ],
+)
+def test_the_decoders_likelihood_is_the_direct_formula(noise, probability):
+    model = SpeedModel()
+    inference = make(model, noise_model=noise, n_candidates=50)
+    inference._rejuvenate = lambda: None  # the weights alone
+    for preference, left, right in ANSWERS:
+        inference.tell(preference, at_speed(model, left), at_speed(model, right))
+    error = model.predicted_rewards_error * math.sqrt(2 * HORIZON * ERROR_CORRELATION)
+    for z, weight in zip(inference.particles, inference.log_weights, strict=True):
+        goal, expected = 3 * ndtr(z[0]), 0.0
+        for preference, left, right in ANSWERS:
+            r_left, r_right = (-STEP_WEIGHT * HORIZON * abs(speed - goal) for speed in (left, right))
+            p = probability(r_left - r_right, abs(r_left) + abs(r_right), error)
+            expected += {LEFT: math.log(p), RIGHT: math.log(1 - p), EQUAL: 0.5 * math.log(p * (1 - p))}[preference]
+        assert weight == pytest.approx(expected, rel=1e-6)
+    assert inference.weights.sum() == pytest.approx(1.0)
+
+
+def test_the_likelihood_from_s_is_the_direct_formula():
+    model = SpeedModel()
+    inference = make(model, likelihood="similarity", n_candidates=50)
+    particles = inference.particles.copy()
+    s = model.similarity(particles, particles)
+    spread = math.sqrt(np.mean([(row[i] - row[j]) ** 2 for row in s for i in range(50) for j in range(50)]))
+    unit = max(1.0, SIMILARITY_RESOLUTION * spread / 1.702)
+    left, right = np.full(5, 0.4), np.full(5, -0.7)
+    expected = np.log(
+        LAPSE / 2 + (1 - LAPSE) * logistic((model.similarity(particles, np.stack([left, right])) @ [1, -1]) / unit)
+    )
+    inference._rejuvenate = lambda: None
+    inference.tell(LEFT, left, right)
+    np.testing.assert_allclose(inference.log_weights, expected, rtol=1e-9)
+
+
+def test_error_free_answers_do_not_care_for_the_scale_of_s():
+    # Beyond the scale at which S's own odds are certain, a hundredfold S changes nothing.
+    weights = []
+    for scale in (100.0, 10_000.0):
+        inference = make(SpeedModel(scale=scale), likelihood="similarity")
+        inference._rejuvenate = lambda: None
+        inference.tell(LEFT, np.full(5, 0.4), np.full(5, -0.7))
+        weights.append(inference.weights)
+    np.testing.assert_allclose(weights[0], weights[1], rtol=1e-6)
+
+
+def test_equal_is_neither_left_nor_right():
+    log_left, log_right = np.log([[0.9], [0.5], [0.1]]), np.log([[0.1], [0.5], [0.9]])
+    equal = preference_log_likelihood(log_left, log_right, [EQUAL])
+    np.testing.assert_allclose(equal, np.log([0.3, 0.5, 0.3]))
+
+
+@pytest.mark.parametrize("likelihood", ["decoder", "similarity"])
+@pytest.mark.parametrize("candidates", ["prior", "aggregate"])
+def test_the_posterior_agrees_with_a_grid(likelihood, candidates):
+    """After several resamplings and moves the particles still follow the posterior, which a fine grid gives exactly."""
+    model = SpeedModel(latent_dim=1, error=0.5)
+    inference = make(model, likelihood=likelihood, candidates=candidates, n_candidates=1500, seed=1)
+    grid = np.linspace(-4, 4, 4001)[:, None]
+    log_posterior = inference.prior.log_density(grid)
+    answers = [(LEFT, 0.9, -0.6), (RIGHT, 1.8, 0.3), (LEFT, 0.8, 0.2), (RIGHT, 1.0, 0.45)]
+    for preference, left, right in answers:
+        pair = [np.array([left]), np.array([right])]
+        if likelihood == "decoder":
+            pair = [at_speed(model, model.speed(z), z) for z in pair]
+        inference.tell(preference, *pair)
+    log_posterior = log_posterior + inference._answer_log_likelihoods(grid, inference.answers)
+    posterior = np.exp(log_posterior - log_posterior.max())
+    posterior /= posterior.sum()
+    mean = posterior @ grid[:, 0]
+    std = math.sqrt(posterior @ (grid[:, 0] - mean) ** 2)
+    estimated = inference.weights @ inference.particles[:, 0]
+    spread = math.sqrt(inference.weights @ (inference.particles[:, 0] - estimated) ** 2)
+    assert estimated == pytest.approx(mean, abs=0.25 * std)
+    assert spread == pytest.approx(std, rel=0.25)
+
+
+def test_slice_moves_leave_the_posterior_as_it_is():
+    # Prior N(0, 1), likelihood of x > 0.3 softened; start from exact draws by rejection, move often, compare quantiles.
+    rng = np.random.default_rng(0)
+
+    def log_likelihood(z):
+        return -np.logaddexp(0.0, -8.0 * (z[:, 0] - 0.3))
+
+    draws = rng.standard_normal((40_000, 2))
+    draws = draws[rng.random(len(draws)) < np.exp(log_likelihood(draws))][:8000]
+    prior = GaussianPrior(2)
+    mean, factor = fit_gaussian(draws, np.full(len(draws), 1 / len(draws)))
+    moved, values = draws, log_likelihood(draws)
+    for _ in range(8):
+        moved, values = elliptical_slice_moves(moved, values, log_likelihood, prior.log_density, mean, factor, 2, rng)
+    np.testing.assert_allclose(values, log_likelihood(moved))
+    assert np.mean(np.any(moved != draws, axis=1)) > 0.95
+    for axis in (0, 1):
+        quantiles = np.linspace(0.05, 0.95, 10)
+        np.testing.assert_allclose(np.quantile(moved[:, axis], quantiles), np.quantile(draws[:, axis], quantiles), atol=0.06)
+
+
+def test_kernel_neighbours_keep_mean_and_covariance_and_stay_where_the_prior_is():
+    rng = np.random.default_rng(0)
+    particles = rng.standard_normal((20_000, 2)) @ np.array([[1.0, 0.0], [0.8, 0.3]]).T + [2.0, -1.0]
+    weights = np.full(len(particles), 1 / len(particles))
+    mean, factor = fit_gaussian(particles, weights)
+    neighbours = kernel_neighbours(particles, mean, factor, 0.3, None, rng)
+    assert np.all(np.any(neighbours != particles, axis=1))
+    np.testing.assert_allclose(neighbours.mean(axis=0), particles.mean(axis=0), atol=0.02)
+    np.testing.assert_allclose(np.cov(neighbours.T), np.cov(particles.T), atol=0.03)
+    upper = kernel_neighbours(particles, mean, factor, 0.3, lambda z: np.where(z[:, 0] > 1, 0.0, -1e9), rng)
+    inside = particles[:, 0] > 1
+    assert np.all(upper[inside, 0] > 1)
+
+
+def test_resampling_keeps_counts_within_one():
+    rng = np.random.default_rng(0)
+    weights = rng.dirichlet(np.ones(7))
+    counts = np.bincount(systematic_resample(weights, 100, rng), minlength=7)
+    assert counts.sum() == 100
+    assert np.all(np.abs(counts - 100 * weights) < 1)
+
+
+@pytest.mark.parametrize("likelihood", ["similarity", "decoder"])
+def test_many_answers_in_many_dimensions_do_not_thin_the_particles_out(likelihood):
+    model = SpeedModel(latent_dim=32)
+    inference = make(model, likelihood=likelihood)
+    goal, rng = 2.2, np.random.default_rng(0)
+    for _ in range(50):
+        left, right = inference.ask_latents()
+        speeds = model.speed(left), model.speed(right)
+        preference = LEFT if abs(speeds[0] - goal) < abs(speeds[1] - goal) else RIGHT
+        if rng.random() < 0.1:
+            preference = RIGHT if preference is LEFT else LEFT
+        shown = [at_speed(model, s, z) for s, z in zip(speeds, (left, right), strict=True)]
+        inference.tell(preference, *shown)
+        assert np.all(np.isfinite(inference.particles))
+        assert inference.effective_size >= 50
+        assert len(np.unique(inference.particles, axis=0)) >= 50
+    assert model.speed(inference.estimate()) == pytest.approx(goal, abs=0.3)
+    if likelihood == "similarity":  # where all particles move, directions that no answer speaks of keep the prior's spread
+        assert 0.6 < inference.particles[:, 1:].std(axis=0).mean() < 1.4
+
+
+def test_the_decision_is_between_the_modes_only_if_that_is_fit():
+    class TwoTasks:
+        """Forwards or backwards: the middle fits neither."""
+
+        def similarity(self, tasks, policies):
+            return np.sign(tasks[:, :1]) * np.where(np.abs(policies[:, 0]) > 0.5, np.sign(policies[:, 0]), 0.0)
+
+    particles = np.array([[-1.0]] * 30 + [[1.0]] * 70)
+    weights = np.full(100, 0.01)
+    assert decide("posterior-mean", TwoTasks(), particles, weights, None)[0] == pytest.approx(0.4)
+    assert decide("expected-fitness", TwoTasks(), particles, weights, np.array([[0.2]]))[0] == 1.0
+    assert decide("most-likely", TwoTasks(), particles, np.arange(100) / 4950, None)[0] == 1.0
+    with pytest.raises(ValueError, match="`decision` must be one of"):
+        decide("best", TwoTasks(), particles, weights, None)
+
+
+def test_expected_fitness_is_the_mean_of_standard_scores():
+    similarities, weights = np.array([[1.0, 2.0, 6.0], [50.0, 20.0, 20.0]]), np.array([0.25, 0.75])
+    expected = [
+        sum(w * (row[j] - np.mean(row)) / np.std(row) for w, row in zip(weights, similarities, strict=True)) for j in range(3)
+    ]
+    np.testing.assert_allclose(expected_fitness(similarities, weights), expected)
+
+
+def test_the_aggregate_prior_is_the_mixture_that_it_says():
+    rng = np.random.default_rng(0)
+    prior = AggregatePrior(rng.normal(size=(20, 2)))
+    z = rng.normal(size=(4, 2))
+    direct = [math.log(np.mean([math.exp(-0.5 * np.sum((x - c) ** 2) / prior.width**2) for c in prior.centres])) for x in z]
+    np.testing.assert_allclose(prior.log_density(z), direct)
+    assert prior.sample(5, rng).shape == (5, 2)
+
+
+def test_a_library_is_asked_about_without_similarity():
+    class DecoderOnly(SpeedModel):
+        similarity = property()  # as PEARLSAC: there is none
+
+    model = DecoderOnly(latent_dim=1)
+    library = [at_speed(model, speed) for speed in np.linspace(0, 3, 13)]
+    inference = make(model, library=library, decision="posterior-mean")
+    goal = 2.05
+    for _ in range(8):
+        first, second = inference.ask_library()
+        speeds = [library[i].observations[1, 1] for i in (first, second)]
+        inference.tell(LEFT if abs(speeds[0] - goal) < abs(speeds[1] - goal) else RIGHT, library[first], library[second])
+    assert model.speed(inference.estimate()) == pytest.approx(goal, abs=0.15)
+
+
+def test_a_snapshot_continues_exactly():
+    model = SpeedModel()
+    first, second = make(model, seed=1), make(model, seed=2)
+    for _ in range(3):
+        left, right = first.ask_latents()
+        first.tell(LEFT, at_speed(model, model.speed(left), left), at_speed(model, model.speed(right), right))
+    second.restore(Snapshot.from_dict(first.snapshot().to_dict()), first.answers)
+    np.testing.assert_array_equal(first.estimate(), second.estimate())
+    np.testing.assert_array_equal(first.ask_latents(), second.ask_latents())
+    with pytest.raises(ValueError, match="snapshot of BayesInference"):
+        first.restore(Snapshot(first.snapshot().random_state, {}), [])
+
+
+class NoDecoder(SpeedModel):
+    predicted_returns = property()
+
+
+class Untrained(SpeedModel):
+    predicted_rewards_error = float("nan")
+
+    def __init__(self):
+        super().__init__()
+        del self.predicted_rewards_error
+
+
+def test_the_likelihood_follows_what_the_model_has():
+    assert make().likelihood == "decoder"
+    assert make(NoDecoder()).likelihood == "similarity"
+
+
+@pytest.mark.parametrize(
+    ("model", "arguments", "message"),
+    [
+        (SpeedModel(), {"likelihood": "exact"}, "`likelihood` must be one of .*, but is 'exact'"),
+        (SpeedModel(), {"decision": "best"}, "`decision` must be one of .*, but is 'best'"),
+        (NoDecoder(), {"likelihood": "decoder"}, "needs a model with `predicted_returns`"),
+        (SpeedModel(error=float("nan")), {"likelihood": "decoder"}, "finite `predicted_rewards_error`, which is nan"),
+        (SpeedModel(), {"likelihood": "similarity", "noise_model": BoltzmannNoise(2.0)}, "fixed beta"),
+        (SpeedModel(), {"library": []}, "`library` must hold at least 2"),
+        (SpeedModel(), {"library": [1, 2], "query_rule": "worst-case"}, "worst-case"),
+        (NoDecoder(), {"library": [1, 2]}, "`library` needs a model with a reward decoder"),
+    ],
+)
+def test_bad_options(model, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        make(model, **arguments)
+
+
+def test_the_decoder_needs_trajectories():
+    with pytest.raises(ValueError, match="needs the two trajectories"):
+        make().tell(LEFT, np.zeros(5), np.ones(5))

@@ -1,0 +1,154 @@
+"""Algorithm 2: which candidates are kept, what happens when there are none, and which one is chosen."""
+
+import numpy as np
+import pytest
+from worlds import SpeedModel
+
+from sb3_poem.adaptation.inference import PaperInference, Snapshot
+from sb3_poem.adaptation.preference import Preference
+
+LEFT, RIGHT, EQUAL = Preference
+
+
+def latent(first, dim=5):
+    z = np.zeros(dim)
+    z[0] = first
+    return z
+
+
+def make(epsilon=0.1, seed=0, **kwargs):
+    return PaperInference(SpeedModel(), epsilon=epsilon, rng=np.random.default_rng(seed), **kwargs)
+
+
+def differences(inference, latents):
+    """S(z, preferred) - S(z, other), one answer a column, from the model's own definition."""
+    model = inference.model
+    columns = []
+    for answer in inference.answers:
+        left, right = model.similarity(latents, np.stack([answer.left, answer.right])).T
+        columns.append(left - right if answer.preference is LEFT else right - left)
+    return np.stack(columns, axis=1)
+
+
+@pytest.mark.parametrize("epsilon", [0.0, 0.1, 0.4])
+def test_candidates_satisfy_every_answer_within_the_tolerance(epsilon):
+    inference = make(epsilon)
+    inference.tell(LEFT, latent(0.5), latent(-0.5))
+    inference.tell(RIGHT, latent(1.5), latent(0.2))
+    inference.ask_latents()
+    odds = 1.0 / (1.0 + np.exp(-differences(inference, inference.candidates)))
+    assert inference.candidates.shape == (100, 5)
+    assert np.all(odds >= 0.5 - epsilon - 1e-12)
+    # ... and the half-spaces are not narrower than eq. 9 says: on a grid, exactly those satisfy all.
+    grid = np.stack([latent(x) for x in np.linspace(-3, 3, 301)])
+    odds = 1.0 / (1.0 + np.exp(-differences(inference, grid)))
+    np.testing.assert_array_equal(inference.satisfied(grid) == 2, np.all(odds >= 0.5 - epsilon, axis=1))
+
+
+def test_equal_excludes_nobody():
+    inference = make(epsilon=0.0)
+    inference.tell(EQUAL, latent(0.5), latent(-0.5))
+    grid = np.stack([latent(x) for x in np.linspace(-3, 3, 31)])
+    assert np.all(inference.satisfied(grid) == 1)
+    # but the most likely latent lies midway between the two
+    inference.ask_latents()
+    model = inference.model
+    estimate = model.speed(inference.estimate())
+    midway = 0.5 * (model.speed(latent(0.5)) + model.speed(latent(-0.5)))
+    nearest = np.abs(model.speed(inference.candidates) - midway).min()
+    assert abs(estimate - midway) == pytest.approx(nearest)
+
+
+def test_line_17_takes_the_candidate_of_highest_likelihood():
+    inference = make()
+    inference.ask_latents()
+    inference.tell(LEFT, latent(0.5), latent(-0.5))
+    inference.ask_latents()
+    inference.tell(RIGHT, latent(1.5), latent(0.2))
+    # Candidates are those drawn before the last answer; the likelihood counts it (lines 3 to 17 in order).
+    likelihood = np.prod(1.0 / (1.0 + np.exp(-differences(inference, inference.candidates))), axis=1)
+    np.testing.assert_array_equal(inference.estimate(), inference.candidates[np.argmax(likelihood)])
+
+
+def test_contradicting_answers_fall_back_in_the_defined_order():
+    inference = make(epsilon=0.0, max_draws=2000)
+    for _ in range(2):  # nobody satisfies all three; whoever satisfies two satisfies the pair of equal answers
+        inference.tell(LEFT, latent(0.5), latent(-0.5))
+    inference.tell(RIGHT, latent(0.5), latent(-0.5))
+    inference.ask_latents()
+    satisfied = inference.satisfied(inference.candidates)
+    assert inference.candidates.shape == (100, 5)
+    assert np.all(satisfied == 2)
+    # of all draws with two satisfied answers these are the likeliest, best first
+    likelihood = np.sum(-np.logaddexp(0.0, -differences(inference, inference.candidates)), axis=1)
+    assert np.all(np.diff(likelihood) <= 1e-12)
+
+
+def test_few_survivors_are_kept_and_filled_up():
+    # The left policy is extreme: hardly any draw prefers it, but those that do come first.
+    inference = make(epsilon=0.0, max_draws=4000)
+    inference.tell(LEFT, latent(3.2), latent(2.4))
+    inference.ask_latents()
+    satisfied = inference.satisfied(inference.candidates)
+    survivors = int(satisfied.sum())
+    assert 0 < survivors < 100
+    assert np.all(satisfied[:survivors] == 1)
+    assert np.all(np.isfinite(inference.candidates))
+
+
+def test_the_query_is_eq_10s():
+    inference = make()
+    left, right = inference.ask_latents()
+    model, z = inference.model, inference.candidates
+    best = 101
+    for i in range(100):
+        for j in range(i + 1, 100):
+            difference = model.scale * (
+                2 * model.speed(z) * (model.speed(z[i]) - model.speed(z[j])) - model.speed(z[i]) ** 2 + model.speed(z[j]) ** 2
+            )
+            odds = 1 / (1 + np.exp(-difference))
+            best = min(best, max(np.sum(odds >= 0.4), np.sum(1 - odds >= 0.4)))
+    s = model.similarity(z, np.stack([left, right]))
+    odds = 1 / (1 + np.exp(s[:, 1] - s[:, 0]))
+    assert max(np.sum(odds >= 0.4), np.sum(1 - odds >= 0.4)) == best
+
+
+def test_reproducible_and_restorable():
+    first, second = make(seed=3), make(seed=3)
+    for inference in (first, second):
+        inference.ask_latents()
+        inference.tell(LEFT, latent(0.5), latent(-0.5))
+    third = make(seed=99)
+    third.restore(Snapshot.from_dict(first.snapshot().to_dict()), first.answers)
+    for inference in (second, third):
+        np.testing.assert_array_equal(first.candidates, inference.candidates)
+    asked = [np.stack(inference.ask_latents()) for inference in (first, second, third)]
+    np.testing.assert_array_equal(asked[0], asked[1])
+    np.testing.assert_array_equal(asked[0], asked[2])
+
+
+@pytest.mark.parametrize("rule", ["worst-case", "information-gain", "random"])
+@pytest.mark.parametrize("candidates", ["prior", "aggregate"])
+def test_every_rule_asks_about_two_policies(rule, candidates):
+    inference = make(query_rule=rule, candidates=candidates)
+    for _ in range(3):
+        left, right = inference.ask_latents()
+        assert not np.array_equal(left, right)
+        inference.tell(LEFT, left, right)
+    assert inference.estimate().shape == (5,)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"epsilon": 0.5}, r"`epsilon` must lie in \[0, 0.5\), but is 0.5"),
+        ({"epsilon": -0.1}, "`epsilon` must lie in"),
+        ({"epsilon": float("nan")}, "`epsilon` must lie in"),
+        ({"n_candidates": 1}, "`n_candidates` must be at least 2"),
+        ({"candidates": "uniform"}, "`candidates` must be one of .*prior.*aggregate.*, but is 'uniform'"),
+        ({"query_rule": "best"}, "`query_rule` must be one of .*worst-case.*, but is 'best'"),
+    ],
+)
+def test_bad_options(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        make(**arguments)

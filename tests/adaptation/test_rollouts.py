@@ -1,0 +1,201 @@
+"""Rollouts in lockstep: what a rollout gives depends on its latent, task and seed alone."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
+from worlds import HORIZON, Blinded, SpeedEnv, SpeedModel
+
+from sb3_poem.common.rollouts import rollout_features, rollout_latents
+
+MODEL = SpeedModel()
+LATENTS = np.random.default_rng(0).standard_normal((7, 5))
+
+
+def vec_env(n, **kwargs):
+    return DummyVecEnv([lambda: SpeedEnv(**kwargs)] * n)
+
+
+@pytest.mark.parametrize("copies", [1, 3, 7, 9])
+def test_any_number_of_latents_against_any_number_of_copies(copies):
+    trajectories = rollout_latents(MODEL, vec_env(copies), LATENTS, seed=5)
+    assert len(trajectories) == 7
+    for i, trajectory in enumerate(trajectories):
+        # One environment by hand is the truth.
+        env = SpeedEnv()
+        observation, _ = env.reset(seed=5 + i)
+        observations, features = [observation], []
+        for _ in range(HORIZON):
+            action, _ = MODEL.predict(observation, state=LATENTS[i])
+            observation, _, _, _, info = env.step(action)
+            observations.append(observation)
+            features.append(info["reward_features"])
+        np.testing.assert_array_equal(trajectory.observations, observations)
+        np.testing.assert_array_equal(trajectory.reward_features, features)
+        np.testing.assert_array_equal(trajectory.latent, LATENTS[i])
+        assert trajectory.frames is None
+
+
+def test_equal_seeds_start_alike_and_others_do_not():
+    first, second, third = rollout_latents(MODEL, vec_env(2), LATENTS[:3], seed=[4, 4, 5])
+    np.testing.assert_array_equal(first.observations[0], second.observations[0])
+    assert first.observations[0, 0] != third.observations[0, 0]
+
+
+def test_tasks_are_set_for_the_rollouts():
+    env = vec_env(2)
+    rollout_latents(MODEL, env, LATENTS[:4], np.array([[0.1], [0.2], [0.3], [0.4]]))
+    np.testing.assert_allclose(np.ravel(env.get_attr("task")), [0.3, 0.4])
+
+
+def test_only_the_first_episode_counts():
+    # A fast policy runs out of the world early; its copy starts again, which must leave no trace.
+    latents = np.zeros((2, 5))
+    latents[:, 0] = [-3.0, 3.0]
+    slow, fast = rollout_latents(MODEL, vec_env(2, end_at=2.0), latents, seed=[1, 1])
+    assert len(slow) == HORIZON
+    assert 1 <= len(fast) < HORIZON
+    assert fast.observations[-1, 0] > 2.0
+    assert np.all(fast.observations[:-1, 0] <= 2.0)
+    features = rollout_features(MODEL, vec_env(3, end_at=2.0), latents, seed=[1, 1])
+    np.testing.assert_array_equal(features[1], fast.reward_features)
+
+
+def test_an_episode_without_end_is_cut():
+    class Endless(SpeedEnv):
+        def step(self, action):
+            observation, reward, _, _, info = super().step(action)
+            return observation, reward, False, False, info
+
+    assert len(rollout_latents(MODEL, DummyVecEnv([Endless]), LATENTS[:1])[0]) == HORIZON
+    assert len(rollout_latents(MODEL, DummyVecEnv([Endless]), LATENTS[:1], max_steps=50)[0]) == 50
+
+
+def test_without_reward_features():
+    env = DummyVecEnv([lambda: Blinded(SpeedEnv())])
+    assert rollout_latents(MODEL, env, LATENTS[:1])[0].reward_features is None
+    with pytest.raises(ValueError, match="reward_features"):
+        rollout_features(MODEL, env, LATENTS[:1])
+
+
+class FastFeatures(VecEnvWrapper):
+    """As TaskVecEnv: the features as one array, and none in the infos."""
+
+    def __init__(self, venv: VecEnv):
+        super().__init__(venv)
+        self.last_reward_features = None
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        observations, rewards, dones, infos = self.venv.step_wait()
+        self.last_reward_features = np.stack([info.pop("reward_features") for info in infos])
+        return observations, rewards, dones, infos
+
+
+def test_features_as_one_array():
+    fast = rollout_features(MODEL, FastFeatures(vec_env(3)), LATENTS)
+    np.testing.assert_array_equal(fast, rollout_features(MODEL, vec_env(3), LATENTS))
+
+
+class DrawsItsTask(SpeedEnv):
+    """As poem_envs' families: a reset with a seed draws the task, until one is set."""
+
+    def reset(self, *, seed=None, options=None):
+        if seed is not None:
+            self._next_task = np.random.default_rng(seed).uniform(0, 3, size=1)
+        return super().reset(seed=seed, options=options)
+
+
+def test_the_environments_own_task_stays():
+    env = DrawsItsTask()
+    env.reset(seed=3)
+    task = env.task.copy()
+    venv = DummyVecEnv([lambda: env])
+    trajectories = rollout_latents(MODEL, venv, LATENTS, seed=5)
+    np.testing.assert_array_equal(env.task, task)
+    for expected, trajectory in zip(rollout_latents(MODEL, vec_env(7), LATENTS, seed=5), trajectories, strict=True):
+        np.testing.assert_array_equal(trajectory.observations, expected.observations)
+
+
+def test_the_task_of_a_vectorised_family_stays():
+    poem_envs = pytest.importorskip("poem_envs")
+    assert poem_envs
+    vec_env_module = pytest.importorskip("sb3_poem.common.vec_env")
+    env = vec_env_module.TaskVecEnv.from_id("poem/PointGoal-v0", 2)
+    env.seed(3)
+    env.reset()
+    tasks = env.tasks.copy()
+
+    class Still:
+        horizon = 25
+
+        def predict(self, observations, state, deterministic):
+            return np.zeros((len(observations), 2), np.float32), state
+
+    trajectories = rollout_latents(Still(), env, LATENTS[:3], seed=[8, 8, 9])
+    np.testing.assert_array_equal(env.tasks, tasks)
+    np.testing.assert_array_equal(trajectories[0].observations, trajectories[1].observations)
+    assert trajectories[0].reward_features.shape == (25, 2)
+    single = DummyVecEnv([lambda: gym.make("poem/PointGoal-v0")])
+    expected = rollout_latents(Still(), single, LATENTS[:1], seed=[8])[0]
+    np.testing.assert_array_equal(trajectories[0].observations, expected.observations)
+
+
+def test_frames():
+    frames = rollout_latents(MODEL, vec_env(1, render_mode="rgb_array"), LATENTS[:2], frames=True)[1].frames
+    assert len(frames) == HORIZON  # the reset and every step but the last, after which the next episode has begun
+    assert frames[0].shape == (16, 16, 3)
+    with pytest.raises(ValueError, match="render_mode"):
+        rollout_latents(MODEL, vec_env(1), LATENTS[:1], frames=True)
+
+
+def test_stochastic_actions_are_reproducible_and_leave_torch_alone():
+    torch = pytest.importorskip("torch")
+
+    class Noisy(SpeedModel):
+        def predict(self, observation, state=None, episode_start=None, deterministic=True):
+            actions, state = super().predict(observation, state)
+            noise = 0.0 if deterministic else 0.1 * torch.randn(actions.shape).numpy()
+            return np.clip(actions + noise, -1, 1), state
+
+    state = torch.get_rng_state()
+    first, second = (rollout_latents(Noisy(), vec_env(3), LATENTS, seed=2, deterministic=False) for _ in range(2))
+    assert torch.equal(torch.get_rng_state(), state)
+    np.testing.assert_array_equal(first[4].actions, second[4].actions)
+    assert not np.array_equal(first[0].actions, rollout_latents(Noisy(), vec_env(3), LATENTS, seed=2)[0].actions)
+
+
+@pytest.mark.parametrize("culprit", ["observation", "action"])
+def test_an_episode_that_is_not_finite_is_named(culprit):
+    class BrokenEnv(SpeedEnv):
+        def step(self, action):
+            observation, *rest = super().step(action)
+            return (observation * np.nan if self._time == 4 and observation[1] > 1.5 else observation), *rest
+
+    class BrokenModel(SpeedModel):
+        def predict(self, observation, state=None, episode_start=None, deterministic=True):
+            actions, state = super().predict(observation, state)
+            return np.where(observation[:, 1:] > 1.5, np.nan, actions), state
+
+    latents = np.zeros((5, 5))
+    latents[:, 0] = [-1.0, -1.0, -1.0, 1.0, -1.0]
+    env, model = (DummyVecEnv([BrokenEnv] * 2), MODEL) if culprit == "observation" else (vec_env(2), BrokenModel())
+    with pytest.raises(ValueError, match=f"an {culprit} of episode 3 at step"):
+        rollout_latents(model, env, latents)
+
+
+@pytest.mark.parametrize(
+    ("latents", "arguments", "message"),
+    [
+        (np.zeros(5), {}, "`latents` must have shape"),
+        (np.full((2, 5), np.nan), {}, "`latents` must be finite"),
+        (np.zeros((2, 5)), {"tasks": np.zeros((3, 1))}, "`tasks` must have shape"),
+        (np.zeros((2, 5)), {"seed": [1]}, "`seed` must be one integer"),
+        (np.zeros((2, 5)), {"max_steps": 0}, "`max_steps` must be at least 1"),
+    ],
+)
+def test_bad_arguments(latents, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        rollout_latents(MODEL, vec_env(1), latents, **arguments)
