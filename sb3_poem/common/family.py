@@ -39,7 +39,7 @@ class FamilyEnv:
         if steps is None:
             raise ValueError("horizon is unknown: register the environment with max_episode_steps, or pass horizon=<steps>")
         if horizon is not None and horizon != steps:
-            raise ValueError(f"horizon is {horizon}, but the environment ends episodes after {limit} steps; leave it out")
+            raise ValueError(f"horizon is {horizon}, but the environment ends episodes after {limit} steps; they must agree")
         if steps < 1:
             raise ValueError(f"horizon must be at least 1 step, got {steps}")
         self.horizon = int(steps)

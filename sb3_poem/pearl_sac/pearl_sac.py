@@ -15,6 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
+from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.common.buffers import ContextStore, Segment, TaskBatch, TaskReplayBuffer
@@ -219,7 +220,7 @@ class PEARLSAC(SAC):
     def _setup_model(self) -> None:
         self.policy_kwargs.pop("use_sde", None)
         if self.env is not None:
-            self._family = FamilyEnv(self.env, self.horizon)
+            self._family = self._family_of(self.env)
             self.horizon: int = self._family.horizon
         self.generators = getattr(self, "generators", None) or Generators(self.seed, self.device)
         self.generators.to(self.device)
@@ -255,18 +256,23 @@ class PEARLSAC(SAC):
         self.latent_means = np.zeros((count, self.latent_dim))
         self.latent_variances = np.ones((count, self.latent_dim))
 
+    def _family_of(self, env: VecEnv) -> FamilyEnv:
+        """View of an environment, which must be of the model's own family once the model has one."""
+        family = FamilyEnv(env, self.horizon)
+        if self.train_tasks is not None:
+            family.check_same_family(self.task_space, self.reward_feature_dim)
+        return family
+
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Change the environment, to one of the same family with any number of copies.
 
-        :raises ValueError: if the environment is of another family
+        :raises ValueError: if the environment is of another family; the model then keeps its own
         """
-        self.n_envs = env.num_envs if isinstance(env, VecEnv) else 1  # experience is kept per task, not per copy
-        super().set_env(env, force_reset)
-        assert self.env is not None
-        family = FamilyEnv(self.env, None)
-        family.check_same_family(self.task_space, self.reward_feature_dim)
-        if family.horizon != self.horizon:
-            raise ValueError(f"env has episodes of {family.horizon} steps, the model was trained on {self.horizon}")
+        vec_env = self._wrap_env(env, self.verbose)
+        check_for_correct_spaces(vec_env, self.observation_space, self.action_space)
+        family = self._family_of(vec_env)
+        self.n_envs = vec_env.num_envs  # experience is kept per task, not per copy
+        super().set_env(vec_env, force_reset)
         self._family = family
 
     @property
@@ -278,8 +284,7 @@ class PEARLSAC(SAC):
         if self._family is None:
             if self.env is None:
                 raise ValueError("the model has no environment; give it one with set_env, or load it with env=...")
-            self._family = FamilyEnv(self.env, None)
-            self._family.check_same_family(self.task_space, self.reward_feature_dim)
+            self._family = self._family_of(self.env)
         return self._family
 
     @property
@@ -462,6 +467,7 @@ class PEARLSAC(SAC):
             with th.autocast(self.device.type, dtype=self._amp_dtype, enabled=self._amp_dtype is not None):
                 loss, metrics = self._losses(batch)
             self._optimise(loss)
+            self._update_entropy_coefficient(metrics["entropy"])
             if self._n_updates % self.target_update_interval == 0:
                 self._update_targets()
             self._n_updates += 1
@@ -553,12 +559,12 @@ class PEARLSAC(SAC):
             + self.kl_coef * kl_loss
             + embedding_loss
         )
-        self._update_entropy_coefficient(log_prob)
         metrics = {
             "critic_loss": critic_loss,
             "actor_loss": actor_loss,
             "decoder_loss": decoder_loss,
             "kl": kl_loss,
+            "entropy": -log_prob.mean(),
             "ent_coef": alpha.squeeze(),
             **embedding_metrics,
         }
@@ -573,10 +579,10 @@ class PEARLSAC(SAC):
             return self.log_ent_coef.detach().exp()
         return self.ent_coef_tensor
 
-    def _update_entropy_coefficient(self, log_prob: th.Tensor) -> None:
+    def _update_entropy_coefficient(self, entropy: th.Tensor) -> None:
         if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
             assert isinstance(self.target_entropy, float)
-            loss = -(self.log_ent_coef * (log_prob.detach().mean() + self.target_entropy)).sum()
+            loss = (self.log_ent_coef * (entropy.detach() - self.target_entropy)).sum()
             self.ent_coef_optimizer.zero_grad()
             loss.backward()
             self.ent_coef_optimizer.step()
@@ -703,6 +709,10 @@ class PEARLSAC(SAC):
         self._dump_pending_logs(log_interval)
         return self
 
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        """The last epoch may overshoot the total; a schedule must not turn negative there."""
+        super()._update_current_progress_remaining(min(num_timesteps, total_timesteps), total_timesteps)
+
     def _dump_pending_logs(self, log_interval: int | None) -> None:
         if self._logs_pending and log_interval and self.epoch % log_interval == 0:
             self.dump_logs()
@@ -742,7 +752,9 @@ class PEARLSAC(SAC):
             data, _, _ = load_from_zip_file(path, device="cpu", load_data=True)
         except (zipfile.BadZipFile, RuntimeError, EOFError, ValueError) as error:
             raise ValueError(f"{path} is truncated, or no model saved by {cls.__name__}: {error}") from error
-        if data is None or "train_tasks" not in data or ("preference_coef" in data) != hasattr(cls, "similarity"):
+        if data is None:
+            raise ValueError(f"{path} is truncated, or no model saved by {cls.__name__}: it holds no data of a model")
+        if "train_tasks" not in data or ("preference_coef" in data) != hasattr(cls, "similarity"):
             raise ValueError(f"{path} holds a model of another algorithm, not of {cls.__name__}")
         if isinstance(path, io.BufferedIOBase):
             path.seek(0)

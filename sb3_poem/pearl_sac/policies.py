@@ -175,7 +175,7 @@ class LatentPolicy(SACPolicy):
         :param episode_start: Not used: a latent outlives episodes
         :param deterministic: Mean action instead of a sample
         :return: actions in the environment's units, and the latents (n, latent_dim)
-        :raises ValueError: for observations that are not finite, or a state of another shape
+        :raises ValueError: for observations or a state that are not finite or of another shape
         """
         self.set_training_mode(False)
         obs = np.asarray(observation, dtype=np.float32)
@@ -191,6 +191,8 @@ class LatentPolicy(SACPolicy):
                 f"state has shape {latents.shape}, but a latent is ({self.latent_dim},), "
                 f"or ({obs.shape[0]}, {self.latent_dim}) for these observations"
             )
+        if not np.all(np.isfinite(latents)):
+            raise ValueError(f"state holds NaN or infinity: {latents}")
         latents = np.array(np.broadcast_to(latents, (obs.shape[0], self.latent_dim)))
         noise = None
         if not deterministic:
