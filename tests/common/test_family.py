@@ -94,7 +94,7 @@ def test_the_horizon_must_be_known_and_agree() -> None:
     with pytest.raises(ValueError, match=r"horizon is unknown: .*max_episode_steps, or pass horizon"):
         FamilyEnv(walks(1))
     assert FamilyEnv(walks(1), 10).horizon == 10
-    with pytest.raises(ValueError, match="horizon is 30, but the environment ends episodes after 25 steps"):
+    with pytest.raises(ValueError, match="horizon is 30, but the environment ends episodes after 25 steps; they must agree"):
         FamilyEnv(make_vec_env(POINT_GOAL, 1), 30)
     assert FamilyEnv(make_vec_env(POINT_GOAL, 1), 25).horizon == 25
 
