@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
-from worlds import HORIZON, Blinded, SpeedEnv, SpeedModel
+from worlds import HORIZON, Blinded, SpeedEnv, SpeedModel, SpeedVecEnv
 
 from sb3_poem.common.rollouts import rollout_features, rollout_latents
 
@@ -97,6 +97,10 @@ class FastFeatures(VecEnvWrapper):
 def test_features_as_one_array():
     fast = rollout_features(MODEL, FastFeatures(vec_env(3)), LATENTS)
     np.testing.assert_array_equal(fast, rollout_features(MODEL, vec_env(3), LATENTS))
+    in_arrays = rollout_latents(MODEL, SpeedVecEnv(3), LATENTS, seed=3)
+    for trajectory, expected in zip(in_arrays, rollout_latents(MODEL, vec_env(3), LATENTS, seed=3), strict=True):
+        np.testing.assert_array_equal(trajectory.observations, expected.observations)
+        np.testing.assert_array_equal(trajectory.reward_features, expected.reward_features)
 
 
 class DrawsItsTask(SpeedEnv):

@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from scipy.special import ndtr
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.common.trajectory import Trajectory
 
@@ -64,6 +65,53 @@ class SpeedEnv(gym.Env):
 
     def render(self) -> np.ndarray:
         return np.full((16, 16, 3), min(255, int(abs(self._place) * 40)), dtype=np.uint8)
+
+
+class SpeedVecEnv(VecEnv):
+    """Many copies of :class:`SpeedEnv` in arrays, with the face of ``TaskVecEnv``; its episodes all end by their horizon."""
+
+    def __init__(self, num_envs: int) -> None:
+        self._one = SpeedEnv()
+        super().__init__(num_envs, SpeedEnv.observation_space, SpeedEnv.action_space)
+        self.tasks = self._next_tasks = np.full((num_envs, 1), 1.5)
+        self.last_reward_features: np.ndarray | None = None
+
+    def set_tasks(self, tasks: np.ndarray) -> None:
+        self._next_tasks = np.array(tasks, dtype=np.float64)
+
+    def reset(self) -> np.ndarray:
+        self.tasks, self._time = self._next_tasks, 0
+        self._places = np.array([np.random.default_rng(seed).normal() for seed in self._seeds])
+        return np.column_stack([self._places, np.zeros(self.num_envs)])
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self._actions = actions
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict]]:
+        speeds = 0.5 * TOP_SPEED * (self._actions[:, 0].astype(np.float64) + 1.0)
+        self._places = self._places + 0.05 * speeds
+        self._time += 1
+        self.last_reward_features = speeds[:, None]
+        observations = np.column_stack([self._places, speeds])
+        done = self._time >= HORIZON
+        infos = [{"terminal_observation": row} if done else {} for row in observations]
+        rewards = SpeedEnv.compute_reward(self.tasks, self.last_reward_features)
+        return observations, rewards, np.full(self.num_envs, done), infos
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        return [getattr(self._one, method_name)(*args, **kwargs)]
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        return [getattr(self._one, attr_name)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        raise NotImplementedError
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Any = None) -> list[bool]:
+        return [False]
+
+    def close(self) -> None:
+        pass
 
 
 class Blinded(gym.Wrapper):

@@ -1,0 +1,224 @@
+"""Evaluation against closed forms and brute force, and what ten answers reach on a family whose limit is known."""
+
+import itertools
+from functools import partial
+
+import numpy as np
+import pytest
+from scipy.stats import kendalltau, norm
+from stable_baselines3.common.vec_env import DummyVecEnv
+from worlds import HORIZON, SpeedEnv, SpeedModel, SpeedVecEnv
+
+from sb3_poem.adaptation import (
+    MistakeOracle,
+    Preference,
+    ReturnOracle,
+    best_codebook,
+    evaluate_adaptation,
+    evaluate_latents,
+    information_limit,
+    known_task_return,
+    property_one,
+)
+from sb3_poem.adaptation.evaluation import preference_order, return_matrix
+
+MODEL = SpeedModel()
+GOALS = np.linspace(0.05, 2.95, 30)[:, None]
+
+
+def vec_env(n=10, **kwargs):
+    return DummyVecEnv([lambda: SpeedEnv(**kwargs)] * n)
+
+
+@pytest.mark.parametrize("k", [0, 1, 2, 3, 5])
+def test_the_limit_on_a_line_is_150_over_2_to_the_k(k):
+    # Goals uniform on [0, 3], return -200 |v - goal|: 2^k speeds in the middles of equal parts, 0.75 / 2^k away on average.
+    grid = (np.arange(480) + 0.5) * 3 / 480
+    returns = -200 * np.abs(grid[:, None] - grid[None, :])
+    assert information_limit(returns, k) == pytest.approx(-150 / 2**k, rel=0.03)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_codebook_against_brute_force(seed, monkeypatch):
+    returns = np.random.default_rng(seed).normal(size=(9, 11))
+    best = {
+        size: max(returns[:, book].max(axis=1).mean() for book in itertools.combinations(range(11), size))
+        for size in (1, 2, 4)
+    }
+    for size in (1, 2, 4):
+        assert returns[:, best_codebook(returns, size)].max(axis=1).mean() == pytest.approx(best[size])
+        assert information_limit(returns, int(np.log2(size))) == pytest.approx(best[size])
+    # The greedy choice with swaps alone: never better than the optimum, and hardly worse.
+    monkeypatch.setattr("sb3_poem.adaptation.limits.EXACT_CODEBOOKS", 0)
+    for size in (1, 2, 4):
+        book = best_codebook(returns, size)
+        assert len(set(book)) == size
+        value = returns[:, book].max(axis=1).mean()
+        assert best[size] - 0.1 <= value <= best[size] + 1e-12
+
+
+def test_enough_policies_or_tasks_are_trivial():
+    returns = np.random.default_rng(0).normal(size=(5, 40))
+    assert information_limit(returns, 3) == pytest.approx(returns.max(axis=1).mean())
+    assert information_limit(returns, 200) == pytest.approx(returns.max(axis=1).mean())
+    np.testing.assert_array_equal(best_codebook(returns, 99), np.arange(40))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: information_limit(np.zeros((2, 2)), -1), "`k` must not be negative"),
+        (lambda: information_limit(np.zeros(3), 1), "`returns` must have shape"),
+        (lambda: information_limit(np.full((2, 2), np.nan), 1), "`returns` must be finite"),
+        (lambda: best_codebook(np.zeros((2, 2)), 0), "`size` must be at least 1"),
+        (lambda: property_one(np.zeros((2, 3)), np.zeros((3, 2))), "must have the same shape"),
+        (lambda: evaluate_latents(MODEL, vec_env(1), np.zeros((2, 5)), np.zeros((3, 1))), "equally many rows"),
+        (lambda: evaluate_latents(MODEL, vec_env(1), np.zeros((2, 5)), np.ones((2, 1)), 0), "`n_episodes` must be"),
+        (lambda: known_task_return(MODEL, vec_env(1), GOALS, 0), "`n_latents` must be at least 1"),
+        (lambda: known_task_return(MODEL, vec_env(1), GOALS, source="all"), "`source` must be"),
+        (lambda: evaluate_adaptation(MODEL, vec_env(1), GOALS, record_at=()), "`record_at` must hold"),
+        (lambda: evaluate_adaptation(MODEL, vec_env(1), GOALS, record_at=(-1, 2)), "`record_at` must hold"),
+    ],
+)
+def test_bad_arguments(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+@pytest.mark.parametrize("copies", [1, 4, 40])
+def test_returns_are_the_true_ones(copies):
+    latents = np.random.default_rng(0).standard_normal((6, 5))
+    returns = evaluate_latents(MODEL, vec_env(copies), latents, GOALS[:6], n_episodes=3)
+    assert returns.shape == (6, 3)
+    expected = -200 * np.abs(MODEL.speed(latents) - GOALS[:6, 0])
+    np.testing.assert_allclose(returns, np.tile(expected[:, None], 3), rtol=1e-5)
+
+
+def test_early_ends_count_up_to_the_end():
+    latents = np.array([[0.0] * 5, [2.0, 0, 0, 0, 0]])
+    returns = evaluate_latents(MODEL, vec_env(3, end_at=1.5), latents, np.zeros((2, 1)), n_episodes=20)
+    steps = returns / (-10 * MODEL.speed(latents))[:, None]
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-4)  # whole steps
+    assert steps.min() < HORIZON <= steps.max() + 1e-6
+
+
+def test_the_matrix_by_relabelling_is_that_by_rolling_out():
+    latents = np.random.default_rng(1).standard_normal((4, 5))
+    relabelled = return_matrix(MODEL, vec_env(5), GOALS[::10], latents, n_episodes=2)
+
+    class OwnDynamics(SpeedEnv):
+        shared_dynamics = False
+
+    rolled_out = return_matrix(MODEL, DummyVecEnv([OwnDynamics] * 5), GOALS[::10], latents, n_episodes=2)
+    expected = -200 * np.abs(GOALS[::10] - MODEL.speed(latents)[None, :])
+    np.testing.assert_allclose(relabelled, expected, rtol=1e-4)
+    np.testing.assert_allclose(rolled_out, expected, rtol=1e-4)
+
+
+def test_known_task_return():
+    known = known_task_return(MODEL, SpeedVecEnv(30), GOALS, n_latents=200, n_episodes=2)
+    assert known.returns.shape == (30, 2)
+    assert known.candidate_returns.shape == (30, 200)
+    gaps = np.abs(MODEL.speed(known.candidate_latents)[None, :] - GOALS).min(axis=1)
+    np.testing.assert_allclose(known.returns[:, 0], -200 * gaps, atol=1e-3)
+    assert known.mean_return == pytest.approx(-200 * gaps.mean(), abs=1e-3)
+    assert known.limit(0) < known.limit(1) < known.limit(3) <= known.limit(10) + 1e-9
+    accuracy, tau = preference_order(MODEL, known)
+    # This model's S keeps the order exactly; what is missing is the gap between a task and its best candidate.
+    assert 0.99 < accuracy <= 1.0
+    assert 0.98 < tau <= 1.0
+
+
+def test_winners_are_measured_on_fresh_episodes():
+    class Lucky(SpeedEnv):
+        """Returns are luck, drawn at the reset."""
+
+        def step(self, action):
+            observation, reward, terminated, truncated, _ = super().step(action)
+            return observation, reward, terminated, truncated, {"reward_features": np.array([self._luck])}
+
+        def reset(self, **kwargs):
+            result = super().reset(**kwargs)
+            self._luck = self.np_random.normal()
+            return result
+
+        @staticmethod
+        def compute_reward(tasks, features):
+            return features[..., 0] + 0.0 * tasks[..., 0]
+
+    known = known_task_return(MODEL, DummyVecEnv([Lucky] * 10), GOALS[:3], n_latents=100, n_episodes=50)
+    assert known.candidate_returns.max() > 1.5 * HORIZON  # the best of a hundred draws
+    assert abs(known.mean_return) < 0.5 * HORIZON
+
+
+def test_property_one_against_scipy():
+    rng = np.random.default_rng(0)
+    returns = np.round(rng.normal(size=(5, 8)), 1)
+    similarities = returns + 0.5 * rng.normal(size=(5, 8))
+    right = total = 0
+    for s, j in zip(similarities, returns, strict=True):
+        for a, b in itertools.combinations(range(8), 2):
+            if j[a] != j[b]:
+                total += 1
+                right += (s[a] > s[b]) == (j[a] > j[b])
+    accuracy, tau = property_one(similarities, returns)
+    assert accuracy == pytest.approx(right / total)
+    assert tau == pytest.approx(np.mean([kendalltau(s, j).statistic for s, j in zip(similarities, returns, strict=True)]))
+    assert property_one(np.zeros((2, 3)), returns[:2, :3])[0] == 0.5
+    assert np.isnan(property_one(np.zeros((2, 3)), np.zeros((2, 3)))[0])
+
+
+@pytest.mark.parametrize("likelihood", ["decoder", "similarity"])
+def test_the_bayesian_rule_is_near_the_information_limit(likelihood):
+    record_at = (0, 1, 2, 3, 5, 10)
+    result = evaluate_adaptation(
+        MODEL, SpeedVecEnv(60), GOALS, ReturnOracle, record_at=record_at, n_episodes=1, seed=1, likelihood=likelihood
+    )
+    assert result.returns.shape == (30, 6, 1)
+    for k in record_at:
+        limit = -150 / 2**k
+        assert limit - 12 <= result.after(k) <= limit + 8  # thirty tasks are not the whole line
+    data = result.to_dict()
+    assert data["queries"] == list(record_at)
+    np.testing.assert_allclose(np.mean(data["task_returns"], axis=0), data["mean_return"])
+    assert len(data["answers"][0]) == 10
+    with pytest.raises(ValueError, match="not after 4"):
+        result.after(4)
+
+
+def test_random_answers_find_nothing():
+    class Coin:
+        def __init__(self, env, task, seed):
+            self.rng = np.random.default_rng(seed)
+
+        def __call__(self, left, right):
+            return list(Preference)[self.rng.integers(2)]
+
+    result = evaluate_adaptation(MODEL, SpeedVecEnv(60), GOALS, Coin, record_at=(5, 10), n_episodes=1, seed=1)
+    # Without information about the goal -150 is the best there is, by always going at 1.5.
+    assert np.all(result.mean_returns < -130)
+
+
+def test_mistakes_cost_less_under_the_bayesian_rule_than_under_the_papers():
+    returns = {}
+    for rule in ("bayes", "paper"):
+        result = evaluate_adaptation(
+            MODEL, SpeedVecEnv(20), GOALS[::3], partial(MistakeOracle, 0.1), record_at=(10,), seed=1, inference=rule
+        )
+        returns[rule] = result.after(10)
+    assert returns["bayes"] > returns["paper"]
+    assert returns["bayes"] > -35
+
+
+def test_evaluation_is_reproducible():
+    runs = [
+        evaluate_adaptation(MODEL, SpeedVecEnv(n), GOALS[:3], record_at=(2,), n_episodes=2, seed=4).returns for n in (3, 3, 7)
+    ]
+    np.testing.assert_array_equal(runs[0], runs[1])
+    np.testing.assert_allclose(runs[0], runs[2], rtol=1e-6)
+
+
+def test_the_prior_of_the_toy_is_uniform_in_speed():
+    # The closed forms above stand on it.
+    quantiles = norm.ppf(np.linspace(0.1, 0.9, 9))
+    np.testing.assert_allclose(MODEL.speed(quantiles[:, None]), np.linspace(0.3, 2.7, 9))

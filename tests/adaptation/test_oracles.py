@@ -1,0 +1,170 @@
+"""Oracles: true returns from reward features, and errors at the rates that they claim."""
+
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3.common.vec_env import DummyVecEnv
+from worlds import HORIZON, SpeedEnv, SpeedModel
+
+from sb3_poem.adaptation import (
+    BoltzmannNoise,
+    BoltzmannOracle,
+    ExactNoise,
+    HumanOracle,
+    MistakeNoise,
+    MistakeOracle,
+    Preference,
+    PreferenceAdapter,
+    ReturnOracle,
+)
+from sb3_poem.adaptation.human import PROMPT
+from sb3_poem.common.trajectory import Trajectory
+
+LEFT, RIGHT, EQUAL = Preference
+
+
+def at_speed(speed, steps=HORIZON, frames=None):
+    features = np.full((steps, 1), float(speed))
+    return Trajectory(np.zeros((steps + 1, 2)), np.zeros((steps, 1)), np.zeros(5), features, frames)
+
+
+def env_with_goal(goal):
+    env = SpeedEnv()
+    env.set_task(np.array([goal]))
+    env.reset()
+    return env
+
+
+def test_the_larger_return_wins_and_equal_returns_are_equal():
+    oracle = ReturnOracle(env_with_goal(2.0))
+    assert oracle(at_speed(1.9), at_speed(1.0)) is LEFT
+    assert oracle(at_speed(2.9), at_speed(1.5)) is RIGHT
+    assert oracle(at_speed(1.5), at_speed(2.5)) is EQUAL
+    assert oracle.true_return(at_speed(1.5)) == pytest.approx(-100.0)  # 20 steps of -10 * 0.5
+    # An early end is the sum up to it: here fewer steps cost less.
+    assert oracle(at_speed(1.5, steps=5), at_speed(1.6)) is LEFT
+    assert oracle.noise_model == ExactNoise()
+
+
+def test_the_task_is_given_or_the_one_in_effect():
+    env = env_with_goal(0.5)
+    assert ReturnOracle(env)(at_speed(0.4), at_speed(2.0)) is LEFT
+    assert ReturnOracle(env, task=[2.1])(at_speed(0.4), at_speed(2.0)) is RIGHT
+    vec_env = DummyVecEnv([lambda: env])
+    assert ReturnOracle().bind(vec_env)(at_speed(0.4), at_speed(2.0)) is LEFT
+    assert ReturnOracle().bind(vec_env, np.array([2.1]))(at_speed(0.4), at_speed(2.0)) is RIGHT
+
+
+def test_mistakes_come_at_their_rate():
+    oracle = MistakeOracle(0.2, env_with_goal(2.0), seed=0)
+    wrong = sum(oracle(at_speed(1.9), at_speed(1.0)) is RIGHT for _ in range(4000))
+    assert wrong / 4000 == pytest.approx(0.2, abs=0.025)
+    assert oracle(at_speed(1.5), at_speed(2.5)) is EQUAL
+    assert oracle.noise_model == MistakeNoise(0.2)
+    assert MistakeOracle(1.0, env_with_goal(2.0))(at_speed(1.9), at_speed(1.0)) is RIGHT
+    assert MistakeOracle(1.0).noise_model == MistakeNoise(0.5)
+    with pytest.raises(ValueError, match="`rate` must lie"):
+        MistakeOracle(1.5)
+
+
+@pytest.mark.parametrize(("beta", "expected"), [(None, 1 / (1 + np.exp(-60 / 100))), (0.02, 1 / (1 + np.exp(-0.02 * 60)))])
+def test_boltzmann_answers_come_at_their_rate(beta, expected):
+    # Returns -20 and -80: C.6's beta is 1 / 100.
+    oracle = BoltzmannOracle(beta, env_with_goal(2.0), seed=0)
+    lefts = sum(oracle(at_speed(1.9), at_speed(1.6)) is LEFT for _ in range(4000))
+    assert lefts / 4000 == pytest.approx(expected, abs=0.025)
+    assert oracle.noise_model == BoltzmannNoise(beta)
+
+
+def test_boltzmann_with_two_returns_of_zero():
+    answers = {BoltzmannOracle(None, env_with_goal(2.0), seed=seed)(at_speed(2.0), at_speed(2.0)) for seed in range(20)}
+    assert answers == {LEFT, RIGHT}
+
+
+@pytest.mark.parametrize("kind", [partial(MistakeOracle, 0.4), BoltzmannOracle])
+def test_noise_follows_the_seed(kind):
+    def answers(seed):
+        oracle = kind(env=env_with_goal(2.0), seed=seed)
+        return [oracle(at_speed(1.9), at_speed(1.6)) for _ in range(40)]
+
+    assert answers(1) == answers(1)
+    assert answers(1) != answers(2)
+
+
+def test_what_an_oracle_needs():
+    blind = Trajectory(np.zeros((3, 2)), np.zeros((2, 1)), np.zeros(5))
+    with pytest.raises(ValueError, match="ReturnOracle computes returns from reward features"):
+        ReturnOracle(env_with_goal(1.0))(blind, blind)
+    with pytest.raises(RuntimeError, match="has no environment"):
+        ReturnOracle()(at_speed(1.0), at_speed(2.0))
+    with pytest.raises(ValueError, match="no task family"):
+        ReturnOracle(gym.make("CartPole-v1"), task=[1.0])(at_speed(1.0), at_speed(2.0))
+    with pytest.raises(ValueError, match="return of a trajectory is nan"):
+        ReturnOracle(env_with_goal(1.0))(at_speed(np.nan), at_speed(2.0))
+
+
+class Terminal:
+    def __init__(self, *lines):
+        self.lines, self.shown, self.prompts = list(lines), [], []
+
+    def read(self, prompt):
+        self.prompts.append(prompt)
+        if not self.lines:
+            raise EOFError
+        return self.lines.pop(0)
+
+
+def frames(n, brightness, shape=(24, 32, 3)):
+    return [np.full(shape, brightness, np.uint8) for _ in range(n)]
+
+
+@pytest.mark.parametrize("video_format", ["gif", "mp4"])
+def test_a_person_sees_both_side_by_side(tmp_path, video_format):
+    import imageio.v3 as imageio
+
+    terminal = Terminal("both?", "", " R ", "can't tell")
+    oracle = HumanOracle(tmp_path / "videos", video_format, read=terminal.read, write=terminal.shown.append)
+    left, right = at_speed(1.0, 4, frames(4, 30)), at_speed(2.0, 6, frames(6, 220))
+    assert oracle(left, right) is RIGHT
+    assert terminal.prompts == [PROMPT] * 3
+    assert "'both?' is no answer" in terminal.shown[1]
+    assert oracle(left, right) is EQUAL
+    files = sorted(path.name for path in (tmp_path / "videos").iterdir())
+    assert files == [f"query-001.{video_format}", f"query-002.{video_format}"]
+    assert str(tmp_path / "videos" / files[0]) in terminal.shown[0]
+    video = imageio.imread(tmp_path / "videos" / files[0])
+    bottom = np.asarray(video[-1])[-6]  # a row well below the captions, where left is dark and right is bright
+    width = bottom.shape[0]
+    assert bottom[: width // 2 - 8].mean() < 60
+    assert bottom[width // 2 + 8 :].mean() > 190
+
+
+def test_a_person_through_the_adapter(tmp_path):
+    terminal = Terminal("l", "left", "1")
+    oracle = HumanOracle(tmp_path, read=terminal.read, write=terminal.shown.append)
+    adapter = PreferenceAdapter(SpeedModel(), SpeedEnv(render_mode="rgb_array"), n_queries=3, oracle=oracle, seed=0)
+    query = adapter.ask()
+    assert len(query.left.frames) == HORIZON
+    # A question that comes from a file is rendered again, from its seed.
+    resumed = PreferenceAdapter.from_json(adapter.to_json(), SpeedModel(), SpeedEnv(render_mode="rgb_array"), oracle=oracle)
+    assert resumed.pending.left.frames is None
+    again = resumed.ask()
+    np.testing.assert_array_equal(again.left.frames, query.left.frames)
+    np.testing.assert_array_equal(again.left.observations, query.left.observations)
+    adapter.adapt()
+    assert [a.preference for a in adapter.answers] == [LEFT] * 3
+    assert adapter.options.noise_model == MistakeNoise(0.05)
+
+
+def test_a_persons_terminal_and_frames_are_needed(tmp_path):
+    with pytest.raises(ValueError, match="no frames to show"):
+        HumanOracle(tmp_path)(at_speed(1.0), at_speed(2.0))
+    closed = HumanOracle(tmp_path, read=Terminal().read, write=lambda line: None)
+    with pytest.raises(RuntimeError, match="standard input is closed"):
+        closed(at_speed(1.0, 2, frames(2, 0)), at_speed(1.0, 2, frames(2, 9)))
+    with pytest.raises(ValueError, match='`video_format` must be "gif" or "mp4"'):
+        HumanOracle(tmp_path, "avi")
+    with pytest.raises(ValueError, match="render_mode"):
+        PreferenceAdapter(SpeedModel(), SpeedEnv(), oracle=HumanOracle(tmp_path)).ask()
