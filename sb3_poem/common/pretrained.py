@@ -10,6 +10,7 @@ from gymnasium import spaces
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as tensors_to_bytes
+from torch import nn
 
 from sb3_poem.common.files import write_atomically
 
@@ -33,16 +34,22 @@ def save_pretrained(model: "PEARLSAC", folder: str | Path, card: dict[str, Any] 
     :param folder: Where; made if missing
     :param card: What the model card should say: ``command``, ``seed``, ``commit``, ``machine``, ``results`` (any JSON)
     :raises OSError: if the folder cannot be written
+    :raises ValueError: if the policy's activation is none of torch.nn's, which JSON could not name
     """
     folder = Path(folder)
+    activation = model.policy.activation_fn
+    if getattr(nn, activation.__name__, None) is not activation:
+        raise ValueError(f"activation_fn must be one of torch.nn to be saved by its name, got {activation}")
     tensors = {f"policy.{name}": value for name, value in model.policy.state_dict().items() if not name.startswith(DERIVED)}
     tensors |= {name: th.as_tensor(getattr(model, name)) for name in ARRAYS}
     config: dict[str, Any] = {
         "format": FORMAT,
         "algorithm": type(model).__name__,
         "env_id": model.env_id,
-        "arguments": {name: getattr(model, attribute) for name, attribute in model.saved_arguments.items()},
+        "arguments": _arguments(model),
         "net_arch": model.policy.net_arch,
+        "activation_fn": activation.__name__,
+        "n_critics": model.policy.n_critics,
         "reward_feature_dim": model.reward_feature_dim,
         "predicted_rewards_error": model.predicted_rewards_error,
         "num_timesteps": model.num_timesteps,
@@ -54,9 +61,25 @@ def save_pretrained(model: "PEARLSAC", folder: str | Path, card: dict[str, Any] 
         tensors[f"{name}.low"], tensors[f"{name}.high"] = th.as_tensor(space.low), th.as_tensor(space.high)
         config[name] = {"dtype": str(space.dtype)}
     tensors = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    write_atomically(folder / WEIGHTS, tensors_to_bytes(tensors))
-    write_atomically(folder / CONFIG, (json.dumps(config, indent=2, default=_to_json) + "\n").encode())
-    write_atomically(folder / CARD, _card_text(config).encode())
+    contents = {  # all made before the first is written
+        WEIGHTS: tensors_to_bytes(tensors),
+        CONFIG: (json.dumps(config, indent=2, default=_to_json) + "\n").encode(),
+        CARD: _card_text(config).encode(),
+    }
+    for name, content in contents.items():
+        write_atomically(folder / name, content)
+
+
+def _arguments(model: "PEARLSAC") -> dict[str, Any]:
+    """Arguments of the constructor with which training goes on as it stopped; a schedule's place takes its default."""
+    arguments = {name: getattr(model, attribute) for name, attribute in model.saved_arguments.items()}
+    arguments["target_entropy"] = model.target_entropy
+    arguments["ent_coef"] = model.ent_coef
+    if model.ent_coef_optimizer is not None:
+        arguments["ent_coef"] = f"auto_{model._entropy_coefficient().item():.9g}"
+    if isinstance(model.learning_rate, (int, float)):
+        arguments["learning_rate"] = model.learning_rate
+    return arguments
 
 
 def _to_json(value: Any) -> Any:
@@ -114,6 +137,8 @@ def from_pretrained(algorithm: type[Model], folder: str | Path, env: Any = None,
     :raises ValueError: if a file is truncated or foreign, the model is of another algorithm, or env of another family
     """
     config = read_config(folder)
+    if config.get("algorithm") is None:
+        raise ValueError(f"{folder} does not hold a complete {algorithm.__name__}: its {CONFIG} names no algorithm")
     if config["algorithm"] != algorithm.__name__:
         raise ValueError(f"{folder} holds a {config['algorithm']}; load it with {config['algorithm']}.from_pretrained")
     weights = Path(folder) / WEIGHTS
@@ -132,13 +157,16 @@ def from_pretrained(algorithm: type[Model], folder: str | Path, env: Any = None,
             setattr(model, name, config[name])
         model._n_updates, model.n_envs = config["n_updates"], 1
         model._statistics_known = True
-        model.target_entropy = -float(np.prod(model.action_space.shape))  # type: ignore[arg-type]
+        if model.target_entropy == "auto":  # which SAC would look up in the environment
+            model.target_entropy = -float(np.prod(model.action_space.shape))  # type: ignore[arg-type]
         model.policy_kwargs["net_arch"] = config["net_arch"]
+        model.policy_kwargs["activation_fn"] = getattr(nn, config.get("activation_fn", "ReLU"))
+        model.policy_kwargs["n_critics"] = config.get("n_critics", 2)
         model._setup_model()
         state = {name.removeprefix("policy."): value for name, value in tensors.items() if name.startswith("policy.")}
         state |= {f"{DERIVED}{name.removeprefix('critic.')}": v for name, v in state.items() if name.startswith("critic.")}
         model.policy.load_state_dict(state)
-    except (KeyError, TypeError, RuntimeError) as error:
+    except (AttributeError, KeyError, TypeError, RuntimeError) as error:
         raise ValueError(f"{folder} does not hold a complete {algorithm.__name__}: {error}") from error
     if env is not None:
         model.set_env(algorithm._vectorise(env, len(model.train_tasks)))  # type: ignore[arg-type]
