@@ -14,6 +14,7 @@ from pathlib import Path
 from sb3_poem.cli import can_draw
 from sb3_poem.cli.outputs import check_writable
 
+ADAPTATION = ["--oracle", "return", "--queries", "10", "--tasks", "30", "--record", "0", "1", "2", "5", "10"]
 NEXT = """\
 Next:
   watch what ten answers change        {video}
@@ -65,7 +66,7 @@ def main() -> None:
 
     print("\n2. Thirty new goals, hidden: each is found by ten answers to `which of these is better?`, without reward.")
     files = ["--json", str(out / "PointGoal.json"), "--plot", str(out / "PointGoal.png")]
-    run("adapt", "--model", str(model), "--oracle", "return", "--queries", "10", "--tasks", "30", *files)
+    run("adapt", "--model", str(model), *ADAPTATION, *files)
 
     print("\n3. The same with a model that ships with the package: a robot that runs at a speed nobody tells it.")
     files = ["--json", str(out / "HalfCheetahVel.json"), "--plot", str(out / "HalfCheetahVel.png")]
@@ -74,7 +75,7 @@ def main() -> None:
         files += ["--video", str(video)]
     else:
         print("(No video: there is neither a display nor off-screen OpenGL here; apt-get install libegl1 libgl1.)")
-    run("adapt", "--model", "HalfCheetahVel", "--oracle", "return", "--queries", "10", "--tasks", "30", *files)
+    run("adapt", "--model", "HalfCheetahVel", *ADAPTATION, *files)
 
     print(f"\nDone in {time.perf_counter() - started:.0f} s. The model is {model}; tables and plots are in {out}/.\n")
     program = Path(sys.executable).with_name("sb3-poem")

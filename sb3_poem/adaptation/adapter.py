@@ -54,7 +54,9 @@ class PreferenceAdapter:
         "bayes" and "worst-case" for "paper".
     :param n_candidates: Candidate latents (N_z).
     :param epsilon: Tolerated error of eq. 9, in [0, 0.5); used by the paper's rules.
-    :param candidates: Where candidates come from: "prior" (N(0, I)) or "aggregate" (the training tasks' posteriors, widened).
+    :param candidates: Where candidates come from: "prior" (N(0, I)) or "aggregate" (the training tasks'
+        posteriors and what lies between neighbours); None takes "aggregate" for "bayes", and for "paper" Algorithm 2's own
+        "prior".
     :param likelihood: For "bayes": "decoder" (predicted returns of the trajectories shown) or "similarity" (S); None
         takes the decoder where the model has one.
     :param decision: For "bayes": "expected-fitness", "posterior-mean" or "most-likely".
@@ -77,7 +79,7 @@ class PreferenceAdapter:
         query_rule: str | None = None,
         n_candidates: int = 100,
         epsilon: float = 0.1,
-        candidates: str = "prior",
+        candidates: str | None = None,
         likelihood: str | None = None,
         decision: str = "expected-fitness",
         noise_model: NoiseModel | None = None,

@@ -17,10 +17,10 @@ class AdaptationEvalCallback(EpochCallback):
     """
     Adapts the model to held-out tasks from preferences while it trains, logs how well that goes, and keeps the best model.
 
-    Logs ``eval/return_after_<k>_queries`` for each k, ``eval/known_task_return`` (the best of many latents for each task),
-    ``eval/preference_accuracy`` and ``eval/kendall_tau`` of Property 1, ``eval/coverage_loss`` (the return that is lost by
-    replacing each training task's latent by the nearest of 1,000 prior draws). It has its own generators: training is the same with it and
-    without it. Evaluation steps do not count as training steps.
+    Logs ``eval/return_after_<k>_queries`` for each k, ``eval/known_task_return`` (the best of many latents for each
+    task), ``eval/preference_accuracy`` and ``eval/kendall_tau`` of Property 1, ``eval/coverage_loss`` (the return that is
+    lost by replacing each training task's latent by the nearest of 1,000 prior draws). It has its own generators:
+    training is the same with it and without it. Evaluation steps do not count as training steps.
 
     :param every: Epochs between two evaluations
     :param n_tasks: Held-out tasks; a finite family is evaluated on all its tasks
@@ -68,9 +68,9 @@ class AdaptationEvalCallback(EpochCallback):
 
     def _on_epoch(self) -> None:
         env, tasks = self._make_env()
-        options = {"seed": self.seed, "n_episodes": self.n_episodes}
+        options: dict[str, Any] = {"seed": self.seed, "n_episodes": self.n_episodes}
         result = evaluate_adaptation(self.model, env, tasks, record_at=self.record_at, **options, **self.adaptation_kwargs)
-        known = known_task_return(self.model, env, tasks, **options)  # type: ignore[arg-type]
+        known = known_task_return(self.model, env, tasks, **options)
         metrics = {f"return_after_{k}_queries": result.after(k) for k in self.record_at}
         metrics["known_task_return"] = known.mean_return
         metrics["coverage_loss"] = self._coverage_loss(env)

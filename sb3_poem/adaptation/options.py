@@ -26,7 +26,7 @@ class AdaptationOptions:
     query_rule: str | None = None
     n_candidates: int = 100
     epsilon: float = 0.1
-    candidates: str = "prior"
+    candidates: str | None = None
     likelihood: str | None = None
     decision: str = "expected-fitness"
     noise_model: NoiseModel | None = None
@@ -54,19 +54,18 @@ class AdaptationOptions:
         :return: The inference.
         :raises ValueError: If an option is out of its range, or needs what the model does not have.
         """
+        candidates = self.candidates or ("aggregate" if self.inference == "bayes" else "prior")
         if self.inference == "paper":
             if library is not None:
                 raise ValueError('a `library` needs inference="bayes": Algorithm 2 compares its own candidates')
             if not hasattr(model, "similarity"):
                 raise ValueError(f'inference="paper" needs a model with a similarity S; {type(model).__name__} has none')
-            return PaperInference(
-                model, self.n_candidates, self.epsilon, self.candidates, self.query_rule or "worst-case", rng
-            )
+            return PaperInference(model, self.n_candidates, self.epsilon, candidates, self.query_rule or "worst-case", rng)
         return BayesInference(
             model,
             self.n_candidates,
             self.epsilon,
-            self.candidates,
+            candidates,
             self.query_rule or "information-gain",
             rng,
             self.likelihood,

@@ -53,13 +53,18 @@ def _add_adapt_arguments(parser: argparse.ArgumentParser) -> None:
     questions.add_argument("--inference", choices=("paper", "bayes"), default="bayes", help="default: %(default)s")
     rules = ("worst-case", "information-gain", "random")
     questions.add_argument("--query-rule", choices=rules, help="how questions are chosen (default: the inference rule's own)")
-    questions.add_argument("--candidates", choices=("prior", "aggregate"), help="default: the adapter's own")
+    questions.add_argument(
+        "--candidates", choices=("prior", "aggregate"), help="default: aggregate for bayes, prior for paper"
+    )
 
     tasks = parser.add_argument_group("test tasks")
     tasks.add_argument("--tasks", type=_count(1), help="how many, drawn anew (default: 30; 1 with --oracle human)")
     tasks.add_argument("--task", type=float, nargs="+", metavar="X", help="this one task instead, its numbers one by one")
     tasks.add_argument("--episodes", type=_count(1), default=10, help="per task and evaluation (default: %(default)s)")
     tasks.add_argument("--seed", type=_count(0), default=0, help="of the test tasks and of everything else (default: 0)")
+    tasks.add_argument(
+        "--record", type=_count(0), nargs="+", metavar="K", help="measure after so many answers (default: each)"
+    )
 
     output = parser.add_argument_group("output")
     output.add_argument("--json", type=Path, metavar="FILE", help="write every task's returns, with versions and command")

@@ -10,6 +10,9 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+
+# A model that rl_zoo3 trained may hold its schedules. Importing it replaces Gymnasium's TimeLimit, so it comes first.
+import rl_zoo3  # noqa: F401
 from rich.console import Console
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
@@ -101,6 +104,8 @@ class Adaptation:
         self.env_id: str = env_id
         self.env_kwargs = parse_env_kwargs(arguments.env_kwargs)
         self.env = self._make_env()
+        if arguments.record and max(arguments.record) > arguments.queries:
+            raise ValueError(f"--record {max(arguments.record)} is more than --queries {arguments.queries}")
         family = FamilyEnv(self.env)
         try:
             family.check_same_family(self.model.task_space, self.model.reward_feature_dim)
@@ -146,7 +151,7 @@ class Adaptation:
             self.env,
             self.tasks,
             factories[arguments.oracle],
-            record_at=range(arguments.queries + 1),
+            record_at=arguments.record or range(arguments.queries + 1),
             n_episodes=arguments.episodes,
             seed=self.seed,
             progress_bar=True,
@@ -179,7 +184,7 @@ class Adaptation:
         if arguments.task is not None:
             return self._evaluate(np.array(latents), answers)
         if arguments.video is not None:
-            self._film(self.tasks[0], latents[0], latents[-1])
+            self._film(self.tasks[0], np.stack([latents[0], latents[-1]]), (0, len(answers)))
         return None
 
     def _evaluate(self, latents: np.ndarray, answers: list[Preference]) -> AdaptationEvaluation:
@@ -217,7 +222,7 @@ class Adaptation:
         title = f"{self.env_id}, {len(self.tasks)} task{'s' * (len(self.tasks) > 1)}, {arguments.oracle} oracle"
         Report(title, settings, evaluation, known).write(self.console, arguments.json, arguments.plot)
         if arguments.video is not None:
-            self._film(self.tasks[0], evaluation.latents[0, 0], evaluation.latents[0, -1])
+            self._film(self.tasks[0], evaluation.latents[0, [0, -1]], (evaluation.record_at[0], evaluation.record_at[-1]))
 
     def _make_rendering_env(self, show_task: bool) -> gym.Env:
         options = {"render_task": True} if show_task else {}
@@ -226,21 +231,15 @@ class Adaptation:
             raise ValueError(f"{self.env_id} cannot be filmed: it has no render mode 'rgb_array'")
         return env
 
-    def _film(self, task: np.ndarray, before: np.ndarray, after: np.ndarray) -> None:
-        """Film one task before the first and after the last answer, from the same start."""
+    def _film(self, task: np.ndarray, latents: np.ndarray, answers: tuple[int, int]) -> None:
+        """Film the policies of two latents, (2, latent_dim), on one task from the same start: after so many answers each."""
         path: Path = self.arguments.video
         task_matters = self.arguments.oracle != "human" or self.arguments.task is not None
         env = DummyVecEnv([partial(self._make_rendering_env, show_task=task_matters)])
         with self.console.status("Filming"):
-            clips = rollout_latents(
-                self.model,
-                env,
-                np.stack([before, after]),
-                np.stack([task, task]),
-                [evaluation_seed(self.seed)] * 2,
-                frames=True,
-            )
-            captions = ["before the first answer", f"after {self.arguments.queries} answers"]
+            seeds = [evaluation_seed(self.seed)] * 2
+            clips = rollout_latents(self.model, env, latents, np.stack([task, task]), seeds, frames=True)
+            captions = [f"after {n} answer{'s' * (n != 1)}" for n in answers]
             if task_matters:
                 for i, clip in enumerate(clips):
                     assert clip.reward_features is not None

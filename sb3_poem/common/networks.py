@@ -4,12 +4,13 @@ Hidden layers may run in bfloat16 under autocast; every output layer runs in flo
 their differences in eight bits of mantissa.
 """
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
 import torch as th
 from torch import nn
-from torch.nn import functional as F
+from torch.nn.functional import softplus
 
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
 MIN_FACTOR_VARIANCE = 1e-7
@@ -32,7 +33,7 @@ class MLP(nn.Module):
         super().__init__()
         widths = [in_dim, *net_arch]
         layers: list[nn.Module] = []
-        for width, next_width in zip(widths[:-1], widths[1:], strict=True):
+        for width, next_width in itertools.pairwise(widths):
             layers += [nn.Linear(width, next_width), activation_fn()]
         self.hidden = nn.Sequential(*layers)
         self.output = nn.Linear(widths[-1], out_dim)
@@ -66,7 +67,7 @@ class EnsembleMLP(nn.Module):
         widths = [in_dim, *net_arch, out_dim]
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
-        for fan_in, fan_out in zip(widths[:-1], widths[1:], strict=True):
+        for fan_in, fan_out in itertools.pairwise(widths):
             bound = 1.0 / np.sqrt(fan_in)  # nn.Linear's own initialisation
             self.weights.append(nn.Parameter(th.empty(n_members, fan_in, fan_out).uniform_(-bound, bound)))
             self.biases.append(nn.Parameter(th.empty(n_members, 1, fan_out).uniform_(-bound, bound)))
@@ -112,7 +113,7 @@ class ContextEncoder(nn.Module):
         :return: mean and variance, each (tasks, latent_dim)
         """
         mean, raw_variance = self.mlp(context).chunk(2, dim=-1)
-        precision = 1.0 / F.softplus(raw_variance).clamp(min=MIN_FACTOR_VARIANCE)
+        precision = 1.0 / softplus(raw_variance).clamp(min=MIN_FACTOR_VARIANCE)
         variance = 1.0 / precision.sum(dim=-2)
         return variance * (precision * mean).sum(dim=-2), variance
 
@@ -157,7 +158,7 @@ class LatentActor(nn.Module):
             return th.tanh(mean), None
         pre_tanh = mean + log_std.exp() * noise
         # log(1 - tanh(x)^2) = 2 (log 2 - x - softplus(-2 x)) does not saturate
-        log_jacobian = 2.0 * (np.log(2.0) - pre_tanh - F.softplus(-2.0 * pre_tanh))
+        log_jacobian = 2.0 * (np.log(2.0) - pre_tanh - softplus(-2.0 * pre_tanh))
         log_prob = -0.5 * noise.pow(2) - log_std - 0.5 * np.log(2.0 * np.pi) - log_jacobian
         return th.tanh(pre_tanh), log_prob.sum(dim=-1)
 

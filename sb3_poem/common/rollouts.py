@@ -234,14 +234,14 @@ def _wave(
     stacked_observations = np.stack(seen, axis=1) if keep else None  # (copies, steps + 1, obs_dim)
     stacked_actions = np.stack(taken, axis=1) if keep else None  # (copies, steps, act_dim)
     for copy in range(n):
-        length = lengths[copy]
+        steps = int(lengths[copy])
         yield _Episode(
             observations=last_observations[copy : copy + 1]
             if stacked_observations is None
-            else stacked_observations[copy, : length + 1].copy(),
-            actions=np.empty((0, 0)) if stacked_actions is None else stacked_actions[copy, :length].copy(),
+            else stacked_observations[copy, : steps + 1].copy(),
+            actions=np.empty((0, 0)) if stacked_actions is None else stacked_actions[copy, :steps].copy(),
             latent=latents[copy].copy(),
-            reward_features=None if stacked_features is None else stacked_features[copy, :length].copy(),
+            reward_features=None if stacked_features is None else stacked_features[copy, :steps].copy(),
             frames=images[copy] if frames else None,
         )
 
@@ -314,7 +314,7 @@ def _reward_features(vec_env: VecEnv, infos: Sequence[dict[str, Any]], running: 
     present = [row for row, needed in zip(rows, running, strict=True) if needed]
     if any(row is None for row in present):
         return None
-    width = np.shape(present[0])
+    width = np.asarray(present[0]).shape
     return np.stack([np.zeros(width) if row is None else np.asarray(row, dtype=np.float64) for row in rows])
 
 

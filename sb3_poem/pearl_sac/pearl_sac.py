@@ -1,37 +1,29 @@
 """Soft actor-critic with a probabilistic task context: what POEM and its baselines share."""
 
-import io
-import pathlib
 import time
-import zipfile
 from collections.abc import Iterable
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
-import gymnasium as gym
 import numpy as np
 import torch as th
-from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.common.buffers import ContextStore, Segment, TaskBatch, TaskReplayBuffer
-from sb3_poem.common.checkpoint import read_checkpoint, restore_stores, save_checkpoint
 from sb3_poem.common.collection import collect_segment
 from sb3_poem.common.family import FamilyEnv
-from sb3_poem.common.files import write_atomically
 from sb3_poem.common.precision import autocast_dtype
-from sb3_poem.common.pretrained import from_pretrained, save_pretrained
 from sb3_poem.common.random import Generators
+from sb3_poem.pearl_sac.persistence import DEFAULT_TRAIN_TASKS, PersistentSAC
 from sb3_poem.pearl_sac.policies import LatentPolicy, MlpPolicy
 
 SelfPEARLSAC = TypeVar("SelfPEARLSAC", bound="PEARLSAC")
 
-DEFAULT_TRAIN_TASKS = 120
 MIN_STD = 1e-3
+AGGREGATE_NEIGHBOURS = 5
 
 
 class MetaBatch(NamedTuple):
@@ -48,12 +40,12 @@ class MetaBatch(NamedTuple):
     returns: th.Tensor
 
 
-class PEARLSAC(SAC):
+class PEARLSAC(PersistentSAC):
     """Context-based meta-RL on soft actor-critic (PEARL, https://arxiv.org/abs/1903.08254).
 
     Training alternates between an epoch's collection, in which every training task is rolled out under its own latest
-    latent, and gradient steps on meta-batches of tasks. It keeps a replay buffer for every task and the contexts of the last epoch,
-    and learns a context encoder, a latent-conditioned actor and critics, and a reward decoder together.
+    latent, and gradient steps on meta-batches of tasks. It keeps a replay buffer for every task and the contexts of the last
+    epoch, and learns a context encoder, a latent-conditioned actor and critics, and a reward decoder together.
 
     :param policy: The policy model to use (MlpPolicy)
     :param env: A task family: an environment, a vectorised environment, or a registered id (which is then vectorised)
@@ -98,10 +90,27 @@ class PEARLSAC(SAC):
     #: Constructor argument -> attribute, for what :meth:`save_pretrained` keeps
     saved_arguments: ClassVar[dict[str, str]] = {
         name: name
-        for name in (
-            "batch_size buffer_size tau gamma gradient_steps n_train_tasks meta_batch_size context_size trajectories_per_task "
-            "latent_dim kl_coef reward_coef policy_coef relabel_fraction reward_scale horizon precision seed"
-        ).split()
+        for name in [
+            "batch_size",
+            "buffer_size",
+            "tau",
+            "gamma",
+            "gradient_steps",
+            "target_update_interval",
+            "n_train_tasks",
+            "meta_batch_size",
+            "context_size",
+            "trajectories_per_task",
+            "latent_dim",
+            "kl_coef",
+            "reward_coef",
+            "policy_coef",
+            "relabel_fraction",
+            "reward_scale",
+            "horizon",
+            "precision",
+            "seed",
+        ]
     }
 
     def __init__(
@@ -147,6 +156,8 @@ class PEARLSAC(SAC):
             ("buffer_size", buffer_size, 1),
             ("n_train_tasks", 1 if n_train_tasks is None else n_train_tasks, 1),
             ("gradient_steps", gradient_steps, -1),
+            ("learning_starts", learning_starts, 0),
+            ("target_update_interval", target_update_interval, 1),
             ("kl_coef", kl_coef, 0),
             ("reward_coef", reward_coef, 0),
             ("policy_coef", policy_coef, 0),
@@ -155,8 +166,9 @@ class PEARLSAC(SAC):
                 raise ValueError(f"{name} must be at least {low}, got {value}")
         if reward_scale != "auto" and not (isinstance(reward_scale, (int, float)) and reward_scale > 0):
             raise ValueError(f'reward_scale must be a positive number or "auto", got {reward_scale!r}')
-        if not 0.0 <= relabel_fraction <= 1.0:
-            raise ValueError(f"relabel_fraction must lie in [0, 1], got {relabel_fraction}")
+        for name, value in (("gamma", gamma), ("tau", tau), ("relabel_fraction", relabel_fraction)):
+            if not 0.0 <= value <= 1.0:
+                raise ValueError(f"{name} must lie in [0, 1], got {value}")
         autocast_dtype(precision, "cpu")  # refuses an unknown name now rather than at the first step
         self.n_train_tasks = n_train_tasks
         self.meta_batch_size = meta_batch_size
@@ -168,7 +180,7 @@ class PEARLSAC(SAC):
         self.policy_coef = policy_coef
         self.relabel_fraction = relabel_fraction
         self.reward_scale = reward_scale
-        self.horizon = horizon  # type: ignore[assignment]
+        self.horizon = horizon
         self.precision = precision
         self.train_tasks: np.ndarray | None = None
         self.latent_means: np.ndarray | None = None
@@ -204,24 +216,11 @@ class PEARLSAC(SAC):
 
     # ------------------------------------------------------------------ setting up
 
-    @staticmethod
-    def _vectorise(env: GymEnv | str, n_train_tasks: int | None) -> GymEnv | str:
-        """A registered id of a family that has a vectorised version becomes one copy per training task."""
-        if isinstance(env, str):
-            import poem_envs  # noqa: F401
-
-            spec = gym.spec(env)
-            if spec.vector_entry_point is not None:
-                from sb3_poem.common.vec_env import TaskVecEnv
-
-                return TaskVecEnv.from_id(env, n_train_tasks or DEFAULT_TRAIN_TASKS)
-        return env
-
     def _setup_model(self) -> None:
         self.policy_kwargs.pop("use_sde", None)
         if self.env is not None:
             self._family = self._family_of(self.env)
-            self.horizon: int = self._family.horizon
+            self.horizon = self._family.horizon
         self.generators = getattr(self, "generators", None) or Generators(self.seed, self.device)
         self.generators.to(self.device)
         if self.train_tasks is None:
@@ -298,19 +297,23 @@ class PEARLSAC(SAC):
 
         :param n: How many
         :param rng: Generator to use
-        :param source: "prior": N(0, I). "aggregate": the mixture of the training tasks' posteriors, widened by a kernel of
-            Silverman's bandwidth, so that tasks between the training tasks are covered too
+        :param source: "prior": N(0, I). "aggregate": the training tasks' posteriors, and what lies between a task and its
+            nearest neighbours, so that tasks between the training tasks are covered but untrained regions are not
         """
-        assert self.latent_means is not None and self.latent_variances is not None
         if source == "prior":
             return rng.standard_normal((n, self.latent_dim))
         if source != "aggregate":
             raise ValueError(f'source must be "prior" or "aggregate", got {source!r}')
-        count, dim = self.latent_means.shape
-        bandwidth = (4.0 / (dim + 2.0) / count) ** (1.0 / (dim + 4.0)) * self.latent_means.std(axis=0)
-        chosen = rng.integers(count, size=n)
-        std = np.sqrt(self.latent_variances[chosen] + bandwidth**2)
-        return self.latent_means[chosen] + std * rng.standard_normal((n, dim))
+        means, variances = self.task_latents, self.latent_variances
+        assert variances is not None
+        chosen = rng.integers(len(means), size=n)
+        draws = means[chosen]
+        n_neighbours = min(AGGREGATE_NEIGHBOURS, len(means) // 4)  # a family of few tasks has nothing in between
+        if n_neighbours:
+            distances = ((means[:, None, :] - means[None, :, :]) ** 2).sum(axis=2)
+            neighbours = distances.argsort(axis=1)[chosen, rng.integers(1, n_neighbours + 1, size=n)]
+            draws = draws + rng.uniform(size=(n, 1)) * (means[neighbours] - draws)
+        return draws + np.sqrt(variances[chosen]) * rng.standard_normal(draws.shape)
 
     def predicted_returns(self, latents: np.ndarray, trajectories: Iterable[Any]) -> np.ndarray:
         """Returns that the reward decoder predicts for trajectories, if each latent were the task's.
@@ -340,7 +343,9 @@ class PEARLSAC(SAC):
         self, env: VecEnv, callback: BaseCallback, *args: Any, log_interval: int | None = None, **kwargs: Any
     ) -> RolloutReturn:
         """Collect one epoch: ``trajectories_per_task`` horizons of every training task under its own latest latent."""
-        assert self.train_tasks is not None and self.latent_means is not None and self.latent_variances is not None
+        assert self.train_tasks is not None
+        assert self.latent_means is not None
+        assert self.latent_variances is not None
         self.policy.set_training_mode(False)
         callback.on_rollout_start()  # between two epochs: evaluations and checkpoints belong here
         self._dump_pending_logs(log_interval)
@@ -492,7 +497,8 @@ class PEARLSAC(SAC):
         self.policy.optimizer.step()
 
     def _update_targets(self) -> None:
-        targets, sources = list(self.policy.critic_target.parameters()), list(self.policy.critic.parameters())
+        targets: list[th.Tensor] = list(self.policy.critic_target.parameters())
+        sources: list[th.Tensor] = list(self.policy.critic.parameters())
         with th.no_grad():
             th._foreach_lerp_(targets, sources, self.tau)
 
@@ -677,7 +683,8 @@ class PEARLSAC(SAC):
 
     def _record_latent_statistics(self) -> None:
         """Log the information in the latents, and how far their aggregate is from the prior."""
-        assert self.latent_means is not None and self.latent_variances is not None
+        assert self.latent_means is not None
+        assert self.latent_variances is not None
         self.logger.record("train/kl_ideal", float(np.log(len(self.latent_means))))
         mean, second = self.latent_means.mean(axis=0), self.latent_variances.mean(axis=0) + self.latent_means.var(axis=0)
         gap = 0.5 * float((mean**2 + second - 1.0 - np.log(second)).sum())
@@ -724,87 +731,6 @@ class PEARLSAC(SAC):
         """Finish the ``learn`` that a checkpoint interrupted, up to its own ``total_timesteps``."""
         remaining = max(0, self._total_timesteps - self.num_timesteps)
         return self.learn(remaining, callback, log_interval=log_interval, reset_num_timesteps=False, progress_bar=progress_bar)
-
-    def save(
-        self,
-        path: str | pathlib.Path | io.BufferedIOBase,
-        exclude: Iterable[str] | None = None,
-        include: Iterable[str] | None = None,
-    ) -> None:
-        """As SB3's, but a file is written completely or not at all."""
-        if isinstance(path, io.BufferedIOBase):
-            super().save(path, exclude, include)
-            return
-        archive = io.BytesIO()
-        super().save(archive, exclude, include)  # type: ignore[arg-type]
-        path = pathlib.Path(path)
-        write_atomically(path if path.suffix else path.with_suffix(".zip"), archive.getbuffer())
-
-    @classmethod
-    def load(  # type: ignore[override]
-        cls: type[SelfPEARLSAC], path: str | pathlib.Path | io.BufferedIOBase, env: GymEnv | str | None = None, **kwargs: Any
-    ) -> SelfPEARLSAC:
-        """As SB3's; ``env`` may be a registered id too.
-
-        :raises ValueError: if the file is truncated or holds another algorithm's model, or env is of another family
-        """
-        try:
-            data, _, _ = load_from_zip_file(path, device="cpu", load_data=True)
-        except (zipfile.BadZipFile, RuntimeError, EOFError, ValueError) as error:
-            raise ValueError(f"{path} is truncated, or no model saved by {cls.__name__}: {error}") from error
-        if data is None:
-            raise ValueError(f"{path} is truncated, or no model saved by {cls.__name__}: it holds no data of a model")
-        if "train_tasks" not in data or ("preference_coef" in data) != hasattr(cls, "similarity"):
-            raise ValueError(f"{path} holds a model of another algorithm, not of {cls.__name__}")
-        if isinstance(path, io.BufferedIOBase):
-            path.seek(0)
-        env = env if env is None else cls._vectorise(env, len(data["train_tasks"]))
-        return super().load(path, env=env, **kwargs)  # type: ignore[arg-type]
-
-    def save_checkpoint(self, path: str | pathlib.Path) -> None:
-        """Write everything to one file, from which :meth:`load_checkpoint` continues bit for bit. Between two epochs only.
-
-        :raises OSError: if it cannot be written; a previous checkpoint stays whole
-        """
-        save_checkpoint(self, path)
-
-    @classmethod
-    def load_checkpoint(
-        cls: type[SelfPEARLSAC], path: str | pathlib.Path, env: GymEnv | str | None = None, device: th.device | str = "auto"
-    ) -> SelfPEARLSAC:
-        """Read a checkpoint; :meth:`resume` then continues the run.
-
-        :param path: A file that :meth:`save_checkpoint` or :class:`TrainingCheckpointCallback` wrote
-        :param env: An environment like the run's own: the same family and number of copies
-        :param device: "auto", "cpu", "cuda"
-        :raises ValueError: if the file is truncated or holds another algorithm's run, or env is of another family
-        """
-        state = read_checkpoint(path, cls.__name__)
-        model = cls.load(io.BytesIO(state["model"].numpy().tobytes()), env, device=device)
-        restore_stores(model, state)
-        return model
-
-    def save_pretrained(self, folder: str | pathlib.Path, card: dict[str, Any] | None = None) -> None:
-        """Write safetensors, JSON and a model card; see :func:`sb3_poem.common.pretrained.save_pretrained`."""
-        save_pretrained(self, folder, card)
-
-    @classmethod
-    def from_pretrained(
-        cls: type[SelfPEARLSAC],
-        folder: str | pathlib.Path,
-        env: GymEnv | str | None = None,
-        device: th.device | str = "auto",
-    ) -> SelfPEARLSAC:
-        """Read what :meth:`save_pretrained` wrote; see :func:`sb3_poem.common.pretrained.from_pretrained`."""
-        return from_pretrained(cls, folder, env, device)
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_family", "context", "_amp_dtype", "_logs_pending"]
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        state_dicts, variables = super()._get_torch_save_params()
-        kept = [name for name in state_dicts if name not in ("actor.optimizer", "critic.optimizer")]
-        return [*kept, "policy.optimizer"], variables
 
 
 def _rows(latents: th.Tensor, n: int) -> th.Tensor:

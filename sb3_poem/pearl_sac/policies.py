@@ -7,7 +7,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
@@ -201,7 +201,8 @@ class LatentPolicy(SACPolicy):
         actions = np.clip(actions, self.action_space.low, self.action_space.high)  # type: ignore[attr-defined]
         return (actions[0] if single else actions), latents  # type: ignore[return-value]
 
-    def _predict(self, observation: th.Tensor, deterministic: bool = False) -> th.Tensor:
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        assert isinstance(observation, th.Tensor)
         latents = np.zeros((observation.shape[0], self.latent_dim))
         noise = None if deterministic else th.randn(observation.shape[0], *self.action_space.shape, device=self.device)  # type: ignore[misc]
         return th.as_tensor(self.act(observation.cpu().numpy(), latents, noise), device=self.device)

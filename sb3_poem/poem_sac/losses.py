@@ -1,7 +1,7 @@
 """The preference loss, for all triples of a meta-batch at once."""
 
 import torch as th
-from torch.nn import functional as F
+from torch.nn.functional import softplus
 
 
 def preference_loss(similarity: th.Tensor, returns: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
@@ -14,12 +14,12 @@ def preference_loss(similarity: th.Tensor, returns: th.Tensor) -> tuple[th.Tenso
     :param returns: (tasks, tasks), J[i, j], NaN where unknown
     :return: loss, and the share of pairs in the right order (NaN without pairs)
     """
-    first, second = th.triu_indices(*similarity.shape, offset=1, device=similarity.device)
+    first, second = th.triu_indices(similarity.shape[0], similarity.shape[1], offset=1, device=similarity.device)
     margin = similarity[:, first] - similarity[:, second]  # (tasks, pairs)
     difference = returns[:, first] - returns[:, second]
     ordered = difference.isfinite() & (difference != 0)
     sign = difference.nan_to_num().sign()
-    losses = th.where(ordered, F.softplus(-sign * margin), 0.0)
+    losses = th.where(ordered, softplus(-sign * margin), 0.0)
     n_pairs = ordered.sum()
     accuracy = ((sign * margin > 0) & ordered).sum() / n_pairs
     return losses.sum() / n_pairs.clamp(min=1), accuracy

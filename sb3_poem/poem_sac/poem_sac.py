@@ -29,8 +29,8 @@ class POEMSAC(PEARLSAC):
     current policies with their action values (eq. 8); an encoder that learns from the actor as well.
 
     Differences from the paper: twin target critics and a learned entropy coefficient, as SB3's SAC has them, instead of a
-    value network; a replay buffer that outlives the epoch for the critics and the actor, while contexts and preference labels are
-    the last epoch's only.
+    value network; a replay buffer that outlives the epoch for the critics and the actor, while contexts and preference
+    labels are the last epoch's only; the critics' loss trains the encoder too, as in PEARL.
 
     All arguments of :class:`PEARLSAC`, and:
 
@@ -100,7 +100,7 @@ class POEMSAC(PEARLSAC):
         ):
             if value not in known:
                 raise ValueError(f"{name} must be one of {', '.join(map(repr, known))}, got {value!r}")
-        if preference_coef < 0:
+        if not preference_coef >= 0:
             raise ValueError(f"preference_coef must be at least 0, got {preference_coef}")
         if preference_group_size < 2:
             raise ValueError(f"preference_group_size must be at least 2, got {preference_group_size}")
@@ -181,9 +181,9 @@ class POEMSAC(PEARLSAC):
         if self._relabels:
             returns = relabelled_returns(self.family.compute_reward, self.train_tasks, epoch.features, epoch.first_episode)
             return returns.reshape(n_tasks, n_tasks, -1).mean(axis=2)
-        returns = super()._measure_returns(epoch, callback)
-        assert returns is not None
-        return self._measure_by_rollouts(returns, epoch, callback)
+        own = super()._measure_returns(epoch, callback)
+        assert own is not None
+        return self._measure_by_rollouts(own, epoch, callback)
 
     def _measure_by_rollouts(self, returns: np.ndarray, epoch: Segment, callback: BaseCallback) -> np.ndarray | None:
         """Run the policies of random groups of tasks on each other's tasks; the transitions go to the tasks' buffers."""

@@ -1,0 +1,154 @@
+"""How far do ten answers take a model? Trains it where it is missing, adapts it under both rules, and records every figure.
+
+    python benchmarks/adaptation.py poem/HalfCheetahVel-v0 --seeds 0 1 2
+
+For every seed: ``sb3-poem train`` (continued from its checkpoint if it was interrupted, skipped if it is done), then
+``sb3-poem adapt`` for each rule and source of candidates, on 30 fresh test tasks with 10 episodes each. The result is
+``benchmarks/results/adaptation-<Family>.json`` and a table of the same name in Markdown.
+"""
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+RESULTS = Path(__file__).parent / "results"
+PROGRAM = [sys.executable, "-m", "sb3_poem.cli"]
+RULES = (("paper", "prior"), ("paper", "aggregate"), ("bayes", "prior"), ("bayes", "aggregate"))
+COLUMNS = (0, 1, 2, 3, 5, 10)
+
+
+def shown(command: list[str]) -> str:
+    """A command as a reader types it."""
+    return " ".join(["sb3-poem", *command])
+
+
+def train(env_id: str, seed: int, folder: Path, algorithm: str, extra: list[str]) -> tuple[Path, dict[str, Any]]:
+    """Train one model, or find it; returns its file and how it was made."""
+    name = env_id.replace("/", "-")
+    record_file, finished = folder / "training.json", sorted(folder.glob(f"{algorithm}/*/{name}.zip"))
+    if record_file.exists() and finished:
+        return finished[-1], json.loads(record_file.read_text())
+    checkpoints = sorted(folder.glob(f"{algorithm}/*/checkpoint.zip"), key=lambda path: path.stat().st_mtime)
+    command = ["train", "--algo", algorithm, "--env", env_id, "--seed", str(seed), "--eval-freq", "-1", *extra]
+    logging = ["-f", str(folder), "--save-freq", "120000", *(["-i", str(checkpoints[-1])] if checkpoints else [])]
+    started = time.time()
+    subprocess.run([*PROGRAM, *command, *logging], check=True)
+    record = {
+        "command": shown(command),
+        "seed": seed,
+        "commit": subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip(),
+        "machine": f"{platform.processor() or platform.machine()}, {len(os.sched_getaffinity(0))} cores",
+        "wall_seconds": None if checkpoints else round(time.time() - started),
+    }
+    record_file.write_text(json.dumps(record, indent=2))
+    return sorted(folder.glob(f"{algorithm}/*/{name}.zip"))[-1], record
+
+
+def adapt(env_id: str, model: Path, rule: str, candidates: str, test_seed: int, out: Path) -> dict[str, Any]:
+    """Adapt one model to 30 fresh tasks under one rule."""
+    command = ["adapt", "--env", env_id, "--tasks", "30", "--episodes", "10", "--queries", "10", "--seed", str(test_seed)]
+    command += ["--record", *map(str, COLUMNS), "--inference", rule, "--candidates", candidates]
+    if not out.exists():
+        subprocess.run([*PROGRAM, *command, "--model", str(model), "--json", str(out)], check=True)
+    return {**json.loads(out.read_text()), "command": shown([*command, "--model", model.name]), "model": model.name}
+
+
+def order_on_test_tasks(env_id: str, model_file: Path, test_seed: int) -> dict[str, float]:
+    """Property 1 on test tasks: preference accuracy and Kendall's tau."""
+    from sb3_poem.adaptation.evaluation import known_task_return, preference_order
+    from sb3_poem.cli.models import load_model
+    from sb3_poem.common.family import FamilyEnv
+    from sb3_poem.common.vec_env import TaskVecEnv
+
+    model = load_model(str(model_file))
+    env = TaskVecEnv.from_id(env_id, 60)
+    family = FamilyEnv(env)
+    tasks = family.all_tasks
+    if tasks is None:
+        tasks = family.sample_tasks(30, np.random.default_rng([test_seed, 77]))
+    known = known_task_return(model, env, tasks, seed=test_seed, selection_episodes=3)
+    accuracy, tau = preference_order(model, known)
+    env.close()
+    return {"preference_accuracy": accuracy, "kendall_tau": tau, "env_steps": model.num_timesteps, "updates": model._n_updates}
+
+
+def table(env_id: str, runs: list[dict[str, Any]]) -> str:
+    """Markdown: one row per seed and rule, and the mean over seeds."""
+    lines = [
+        f"# Adaptation, {env_id}",
+        "",
+        "Mean true return on 30 fresh test tasks, 10 episodes each, after k error-free answers.",
+        "",
+    ]
+    header = ["seed", "rule", "candidates", *(f"k = {k}" for k in COLUMNS), "task known"]
+    lines += ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
+    for run in runs:
+        for result in run["adaptations"]:
+            cells = [f"{value:.1f}" for value in result["mean_return"]]
+            cells = [str(run["training"]["seed"]), result["inference"], result["candidates"], *cells]
+            lines.append("| " + " | ".join([*cells, f"{result['known_task_return']:.1f}"]) + " |")
+        limit = [f"{value:.1f}" for value in run["adaptations"][-1]["limit"]]
+        lines.append("| " + " | ".join([str(run["training"]["seed"]), "*limit*", "", *limit, ""]) + " |")
+    lines += [
+        "",
+        "| seed | environment steps | updates | wall time, s | preference accuracy | Kendall's tau |",
+        "|---|---|---|---|---|---|",
+    ]
+    for run in runs:
+        order, training = run["order"], run["training"]
+        lines.append(
+            f"| {training['seed']} | {order['env_steps']:,} | {order['updates']:,} | {training['wall_seconds']} "
+            f"| {order['preference_accuracy']:.3f} | {order['kendall_tau']:.3f} |"
+        )
+    lines += ["", f"Trained with `{runs[0]['training']['command']}` (and the other seeds),"]
+    lines += [f"adapted with `{runs[0]['adaptations'][0]['command']}` (and the other rules)."]
+    lines += [
+        "Commits: " + ", ".join(run["training"]["commit"] for run in runs) + f". Machine: {runs[0]['training']['machine']}."
+    ]
+    notes = sorted({run["training"]["note"] for run in runs if "note" in run["training"]})
+    return "\n".join([*lines, *notes]) + "\n"
+
+
+def main() -> None:
+    """Train, adapt, record."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("env_id")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--algo", default="poem_sac")
+    parser.add_argument("--runs", type=Path, default=Path("logs/benchmark"), help="where models and checkpoints are kept")
+    parser.add_argument("--train-args", nargs=argparse.REMAINDER, default=[], help="further arguments of sb3-poem train")
+    arguments = parser.parse_args()
+    family = arguments.env_id.split("/")[-1].split("-")[0]
+    runs = []
+    for seed in arguments.seeds:
+        folder = arguments.runs / family / f"seed{seed}"
+        folder.mkdir(parents=True, exist_ok=True)
+        model, training = train(arguments.env_id, seed, folder, arguments.algo, arguments.train_args)
+        test_seed = 100 + seed
+        adaptations = [
+            adapt(arguments.env_id, model, rule, candidates, test_seed, folder / f"adapt-{rule}-{candidates}.json")
+            for rule, candidates in RULES
+        ]
+        runs.append(
+            {
+                "training": training,
+                "adaptations": adaptations,
+                "order": order_on_test_tasks(arguments.env_id, model, test_seed),
+            }
+        )
+        RESULTS.mkdir(exist_ok=True)
+        (RESULTS / f"adaptation-{family}.json").write_text(json.dumps({"env_id": arguments.env_id, "runs": runs}, indent=1))
+        (RESULTS / f"adaptation-{family}.md").write_text(table(arguments.env_id, runs))
+    print(table(arguments.env_id, runs))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,145 @@
+"""How models and training runs are written and read: SB3's zip, checkpoints, and pretrained folders."""
+
+import io
+import pathlib
+import zipfile
+from collections.abc import Iterable
+from typing import Any, ClassVar, TypeVar, cast
+
+import gymnasium as gym
+import torch as th
+from stable_baselines3 import SAC
+from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.type_aliases import GymEnv
+
+from sb3_poem.common.checkpoint import read_checkpoint, restore_stores, save_checkpoint
+from sb3_poem.common.files import write_atomically
+from sb3_poem.common.pretrained import from_pretrained, save_pretrained
+
+SelfPersistent = TypeVar("SelfPersistent", bound="PersistentSAC")
+
+DEFAULT_TRAIN_TASKS = 120
+
+
+class PersistentSAC(SAC):
+    """SAC whose files are written atomically and refuse what is not theirs; the base of :class:`PEARLSAC`."""
+
+    #: Constructor argument -> attribute, for what :meth:`save_pretrained` keeps
+    saved_arguments: ClassVar[dict[str, str]] = {
+        name: name
+        for name in (
+            "batch_size",
+            "buffer_size",
+            "tau",
+            "gamma",
+            "gradient_steps",
+            "target_update_interval",
+            "n_train_tasks",
+            "meta_batch_size",
+            "context_size",
+            "trajectories_per_task",
+            "latent_dim",
+            "kl_coef",
+            "reward_coef",
+            "policy_coef",
+            "relabel_fraction",
+            "reward_scale",
+            "horizon",
+            "precision",
+            "seed",
+        )
+    }
+
+    @staticmethod
+    def _vectorise(env: GymEnv | str, n_train_tasks: int | None) -> GymEnv | str:
+        """A registered id of a family that has a vectorised version becomes one copy per training task."""
+        if isinstance(env, str):
+            import poem_envs  # noqa: F401
+
+            spec = gym.spec(env)
+            if spec.vector_entry_point is not None:
+                from sb3_poem.common.vec_env import TaskVecEnv
+
+                return TaskVecEnv.from_id(env, n_train_tasks or DEFAULT_TRAIN_TASKS)
+        return env
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """As SB3's, but a file is written completely or not at all."""
+        if isinstance(path, io.BufferedIOBase):
+            super().save(path, exclude, include)
+            return
+        archive = io.BytesIO()
+        super().save(archive, exclude, include)  # type: ignore[arg-type]
+        path = pathlib.Path(path)
+        write_atomically(path if path.suffix else path.with_suffix(".zip"), archive.getbuffer())
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls: type[SelfPersistent], path: str | pathlib.Path | io.BufferedIOBase, env: GymEnv | str | None = None, **kwargs: Any
+    ) -> SelfPersistent:
+        """As SB3's; ``env`` may be a registered id too.
+
+        :raises ValueError: if the file is truncated or holds another algorithm's model, or env is of another family
+        """
+        try:
+            data, _, _ = load_from_zip_file(path, device="cpu", load_data=True)
+        except (zipfile.BadZipFile, RuntimeError, EOFError, ValueError) as error:
+            raise ValueError(f"{path} is truncated, or no model saved by {cls.__name__}: {error}") from error
+        if data is None:
+            raise ValueError(f"{path} is truncated, or no model saved by {cls.__name__}: it holds no data of a model")
+        if "train_tasks" not in data or ("preference_coef" in data) != hasattr(cls, "similarity"):
+            raise ValueError(f"{path} holds a model of another algorithm, not of {cls.__name__}")
+        if isinstance(path, io.BufferedIOBase):
+            path.seek(0)
+        env = env if env is None else cls._vectorise(env, len(data["train_tasks"]))
+        return super().load(path, env=env, **kwargs)  # type: ignore[arg-type]
+
+    def save_checkpoint(self, path: str | pathlib.Path) -> None:
+        """Write everything to one file, from which :meth:`load_checkpoint` continues bit for bit. Between two epochs only.
+
+        :raises OSError: if it cannot be written; a previous checkpoint stays whole
+        """
+        save_checkpoint(cast(Any, self), path)
+
+    @classmethod
+    def load_checkpoint(
+        cls: type[SelfPersistent], path: str | pathlib.Path, env: GymEnv | str | None = None, device: th.device | str = "auto"
+    ) -> SelfPersistent:
+        """Read a checkpoint; :meth:`resume` then continues the run.
+
+        :param path: A file that :meth:`save_checkpoint` or :class:`TrainingCheckpointCallback` wrote
+        :param env: An environment like the run's own: the same family and number of copies
+        :param device: "auto", "cpu", "cuda"
+        :raises ValueError: if the file is truncated or holds another algorithm's run, or env is of another family
+        """
+        state = read_checkpoint(path, cls.__name__)
+        model = cls.load(io.BytesIO(state["model"].numpy().tobytes()), env, device=device)
+        restore_stores(cast(Any, model), state)
+        return model
+
+    def save_pretrained(self, folder: str | pathlib.Path, card: dict[str, Any] | None = None) -> None:
+        """Write safetensors, JSON and a model card; see :func:`sb3_poem.common.pretrained.save_pretrained`."""
+        save_pretrained(cast(Any, self), folder, card)
+
+    @classmethod
+    def from_pretrained(
+        cls: type[SelfPersistent],
+        folder: str | pathlib.Path,
+        env: GymEnv | str | None = None,
+        device: th.device | str = "auto",
+    ) -> SelfPersistent:
+        """Read what :meth:`save_pretrained` wrote; see :func:`sb3_poem.common.pretrained.from_pretrained`."""
+        return from_pretrained(cast(Any, cls), folder, env, device)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_family", "context", "_amp_dtype", "_logs_pending"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, variables = super()._get_torch_save_params()
+        kept = [name for name in state_dicts if name not in ("actor.optimizer", "critic.optimizer")]
+        return [*kept, "policy.optimizer"], variables
