@@ -55,8 +55,8 @@ class PreferenceAdapter:
     :param n_candidates: Candidate latents (N_z).
     :param epsilon: Tolerated error of eq. 9, in [0, 0.5); used by the paper's rules.
     :param candidates: Where candidates come from: "prior" (N(0, I)) or "aggregate" (the training tasks'
-        posteriors and what lies between neighbours); None takes "aggregate" for "bayes", and for "paper" Algorithm 2's own
-        "prior".
+        posteriors and what lies between neighbours); None takes the prior, and for
+        "bayes" the aggregate where that is far from the prior.
     :param likelihood: For "bayes": "decoder" (predicted returns of the trajectories shown) or "similarity" (S); None
         takes the decoder where the model has one.
     :param decision: For "bayes": "expected-fitness", "posterior-mean" or "most-likely".

@@ -231,17 +231,17 @@ def _wave(
 
     have_features = all(rows is not None for rows in features)
     stacked_features = np.stack([rows for rows in features if rows is not None], axis=1) if have_features else None
-    stacked_observations = np.stack(seen, axis=1) if keep else None  # (copies, steps + 1, obs_dim)
-    stacked_actions = np.stack(taken, axis=1) if keep else None  # (copies, steps, act_dim)
+    stacked_observations = np.stack(seen, axis=1) if keep else None  # (copies, used + 1, obs_dim)
+    stacked_actions = np.stack(taken, axis=1) if keep else None  # (copies, used, act_dim)
     for copy in range(n):
-        steps = int(lengths[copy])
+        used = int(lengths[copy])
         yield _Episode(
             observations=last_observations[copy : copy + 1]
             if stacked_observations is None
-            else stacked_observations[copy, : steps + 1].copy(),
-            actions=np.empty((0, 0)) if stacked_actions is None else stacked_actions[copy, :steps].copy(),
+            else stacked_observations[copy, : used + 1].copy(),
+            actions=np.empty((0, 0)) if stacked_actions is None else stacked_actions[copy, :used].copy(),
             latent=latents[copy].copy(),
-            reward_features=None if stacked_features is None else stacked_features[copy, :steps].copy(),
+            reward_features=None if stacked_features is None else stacked_features[copy, :used].copy(),
             frames=images[copy] if frames else None,
         )
 
