@@ -233,16 +233,16 @@ def _wave(
     stacked_features = np.stack([rows for rows in features if rows is not None], axis=1) if have_features else None
     stacked_observations = np.stack(seen, axis=1) if keep else None  # (copies, used + 1, obs_dim)
     stacked_actions = np.stack(taken, axis=1) if keep else None  # (copies, used, act_dim)
-    for copy in range(n):
-        used = int(lengths[copy])
+    for row in range(n):
+        used = int(lengths[row])
         yield _Episode(
-            observations=last_observations[copy : copy + 1]
+            observations=last_observations[row : row + 1]
             if stacked_observations is None
-            else stacked_observations[copy, : used + 1].copy(),
-            actions=np.empty((0, 0)) if stacked_actions is None else stacked_actions[copy, :used].copy(),
-            latent=latents[copy].copy(),
-            reward_features=None if stacked_features is None else stacked_features[copy, :used].copy(),
-            frames=images[copy] if frames else None,
+            else stacked_observations[row, : used + 1].copy(),
+            actions=np.empty((0, 0)) if stacked_actions is None else stacked_actions[row, :used].copy(),
+            latent=latents[row].copy(),
+            reward_features=None if stacked_features is None else stacked_features[row, :used].copy(),
+            frames=images[row] if frames else None,
         )
 
 

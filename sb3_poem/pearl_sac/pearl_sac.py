@@ -370,12 +370,12 @@ class PEARLSAC(PersistentSAC):
                 return RolloutReturn(self.num_timesteps - steps_before, 0, continue_training=False)
             self.replay_buffer.extend(segment)
             segments.append(segment)
-        if not self._statistics_known:
-            self._set_statistics(segments)
         epoch = _concatenate(segments, len(wanted))
         returns = self._measure_returns(epoch, callback)
         if returns is None:
             return RolloutReturn(self.num_timesteps - steps_before, 0, continue_training=False)
+        if not self._statistics_known:  # after the returns, which the policies that collected the epoch must earn
+            self._set_statistics(segments)
         self._replace_context(epoch, returns)
         self.epoch += 1
         collected = self.num_timesteps - steps_before
