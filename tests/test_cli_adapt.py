@@ -2,11 +2,13 @@
 
 import io
 import json
+import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rl_zoo3.utils import SimpleLinearSchedule
 
 from sb3_poem import PEARLSAC, POEMSAC, MistakeOracle, PreferenceAdapter, TaskVecEnv, cli
 from sb3_poem.adaptation import evaluate_adaptation, information_limit, known_task_return
@@ -64,8 +66,8 @@ def test_json_holds_what_the_library_measures(model: tuple[POEMSAC, str], tmp_pa
 def test_table_plot_and_video(model: tuple[POEMSAC, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     imageio = pytest.importorskip("imageio.v3")
     plot, video = tmp_path / "plot.png", tmp_path / "video.gif"
-    flags = ["--env", ENV_ID, "--queries", 2, "--tasks", 2, "--episodes", 1, "--plot", plot, "--video", video]
-    assert adapt(model[1], *flags) == 0
+    flags = ["--env", ENV_ID, "--queries", 2, "--tasks", 2, "--episodes", 1, "--record", 0, 2]
+    assert adapt(model[1], *flags, "--plot", plot, "--video", video) == 0
     shown = capsys.readouterr().out
     for words in ("answers", "limit", "std. error", "task known", str(plot), str(video)):
         assert words in shown
@@ -94,6 +96,17 @@ def test_pretrained_folder_and_the_other_algorithm(model: tuple[POEMSAC, str], t
     pearl = PEARLSAC("MlpPolicy", ENV_ID, policy_kwargs={"net_arch": [16, 16]}, **SMALL).learn(300)
     pearl.save(tmp_path / "pearl.zip")
     assert adapt(str(tmp_path / "pearl"), *flags, "--query-rule", "random") == 0
+
+
+def test_a_model_with_a_schedule_of_rl_zoo3_in_a_process_of_its_own(tmp_path: Path) -> None:
+    """Such a model brings rl_zoo3 with it, which replaces one of Gymnasium's wrappers."""
+    model = POEMSAC("MlpPolicy", ENV_ID, SimpleLinearSchedule(1e-3), policy_kwargs={"net_arch": [16, 16]}, **SMALL)
+    model.learn(300).save(tmp_path / "model.zip")
+    flags = ["--model", str(tmp_path / "model"), "--queries", "1", "--tasks", "1", "--episodes", "1"]
+    command = [sys.executable, "-m", "sb3_poem.cli", "adapt", *flags]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "task known" in done.stdout
 
 
 def test_a_person_answers_with_a_task(model: tuple[POEMSAC, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,6 +143,7 @@ def test_a_person_answers_by_their_own_wish(
         (["--task", 99.0, "--episodes", 1], "99"),
         (["--task", 1.0, "--tasks", 3], "--task is one task"),
         (["--oracle", "human", "--tasks", 3], "one task"),
+        (["--queries", 5, "--record", 0, 6], "--record 6 is more than --queries 5"),
         (["--oracle", "human", "--plot", "a.png"], "--plot needs returns"),
         (["--oracle", "mistake", "--mistake-rate", 1.5], "1.5"),
         (["--oracle", "boltzmann", "--beta", -1.0], "-1.0"),
