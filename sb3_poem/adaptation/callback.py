@@ -28,7 +28,8 @@ class AdaptationEvalCallback(EpochCallback):
     :param n_episodes: Episodes of each task and measurement
     :param best_model_save_path: Folder for ``best_model.zip``, the model of the highest return after the most answers
     :param seed: Seed of the held-out tasks and of everything else here
-    :param adaptation_kwargs: Options of :func:`sb3_poem.adaptation.adapt_tasks`, for instance ``inference``
+    :param adaptation_kwargs: Options of :func:`sb3_poem.adaptation.adapt_tasks`, for instance ``inference``. A model without a
+        similarity is asked random queries unless they say otherwise
     :param verbose: 1 prints each result
     :raises ValueError: for a number of tasks or episodes below 1
     """
@@ -61,7 +62,13 @@ class AdaptationEvalCallback(EpochCallback):
         family = self.model.family
         if self._env is None:
             spec = family.env.get_attr("spec", indices=[0])[0]
-            self._env = TaskVecEnv.from_id(spec.id, 2 * self.n_tasks, **spec.kwargs)
+            if spec is None:
+                raise ValueError(
+                    "AdaptationEvalCallback makes copies of the environment, which must be registered with Gymnasium; "
+                    "register it, or call evaluate_adaptation with a vector environment of your own"
+                )
+            limit = spec.max_episode_steps
+            self._env = TaskVecEnv.from_id(spec.id, 2 * self.n_tasks, max_episode_steps=limit, **spec.kwargs)
         if family.all_tasks is not None and len(family.all_tasks) <= self.n_tasks:
             return self._env, family.all_tasks
         return self._env, family.sample_tasks(self.n_tasks, np.random.default_rng(self.seed))
@@ -69,6 +76,8 @@ class AdaptationEvalCallback(EpochCallback):
     def _on_epoch(self) -> None:
         env, tasks = self._make_env()
         options: dict[str, Any] = {"seed": self.seed, "n_episodes": self.n_episodes}
+        if not hasattr(self.model, "similarity"):
+            self.adaptation_kwargs.setdefault("query_rule", "random")
         result = evaluate_adaptation(self.model, env, tasks, record_at=self.record_at, **options, **self.adaptation_kwargs)
         known = known_task_return(self.model, env, tasks, **options)
         metrics = {f"return_after_{k}_queries": result.after(k) for k in self.record_at}

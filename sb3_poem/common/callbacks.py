@@ -52,13 +52,25 @@ class TrainingCheckpointCallback(EpochCallback):
     """Writes a checkpoint from which ``load_checkpoint`` and ``resume`` continue bit for bit, always to the same file.
 
     :param path: The file; it is replaced atomically
-    :param every: Epochs between two checkpoints; the end of training writes one too
+    :param every: Epochs between two checkpoints; the end of training writes one too, unless it was stopped within an epoch
     :param verbose: 1 reports each write
     """
 
     def __init__(self, path: str | Path, every: int = 1, verbose: int = 0) -> None:
         super().__init__(every, verbose)
         self.path = Path(path)
+        self._collecting = False
+
+    def _on_rollout_start(self) -> None:
+        super()._on_rollout_start()
+        self._collecting = True
+
+    def _on_rollout_end(self) -> None:
+        self._collecting = False
+
+    def _on_training_end(self) -> None:
+        if not self._collecting:  # half an epoch could not be continued bit for bit
+            super()._on_training_end()
 
     def _on_epoch(self) -> None:
         self.model.save_checkpoint(self.path)
