@@ -1,0 +1,149 @@
+"""Callbacks between epochs, and evaluation by adaptation while training."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch as th
+from meta_toys import EPOCH, POINT_GOAL, differing, parameters, small, walks
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
+
+from sb3_poem import PEARLSAC, POEMSAC, AdaptationEvalCallback, TrainingCheckpointCallback
+from sb3_poem.common.callbacks import EpochCallback
+
+
+class Note(EpochCallback):
+    """Notes when it is called: (epoch, updates, environment steps)."""
+
+    def _init_callback(self) -> None:
+        self.calls: list[tuple[int, int, int]] = []
+
+    def _on_epoch(self) -> None:
+        self.calls.append((self.model.epoch, self.model._n_updates, self.model.num_timesteps))
+
+
+def after(epoch: int) -> tuple[int, int, int]:
+    """A model between two epochs: it has learned from all that it collected."""
+    return epoch, 5 * epoch, EPOCH * epoch
+
+
+@pytest.mark.parametrize(("every", "expected"), [(1, [1, 2, 3, 4, 5]), (2, [2, 4, 5]), (5, [5]), (9, [5])])
+def test_is_called_between_epochs_and_at_the_end(every: int, expected: list[int]) -> None:
+    note = Note(every)
+    model = small(PEARLSAC).learn(5 * EPOCH, note)
+    assert note.calls == [after(epoch) for epoch in expected]
+    model.learn(EPOCH, note, reset_num_timesteps=False)
+    assert note.calls == [after(6)]  # counted from where training began
+
+
+def test_every_must_be_positive(tmp_path: Path) -> None:
+    for every in (0, -1):
+        with pytest.raises(ValueError, match="every must be at least 1 epoch, got"):
+            EpochCallback(every)
+        with pytest.raises(ValueError, match="every must be at least 1 epoch, got"):
+            TrainingCheckpointCallback(tmp_path / "c.pt", every)
+        with pytest.raises(ValueError, match="every must be at least 1 epoch, got"):
+            AdaptationEvalCallback(every)
+
+
+def test_checkpoints_replace_each_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "runs" / "checkpoint.pt"
+    small(PEARLSAC).learn(3 * EPOCH, TrainingCheckpointCallback(path, every=2, verbose=1))
+    assert [file.name for file in path.parent.iterdir()] == ["checkpoint.pt"]
+    assert PEARLSAC.load_checkpoint(path).num_timesteps == 3 * EPOCH
+    assert capsys.readouterr().out.count("Checkpoint of ") == 2
+
+
+def test_a_stop_within_an_epoch_writes_no_checkpoint_of_half_an_epoch(tmp_path: Path) -> None:
+    """What was collected since the last whole epoch was not learned from, and could not be continued bit for bit."""
+
+    class Stop(BaseCallback):
+        def _on_step(self) -> bool:
+            return self.n_calls < 85  # in the fourth epoch: the third was not written yet
+
+    path = tmp_path / "checkpoint.pt"
+    small(PEARLSAC).learn(5 * EPOCH, [TrainingCheckpointCallback(path, every=2), Stop()])
+    loaded = PEARLSAC.load_checkpoint(path, POINT_GOAL)
+    assert (loaded.epoch, loaded.num_timesteps) == (2, 2 * EPOCH)
+    assert not differing(parameters(loaded.resume()), parameters(small(PEARLSAC).learn(5 * EPOCH)))
+
+
+# ---------------------------------------------------------------- evaluation
+
+QUICK = {"n_tasks": 4, "record_at": (0, 2), "n_episodes": 1}
+METRICS = {"return_after_0_queries", "return_after_2_queries", "known_task_return", "coverage_loss"}
+POEM_METRICS = {"preference_accuracy", "kendall_tau"}
+
+
+@pytest.mark.parametrize("algorithm", [PEARLSAC, POEMSAC])
+def test_evaluation_is_logged_and_changes_nothing(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
+    callback = AdaptationEvalCallback(every=2, best_model_save_path=tmp_path / "best", **QUICK)
+    model = small(algorithm)
+    model.set_logger(configure(str(tmp_path), ["json"]))
+    th.manual_seed(5)
+    model.learn(3 * EPOCH, callback)
+    plain = small(algorithm).learn(3 * EPOCH)
+    assert not differing(parameters(model), parameters(plain))
+    assert model.num_timesteps == plain.num_timesteps
+    assert [episode["r"] for episode in model.ep_info_buffer] == [episode["r"] for episode in plain.ep_info_buffer]
+
+    lines = [json.loads(line) for line in (tmp_path / "progress.json").read_text().splitlines()]
+    metrics = METRICS | (POEM_METRICS if algorithm is POEMSAC else set())
+    evaluated = [line["time/total_timesteps"] for line in lines if "eval/known_task_return" in line]
+    assert evaluated == [2 * EPOCH, 3 * EPOCH]
+    for line in lines[1:]:
+        assert metrics == {name.removeprefix("eval/") for name in line if name.startswith("eval/")}
+        for name in metrics - {"coverage_loss", "preference_accuracy", "kendall_tau"}:
+            assert -60.0 < line[f"eval/{name}"] < 0.0
+    if algorithm is POEMSAC:
+        assert 0.0 <= callback.last_evaluation["preference_accuracy"] <= 1.0
+        assert -1.0 <= callback.last_evaluation["kendall_tau"] <= 1.0
+    returns = [line["eval/return_after_2_queries"] for line in lines[1:]]
+    assert callback.best_return == pytest.approx(max(returns))
+    best = algorithm.load(tmp_path / "best" / "best_model.zip")
+    assert best.num_timesteps == (2 if returns[0] >= returns[1] else 3) * EPOCH
+
+
+def test_evaluation_of_a_finite_family_is_on_all_its_tasks() -> None:
+    callback = AdaptationEvalCallback(n_tasks=5, record_at=(1,), n_episodes=1)
+    model = small(POEMSAC, "poem/HalfCheetahFwdBack-v0", n_train_tasks=2)
+    callback.init_callback(model)
+    env, tasks = callback._make_env()
+    assert sorted(tasks.ravel()) == [-1.0, 1.0]
+    assert env.get_attr("spec")[0].id == "poem/HalfCheetahFwdBack-v0"
+
+
+def test_evaluation_takes_the_training_environments_arguments() -> None:
+    from sb3_poem.common.vec_env import TaskVecEnv
+
+    callback = AdaptationEvalCallback(**QUICK)
+    callback.init_callback(small(POEMSAC, TaskVecEnv.from_id(POINT_GOAL, 3, step_length=0.2, max_episode_steps=7)))
+    env, tasks = callback._make_env()
+    assert env.num_envs == 8
+    assert tasks.shape == (4, 1)
+    spec = env.get_attr("spec")[0]
+    assert spec.kwargs["step_length"] == 0.2
+    assert spec.max_episode_steps == 7
+    again = callback._make_env()
+    assert again[0] is env
+    assert np.array_equal(again[1], tasks)
+
+
+def test_evaluation_needs_a_registered_family() -> None:
+    with pytest.raises(ValueError, match="must be registered with Gymnasium"):
+        small(POEMSAC, walks(2), horizon=10).learn(1, AdaptationEvalCallback(**QUICK))
+
+
+@pytest.mark.parametrize("arguments", [{"n_tasks": 0}, {"n_episodes": 0}])
+def test_evaluation_refuses_nothing_to_do(arguments: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match="n_tasks and n_episodes must be at least 1, got"):
+        AdaptationEvalCallback(**arguments)
+
+
+def test_evaluation_prints_when_asked(capsys: pytest.CaptureFixture[str]) -> None:
+    small(POEMSAC).learn(EPOCH, AdaptationEvalCallback(**QUICK, verbose=1))
+    assert "Evaluation after 300 steps: return_after_0_queries -" in capsys.readouterr().out

@@ -1,0 +1,485 @@
+"""What POEMSAC adds: where preferences come from, its contexts, its embeddings and its ablations."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from meta_toys import EPOCH, N_TASKS, POINT_GOAL, TwoWalks, Walk, WindyWalk, parameters, small, walks
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_poem import PEARLSAC, POEMSAC
+from sb3_poem.common.vec_env import TaskVecEnv
+
+
+def nearly_deterministic(model: PEARLSAC) -> PEARLSAC:
+    """Policies whose noise is below float32: every rollout of a latent is the same."""
+    with th.no_grad():
+        actions = model.action_space.shape[0]
+        model.policy.actor.mlp.output.weight[actions:] = 0.0
+        model.policy.actor.mlp.output.bias[actions:] = -20.0
+    return model
+
+
+# ---------------------------------------------------------------- J
+
+
+def policy_returns(model: PEARLSAC, env: gym.Env, latents: np.ndarray) -> np.ndarray:
+    """(tasks, policies): returns of the mean actions, by stepping one environment in each task."""
+    returns = np.zeros((len(model.train_tasks), len(latents)))
+    for i, task in enumerate(model.train_tasks):
+        for j, latent in enumerate(latents):
+            obs, _ = env.reset(seed=0, options={"task": task})
+            done = False
+            while not done:
+                action, _ = model.predict(obs, state=latent, deterministic=True)
+                obs, reward, terminated, truncated, _ = env.step(action)
+                returns[i, j] += reward
+                done = terminated or truncated
+    return returns
+
+
+class Spy:
+    """Notes every epoch's latents and returns."""
+
+    def __init__(self, model: PEARLSAC) -> None:
+        self.latents: list[np.ndarray] = []
+        self.returns: list[np.ndarray] = []
+        self._replace = model._replace_context
+        model._replace_context = self._note  # type: ignore[method-assign]
+
+    def _note(self, epoch: Any, returns: np.ndarray) -> None:
+        self.latents.append(epoch.latents)
+        self.returns.append(returns.copy())
+        self._replace(epoch, returns)
+
+
+@pytest.fixture(scope="module")
+def sources() -> dict[str, tuple[POEMSAC, Spy]]:
+    """Two epochs of policies that differ only by their latents: equal starts, no noise, no learning."""
+    result = {}
+    for source in ("relabel", "rollout"):
+        env = TaskVecEnv.from_id(POINT_GOAL, 4, reset_noise_scale=0.0)
+        model = small(POEMSAC, env, preference_source=source, gradient_steps=0, n_train_tasks=6, preference_group_size=3)
+        spy = Spy(nearly_deterministic(model))
+        result[source] = model.learn(1), spy
+        model.learn(1, reset_num_timesteps=False)
+    return result
+
+
+@pytest.mark.parametrize("source", ["relabel", "rollout"])
+def test_returns_are_those_of_environments_of_every_task(sources: dict, source: str) -> None:
+    model, spy = sources[source]
+    truth = policy_returns(model, gym.make(POINT_GOAL, reset_noise_scale=0.0), spy.latents[1])
+    assert np.ptp(truth) > 1.0
+    known = np.isfinite(spy.returns[1])
+    assert known.all() == (source == "relabel")
+    np.testing.assert_allclose(spy.returns[1][known], truth[known], atol=1e-3)
+
+
+def test_measured_returns_equal_relabelled_ones(sources: dict) -> None:
+    """In the first epoch, where both see the same policies (and observations are not standardised yet)."""
+    (_, relabelled), (_, measured) = sources["relabel"], sources["rollout"]
+    assert np.array_equal(relabelled.latents[0], measured.latents[0])
+    known = np.isfinite(measured.returns[0])
+    np.testing.assert_allclose(measured.returns[0][known], relabelled.returns[0][known], atol=1e-3)
+
+
+def test_returns_are_measured_within_groups_and_counted(sources: dict) -> None:
+    model, spy = sources["rollout"]
+    groups = model._groups
+    assert sorted(np.concatenate(groups)) == list(range(6))  # every task in one group
+    assert [len(group) for group in groups] == [3, 3]
+    expected = np.zeros((6, 6), dtype=bool)
+    for group in groups:
+        expected[np.ix_(group, group)] = True
+    assert np.array_equal(np.isfinite(spy.returns[1]), expected)
+    # an epoch: 6 tasks in waves of 4, and 2 groups of 3 * 2 pairs in waves of 4; all steps count, and fill the tasks' buffers
+    assert model.num_timesteps == 2 * (2 + 3) * 4 * 25
+    assert model.replay_buffer.counts.sum() == model.num_timesteps
+    assert model.replay_buffer.counts.min() >= 2 * (1 + 2) * 25
+    assert sources["relabel"][0].num_timesteps == 2 * 2 * 4 * 25  # not a step beyond the collection's own
+
+
+def test_meta_batches_are_whole_groups() -> None:
+    model = small(POEMSAC, preference_source="rollout", n_train_tasks=14, meta_batch_size=9, preference_group_size=4).learn(1)
+    assert [len(group) for group in model._groups] == [5, 5, 4]
+    for _ in range(5):
+        batch = model._sample_meta_batch(8)
+        chosen = set(batch.task_ids.tolist())
+        inside = [group for group in model._groups if chosen & set(group)]
+        assert len(inside) == 2
+        assert chosen == {task for group in inside for task in group}
+        # all that is known of these tasks is in the batch: 5 or 4 policies for each
+        known = batch.returns.isfinite()
+        assert set(known.sum(dim=1).tolist()) <= {4, 5}
+        th.testing.assert_close(
+            batch.returns, model.context.returns[batch.task_ids][:, batch.task_ids], equal_nan=True, rtol=0, atol=0
+        )
+    assert small(POEMSAC, preference_source="rollout", meta_batch_size=2)._choose_tasks().size == 2  # before any epoch
+
+
+def test_measured_groups_change_every_epoch() -> None:
+    model = small(POEMSAC, preference_source="rollout").learn(1)
+    first = [set(group) for group in model._groups]
+    model.learn(1, reset_num_timesteps=False)
+    assert model.epoch == 2
+    assert [set(group) for group in model._groups] != first
+
+
+def test_auto_relabels_where_it_can() -> None:
+    assert small(POEMSAC)._relabels
+    windy = small(POEMSAC, walks(4, WindyWalk), horizon=10)
+    assert not windy._relabels
+    windy.learn(1)
+    assert not windy.context.returns.isfinite().all()
+    assert small(POEMSAC, walks(4), horizon=10, preference_source="rollout")._relabels is False
+
+
+def test_returns_of_tasks_with_their_own_dynamics() -> None:
+    """The wind blows a policy elsewhere on another task, which only running it there tells."""
+    arguments = {"gradient_steps": 0, "n_train_tasks": 6, "preference_group_size": 3}
+    model = nearly_deterministic(small(POEMSAC, walks(4, StillWindyWalk), horizon=10, **arguments))
+    spy = Spy(model)
+    model.learn(2 * 5 * 4 * 10)
+    truth = policy_returns(model, gym.wrappers.TimeLimit(StillWindyWalk(), 10), spy.latents[1])
+    returns = spy.returns[1]
+    known = np.isfinite(returns)
+    assert known.sum() == 2 * 9
+    np.testing.assert_allclose(returns[known], truth[known], atol=1e-3)
+
+
+class StillWindyWalk(WindyWalk):
+    """Episodes begin at the origin."""
+
+    def _begin_episode(self, rng: np.random.Generator) -> np.ndarray:
+        super()._begin_episode(rng)
+        self._place = 0.0
+        return self._observation()
+
+
+def test_trajectories_of_a_task_are_averaged() -> None:
+    env = TaskVecEnv.from_id(POINT_GOAL, 3, reset_noise_scale=0.0)
+    model = nearly_deterministic(small(POEMSAC, env, gradient_steps=0, n_train_tasks=4, trajectories_per_task=2))
+    spy = Spy(model)
+    model.learn(2 * 3 * 3 * 25)
+    truth = policy_returns(model, gym.make(POINT_GOAL, reset_noise_scale=0.0), spy.latents[1])  # (4, 8)
+    np.testing.assert_allclose(spy.returns[1], truth.reshape(4, 4, 2).mean(axis=2), atol=1e-3)
+
+
+# ---------------------------------------------------------------- contexts
+
+
+def test_contexts_are_standardised_transitions_with_the_critics_values() -> None:
+    model = small(POEMSAC, gradient_steps=3).learn(EPOCH)
+    latents: list[np.ndarray] = []
+    replace, before = model._replace_context, {}
+
+    def spy(epoch: Any, returns: np.ndarray) -> None:
+        latents.append(epoch.latents)
+        before.update({name: value.clone() for name, value in model.policy.critic.state_dict().items()})
+        replace(epoch, returns)
+
+    model._replace_context = spy
+    model.learn(EPOCH, reset_num_timesteps=False)
+    policy, rows = model.policy, model.replay_buffer.rows[:, 25:50]  # the second epoch's
+    transitions = model.context.transitions
+    assert transitions.shape == (N_TASKS, 25, 2 + 2 + 2 + 1 + 1)
+    standardised = [((rows[..., s] - policy.obs_mean) / policy.obs_std).clamp(-10, 10) for s in (slice(0, 2), slice(4, 6))]
+    th.testing.assert_close(transitions[..., :2], standardised[0])
+    assert th.equal(transitions[..., 2:4], rows[..., 2:4])
+    th.testing.assert_close(transitions[..., 4:6], standardised[1])
+    th.testing.assert_close(model.context.rewards, rows[..., 6])
+    th.testing.assert_close(transitions[..., 6], (rows[..., 6] - rows[..., 6].mean()) / rows[..., 6].std(), atol=1e-5, rtol=0)
+    # Q of the critics before this epoch's updates, the smaller of two, each task under the latent that acted
+    policy.critic.load_state_dict(before)
+    with th.no_grad():
+        values = th.stack(
+            [
+                policy.critic(standardised[0][i], rows[i, :, 2:4], th.tensor(latents[0][i]).float().expand(25, -1)).min(dim=0)[
+                    0
+                ]
+                for i in range(N_TASKS)
+            ]
+        )
+    th.testing.assert_close(transitions[..., 7], (values - values.mean()) / values.std(), atol=1e-4, rtol=0)
+
+
+def test_values_are_zero_before_the_first_update() -> None:
+    model = small(POEMSAC, gradient_steps=0).learn(1)
+    assert (model.context.transitions[..., 7] == 0).all()
+
+
+def test_observations_and_rewards_are_standardised_by_the_first_epoch() -> None:
+    model = small(PEARLSAC, gradient_steps=1).learn(EPOCH)
+    first = model.replay_buffer.rows[:, :25].clone()
+    model.learn(EPOCH, reset_num_timesteps=False)
+    obs, rewards = first[..., :2].reshape(-1, 2).numpy(), first[..., 6].numpy()
+    np.testing.assert_allclose(model.policy.obs_mean.numpy(), obs.mean(axis=0), atol=1e-5)
+    np.testing.assert_allclose(model.policy.obs_std.numpy(), obs.std(axis=0), rtol=1e-4)
+    assert model.policy.reward_mean.item() == pytest.approx(rewards.mean(), abs=1e-5)
+    assert model.policy.reward_std.item() == pytest.approx(rewards.std(), rel=1e-4)
+
+
+def test_the_context_is_the_last_epochs_only() -> None:
+    model = small(POEMSAC).learn(3 * EPOCH)
+    latest = model.replay_buffer.rows[:, 50:75, 6]
+    th.testing.assert_close(model.context.rewards, latest)
+    own = latest.double().sum(dim=1)
+    np.testing.assert_allclose(np.diagonal(model.context.returns.numpy()), own.numpy(), rtol=1e-5)
+
+
+def test_posteriors_are_the_encoders_of_the_context() -> None:
+    model = small(POEMSAC, context_size=25).learn(EPOCH)
+    with th.no_grad():
+        mean, variance = model.policy.encoder(model.context.transitions)
+    np.testing.assert_allclose(model.latent_means, mean.numpy(), atol=1e-5)
+    np.testing.assert_allclose(model.latent_variances, variance.numpy(), rtol=1e-4)
+    assert np.array_equal(model.task_latents, model.latent_means)
+
+
+# ---------------------------------------------------------------- relabelled batches
+
+
+@pytest.mark.parametrize(("fraction", "n_foreign"), [(0.0, 0), (0.25, 4), (1.0, 16)])
+def test_a_share_of_every_batch_is_relabelled(fraction: float, n_foreign: int) -> None:
+    model = small(POEMSAC, walks(4), horizon=10, relabel_fraction=fraction).learn(1)
+    batch = model._sample_meta_batch(16)
+    tasks = model.train_tasks[batch.task_ids.numpy()]
+    features = batch.transitions.features.numpy()
+    truth = -np.abs(features[..., 0] - tasks) - 0.01 * features[..., 1] ** 2
+    np.testing.assert_allclose(batch.transitions.rewards.numpy(), truth, atol=1e-5)  # own or relabelled, all fit the task
+    own = [set(map(tuple, model.replay_buffer.rows[task, :10, :2].tolist())) for task in batch.task_ids]
+    is_own = np.array([[tuple(obs) in own[i] for obs in row] for i, row in enumerate(batch.transitions.observations.tolist())])
+    assert is_own[:, : 16 - n_foreign].all()
+    if n_foreign:
+        assert not is_own[:, 16 - n_foreign :].all()
+
+
+# ---------------------------------------------------------------- embeddings and ablations
+
+
+def test_similarity_is_the_inner_product_of_the_two_embeddings() -> None:
+    model = small(POEMSAC)
+    tasks, policies = np.random.default_rng(0).normal(size=(4, 5)), np.random.default_rng(1).normal(size=(7, 5))
+    similarity = model.similarity(tasks, policies)
+    assert similarity.shape == (4, 7)
+    assert similarity.dtype == np.float64
+    for i in range(4):
+        for j in range(7):
+            z_r = model.policy.reward_mapping(th.tensor(tasks[i]).float())
+            z_pi = model.policy.policy_mapping(th.tensor(policies[j]).float())
+            assert similarity[i, j] == pytest.approx((z_r @ z_pi).item(), abs=1e-5)
+    assert model.similarity(tasks[0], policies[0]).shape == (1, 1)
+
+
+def test_similarities_keep_float32_under_autocast() -> None:
+    """Preferences live in differences of S, which bfloat16 would round to 2 where S is in the hundreds."""
+    model = small(POEMSAC, similarity="inner")
+    tasks = th.tensor([[20.0, 0.0, 0.0, 0.0, 0.0]])
+    policies = th.tensor([[15.0, 0.0, 0.0, 0.0, 0.0], [15.01, 0.0, 0.0, 0.0, 0.0]])
+    with th.autocast("cpu", dtype=th.bfloat16):
+        similarity = model.policy.similarity(tasks, policies)
+    assert similarity.dtype == th.float32
+    np.testing.assert_allclose(similarity.detach().numpy(), [[300.0, 300.2]], atol=1e-3)
+
+
+def test_the_inner_product_has_one_embedding() -> None:
+    model = small(POEMSAC, similarity="inner").learn(EPOCH)
+    latents = np.random.default_rng(0).normal(size=(4, 5))
+    z = th.tensor(latents).float()
+    assert model.policy.policy_embedding(z) is z
+    assert model.policy.reward_embedding(z) is z
+    np.testing.assert_allclose(model.similarity(latents, latents), latents @ latents.T, rtol=1e-5)
+    names = model.policy.state_dict().keys()
+    assert not any("mapping" in name for name in names)
+    assert any("mapping" in name for name in small(POEMSAC).policy.state_dict())
+
+
+def test_contexts_without_values() -> None:
+    model = small(POEMSAC, context="pearl").learn(EPOCH)
+    assert model.context.transitions.shape[-1] == 2 + 2 + 2 + 1
+    assert model.policy.encoder.mlp.hidden[0].in_features == 7
+    assert small(POEMSAC).policy.encoder.mlp.hidden[0].in_features == 8
+
+
+def test_without_its_parts_poem_is_pearl() -> None:
+    """The ablations leave PEARLSAC's networks, and the same losses but for the actor's gradient to the encoder."""
+    arguments = {"kl_coef": 0.3, "reward_coef": 0.7, "policy_coef": 1.0}
+    pearl = small(PEARLSAC, **arguments)
+    poem = small(POEMSAC, similarity="inner", context="pearl", preference_coef=0.0, **arguments)
+    assert parameters(pearl).keys() == parameters(poem).keys()
+    poem._actor_embedding = lambda latents: latents.detach()
+    pearl.learn(2 * EPOCH)
+    poem.learn(2 * EPOCH)
+    assert all(th.equal(value, parameters(pearl)[name]) for name, value in parameters(poem).items())
+
+
+# ---------------------------------------------------------------- gradients
+
+
+def gradients(model: PEARLSAC, **weights: float) -> set[str]:
+    """Which modules a loss reaches, when all others are switched off."""
+    for name in ("kl_coef", "reward_coef", "policy_coef", "preference_coef"):
+        if hasattr(model, name):
+            setattr(model, name, weights.get(name, 0.0))
+    with th.autocast("cpu", enabled=False):
+        loss, _ = model._losses(model._sample_meta_batch(16))
+        if not weights.get("critic", 0.0):
+            critic, _ = model._critic_loss(model._sample_meta_batch(16).transitions, th.zeros(6, 5))
+            loss = loss + 0.0 * critic
+    model.policy.zero_grad()
+    loss.backward()
+    return {
+        name.split(".")[0]
+        for name, parameter in model.policy.named_parameters()
+        if parameter.grad is not None and (parameter.grad != 0).any()
+    }
+
+
+def test_each_loss_trains_what_the_paper_says() -> None:
+    """Figure 3 and section 5.3; the critics' loss (here always on) trains critics and, as in PEARL, the encoder."""
+    base = {"critic", "encoder"}
+    poem = small(POEMSAC).learn(EPOCH)
+    assert gradients(poem) == base
+    assert gradients(poem, reward_coef=1.0) == base | {"decoder", "reward_mapping"}
+    assert gradients(poem, policy_coef=1.0) == base | {"actor", "policy_mapping"}
+    assert gradients(poem, preference_coef=1.0) == base | {"policy_mapping", "reward_mapping"}
+    assert gradients(poem, kl_coef=1.0) == base
+    pearl = small(PEARLSAC).learn(EPOCH)
+    assert gradients(pearl, policy_coef=1.0) == base | {"actor"}
+
+
+def encoder_gradient(model: PEARLSAC, batch: Any, name: str) -> float:
+    latents, kl = model._encode(batch.context)
+    losses = {
+        "actor": lambda: model._actor_loss(batch.transitions, latents, th.ones(()))[0],
+        "decoder": lambda: model._decoder_loss(batch, latents),
+        "preference": lambda: model._embedding_loss(batch, latents)[0],
+        "critic": lambda: model._critic_loss(batch.transitions, latents)[0],
+        "kl": lambda: kl.mean(),
+    }
+    model.policy.zero_grad()
+    losses[name]().backward()
+    return sum(
+        float(parameter.grad.abs().sum()) for parameter in model.policy.encoder.parameters() if parameter.grad is not None
+    )
+
+
+def test_which_losses_reach_the_encoder() -> None:
+    poem, pearl = small(POEMSAC).learn(EPOCH), small(PEARLSAC).learn(EPOCH)
+    batch, other = poem._sample_meta_batch(16), pearl._sample_meta_batch(16)
+    for name in ("actor", "decoder", "preference", "critic", "kl"):
+        assert encoder_gradient(poem, batch, name) > 0, name
+    for name in ("decoder", "critic", "kl"):
+        assert encoder_gradient(pearl, other, name) > 0, name
+    assert encoder_gradient(pearl, other, "actor") == 0.0
+
+
+def test_the_actors_loss_does_not_train_the_critics() -> None:
+    model = small(POEMSAC).learn(EPOCH)
+    batch = model._sample_meta_batch(16)
+    latents, _ = model._encode(batch.context)
+    model.policy.zero_grad()
+    model._actor_loss(batch.transitions, latents, th.ones(()))[0].backward()
+    assert all(parameter.grad is None for parameter in model.policy.critic.parameters())
+    assert all(parameter.grad is None for parameter in model.policy.critic_target.parameters())
+
+
+def test_kl_is_that_of_two_normals() -> None:
+    from torch.distributions import Normal, kl_divergence
+
+    model = small(POEMSAC).learn(EPOCH)
+    context = model.context.transitions
+    with th.no_grad():
+        mean, variance = model.policy.encoder(context)
+        _, kl = model._encode(context)
+    expected = kl_divergence(Normal(mean, variance.sqrt()), Normal(th.zeros(5), th.ones(5))).sum(dim=1)
+    th.testing.assert_close(kl, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_targets_are_bootstrapped_except_at_an_early_end() -> None:
+    """The critics' loss against soft Bellman targets computed here, with gamma and alpha far from trivial."""
+    model = small(POEMSAC, walks(4, edge=0.4), horizon=10, gamma=0.9, ent_coef=0.3).learn(120)
+    batch = model._sample_meta_batch(16).transitions
+    assert 0 < batch.terminated.sum() < batch.terminated.numel()
+    policy, latents = model.policy, th.randn(6, 5)
+    state = model.generators.torch.get_state()
+    loss, alpha = model._critic_loss(batch, latents)
+    model.generators.torch.set_state(state)
+    noise = th.randn(6, 16, 1, generator=model.generators.torch)
+    total = 0.0
+    with th.no_grad():
+        for i in range(6):
+            z = latents[i].expand(16, 5)
+            obs, next_obs = (
+                ((x - policy.obs_mean) / policy.obs_std).clamp(-10, 10)
+                for x in (batch.observations[i], batch.next_observations[i])
+            )
+            next_actions, log_prob = policy.actor(next_obs, policy.policy_mapping(z), noise[i])
+            next_values = policy.critic_target(next_obs, next_actions, z).min(dim=0).values - 0.3 * log_prob
+            target = batch.rewards[i] / policy.reward_std + 0.9 * (1 - batch.terminated[i]) * next_values
+            for value in policy.critic(obs, batch.actions[i], z):
+                total += 0.5 * (value - target).pow(2).mean().item() / 6
+    assert alpha.item() == pytest.approx(0.3)
+    assert loss.item() == pytest.approx(total, rel=1e-4)
+
+
+def test_predicted_returns_are_sums_of_decoded_rewards() -> None:
+    from sb3_poem.common.trajectory import Trajectory
+
+    model = small(POEMSAC, walks(4), horizon=10).learn(120)
+    rng = np.random.default_rng(0)
+    lengths, latents = (4, 9), rng.normal(size=(3, 5))
+    trajectories = [Trajectory(rng.normal(size=(n + 1, 2)), rng.uniform(-2.0, 4.0, size=(n, 1)), np.zeros(5)) for n in lengths]
+    returns = model.predicted_returns(latents, trajectories)
+    assert returns.shape == (3, 2)
+    assert returns.dtype == np.float64
+    policy = model.policy
+    for i, latent in enumerate(latents):
+        z_r = policy.reward_mapping(th.tensor(latent).float())
+        for j, trajectory in enumerate(trajectories):
+            total = 0.0
+            for t in range(lengths[j]):
+                obs, next_obs = (policy.standardise(th.tensor(trajectory.observations[t + k]).float()) for k in (0, 1))
+                action = th.tensor(2.0 * (trajectory.actions[t] + 2.0) / 6.0 - 1.0).float()
+                value = policy.decoder(obs, action, next_obs, z_r)
+                total += (value * policy.reward_std + policy.reward_mean).item()
+            assert returns[i, j] == pytest.approx(total, abs=1e-4)
+
+
+# ---------------------------------------------------------------- two tasks
+
+
+@pytest.mark.parametrize("arguments", [{}, {"meta_batch_size": 1}, {"preference_source": "rollout"}, {"similarity": "inner"}])
+def test_a_family_of_two_tasks_trains_without_nan(arguments: dict[str, Any]) -> None:
+    model = small(POEMSAC, walks(2, TwoWalks), horizon=10, n_train_tasks=None, **arguments).learn(100)
+    assert model._n_updates == 25 or arguments.get("preference_source") == "rollout"
+    assert all(value.isfinite().all() for value in parameters(model).values())
+    assert np.isfinite(model.latent_means).all()
+    assert np.isfinite(model.similarity(model.task_latents, model.task_latents)).all()
+
+
+def test_one_task_is_a_family_too() -> None:
+    for source in ("relabel", "rollout"):
+        model = small(POEMSAC, walks(2), horizon=10, n_train_tasks=1, preference_source=source).learn(60)
+        assert all(value.isfinite().all() for value in parameters(model).values())
+
+
+@pytest.mark.parametrize("algorithm", [PEARLSAC, POEMSAC])
+def test_half_cheetah_forwards_and_backwards(algorithm: type[PEARLSAC]) -> None:
+    """Two tasks on the real simulator, from the id alone."""
+    env = TaskVecEnv.from_id("poem/HalfCheetahFwdBack-v0", 2, max_episode_steps=20)
+    model = small(algorithm, env, n_train_tasks=None).learn(80)
+    assert sorted(model.train_tasks.ravel()) == [-1.0, 1.0]
+    assert all(value.isfinite().all() for value in parameters(model).values())
+    if isinstance(model, POEMSAC):  # what forwards earns, backwards pays for, but for the control cost
+        assert model.context.returns.isfinite().all()
+
+
+def test_environments_of_one_copy_and_many_tasks() -> None:
+    env = DummyVecEnv([lambda: gym.wrappers.TimeLimit(Walk(), 10)])
+    assert small(POEMSAC, env, horizon=10, preference_source="rollout", n_train_tasks=4).learn(1).num_timesteps == 160
