@@ -1,8 +1,6 @@
 """Checkpoints that hold all of a training run, so that it continues bit for bit."""
 
 import io
-import pickle
-import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -47,7 +45,9 @@ def read_checkpoint(path: str | Path, algorithm: str) -> dict[str, Any]:
     """
     try:
         state = th.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, EOFError, pickle.UnpicklingError, zipfile.BadZipFile, KeyError) as error:
+    except OSError:
+        raise
+    except Exception as error:  # what unpickling foreign bytes may raise is no closed list
         raise ValueError(f"{path} is truncated, or no checkpoint of sb3_poem: {error}") from error
     if not isinstance(state, dict) or state.get("format") != FORMAT:
         raise ValueError(f"{path} is no checkpoint of this version of sb3_poem (expected {FORMAT!r})")
