@@ -47,7 +47,7 @@ def main() -> None:
     check_writable(out)
     started = time.perf_counter()
 
-    print("1. Meta-train a point that walks to goals on a half-circle. It sees 120 goals and their rewards.")
+    print("1. Meta-train a point that walks to goals on a half-circle. It sees some goals and their rewards.")
     run(
         "train",
         "--env",

@@ -44,6 +44,8 @@ def _add_adapt_arguments(parser: argparse.ArgumentParser) -> None:
     model.add_argument("--env-kwargs", nargs="+", metavar="KEY:VALUE", default=[], help="arguments of the environment")
     model.add_argument("--gym-packages", nargs="+", metavar="MODULE", default=[], help="modules that register environments")
     model.add_argument("--device", default="cpu", help="PyTorch device (default: %(default)s)")
+    # Small batches: more threads would mostly wait for one another, and for those that simulate.
+    model.add_argument("--num-threads", type=_count(1), default=1, help="of PyTorch (default: %(default)s)")
 
     questions = parser.add_argument_group("the questions and who answers them")
     questions.add_argument("--oracle", choices=("return", "boltzmann", "mistake", "human"), default="return")

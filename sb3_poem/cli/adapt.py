@@ -13,6 +13,7 @@ import numpy as np
 
 # A model that rl_zoo3 trained may hold its schedules. Importing it replaces Gymnasium's TimeLimit, so it comes first.
 import rl_zoo3  # noqa: F401
+import torch as th
 from rich.console import Console
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
@@ -63,6 +64,7 @@ def run_adapt(arguments: argparse.Namespace) -> None:
         raise ValueError("--plot needs returns, and with --oracle human only --task says by which goal to measure them")
     for package in arguments.gym_packages:
         importlib.import_module(package)
+    th.set_num_threads(arguments.num_threads)
     console = Console()
     adaptation = Adaptation(arguments, console)
     evaluation = adaptation.ask_person() if arguments.oracle == "human" else adaptation.ask_oracle()
