@@ -107,7 +107,7 @@ class BayesInference(LatentInference):
         self.noise_model: NoiseModel = ExactNoise() if noise_model is None else noise_model
         self.library = None if library is None else list(library)
         self._check_options()
-        self.particles = self.prior.sample(n_candidates, self.rng)
+        self.particles = self.prior.balanced_sample(n_candidates, self.rng)
         self.log_weights = np.zeros(n_candidates)
         self._spread, self._unit = self._similarity_scale()
         # Sums over answers that tie S to the decoder's returns: S dS, S dR, |R| and their number.

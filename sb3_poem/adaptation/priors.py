@@ -17,6 +17,9 @@ class Prior(Protocol):
     def sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """(n, d) draws."""
 
+    def balanced_sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """(n, d) draws that stand for the distribution more evenly than independent ones do."""
+
     def log_density(self, latents: np.ndarray) -> np.ndarray:
         """(m,) log density at (m, d), up to a constant."""
 
@@ -36,6 +39,11 @@ class GaussianPrior:
     def sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """(n, d) draws."""
         return rng.standard_normal((n, self.dim))
+
+    def balanced_sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """(n, d) draws in pairs of z and -z, so that their mean is the prior's own (an odd one is left over)."""
+        half = rng.standard_normal(((n + 1) // 2, self.dim))
+        return np.concatenate([half, -half])[:n]
 
     def log_density(self, latents: np.ndarray) -> np.ndarray:
         """(m,) log density at (m, d), up to a constant."""
@@ -65,6 +73,12 @@ class AggregatePrior:
     def sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """(n, d) draws."""
         chosen = self.centres[rng.integers(len(self.centres), size=n)]
+        return chosen + self.width * rng.standard_normal(chosen.shape)
+
+    def balanced_sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """(n, d) draws, no centre taken once more than another."""
+        rounds = [rng.permutation(len(self.centres)) for _ in range(-(-n // len(self.centres)))]
+        chosen = self.centres[np.concatenate(rounds)[:n]]
         return chosen + self.width * rng.standard_normal(chosen.shape)
 
     def log_density(self, latents: np.ndarray) -> np.ndarray:

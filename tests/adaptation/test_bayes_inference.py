@@ -17,6 +17,7 @@ from sb3_poem.adaptation.moves import (
     systematic_resample,
 )
 from sb3_poem.adaptation.noise import LAPSE, BoltzmannNoise, ExactNoise, MistakeNoise
+from sb3_poem.adaptation.options import AdaptationOptions
 from sb3_poem.adaptation.preference import Preference
 from sb3_poem.adaptation.priors import AggregatePrior, GaussianPrior
 from sb3_poem.common.trajectory import Trajectory
@@ -223,6 +224,31 @@ def test_the_aggregate_prior_is_the_mixture_that_it_says():
     direct = [math.log(np.mean([math.exp(-0.5 * np.sum((x - c) ** 2) / prior.width**2) for c in prior.centres])) for x in z]
     np.testing.assert_allclose(prior.log_density(z), direct)
     assert prior.sample(5, rng).shape == (5, 2)
+
+
+def test_balanced_draws_follow_the_prior_more_evenly():
+    rng = np.random.default_rng(0)
+    gaussian = GaussianPrior(3)
+    draws = gaussian.balanced_sample(5000, rng)
+    np.testing.assert_allclose(draws.mean(axis=0), 0.0, atol=1e-12)
+    np.testing.assert_allclose(np.cov(draws.T), np.eye(3), atol=0.1)
+    assert gaussian.balanced_sample(7, rng).shape == (7, 3)
+    aggregate = AggregatePrior(100.0 * np.arange(6.0)[:, None])
+    aggregate.width = 0.1
+    counts = np.bincount(np.round(aggregate.balanced_sample(15, rng)[:, 0] / 100).astype(int), minlength=6)
+    assert set(counts) == {2, 3}
+
+
+def test_candidates_by_default_come_from_where_the_policy_was_trained():
+    def prior(model, **options):
+        return AdaptationOptions(**options).make_inference(model, np.random.default_rng(0)).prior
+
+    near, far = SpeedModel(), SpeedModel()
+    near.aggregate_to_prior_kl, far.aggregate_to_prior_kl = 0.05, 2.0
+    assert isinstance(prior(near), GaussianPrior)
+    assert isinstance(prior(far), AggregatePrior)
+    assert isinstance(prior(far, candidates="prior"), GaussianPrior)
+    assert isinstance(prior(far, inference="paper"), GaussianPrior)  # Algorithm 2 as it is
 
 
 def test_a_library_is_asked_about_without_similarity():
