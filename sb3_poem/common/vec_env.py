@@ -255,12 +255,19 @@ def _wrappers(env: gym.Env) -> list[gym.Wrapper]:
     return wrappers
 
 
+def _is_absorbed(wrapper: gym.Wrapper) -> bool:
+    """Whether the vectorised version does itself what the wrapper does."""
+    # An import of rl_zoo3 replaces Gymnasium's TimeLimit, for environments that are made later, by a subclass of its own.
+    patched = isinstance(wrapper, TimeLimit) and type(wrapper).__module__ == "rl_zoo3.gym_patches"
+    return patched or type(wrapper) in ABSORBED_WRAPPERS
+
+
 def _vectorised(env: gym.Env, wrappers: list[gym.Wrapper], num_envs: int, nthread: int | None) -> TaskFamilyVector:
     """The vectorised version of a single environment, from its registration and arguments."""
     bare, instead = env.unwrapped, "use DummyVecEnv instead of TaskVecEnv"
     if not isinstance(bare, TaskFamily):
         raise ValueError(f"{bare} is no task family (a subclass of poem_envs.TaskFamily); {instead}")
-    foreign = [type(wrapper).__name__ for wrapper in wrappers if type(wrapper) not in ABSORBED_WRAPPERS]
+    foreign = [type(wrapper).__name__ for wrapper in wrappers if not _is_absorbed(wrapper)]
     if foreign:
         allowed = ", ".join(kind.__name__ for kind in ABSORBED_WRAPPERS)
         raise ValueError(

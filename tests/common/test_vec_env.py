@@ -2,6 +2,8 @@
 
 import functools
 import pickle
+import subprocess
+import sys
 import warnings
 
 import gymnasium as gym
@@ -256,3 +258,15 @@ def test_learning_is_the_same_as_with_dummy_vec_env():
         model = SAC("MlpPolicy", env, learning_starts=60, seed=1, **SMALL).learn(70)
         weights.append(model.policy.state_dict())
     assert all(np.array_equal(weights[0][key].numpy(), weights[1][key].numpy()) for key in weights[0])
+
+
+def test_takes_environments_that_were_made_after_an_import_of_rl_zoo3():
+    """rl_zoo3 patches Gymnasium's TimeLimit when it is imported, whoever imported TimeLimit before."""
+    code = """
+import gymnasium as gym
+from sb3_poem.common.vec_env import TaskVecEnv
+import rl_zoo3.gym_patches
+env = TaskVecEnv([lambda: gym.make("poem/PointGoal-v0")] * 2)
+assert env.reset().shape == (2, 2)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
