@@ -213,3 +213,19 @@ class RewardDecoder(nn.Module):
     def forward(self, obs: th.Tensor, actions: th.Tensor, next_obs: th.Tensor, embedding: th.Tensor) -> th.Tensor:
         """Predicted standardised rewards (...) of transitions (..., dim)."""
         return self.mlp(th.cat([obs, actions, next_obs, embedding], dim=-1)).squeeze(-1)
+
+    def for_embeddings(
+        self, obs: th.Tensor, actions: th.Tensor, next_obs: th.Tensor, embeddings: th.Tensor, chunk_size: int = 4
+    ) -> th.Tensor:
+        """Predicted standardised rewards (m, steps) of the same transitions (steps, dim) under each of m embeddings (m, d).
+
+        The first layer sees the transitions once, not m times, and few embeddings at a time stay in the cache.
+        """
+        first, rest = self.mlp.hidden[0], self.mlp.hidden[1:]
+        assert isinstance(first, nn.Linear)
+        transitions = th.cat([obs, actions, next_obs], dim=-1)
+        of_transitions, of_embeddings = first.weight.split([transitions.shape[-1], embeddings.shape[-1]], dim=1)
+        base = transitions @ of_transitions.T + first.bias  # (steps, width)
+        shifts = (embeddings @ of_embeddings.T)[:, None, :]  # (m, 1, width)
+        rewards = [self.mlp.output(rest(base + shift)).squeeze(-1) for shift in shifts.split(chunk_size)]
+        return th.cat(rewards)

@@ -332,15 +332,13 @@ class PEARLSAC(PersistentSAC):
         columns = []
         with th.no_grad():
             latent_tensor = th.as_tensor(np.atleast_2d(latents), dtype=th.float32, device=self.device)
-            embedding = self.policy.reward_embedding(latent_tensor)[:, None, :]
+            embeddings = self.policy.reward_embedding(latent_tensor)
             for trajectory in trajectories:
                 obs = self.policy.standardise(th.as_tensor(trajectory.observations, dtype=th.float32, device=self.device))
                 actions = th.as_tensor(trajectory.actions, dtype=th.float32, device=self.device)
                 actions = self.policy.scale_action_batch(actions)
-                shape = (embedding.shape[0], actions.shape[0], -1)
-                rewards = self.policy.decode_rewards(
-                    obs[:-1].expand(shape), actions.expand(shape), obs[1:].expand(shape), embedding.expand(shape)
-                )
+                standardised = self.policy.decoder.for_embeddings(obs[:-1], actions, obs[1:], embeddings)
+                rewards = standardised * self.policy.reward_std + self.policy.reward_mean
                 columns.append(rewards.double().sum(dim=1))
         return th.stack(columns, dim=1).cpu().numpy()
 
