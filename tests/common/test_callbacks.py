@@ -74,7 +74,7 @@ def test_a_stop_within_an_epoch_writes_no_checkpoint_of_half_an_epoch(tmp_path: 
 
 # ---------------------------------------------------------------- evaluation
 
-QUICK = {"n_tasks": 4, "record_at": (0, 2), "n_episodes": 1}
+QUICK = {"n_tasks": 10, "record_at": (0, 2), "n_episodes": 1}
 METRICS = {"return_after_0_queries", "return_after_2_queries", "known_task_return", "coverage_loss"}
 POEM_METRICS = {"preference_accuracy", "kendall_tau"}
 
@@ -123,8 +123,8 @@ def test_evaluation_takes_the_training_environments_arguments() -> None:
     callback = AdaptationEvalCallback(**QUICK)
     callback.init_callback(small(POEMSAC, TaskVecEnv.from_id(POINT_GOAL, 3, step_length=0.2, max_episode_steps=7)))
     env, tasks = callback._make_env()
-    assert env.num_envs == 8
-    assert tasks.shape == (4, 1)
+    assert env.num_envs == 20
+    assert tasks.shape == (10, 1)
     spec = env.get_attr("spec")[0]
     assert spec.kwargs["step_length"] == 0.2
     assert spec.max_episode_steps == 7

@@ -140,6 +140,7 @@ def run(kind, number, path):
         os.replace = count_down(os.replace, number)
     model.learn(5 * EPOCH, callbacks)
 
+small(POEMSAC)  # torch imports much at its first optimiser; gradients would not survive a fork, so none yet
 for moment in moments:  # forked: the imports take longer than the runs
     kind, number = moment.split("-")
     path = os.path.join(folder, moment + ".pt")

@@ -42,6 +42,10 @@ def algorithm(request: pytest.FixtureRequest) -> type[PEARLSAC]:
     return request.param
 
 
+#: For what is one code in both
+one_is_enough = pytest.mark.parametrize("algorithm", [POEMSAC])
+
+
 @pytest.fixture(scope="module", params=[PEARLSAC, POEMSAC])
 def trained(request: pytest.FixtureRequest) -> PEARLSAC:
     """A model after two epochs; tests leave it as it is."""
@@ -92,9 +96,8 @@ def test_an_id_gets_a_copy_for_every_task(algorithm: type[PEARLSAC]) -> None:
     assert model.env_id == POINT_GOAL
 
 
+@one_is_enough
 def test_subprocesses(algorithm: type[PEARLSAC]) -> None:
-    if algorithm is PEARLSAC:
-        pytest.skip("one start of two processes is slow enough")
     env = SubprocVecEnv([functools.partial(gym.make, f"poem_envs:{POINT_GOAL}")] * 2, start_method="forkserver")
     try:
         model = small(algorithm, env).learn(EPOCH)
@@ -270,6 +273,7 @@ def test_loaded_models_continue_with_any_number_of_copies(trained: PEARLSAC, tmp
     assert np.array_equal(loaded.train_tasks, trained.train_tasks)
 
 
+@one_is_enough
 def test_set_env_takes_another_number_of_copies(algorithm: type[PEARLSAC]) -> None:
     model = small(algorithm).learn(EPOCH)
     for env in (make_vec_env(POINT_GOAL, 2), TaskVecEnv.from_id(POINT_GOAL, 30), gym.make(POINT_GOAL)):
@@ -278,6 +282,7 @@ def test_set_env_takes_another_number_of_copies(algorithm: type[PEARLSAC]) -> No
     assert model.num_timesteps == EPOCH + 300 + 750 + 300
 
 
+@one_is_enough
 def test_set_env_of_a_family_that_is_not_registered(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
     """Its episodes' length is the model's to know."""
     model = small(algorithm, walks(2), horizon=10).learn(1)
@@ -369,6 +374,7 @@ def test_policy_saves_alone(trained: PEARLSAC, tmp_path: Path) -> None:
     assert np.array_equal(policy.predict(OBS, latents, deterministic=True)[0], expected)
 
 
+@one_is_enough
 def test_replay_buffer_saves_alone(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
     model = small(algorithm).learn(EPOCH)
     model.save_replay_buffer(tmp_path / "buffer")
@@ -449,6 +455,7 @@ def test_the_policy_can_be_a_class(algorithm: type[PEARLSAC]) -> None:
         algorithm("CnnPolicy", POINT_GOAL, **arguments)
 
 
+@one_is_enough
 def test_another_optimizer(algorithm: type[PEARLSAC]) -> None:
     kwargs = {"net_arch": ARCH, "optimizer_class": th.optim.SGD, "optimizer_kwargs": {"momentum": 0.9}}
     model = small(algorithm, policy_kwargs=kwargs).learn(EPOCH)
@@ -478,6 +485,7 @@ def learning_rates(model: PEARLSAC) -> tuple[float, ...]:
     return tuple(optimizer.param_groups[0]["lr"] for optimizer in optimizers)
 
 
+@one_is_enough
 def test_learning_rate_schedules_reach_the_optimisers(algorithm: type[PEARLSAC]) -> None:
     record = Record(learning_rates)
     small(algorithm, learning_rate=lambda remaining: 1e-3 * remaining).learn(4 * EPOCH, record)
@@ -486,6 +494,7 @@ def test_learning_rate_schedules_reach_the_optimisers(algorithm: type[PEARLSAC])
     np.testing.assert_allclose(record.values, np.repeat(np.array(expected)[:, None], 2, axis=1), atol=1e-12)
 
 
+@one_is_enough
 def test_a_schedule_never_turns_negative(algorithm: type[PEARLSAC]) -> None:
     """Whole epochs overshoot the total; a learning rate below 0 would climb the loss."""
     record = Record(learning_rates)
@@ -493,6 +502,7 @@ def test_a_schedule_never_turns_negative(algorithm: type[PEARLSAC]) -> None:
     assert min(min(rates) for rates in record.values) >= 0.0
 
 
+@one_is_enough
 def test_entropy_coefficient(algorithm: type[PEARLSAC]) -> None:
     fixed = small(algorithm, ent_coef=0.3).learn(EPOCH)
     assert fixed.ent_coef_optimizer is None
@@ -507,6 +517,7 @@ def test_entropy_coefficient(algorithm: type[PEARLSAC]) -> None:
         small(algorithm, ent_coef="little")
 
 
+@one_is_enough
 def test_target_entropy(algorithm: type[PEARLSAC]) -> None:
     assert small(algorithm).target_entropy == -2.0
     assert small(algorithm, target_entropy=-0.5).target_entropy == -0.5
@@ -524,6 +535,7 @@ def critic_networks(model: PEARLSAC) -> th.Tensor:
     return th.cat([parameter.detach().flatten() for parameter in model.policy.critic.parameters()])
 
 
+@one_is_enough
 def test_target_critics_follow_slowly(algorithm: type[PEARLSAC]) -> None:
     model = small(algorithm, gradient_steps=1, tau=0.25)
     before = target_networks(model).clone()
@@ -532,6 +544,7 @@ def test_target_critics_follow_slowly(algorithm: type[PEARLSAC]) -> None:
     th.testing.assert_close(target_networks(model), 0.75 * before + 0.25 * critic_networks(model))
 
 
+@one_is_enough
 def test_target_update_interval(algorithm: type[PEARLSAC]) -> None:
     """Updates at gradient steps 0, 3, 6, ... with tau = 1 copy the critics."""
     model, seen = small(algorithm, gradient_steps=7, target_update_interval=3, tau=1.0), []
@@ -547,6 +560,7 @@ def test_target_update_interval(algorithm: type[PEARLSAC]) -> None:
     assert seen == [0, 3, 6]
 
 
+@one_is_enough
 def test_gradient_steps_and_learning_starts(algorithm: type[PEARLSAC]) -> None:
     assert small(algorithm, gradient_steps=0).learn(EPOCH)._n_updates == 0
     assert small(algorithm, gradient_steps=-1, n_train_tasks=2).learn(1)._n_updates == 50
@@ -558,6 +572,7 @@ def test_gradient_steps_and_learning_starts(algorithm: type[PEARLSAC]) -> None:
     assert first_actions.std().item() == pytest.approx(1 / np.sqrt(3), rel=0.1)
 
 
+@one_is_enough
 def test_horizons_per_task_and_epoch(algorithm: type[PEARLSAC]) -> None:
     model = small(algorithm, trajectories_per_task=3).learn(1)
     assert model.num_timesteps == 3 * EPOCH
@@ -568,6 +583,7 @@ def test_horizons_per_task_and_epoch(algorithm: type[PEARLSAC]) -> None:
     assert sorted(model.context.rewards[4].tolist()) == pytest.approx(sorted(raw[4].tolist()), abs=1e-5)
 
 
+@one_is_enough
 def test_buffer_size_bounds_memory(algorithm: type[PEARLSAC]) -> None:
     model = small(algorithm, buffer_size=30).learn(3 * EPOCH)
     assert (model.replay_buffer.counts == 30).all()
@@ -605,6 +621,7 @@ def test_a_callback_stops_training(algorithm: type[PEARLSAC], calls: int) -> Non
     assert model.num_timesteps == calls * N_TASKS + EPOCH
 
 
+@one_is_enough
 def test_sb3s_callbacks(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
     events: list[int] = []
 
@@ -634,6 +651,7 @@ def test_sb3s_callbacks(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
     assert saved.num_timesteps == 30 * N_TASKS
 
 
+@one_is_enough
 def test_a_function_as_callback(algorithm: type[PEARLSAC]) -> None:
     """SB3 takes a function of locals and globals too; it sees what it would see on SAC."""
     seen: list[set[str]] = []
@@ -647,6 +665,7 @@ def test_a_function_as_callback(algorithm: type[PEARLSAC]) -> None:
     assert {"infos", "dones", "rewards", "actions", "new_obs"} <= seen[0]
 
 
+@one_is_enough
 def test_progress_bar(algorithm: type[PEARLSAC], capsys: pytest.CaptureFixture[str]) -> None:
     small(algorithm).learn(2 * EPOCH, progress_bar=True)
     captured = capsys.readouterr()
@@ -692,6 +711,7 @@ def test_csv_and_json_logs(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
     assert float(rows[0]["rollout/train_task_return"]) == pytest.approx(float(rows[0]["rollout/ep_rew_mean"]), rel=1e-5)
 
 
+@one_is_enough
 @pytest.mark.parametrize(("log_interval", "expected"), [(2, [2, 4]), (None, []), (1, [1, 2, 3, 4])])
 def test_log_interval_counts_epochs(
     algorithm: type[PEARLSAC], tmp_path: Path, log_interval: int | None, expected: list[int]
@@ -703,6 +723,7 @@ def test_log_interval_counts_epochs(
     assert [line["time/total_timesteps"] // EPOCH for line in lines] == expected
 
 
+@one_is_enough
 def test_tensorboard(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -718,6 +739,7 @@ def test_tensorboard(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
     assert [event.step for event in events.Scalars("train/kl")] == [EPOCH, 2 * EPOCH, 3 * EPOCH]
 
 
+@one_is_enough
 def test_verbose_prints_a_table(algorithm: type[PEARLSAC], capsys: pytest.CaptureFixture[str]) -> None:
     small(algorithm, verbose=1).learn(EPOCH)
     printed = capsys.readouterr().out
@@ -727,6 +749,7 @@ def test_verbose_prints_a_table(algorithm: type[PEARLSAC], capsys: pytest.Captur
     assert capsys.readouterr().out == ""
 
 
+@one_is_enough
 def test_monitors_episode_info(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
     """Returns as SB3 logs them are those of the tasks; a Monitor file is written."""
     env = make_vec_env(POINT_GOAL, 3, monitor_dir=str(tmp_path / "monitor"))

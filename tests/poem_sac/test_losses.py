@@ -122,7 +122,7 @@ def train_embedding(two_encoder: bool, latent_dim: int, seed: int) -> tuple[floa
     return preference_loss(similarity, CYCLIC_RETURNS)[1].item(), similarity
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_two_encoders_order_what_no_symmetric_similarity_can(seed: int) -> None:
     """
     The preferences demand S12 > S13, S23 > S21, S31 > S32. With S symmetric: S12 > S13 = S31 > S32 = S23 > S21 = S12.
