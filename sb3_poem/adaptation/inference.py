@@ -220,7 +220,7 @@ class PaperInference(LatentInference):
         candidates: str = "prior",
         query_rule: str = "worst-case",
         rng: np.random.Generator | None = None,
-        max_draws: int = 32768,
+        max_draws: int = 16384,
     ) -> None:
         super().__init__(model, n_candidates, epsilon, candidates, query_rule, rng or np.random.default_rng())
         self.max_draws = max(max_draws, n_candidates)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from gymnasium import wrappers
 
 ALL_IDS = [
     "poem/PointGoal-v0",
@@ -25,3 +26,11 @@ def env_id(request: pytest.FixtureRequest) -> str:
 def rng() -> np.random.Generator:
     """A generator for actions and tasks."""
     return np.random.default_rng(20250101)
+
+
+@pytest.fixture(autouse=True)
+def gymnasiums_own_time_limit(monkeypatch):
+    """An import of rl_zoo3, by a test before, replaces TimeLimit by one that hides a time limit behind a termination."""
+    kind = wrappers.TimeLimit
+    if kind.__module__.startswith("rl_zoo3"):
+        monkeypatch.setattr(wrappers, "TimeLimit", kind.__base__)
