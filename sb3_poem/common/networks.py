@@ -1,23 +1,21 @@
 """Networks that PEARLSAC and POEMSAC are made of.
 
-Hidden layers may run in bfloat16 under autocast; every output layer runs in float32, because values in the hundreds lose
-their differences in eight bits of mantissa.
+Hidden layers may run in bfloat16 (see :mod:`sb3_poem.common.precision`); every output layer runs in float32, because values
+in the hundreds lose their differences in eight bits of mantissa.
 """
 
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch as th
 from torch import nn
-from torch.nn.functional import softplus
+from torch.autograd.function import once_differentiable
+from torch.nn.functional import linear, softplus
 
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
 MIN_FACTOR_VARIANCE = 1e-7
-
-
-def _full_precision(x: th.Tensor) -> th.autocast:
-    return th.autocast(x.device.type, enabled=False)
 
 
 class MLP(nn.Module):
@@ -32,62 +30,49 @@ class MLP(nn.Module):
     def __init__(self, in_dim: int, out_dim: int, net_arch: Sequence[int], activation_fn: type[nn.Module] = nn.ReLU) -> None:
         super().__init__()
         widths = [in_dim, *net_arch]
-        layers: list[nn.Module] = []
-        for width, next_width in itertools.pairwise(widths):
-            layers += [nn.Linear(width, next_width), activation_fn()]
-        self.hidden = nn.Sequential(*layers)
+        self.activation = nn.ReLU(inplace=True) if activation_fn is nn.ReLU else activation_fn()
+        self.hidden = nn.ModuleList(nn.Linear(width, next_width) for width, next_width in itertools.pairwise(widths))
         self.output = nn.Linear(widths[-1], out_dim)
-
-    def forward(self, x: th.Tensor) -> th.Tensor:
-        """Map (..., in_dim) to (..., out_dim), float32."""
-        x = self.hidden(x)
-        with _full_precision(x):
-            return self.output(x.float())
-
-
-class EnsembleMLP(nn.Module):
-    """Several perceptrons of one shape, evaluated in one batched product.
-
-    :param n_members: Number of networks
-    :param in_dim: Width of the input, shared by all
-    :param out_dim: Width of the output of each
-    :param net_arch: Widths of the hidden layers
-    :param activation_fn: Activation between layers
-    """
-
-    def __init__(
-        self,
-        n_members: int,
-        in_dim: int,
-        out_dim: int,
-        net_arch: Sequence[int],
-        activation_fn: type[nn.Module] = nn.ReLU,
-    ) -> None:
-        super().__init__()
-        widths = [in_dim, *net_arch, out_dim]
-        self.weights = nn.ParameterList()
-        self.biases = nn.ParameterList()
-        for fan_in, fan_out in itertools.pairwise(widths):
-            bound = 1.0 / np.sqrt(fan_in)  # nn.Linear's own initialisation
-            self.weights.append(nn.Parameter(th.empty(n_members, fan_in, fan_out).uniform_(-bound, bound)))
-            self.biases.append(nn.Parameter(th.empty(n_members, 1, fan_out).uniform_(-bound, bound)))
-        self.activation = activation_fn()
-        self.n_members = n_members
+        #: Copies of the hidden layers in another arithmetic, while :class:`MixedPrecision` holds
+        self.stand_ins: list[nn.Linear] | None = None
 
     def forward(self, x: th.Tensor, frozen: bool = False) -> th.Tensor:
-        """Evaluate all members on the same input.
+        """Map (..., in_dim) to (..., out_dim), float32.
 
-        :param x: (batch, in_dim)
+        :param x: Input
         :param frozen: Do not build a graph to the parameters; gradients still reach ``x``
-        :return: (n_members, batch, out_dim), float32
         """
-        weights = [w.detach() for w in self.weights] if frozen else list(self.weights)
-        biases = [b.detach() for b in self.biases] if frozen else list(self.biases)
-        h = x.expand(self.n_members, *x.shape)
-        for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
-            h = self.activation(th.baddbmm(bias, h, weight))
-        with _full_precision(h):
-            return th.baddbmm(biases[-1], h.float(), weights[-1])
+        h = x.reshape(-1, x.shape[-1])  # a product of two dimensions is no view, so that activations may work in place
+        for layer in self.hidden if self.stand_ins is None else self.stand_ins:
+            assert isinstance(layer, nn.Linear)
+            weight, bias = _parameters(layer, frozen)
+            h = self.activation(linear(h.to(weight.dtype), weight, bias))
+        weight, bias = _parameters(self.output, frozen)
+        out = linear(h, weight, bias) if h.dtype == weight.dtype else _OutputLayer.apply(h, weight, bias)
+        return out.view(*x.shape[:-1], -1)
+
+
+def _parameters(layer: nn.Linear, frozen: bool) -> tuple[th.Tensor, th.Tensor]:
+    return (layer.weight.detach(), layer.bias.detach()) if frozen else (layer.weight, layer.bias)
+
+
+class _OutputLayer(th.autograd.Function):
+    """Float32 outputs of hidden values in less; gradients go back in the arithmetic of the hidden layers."""
+
+    @staticmethod
+    def forward(ctx: Any, h: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:
+        ctx.save_for_backward(h, weight)
+        return linear(h.float(), weight, bias)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: th.Tensor) -> tuple[th.Tensor | None, ...]:  # type: ignore[override]
+        h, weight = ctx.saved_tensors
+        low = grad.to(h.dtype)
+        grad_weight = grad_bias = None
+        if ctx.needs_input_grad[1]:
+            grad_weight, grad_bias = (low.t() @ h).float(), grad.sum(dim=0)
+        return low @ weight.to(h.dtype), grad_weight, grad_bias
 
 
 class ContextEncoder(nn.Module):
@@ -183,11 +168,16 @@ class LatentCritic(nn.Module):
         n_critics: int = 2,
     ) -> None:
         super().__init__()
-        self.ensemble = EnsembleMLP(n_critics, obs_dim + action_dim + latent_dim, 1, net_arch, activation_fn)
+        in_dim = obs_dim + action_dim + latent_dim
+        self.members = nn.ModuleList(MLP(in_dim, 1, net_arch, activation_fn) for _ in range(n_critics))
 
     def forward(self, obs: th.Tensor, actions: th.Tensor, latents: th.Tensor, frozen: bool = False) -> th.Tensor:
-        """Values of (batch, obs_dim), (batch, action_dim), (batch, latent_dim) -> (n_critics, batch)."""
-        return self.ensemble(th.cat([obs, actions, latents], dim=-1), frozen).squeeze(-1)
+        """Values of (..., obs_dim), (..., action_dim), (..., latent_dim) -> (n_critics, ...).
+
+        :param frozen: Do not build a graph to the parameters; gradients still reach the inputs
+        """
+        x = th.cat([obs, actions, latents], dim=-1)
+        return th.stack([member(x, frozen) for member in self.members]).squeeze(-1)
 
 
 class RewardDecoder(nn.Module):
@@ -221,11 +211,16 @@ class RewardDecoder(nn.Module):
 
         The first layer sees the transitions once, not m times, and few embeddings at a time stay in the cache.
         """
-        first, rest = self.mlp.hidden[0], self.mlp.hidden[1:]
+        first, *others = self.mlp.hidden
         assert isinstance(first, nn.Linear)
         transitions = th.cat([obs, actions, next_obs], dim=-1)
         of_transitions, of_embeddings = first.weight.split([transitions.shape[-1], embeddings.shape[-1]], dim=1)
         base = transitions @ of_transitions.T + first.bias  # (steps, width)
         shifts = (embeddings @ of_embeddings.T)[:, None, :]  # (m, 1, width)
-        rewards = [self.mlp.output(rest(base + shift)).squeeze(-1) for shift in shifts.split(chunk_size)]
+        rewards = []
+        for shift in shifts.split(chunk_size):
+            x = self.mlp.activation(base + shift)
+            for layer in others:
+                x = self.mlp.activation(layer(x))
+            rewards.append(self.mlp.output(x).squeeze(-1))
         return th.cat(rewards)

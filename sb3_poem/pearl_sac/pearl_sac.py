@@ -1,46 +1,27 @@
 """Soft actor-critic with a probabilistic task context: what POEM and its baselines share."""
 
 import time
-from collections.abc import Iterable
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
-from stable_baselines3.common.utils import check_for_correct_spaces
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from torch import nn
 
-from sb3_poem.common.buffers import ContextStore, Segment, TaskBatch, TaskReplayBuffer
-from sb3_poem.common.collection import collect_segment
+from sb3_poem.common.buffers import ContextStore, TaskBatch, TaskReplayBuffer
 from sb3_poem.common.family import FamilyEnv
-from sb3_poem.common.precision import autocast_dtype
+from sb3_poem.common.precision import MixedPrecision, hidden_dtype
 from sb3_poem.common.random import Generators
-from sb3_poem.pearl_sac.persistence import DEFAULT_TRAIN_TASKS, PersistentSAC
+from sb3_poem.pearl_sac import losses
+from sb3_poem.pearl_sac.collecting import MIN_STD, CollectingSAC
+from sb3_poem.pearl_sac.losses import MetaBatch, TaskEmbeddings
 from sb3_poem.pearl_sac.policies import LatentPolicy, MlpPolicy
 
 SelfPEARLSAC = TypeVar("SelfPEARLSAC", bound="PEARLSAC")
 
-MIN_STD = 1e-3
-AGGREGATE_NEIGHBOURS = 5
 
-
-class MetaBatch(NamedTuple):
-    """What one gradient step sees of a meta-batch of tasks.
-
-    task_ids (tasks,), transitions: a :class:`TaskBatch` (tasks, batch, ...), context (tasks, context_size, context_dim),
-    context_rewards (tasks, context_size), returns (tasks, tasks): J[i, j], NaN where unknown.
-    """
-
-    task_ids: th.Tensor
-    transitions: TaskBatch
-    context: th.Tensor
-    context_rewards: th.Tensor
-    returns: th.Tensor
-
-
-class PEARLSAC(PersistentSAC):
+class PEARLSAC(CollectingSAC):
     """Context-based meta-RL on soft actor-critic (PEARL, https://arxiv.org/abs/1903.08254).
 
     Training alternates between an epoch's collection, in which every training task is rolled out under its own latest
@@ -84,34 +65,6 @@ class PEARLSAC(PersistentSAC):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy}
-    policy: LatentPolicy
-    replay_buffer: TaskReplayBuffer
-    context_has_value: bool = False
-    #: Constructor argument -> attribute, for what :meth:`save_pretrained` keeps
-    saved_arguments: ClassVar[dict[str, str]] = {
-        name: name
-        for name in [
-            "batch_size",
-            "buffer_size",
-            "tau",
-            "gamma",
-            "gradient_steps",
-            "target_update_interval",
-            "n_train_tasks",
-            "meta_batch_size",
-            "context_size",
-            "trajectories_per_task",
-            "latent_dim",
-            "kl_coef",
-            "reward_coef",
-            "policy_coef",
-            "relabel_fraction",
-            "reward_scale",
-            "horizon",
-            "precision",
-            "seed",
-        ]
-    }
 
     def __init__(
         self,
@@ -169,7 +122,7 @@ class PEARLSAC(PersistentSAC):
         for name, value in (("gamma", gamma), ("tau", tau), ("relabel_fraction", relabel_fraction)):
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must lie in [0, 1], got {value}")
-        autocast_dtype(precision, "cpu")  # refuses an unknown name now rather than at the first step
+        hidden_dtype(precision, "cpu")  # refuses an unknown name now rather than at the first step
         self.n_train_tasks = n_train_tasks
         self.meta_batch_size = meta_batch_size
         self.context_size = context_size
@@ -214,8 +167,6 @@ class PEARLSAC(PersistentSAC):
             _init_setup_model=_init_setup_model,
         )
 
-    # ------------------------------------------------------------------ setting up
-
     def _setup_model(self) -> None:
         self.policy_kwargs.pop("use_sde", None)
         if self.env is not None:
@@ -230,236 +181,9 @@ class PEARLSAC(PersistentSAC):
         self._complete_policy_kwargs()
         self.replay_buffer_kwargs = {"n_tasks": len(self.train_tasks), "feature_dim": self.reward_feature_dim}
         super()._setup_model()
-        self._amp_dtype = autocast_dtype(self.precision, self.device.type)
 
     def _complete_policy_kwargs(self) -> None:
         """Give the policy what only a subclass knows."""
-
-    def _draw_tasks(self) -> None:
-        assert self._family is not None, "a new model needs an environment"
-        family = self._family
-        count = self.n_train_tasks
-        if count is None:
-            count = DEFAULT_TRAIN_TASKS if family.all_tasks is None else min(DEFAULT_TRAIN_TASKS, len(family.all_tasks))
-        if family.all_tasks is not None and count > len(family.all_tasks):
-            raise ValueError(
-                f"n_train_tasks is {count}, but {family.env_id} is a finite family of {len(family.all_tasks)} tasks; "
-                f"use at most {len(family.all_tasks)}, or None for all"
-            )
-        if self.relabel_fraction > 0 and not family.shared_dynamics:
-            raise ValueError(f"relabel_fraction must be 0: the tasks of {family.env_id} do not share dynamics")
-        self.env_id = family.env_id
-        self.task_space = family.task_space
-        self.reward_feature_dim = family.reward_feature_dim
-        self.train_tasks = family.sample_tasks(count, self.generators.child())
-        self.latent_means = np.zeros((count, self.latent_dim))
-        self.latent_variances = np.ones((count, self.latent_dim))
-
-    def _family_of(self, env: VecEnv) -> FamilyEnv:
-        """View of an environment, which must be of the model's own family once the model has one."""
-        family = FamilyEnv(env, self.horizon)
-        if self.train_tasks is not None:
-            family.check_same_family(self.task_space, self.reward_feature_dim)
-        return family
-
-    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """Change the environment, to one of the same family with any number of copies.
-
-        :raises ValueError: if the environment is of another family; the model then keeps its own
-        """
-        vec_env = self._wrap_env(env, self.verbose)
-        check_for_correct_spaces(vec_env, self.observation_space, self.action_space)
-        family = self._family_of(vec_env)
-        self.n_envs = vec_env.num_envs  # experience is kept per task, not per copy
-        super().set_env(vec_env, force_reset)
-        self._family = family
-
-    @property
-    def family(self) -> FamilyEnv:
-        """The environment as a task family.
-
-        :raises ValueError: if the model was loaded without an environment
-        """
-        if self._family is None:
-            if self.env is None:
-                raise ValueError("the model has no environment; give it one with set_env, or load it with env=...")
-            self._family = self._family_of(self.env)
-        return self._family
-
-    @property
-    def task_latents(self) -> np.ndarray:
-        """Posterior means of the training tasks' latents, (n_train_tasks, latent_dim)."""
-        assert self.latent_means is not None
-        return self.latent_means
-
-    @property
-    def aggregate_to_prior_kl(self) -> float:
-        """How far the training tasks' aggregate posterior is from N(0, I): KL of its moment-matched Gaussian, nats."""
-        assert self.latent_variances is not None
-        mean, second = self.task_latents.mean(axis=0), self.latent_variances.mean(axis=0) + self.task_latents.var(axis=0)
-        return 0.5 * float((mean**2 + second - 1.0 - np.log(second)).sum())
-
-    def sample_latents(self, n: int, rng: np.random.Generator, source: str = "prior") -> np.ndarray:
-        """Draw latents (n, latent_dim).
-
-        :param n: How many
-        :param rng: Generator to use
-        :param source: "prior": N(0, I). "aggregate": the training tasks' posteriors, and what lies between a task and its
-            nearest neighbours, so that tasks between the training tasks are covered but untrained regions are not
-        """
-        if source == "prior":
-            return rng.standard_normal((n, self.latent_dim))
-        if source != "aggregate":
-            raise ValueError(f'source must be "prior" or "aggregate", got {source!r}')
-        means, variances = self.task_latents, self.latent_variances
-        assert variances is not None
-        chosen = rng.integers(len(means), size=n)
-        draws = means[chosen]
-        n_neighbours = min(AGGREGATE_NEIGHBOURS, len(means) // 4)  # a family of few tasks has nothing in between
-        if n_neighbours:
-            distances = ((means[:, None, :] - means[None, :, :]) ** 2).sum(axis=2)
-            neighbours = distances.argsort(axis=1)[chosen, rng.integers(1, n_neighbours + 1, size=n)]
-            draws = draws + rng.uniform(size=(n, 1)) * (means[neighbours] - draws)
-        return draws + np.sqrt(variances[chosen]) * rng.standard_normal(draws.shape)
-
-    def predicted_returns(self, latents: np.ndarray, trajectories: Iterable[Any]) -> np.ndarray:
-        """Returns that the reward decoder predicts for trajectories, if each latent were the task's.
-
-        :param latents: (m, latent_dim)
-        :param trajectories: With ``observations`` (T + 1, obs_dim) and ``actions`` (T, action_dim) in the environment's units
-        :return: (m, number of trajectories)
-        """
-        columns = []
-        with th.no_grad():
-            latent_tensor = th.as_tensor(np.atleast_2d(latents), dtype=th.float32, device=self.device)
-            embeddings = self.policy.reward_embedding(latent_tensor)
-            for trajectory in trajectories:
-                obs = self.policy.standardise(th.as_tensor(trajectory.observations, dtype=th.float32, device=self.device))
-                actions = th.as_tensor(trajectory.actions, dtype=th.float32, device=self.device)
-                actions = self.policy.scale_action_batch(actions)
-                standardised = self.policy.decoder.for_embeddings(obs[:-1], actions, obs[1:], embeddings)
-                rewards = standardised * self.policy.reward_std + self.policy.reward_mean
-                columns.append(rewards.double().sum(dim=1))
-        return th.stack(columns, dim=1).cpu().numpy()
-
-    # ------------------------------------------------------------------ collection
-
-    def collect_rollouts(  # type: ignore[override]
-        self, env: VecEnv, callback: BaseCallback, *args: Any, log_interval: int | None = None, **kwargs: Any
-    ) -> RolloutReturn:
-        """Collect one epoch: ``trajectories_per_task`` horizons of every training task under its own latest latent."""
-        assert self.train_tasks is not None
-        assert self.latent_means is not None
-        assert self.latent_variances is not None
-        self.policy.set_training_mode(False)
-        callback.on_rollout_start()  # between two epochs: evaluations and checkpoints belong here
-        self._dump_pending_logs(log_interval)
-        started, steps_before = time.perf_counter(), self.num_timesteps
-        n_tasks, n_envs = len(self.train_tasks), env.num_envs
-        wanted = np.repeat(np.arange(n_tasks), self.trajectories_per_task)
-        # the last wave is filled up: its copies are stepped anyway, so let them add to the replay buffers
-        slots = np.resize(wanted, -(-len(wanted) // n_envs) * n_envs)
-        segments: list[Segment] = []
-        for wave in slots.reshape(-1, n_envs):
-            draws = self.generators.numpy.standard_normal((n_envs, self.latent_dim))
-            latents = self.latent_means[wave] + np.sqrt(self.latent_variances[wave]) * draws
-            segment = self._collect(callback, wave, self.train_tasks[wave], latents)
-            if segment is None:
-                return RolloutReturn(self.num_timesteps - steps_before, 0, continue_training=False)
-            self.replay_buffer.extend(segment)
-            segments.append(segment)
-        epoch = _concatenate(segments, len(wanted))
-        returns = self._measure_returns(epoch, callback)
-        if returns is None:
-            return RolloutReturn(self.num_timesteps - steps_before, 0, continue_training=False)
-        if not self._statistics_known:  # after the returns, which the policies that collected the epoch must earn
-            self._set_statistics(segments)
-        self._replace_context(epoch, returns)
-        self.epoch += 1
-        collected = self.num_timesteps - steps_before
-        self.logger.record("time/collection_fps", collected / (time.perf_counter() - started))
-        own_returns = np.nanmean(np.diagonal(returns))
-        self.logger.record("rollout/train_task_return", own_returns)
-        self._logs_pending = True
-        callback.on_rollout_end()
-        return RolloutReturn(collected, 0, continue_training=True)
-
-    def _collect(self, callback: BaseCallback, task_ids: np.ndarray, tasks: np.ndarray, latents: np.ndarray) -> Segment | None:
-        family, noise_shape = self.family, (len(latents), int(self.action_space.shape[0]))  # type: ignore[index]
-
-        def act(obs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            if self.num_timesteps < self.learning_starts:
-                scaled = self.generators.numpy.uniform(-1.0, 1.0, noise_shape).astype(np.float32)
-            else:
-                noise = th.randn(noise_shape, generator=self.generators.torch, device=self.device)
-                scaled = self.policy.act(obs, latents, noise)
-            actions = np.clip(self.policy.unscale_action(scaled), self.action_space.low, self.action_space.high)  # type: ignore[attr-defined]
-            return actions, scaled
-
-        def on_step(step_locals: dict[str, Any]) -> bool:
-            self.num_timesteps += family.num_envs
-            callback.update_locals(step_locals)
-            if not callback.on_step():
-                return False
-            self._update_info_buffer(step_locals["infos"], step_locals["dones"])
-            self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
-            self._episode_num += int(step_locals["dones"].sum())
-            return True
-
-        episodes = np.full(family.num_envs, self._episode_num)
-        return collect_segment(family, act, task_ids, tasks, latents, self.generators.integer_seed(), episodes, on_step)
-
-    def _set_statistics(self, segments: list[Segment]) -> None:
-        """Standardise by the first epoch's mean and deviation."""
-        obs = np.concatenate([segment.observations.reshape(-1, segment.observations.shape[-1]) for segment in segments])
-        rewards = np.concatenate([segment.rewards.ravel() for segment in segments])
-        policy = self.policy
-        with th.no_grad():
-            policy.obs_mean.copy_(th.as_tensor(obs.mean(axis=0)))
-            policy.obs_std.copy_(th.as_tensor(np.maximum(obs.std(axis=0), MIN_STD)))
-            policy.reward_mean.fill_(float(rewards.mean()))
-            policy.reward_std.fill_(max(float(rewards.std()), MIN_STD))
-        self._statistics_known = True
-
-    def _measure_returns(self, epoch: Segment, callback: BaseCallback) -> np.ndarray | None:
-        """J[i, j]: the return of task j's policy on task i, (n_train_tasks, n_train_tasks); NaN where unknown."""
-        assert self.train_tasks is not None
-        n_tasks = len(self.train_tasks)
-        own = (epoch.rewards * epoch.first_episode).sum(axis=1).reshape(n_tasks, -1).mean(axis=1)
-        returns = np.full((n_tasks, n_tasks), np.nan)
-        np.fill_diagonal(returns, own)
-        return returns
-
-    def _replace_context(self, epoch: Segment, returns: np.ndarray) -> None:
-        n_tasks, per_task = len(returns), self.trajectories_per_task
-        with th.no_grad():
-            obs, next_obs = (
-                self.policy.standardise(th.as_tensor(values, device=self.device))
-                for values in (epoch.observations, epoch.next_observations)
-            )
-            actions = th.as_tensor(epoch.actions, device=self.device)
-            rewards = th.as_tensor(epoch.rewards, dtype=th.float32, device=self.device)
-            parts = [obs, actions, next_obs, _standardised(rewards)[..., None]]
-            if self.context_has_value:
-                parts.append(_standardised(self._context_values(obs, actions, epoch.latents))[..., None])
-            transitions = th.cat(parts, dim=-1)
-        steps = per_task * transitions.shape[1]
-        self.context = ContextStore(
-            transitions.reshape(n_tasks, steps, -1),
-            rewards.reshape(n_tasks, steps),
-            th.as_tensor(returns, dtype=th.float32, device=self.device),
-        )
-
-    def _context_values(self, obs: th.Tensor, actions: th.Tensor, latents: np.ndarray) -> th.Tensor:
-        """Q(s, a) of the current critics along the context (eq. 8); 0 before the first update (Algorithm 1, line 2)."""
-        if self._n_updates == 0:
-            return th.zeros(obs.shape[:2], device=self.device)
-        z = th.as_tensor(latents, dtype=th.float32, device=self.device)
-        rows = [
-            self.policy.critic(o, a, zi.expand(o.shape[0], -1)).min(dim=0).values  # type: ignore[operator]
-            for o, a, zi in zip(obs, actions, z, strict=True)
-        ]
-        return th.stack(rows)
 
     # ------------------------------------------------------------------ learning
 
@@ -472,17 +196,19 @@ class PEARLSAC(PersistentSAC):
         self._update_learning_rate(optimizers)
         started = time.perf_counter()
         history: dict[str, list[th.Tensor]] = {}
-        for _ in range(gradient_steps):
-            batch = self._sample_meta_batch(batch_size)
-            with th.autocast(self.device.type, dtype=self._amp_dtype, enabled=self._amp_dtype is not None):
-                loss, metrics = self._losses(batch)
-            self._optimise(loss)
-            self._update_entropy_coefficient(metrics["entropy"])
-            if self._n_updates % self.target_update_interval == 0:
-                self._update_targets()
-            self._n_updates += 1
-            for name, value in metrics.items():
-                history.setdefault(name, []).append(value.detach())
+        policy = self.policy
+        networks = nn.ModuleList([policy.encoder, policy.decoder, policy.actor, policy.critic, policy.critic_target])
+        with MixedPrecision(networks, hidden_dtype(self.precision, self.device.type)) as precision:
+            for _ in range(gradient_steps):
+                precision.refresh()
+                loss, metrics = self._losses(self._sample_meta_batch(batch_size))
+                self._optimise(loss, precision)
+                self._update_entropy_coefficient(metrics["entropy"])
+                if self._n_updates % self.target_update_interval == 0:
+                    self._update_targets()
+                self._n_updates += 1
+                for name, value in metrics.items():
+                    history.setdefault(name, []).append(value.detach())
         self._refresh_posteriors()
         self.logger.record("time/updates_per_second", gradient_steps / max(time.perf_counter() - started, 1e-9))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
@@ -491,7 +217,7 @@ class PEARLSAC(PersistentSAC):
         self._record_latent_statistics()
         self._measure_decoder()
 
-    def _optimise(self, loss: th.Tensor) -> None:
+    def _optimise(self, loss: th.Tensor, precision: MixedPrecision) -> None:
         if not th.isfinite(loss):
             raise ValueError(
                 f"the training loss is {loss.item()} at update {self._n_updates}; no network was changed by it. "
@@ -499,6 +225,7 @@ class PEARLSAC(PersistentSAC):
             )
         self.policy.optimizer.zero_grad(set_to_none=True)
         loss.backward()
+        precision.collect_gradients()
         self.policy.optimizer.step()
 
     def _update_targets(self) -> None:
@@ -552,17 +279,23 @@ class PEARLSAC(PersistentSAC):
         """Latents (tasks, d) by reparameterisation, and the KL of their posteriors to N(0, I), (tasks,)."""
         mean, variance = self.policy.encoder(context)
         noise = th.randn(mean.shape, generator=self.generators.torch, device=self.device)
-        kl = 0.5 * (mean.pow(2) + variance - 1.0 - variance.log()).sum(dim=-1)
-        return mean + variance.sqrt() * noise, kl
+        return mean + variance.sqrt() * noise, losses.kl_to_prior(mean, variance)
+
+    def _embed(self, latents: th.Tensor) -> TaskEmbeddings:
+        """What actor and decoder see of the latents. PEARL's encoder learns nothing from the actor."""
+        return TaskEmbeddings(latents, self.policy.policy_embedding(latents.detach()), self.policy.reward_embedding(latents))
 
     def _losses(self, batch: MetaBatch) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """Sum of all losses of a meta-batch, and what to log of them."""
         latents, kl = self._encode(batch.context)
-        critic_loss, alpha = self._critic_loss(batch.transitions, latents)
-        actor_loss, log_prob = self._actor_loss(batch.transitions, latents, alpha)
-        decoder_loss = self._decoder_loss(batch, latents)
+        embeddings = self._embed(latents)
+        transitions = self._standardise(batch.transitions)
+        alpha = self._entropy_coefficient()
+        critic_loss = self._critic_loss(transitions, embeddings, alpha)
+        actor_loss, log_prob = self._actor_loss(transitions, embeddings, alpha)
+        decoder_loss = self._decoder_loss(batch, transitions, embeddings)
         kl_loss = kl.mean()
-        embedding_loss, embedding_metrics = self._embedding_loss(batch, latents)
+        embedding_loss, embedding_metrics = self._embedding_loss(batch, embeddings)
         loss = (
             critic_loss
             + self.policy_coef * actor_loss
@@ -575,13 +308,13 @@ class PEARLSAC(PersistentSAC):
             "actor_loss": actor_loss,
             "decoder_loss": decoder_loss,
             "kl": kl_loss,
-            "entropy": -log_prob.mean(),
+            "entropy": -log_prob,
             "ent_coef": alpha.squeeze(),
             **embedding_metrics,
         }
         return loss, metrics
 
-    def _embedding_loss(self, batch: MetaBatch, latents: th.Tensor) -> tuple[th.Tensor | float, dict[str, th.Tensor]]:
+    def _embedding_loss(self, batch: MetaBatch, embeddings: TaskEmbeddings) -> tuple[th.Tensor | float, dict[str, th.Tensor]]:
         """A subclass's own demand on the latents (weighted), and what to log of it."""
         return 0.0, {}
 
@@ -593,64 +326,40 @@ class PEARLSAC(PersistentSAC):
     def _update_entropy_coefficient(self, entropy: th.Tensor) -> None:
         if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
             assert isinstance(self.target_entropy, float)
-            loss = (self.log_ent_coef * (entropy.detach() - self.target_entropy)).sum()
-            self.ent_coef_optimizer.zero_grad()
-            loss.backward()
+            # the gradient of log_ent_coef * (entropy - target_entropy)
+            self.log_ent_coef.grad = (entropy.detach() - self.target_entropy).view_as(self.log_ent_coef)
             self.ent_coef_optimizer.step()
 
-    def _critic_latents(self, latents: th.Tensor) -> th.Tensor:
-        """Latents as the critics' loss sees them: PEARL trains its encoder through them."""
-        return latents
+    def _standardise(self, batch: TaskBatch) -> TaskBatch:
+        standardise = self.policy.standardise
+        return batch._replace(
+            observations=standardise(batch.observations), next_observations=standardise(batch.next_observations)
+        )
 
-    def _actor_embedding(self, latents: th.Tensor) -> th.Tensor:
-        """Policy embedding as the actor's loss sees it: PEARL's encoder learns nothing from the actor."""
-        return self.policy.policy_embedding(latents.detach())
+    def _noise(self, batch: TaskBatch) -> th.Tensor:
+        return th.randn(batch.actions.shape, generator=self.generators.torch, device=self.device)
 
-    def _critic_loss(self, batch: TaskBatch, latents: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        policy, n = self.policy, batch.rewards.shape[1]
-        obs, next_obs = policy.standardise(batch.observations), policy.standardise(batch.next_observations)
-        alpha = self._entropy_coefficient()
-        with th.no_grad():
-            z = latents.detach()
-            noise = th.randn(batch.actions.shape, generator=self.generators.torch, device=self.device)
-            next_actions, next_log_prob = policy.actor(next_obs, _rows(policy.policy_embedding(z), n), noise)  # type: ignore[operator]
-            next_values = policy.critic_target(_flat(next_obs), _flat(next_actions), _flat(_rows(z, n))).min(dim=0).values  # type: ignore[operator]
-            next_values = next_values - alpha * _flat(next_log_prob[..., None]).squeeze(-1)
-            scale = 1.0 / policy.reward_std if self.reward_scale == "auto" else self.reward_scale
-            targets = scale * batch.rewards.reshape(-1)
-            targets = targets + self.gamma * (1.0 - batch.terminated.reshape(-1)) * next_values
-        values = policy.critic(_flat(obs), _flat(batch.actions), _flat(_rows(self._critic_latents(latents), n)))  # type: ignore[operator]
-        return 0.5 * (values - targets).pow(2).mean(dim=1).sum(), alpha
+    def _critic_loss(self, batch: TaskBatch, embeddings: TaskEmbeddings, alpha: th.Tensor) -> th.Tensor:
+        scale = 1.0 / self.policy.reward_std if self.reward_scale == "auto" else self.reward_scale
+        return losses.critic_loss(self.policy, batch, embeddings, alpha, self.gamma, scale, self._noise(batch))  # type: ignore[arg-type]
 
-    def _actor_loss(self, batch: TaskBatch, latents: th.Tensor, alpha: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        policy, n = self.policy, batch.rewards.shape[1]
-        obs = policy.standardise(batch.observations)
-        noise = th.randn(batch.actions.shape, generator=self.generators.torch, device=self.device)
-        actions, log_prob = policy.actor(obs, _rows(self._actor_embedding(latents), n), noise)  # type: ignore[operator]
-        # the latent is a task here, not a decision: the actor must not raise its value by moving it
-        z = _flat(_rows(latents.detach(), n))
-        values = policy.critic(_flat(obs), _flat(actions), z, frozen=True).min(dim=0).values  # type: ignore[operator]
-        log_prob = log_prob.reshape(-1)
-        return (alpha * log_prob - values).mean(), log_prob
+    def _actor_loss(self, batch: TaskBatch, embeddings: TaskEmbeddings, alpha: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        return losses.actor_loss(self.policy, batch, embeddings, alpha, self._noise(batch))
 
-    def _decoder_loss(self, batch: MetaBatch, latents: th.Tensor) -> th.Tensor:
-        """Squared error of the decoder, relative to the variance of the epoch's rewards.
-
-        On context transitions (eq. 4); with relabelling on the batch of transitions instead, which holds other tasks' policies
-        too: adaptation asks the decoder about trajectories of any policy.
+    def _decoder_loss(self, batch: MetaBatch, transitions: TaskBatch, embeddings: TaskEmbeddings) -> th.Tensor:
+        """On context transitions (eq. 4); with relabelling on the batch of transitions instead, which holds other tasks'
+        policies too: adaptation asks the decoder about trajectories of any policy.
         """
-        policy = self.policy
         if self.relabel_fraction > 0:
-            data = batch.transitions
-            obs, next_obs = policy.standardise(data.observations), policy.standardise(data.next_observations)
-            actions, rewards = data.actions, data.rewards
+            obs, actions, next_obs = transitions.observations, transitions.actions, transitions.next_observations
+            rewards = transitions.rewards
         else:
-            widths = [policy.obs_mean.shape[0], int(self.action_space.shape[0]), policy.obs_mean.shape[0]]  # type: ignore[index]
+            obs_dim, action_dim = transitions.observations.shape[-1], transitions.actions.shape[-1]
+            widths = [obs_dim, action_dim, obs_dim]
             obs, actions, next_obs = batch.context[..., : sum(widths)].split(widths, dim=-1)
             rewards = batch.context_rewards
-        embedding = _rows(policy.reward_embedding(latents), rewards.shape[1])
-        error = policy.decode_rewards(obs, actions, next_obs, embedding) - rewards
-        return error.pow(2).mean() / self._reward_variance()
+        variance = self._reward_variance()
+        return losses.decoder_loss(self.policy, obs, actions, next_obs, rewards, embeddings.reward, variance)
 
     def _reward_variance(self) -> th.Tensor:
         assert self.context is not None
@@ -681,7 +390,7 @@ class PEARLSAC(PersistentSAC):
         with th.no_grad():
             latents = th.as_tensor(self.task_latents, dtype=th.float32, device=device)
             obs, next_obs = policy.standardise(data.observations), policy.standardise(data.next_observations)
-            embedding = _rows(policy.reward_embedding(latents), per_task)
+            embedding = losses.rows(policy.reward_embedding(latents), per_task)
             predicted = policy.decode_rewards(obs, data.actions, next_obs, embedding).cpu().numpy()
         self.predicted_rewards_error = float(np.sqrt(np.mean((predicted - rewards) ** 2)))
         self.logger.record("train/decoder_error", self.predicted_rewards_error)
@@ -723,35 +432,9 @@ class PEARLSAC(PersistentSAC):
         """The last epoch may overshoot the total; a schedule must not turn negative there."""
         super()._update_current_progress_remaining(min(num_timesteps, total_timesteps), total_timesteps)
 
-    def _dump_pending_logs(self, log_interval: int | None) -> None:
-        if self._logs_pending and log_interval and self.epoch % log_interval == 0:
-            self.dump_logs()
-            self._logs_pending = False
-
     def resume(
         self: SelfPEARLSAC, callback: MaybeCallback = None, log_interval: int | None = 1, progress_bar: bool = False
     ) -> SelfPEARLSAC:
         """Finish the ``learn`` that a checkpoint interrupted, up to its own ``total_timesteps``."""
         remaining = max(0, self._total_timesteps - self.num_timesteps)
         return self.learn(remaining, callback, log_interval=log_interval, reset_num_timesteps=False, progress_bar=progress_bar)
-
-
-def _rows(latents: th.Tensor, n: int) -> th.Tensor:
-    """(tasks, d) -> (tasks, n, d)."""
-    return latents[:, None, :].expand(-1, n, -1)
-
-
-def _flat(x: th.Tensor) -> th.Tensor:
-    """(tasks, n, d) -> (tasks * n, d)."""
-    return x.reshape(-1, x.shape[-1])
-
-
-def _standardised(values: th.Tensor) -> th.Tensor:
-    return (values - values.mean()) / values.std().clamp(min=MIN_STD)
-
-
-def _concatenate(segments: list[Segment], n: int) -> Segment:
-    """The first ``n`` copies of all waves as one segment."""
-    return Segment(
-        **{name: np.concatenate([getattr(segment, name) for segment in segments])[:n] for name in Segment.__dataclass_fields__}
-    )

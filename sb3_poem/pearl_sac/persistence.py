@@ -137,7 +137,7 @@ class PersistentSAC(SAC):
         return from_pretrained(cast(Any, cls), folder, env, device)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_family", "context", "_amp_dtype", "_logs_pending"]
+        return [*super()._excluded_save_params(), "_family", "context", "_logs_pending"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

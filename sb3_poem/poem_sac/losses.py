@@ -14,12 +14,11 @@ def preference_loss(similarity: th.Tensor, returns: th.Tensor) -> tuple[th.Tenso
     :param returns: (tasks, tasks), J[i, j], NaN where unknown
     :return: loss, and the share of pairs in the right order (NaN without pairs)
     """
-    first, second = th.triu_indices(similarity.shape[0], similarity.shape[1], offset=1, device=similarity.device)
-    margin = similarity[:, first] - similarity[:, second]  # (tasks, pairs)
-    difference = returns[:, first] - returns[:, second]
-    ordered = difference.isfinite() & (difference != 0)
-    sign = difference.nan_to_num().sign()
-    losses = th.where(ordered, softplus(-sign * margin), 0.0)
+    margin = similarity[:, :, None] - similarity[:, None, :]  # (tasks i, policies j, policies k)
+    # every pair counts twice, as (j, k) and as (k, j), which changes neither of the means
+    sign = (returns[:, :, None] - returns[:, None, :]).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0).sign()
+    agreement = sign * margin
+    ordered = sign.abs()
     n_pairs = ordered.sum()
-    accuracy = ((sign * margin > 0) & ordered).sum() / n_pairs
-    return losses.sum() / n_pairs.clamp(min=1), accuracy
+    loss = (ordered * softplus(-agreement)).sum() / n_pairs.clamp(min=1.0)
+    return loss, (agreement > 0).sum() / n_pairs

@@ -10,7 +10,8 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 
 from sb3_poem.common.buffers import Segment
 from sb3_poem.common.collection import relabelled_returns
-from sb3_poem.pearl_sac.pearl_sac import PEARLSAC, MetaBatch
+from sb3_poem.pearl_sac.losses import MetaBatch, TaskEmbeddings
+from sb3_poem.pearl_sac.pearl_sac import PEARLSAC
 from sb3_poem.poem_sac.losses import preference_loss
 from sb3_poem.poem_sac.policies import MlpPolicy, POEMPolicy
 
@@ -211,12 +212,13 @@ class POEMSAC(PEARLSAC):
         chosen = self.generators.numpy.choice(len(self._groups), size=count, replace=False)
         return np.concatenate([self._groups[index] for index in chosen])
 
-    def _actor_embedding(self, latents: th.Tensor) -> th.Tensor:
+    def _embed(self, latents: th.Tensor) -> TaskEmbeddings:
         """L_policy trains f_pi and the encoder (section 5.3)."""
-        return self.policy.policy_embedding(latents)
+        return TaskEmbeddings(latents, self.policy.policy_embedding(latents), self.policy.reward_embedding(latents))
 
-    def _embedding_loss(self, batch: MetaBatch, latents: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
-        loss, accuracy = preference_loss(self.policy.similarity(latents, latents), batch.returns)
+    def _embedding_loss(self, batch: MetaBatch, embeddings: TaskEmbeddings) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+        similarity = embeddings.reward @ embeddings.policy.T  # eq. 3
+        loss, accuracy = preference_loss(similarity, batch.returns)
         return self.preference_coef * loss, {"preference_loss": loss, "preference_accuracy": accuracy}
 
     def learn(  # type: ignore[override]

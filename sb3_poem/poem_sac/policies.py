@@ -31,9 +31,7 @@ class POEMPolicy(LatentPolicy):
 
     def similarity(self, task_latents: th.Tensor, policy_latents: th.Tensor) -> th.Tensor:
         """S(z_i, z_j) = <f_r(z_i), f_pi(z_j)> (eq. 3): (m, d), (n, d) -> (m, n)."""
-        rewards, policies = self.reward_embedding(task_latents), self.policy_embedding(policy_latents)
-        with th.autocast(rewards.device.type, enabled=False):  # preferences are differences, which bfloat16 rounds away
-            return rewards.float() @ policies.float().T
+        return self.reward_embedding(task_latents) @ self.policy_embedding(policy_latents).T
 
     def _get_constructor_parameters(self) -> dict:
         return {**super()._get_constructor_parameters(), "two_encoder": self.two_encoder}

@@ -11,7 +11,6 @@ from sb3_poem.common.networks import (
     MIN_FACTOR_VARIANCE,
     MLP,
     ContextEncoder,
-    EnsembleMLP,
     LatentActor,
     LatentCritic,
     RewardDecoder,
@@ -36,49 +35,31 @@ def set_output(mlp: MLP, bias: list[float]) -> None:
 def test_mlp_is_linear_layers_and_activations() -> None:
     mlp = MLP(4, 3, [8, 7], nn.Tanh)
     x = th.randn(2, 5, 4)
-    first, second = (layer for layer in mlp.hidden if isinstance(layer, nn.Linear))
+    first, second = mlp.hidden
     h = np.tanh(x.numpy() @ first.weight.detach().numpy().T + first.bias.detach().numpy())
     h = np.tanh(h @ second.weight.detach().numpy().T + second.bias.detach().numpy())
     expected = h @ mlp.output.weight.detach().numpy().T + mlp.output.bias.detach().numpy()
     np.testing.assert_allclose(mlp(x).detach().numpy(), expected, atol=1e-6)
 
 
-def separate_networks(ensemble: EnsembleMLP) -> list[nn.Sequential]:
-    networks = []
-    for member in range(ensemble.n_members):
-        layers: list[nn.Module] = []
-        for weight, bias in zip(ensemble.weights, ensemble.biases, strict=True):
-            linear = nn.Linear(weight.shape[1], weight.shape[2])
-            with th.no_grad():
-                linear.weight.copy_(weight[member].T)
-                linear.bias.copy_(bias[member, 0])
-            layers += [linear, nn.ReLU()]
-        networks.append(nn.Sequential(*layers[:-1]))
-    return networks
-
-
-def test_ensemble_is_separate_networks_with_their_gradients() -> None:
-    ensemble = EnsembleMLP(3, 4, 2, [8, 6])
-    networks = separate_networks(ensemble)
-    x = th.randn(10, 4)
-    values, expected = ensemble(x), th.stack([network(x) for network in networks])
+def test_rectified_mlp_is_torchs_own_with_its_gradients() -> None:
+    mlp = MLP(4, 3, [8, 7])
+    twin = nn.Sequential(nn.Linear(4, 8), nn.ReLU(), nn.Linear(8, 7), nn.ReLU(), nn.Linear(7, 3))
+    layers = [*mlp.hidden, mlp.output]
+    with th.no_grad():
+        for ours, theirs in zip(layers, twin[::2], strict=True):
+            theirs.weight.copy_(ours.weight)
+            theirs.bias.copy_(ours.bias)
+    x, y = (th.randn(2, 5, 4).requires_grad_() for _ in range(2))
+    y.data.copy_(x.data)
+    values, expected = mlp(x), twin(y)
     th.testing.assert_close(values, expected)
-    target = th.randn(3, 10, 2)
-    (values - target).pow(2).mean().backward()
-    (expected - target).pow(2).mean().backward()
-    for index, (weight, bias) in enumerate(zip(ensemble.weights, ensemble.biases, strict=True)):
-        th.testing.assert_close(weight.grad, th.stack([network[2 * index].weight.grad.T for network in networks]))
-        th.testing.assert_close(bias.grad[:, 0], th.stack([network[2 * index].bias.grad for network in networks]))
-
-
-def test_ensemble_starts_like_linear_layers() -> None:
-    ensemble = EnsembleMLP(2, 50, 1, [400])
-    linear = nn.Linear(50, 400)
-    bound = 1.0 / np.sqrt(50.0)
-    for values in (ensemble.weights[0], ensemble.biases[0]):
-        assert values.abs().max().item() <= bound
-    assert ensemble.weights[0].std().item() == pytest.approx(linear.weight.std().item(), rel=0.05)
-    assert not th.equal(ensemble.weights[0][0], ensemble.weights[0][1])
+    for out in (values, expected):
+        out.pow(2).mean().backward()
+    th.testing.assert_close(x.grad, y.grad)
+    for ours, theirs in zip(layers, twin[::2], strict=True):
+        th.testing.assert_close(ours.weight.grad, theirs.weight.grad)
+        th.testing.assert_close(ours.bias.grad, theirs.bias.grad)
 
 
 def test_frozen_gives_gradients_to_the_input_only() -> None:
@@ -93,31 +74,6 @@ def test_frozen_gives_gradients_to_the_input_only() -> None:
     assert all(parameter.grad is not None for parameter in critic.parameters())
     for x, gradient in zip((obs, actions, latents), frozen, strict=True):
         th.testing.assert_close(x.grad, gradient)
-
-
-def test_output_layers_stay_in_float32_under_autocast() -> None:
-    mlp, ensemble = MLP(4, 3, [16]), EnsembleMLP(2, 4, 3, [16])
-    x = th.randn(8, 4)
-    with th.autocast("cpu", dtype=th.bfloat16):
-        hidden = mlp.hidden(x)
-        assert hidden.dtype == th.bfloat16  # the hidden layers do run in bfloat16
-        output, outputs = mlp(x), ensemble(x)
-        bare = MLP(4, 3, [])
-        bare_output = bare(x)
-    for value in (output, outputs, bare_output):
-        assert value.dtype == th.float32
-    assert th.equal(output, nn.functional.linear(hidden.float(), mlp.output.weight, mlp.output.bias))
-    assert th.equal(bare_output, nn.functional.linear(x, bare.output.weight, bare.output.bias))
-
-
-def test_values_in_the_hundreds_keep_their_differences_under_autocast() -> None:
-    ensemble = EnsembleMLP(1, 1, 1, [])
-    with th.no_grad():
-        ensemble.weights[0].fill_(1.0)
-        ensemble.biases[0].fill_(300.0)
-    with th.autocast("cpu", dtype=th.bfloat16):
-        values = ensemble(th.tensor([[0.01], [0.02]]))[0, :, 0]  # bfloat16 has steps of 2 here
-    np.testing.assert_allclose(values.detach().numpy(), [300.01, 300.02], atol=1e-4)
 
 
 # ---------------------------------------------------------------- encoder

@@ -433,7 +433,7 @@ def test_the_callers_policy_kwargs_stay_as_they_are(algorithm: type[PEARLSAC]) -
     policy_kwargs = {"net_arch": {key: list(value) for key, value in ARCH.items()}, "n_critics": 3}
     model = small(algorithm, policy_kwargs=policy_kwargs)
     assert policy_kwargs == {"net_arch": ARCH, "n_critics": 3}
-    assert model.policy.critic.ensemble.n_members == 3
+    assert len(model.policy.critic.members) == 3
     small(algorithm, policy_kwargs=policy_kwargs)
 
 
@@ -442,7 +442,7 @@ def test_net_arch_as_a_list_is_for_actor_and_critics(algorithm: type[PEARLSAC]) 
     assert policy.net_arch["pi"] == policy.net_arch["qf"] == [24, 12]
     assert policy.actor.mlp.output.in_features == 12
     assert policy.encoder.mlp.output.in_features == 200
-    assert isinstance(policy.actor.mlp.hidden[1], th.nn.Tanh)
+    assert isinstance(policy.actor.mlp.activation, th.nn.Tanh)
     with pytest.raises(ValueError, match=r"net_arch has unknown keys \['vf'\]; known are .*'decoder'.*"):
         small(algorithm, policy_kwargs={"net_arch": {"vf": [1]}})
 

@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_poem import PEARLSAC, POEMSAC
 from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.pearl_sac.losses import TaskEmbeddings
 
 
 def nearly_deterministic(model: PEARLSAC) -> PEARLSAC:
@@ -276,17 +277,6 @@ def test_similarity_is_the_inner_product_of_the_two_embeddings() -> None:
     assert model.similarity(tasks[0], policies[0]).shape == (1, 1)
 
 
-def test_similarities_keep_float32_under_autocast() -> None:
-    """Preferences live in differences of S, which bfloat16 would round to 2 where S is in the hundreds."""
-    model = small(POEMSAC, similarity="inner")
-    tasks = th.tensor([[20.0, 0.0, 0.0, 0.0, 0.0]])
-    policies = th.tensor([[15.0, 0.0, 0.0, 0.0, 0.0], [15.01, 0.0, 0.0, 0.0, 0.0]])
-    with th.autocast("cpu", dtype=th.bfloat16):
-        similarity = model.policy.similarity(tasks, policies)
-    assert similarity.dtype == th.float32
-    np.testing.assert_allclose(similarity.detach().numpy(), [[300.0, 300.2]], atol=1e-3)
-
-
 def test_the_inner_product_has_one_embedding() -> None:
     model = small(POEMSAC, similarity="inner").learn(EPOCH)
     latents = np.random.default_rng(0).normal(size=(4, 5))
@@ -312,7 +302,7 @@ def test_without_its_parts_poem_is_pearl() -> None:
     pearl = small(PEARLSAC, **arguments)
     poem = small(POEMSAC, similarity="inner", context="pearl", preference_coef=0.0, **arguments)
     assert parameters(pearl).keys() == parameters(poem).keys()
-    poem._actor_embedding = lambda latents: latents.detach()
+    poem._embed = lambda latents: TaskEmbeddings(latents, latents.detach(), latents)
     pearl.learn(2 * EPOCH)
     poem.learn(2 * EPOCH)
     assert all(th.equal(value, parameters(pearl)[name]) for name, value in parameters(poem).items())
@@ -326,11 +316,7 @@ def gradients(model: PEARLSAC, **weights: float) -> set[str]:
     for name in ("kl_coef", "reward_coef", "policy_coef", "preference_coef"):
         if hasattr(model, name):
             setattr(model, name, weights.get(name, 0.0))
-    with th.autocast("cpu", enabled=False):
-        loss, _ = model._losses(model._sample_meta_batch(16))
-        if not weights.get("critic", 0.0):
-            critic, _ = model._critic_loss(model._sample_meta_batch(16).transitions, th.zeros(6, 5))
-            loss = loss + 0.0 * critic
+    loss, _ = model._losses(model._sample_meta_batch(16))
     model.policy.zero_grad()
     loss.backward()
     return {
@@ -355,11 +341,12 @@ def test_each_loss_trains_what_the_paper_says() -> None:
 
 def encoder_gradient(model: PEARLSAC, batch: Any, name: str) -> float:
     latents, kl = model._encode(batch.context)
+    embeddings, transitions = model._embed(latents), model._standardise(batch.transitions)
     losses = {
-        "actor": lambda: model._actor_loss(batch.transitions, latents, th.ones(()))[0],
-        "decoder": lambda: model._decoder_loss(batch, latents),
-        "preference": lambda: model._embedding_loss(batch, latents)[0],
-        "critic": lambda: model._critic_loss(batch.transitions, latents)[0],
+        "actor": lambda: model._actor_loss(transitions, embeddings, th.ones(()))[0],
+        "decoder": lambda: model._decoder_loss(batch, transitions, embeddings),
+        "preference": lambda: model._embedding_loss(batch, embeddings)[0],
+        "critic": lambda: model._critic_loss(transitions, embeddings, th.ones(())),
         "kl": lambda: kl.mean(),
     }
     model.policy.zero_grad()
@@ -384,7 +371,7 @@ def test_the_actors_loss_does_not_train_the_critics() -> None:
     batch = model._sample_meta_batch(16)
     latents, _ = model._encode(batch.context)
     model.policy.zero_grad()
-    model._actor_loss(batch.transitions, latents, th.ones(()))[0].backward()
+    model._actor_loss(model._standardise(batch.transitions), model._embed(latents), th.ones(()))[0].backward()
     assert all(parameter.grad is None for parameter in model.policy.critic.parameters())
     assert all(parameter.grad is None for parameter in model.policy.critic_target.parameters())
 
@@ -408,7 +395,8 @@ def test_targets_are_bootstrapped_except_at_an_early_end() -> None:
     assert 0 < batch.terminated.sum() < batch.terminated.numel()
     policy, latents = model.policy, th.randn(6, 5)
     state = model.generators.torch.get_state()
-    loss, alpha = model._critic_loss(batch, latents)
+    alpha = model._entropy_coefficient()
+    loss = model._critic_loss(model._standardise(batch), model._embed(latents), alpha)
     model.generators.torch.set_state(state)
     noise = th.randn(6, 16, 1, generator=model.generators.torch)
     total = 0.0

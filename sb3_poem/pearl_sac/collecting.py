@@ -1,0 +1,161 @@
+"""The collection of an epoch: every training task is rolled out under its own latest latent."""
+
+import time
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import RolloutReturn
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_poem.common.buffers import ContextStore, Segment, TaskReplayBuffer
+from sb3_poem.common.collection import collect_segment
+from sb3_poem.pearl_sac.tasks import TaskSAC
+
+MIN_STD = 1e-3
+
+
+class CollectingSAC(TaskSAC):
+    """Fills the tasks' replay buffers and replaces their contexts, epoch by epoch; a base of :class:`PEARLSAC`."""
+
+    replay_buffer: TaskReplayBuffer
+    context: ContextStore | None
+    context_has_value: bool = False
+    epoch: int
+    trajectories_per_task: int
+    _statistics_known: bool
+    _logs_pending: bool
+
+    def collect_rollouts(  # type: ignore[override]
+        self, env: VecEnv, callback: BaseCallback, *args: Any, log_interval: int | None = None, **kwargs: Any
+    ) -> RolloutReturn:
+        """Collect one epoch: ``trajectories_per_task`` horizons of every training task under its own latest latent."""
+        assert self.train_tasks is not None
+        assert self.latent_means is not None
+        assert self.latent_variances is not None
+        self.policy.set_training_mode(False)
+        callback.on_rollout_start()  # between two epochs: evaluations and checkpoints belong here
+        self._dump_pending_logs(log_interval)
+        started, steps_before = time.perf_counter(), self.num_timesteps
+        n_tasks, n_envs = len(self.train_tasks), env.num_envs
+        wanted = np.repeat(np.arange(n_tasks), self.trajectories_per_task)
+        # the last wave is filled up: its copies are stepped anyway, so let them add to the replay buffers
+        slots = np.resize(wanted, -(-len(wanted) // n_envs) * n_envs)
+        segments: list[Segment] = []
+        for wave in slots.reshape(-1, n_envs):
+            draws = self.generators.numpy.standard_normal((n_envs, self.latent_dim))
+            latents = self.latent_means[wave] + np.sqrt(self.latent_variances[wave]) * draws
+            segment = self._collect(callback, wave, self.train_tasks[wave], latents)
+            if segment is None:
+                return RolloutReturn(self.num_timesteps - steps_before, 0, continue_training=False)
+            self.replay_buffer.extend(segment)
+            segments.append(segment)
+        epoch = _concatenate(segments, len(wanted))
+        returns = self._measure_returns(epoch, callback)
+        if returns is None:
+            return RolloutReturn(self.num_timesteps - steps_before, 0, continue_training=False)
+        if not self._statistics_known:  # after the returns, which the policies that collected the epoch must earn
+            self._set_statistics(segments)
+        self._replace_context(epoch, returns)
+        self.epoch += 1
+        collected = self.num_timesteps - steps_before
+        self.logger.record("time/collection_fps", collected / (time.perf_counter() - started))
+        own_returns = np.nanmean(np.diagonal(returns))
+        self.logger.record("rollout/train_task_return", own_returns)
+        self._logs_pending = True
+        callback.on_rollout_end()
+        return RolloutReturn(collected, 0, continue_training=True)
+
+    def _collect(self, callback: BaseCallback, task_ids: np.ndarray, tasks: np.ndarray, latents: np.ndarray) -> Segment | None:
+        family, noise_shape = self.family, (len(latents), int(self.action_space.shape[0]))  # type: ignore[index]
+
+        def act(obs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            if self.num_timesteps < self.learning_starts:
+                scaled = self.generators.numpy.uniform(-1.0, 1.0, noise_shape).astype(np.float32)
+            else:
+                noise = th.randn(noise_shape, generator=self.generators.torch, device=self.device)
+                scaled = self.policy.act(obs, latents, noise)
+            actions = np.clip(self.policy.unscale_action(scaled), self.action_space.low, self.action_space.high)  # type: ignore[attr-defined]
+            return actions, scaled
+
+        def on_step(step_locals: dict[str, Any]) -> bool:
+            self.num_timesteps += family.num_envs
+            callback.update_locals(step_locals)
+            if not callback.on_step():
+                return False
+            self._update_info_buffer(step_locals["infos"], step_locals["dones"])
+            self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+            self._episode_num += int(step_locals["dones"].sum())
+            return True
+
+        episodes = np.full(family.num_envs, self._episode_num)
+        return collect_segment(family, act, task_ids, tasks, latents, self.generators.integer_seed(), episodes, on_step)
+
+    def _set_statistics(self, segments: list[Segment]) -> None:
+        """Standardise by the first epoch's mean and deviation."""
+        obs = np.concatenate([segment.observations.reshape(-1, segment.observations.shape[-1]) for segment in segments])
+        rewards = np.concatenate([segment.rewards.ravel() for segment in segments])
+        policy = self.policy
+        with th.no_grad():
+            policy.obs_mean.copy_(th.as_tensor(obs.mean(axis=0)))
+            policy.obs_std.copy_(th.as_tensor(np.maximum(obs.std(axis=0), MIN_STD)))
+            policy.reward_mean.fill_(float(rewards.mean()))
+            policy.reward_std.fill_(max(float(rewards.std()), MIN_STD))
+        self._statistics_known = True
+
+    def _measure_returns(self, epoch: Segment, callback: BaseCallback) -> np.ndarray | None:
+        """J[i, j]: the return of task j's policy on task i, (n_train_tasks, n_train_tasks); NaN where unknown."""
+        assert self.train_tasks is not None
+        n_tasks = len(self.train_tasks)
+        own = (epoch.rewards * epoch.first_episode).sum(axis=1).reshape(n_tasks, -1).mean(axis=1)
+        returns = np.full((n_tasks, n_tasks), np.nan)
+        np.fill_diagonal(returns, own)
+        return returns
+
+    def _replace_context(self, epoch: Segment, returns: np.ndarray) -> None:
+        n_tasks, per_task = len(returns), self.trajectories_per_task
+        with th.no_grad():
+            obs, next_obs = (
+                self.policy.standardise(th.as_tensor(values, device=self.device))
+                for values in (epoch.observations, epoch.next_observations)
+            )
+            actions = th.as_tensor(epoch.actions, device=self.device)
+            rewards = th.as_tensor(epoch.rewards, dtype=th.float32, device=self.device)
+            parts = [obs, actions, next_obs, _standardised(rewards)[..., None]]
+            if self.context_has_value:
+                parts.append(_standardised(self._context_values(obs, actions, epoch.latents))[..., None])
+            transitions = th.cat(parts, dim=-1)
+        steps = per_task * transitions.shape[1]
+        self.context = ContextStore(
+            transitions.reshape(n_tasks, steps, -1),
+            rewards.reshape(n_tasks, steps),
+            th.as_tensor(returns, dtype=th.float32, device=self.device),
+        )
+
+    def _context_values(self, obs: th.Tensor, actions: th.Tensor, latents: np.ndarray) -> th.Tensor:
+        """Q(s, a) of the current critics along the context (eq. 8); 0 before the first update (Algorithm 1, line 2)."""
+        if self._n_updates == 0:
+            return th.zeros(obs.shape[:2], device=self.device)
+        z = th.as_tensor(latents, dtype=th.float32, device=self.device)
+        rows = [
+            self.policy.critic(o, a, zi.expand(o.shape[0], -1)).min(dim=0).values  # type: ignore[operator]
+            for o, a, zi in zip(obs, actions, z, strict=True)
+        ]
+        return th.stack(rows)
+
+    def _dump_pending_logs(self, log_interval: int | None) -> None:
+        if self._logs_pending and log_interval and self.epoch % log_interval == 0:
+            self.dump_logs()
+            self._logs_pending = False
+
+
+def _standardised(values: th.Tensor) -> th.Tensor:
+    return (values - values.mean()) / values.std().clamp(min=MIN_STD)
+
+
+def _concatenate(segments: list[Segment], n: int) -> Segment:
+    """The first ``n`` copies of all waves as one segment."""
+    return Segment(
+        **{name: np.concatenate([getattr(segment, name) for segment in segments])[:n] for name in Segment.__dataclass_fields__}
+    )

@@ -1,0 +1,139 @@
+"""The tasks of a meta-trained model: which it was trained on, their latents, and the environment that they come from."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.utils import check_for_correct_spaces
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.random import Generators
+from sb3_poem.pearl_sac.persistence import DEFAULT_TRAIN_TASKS, PersistentSAC
+from sb3_poem.pearl_sac.policies import LatentPolicy
+
+AGGREGATE_NEIGHBOURS = 5
+
+
+class TaskSAC(PersistentSAC):
+    """Soft actor-critic on a family of tasks, each with a posterior of its latent; a base of :class:`PEARLSAC`."""
+
+    policy: LatentPolicy
+    generators: Generators
+    horizon: int | None
+    latent_dim: int
+    n_train_tasks: int | None
+    relabel_fraction: float
+    train_tasks: np.ndarray | None
+    latent_means: np.ndarray | None
+    latent_variances: np.ndarray | None
+    _family: FamilyEnv | None
+
+    def _draw_tasks(self) -> None:
+        assert self._family is not None, "a new model needs an environment"
+        family = self._family
+        count = self.n_train_tasks
+        if count is None:
+            count = DEFAULT_TRAIN_TASKS if family.all_tasks is None else min(DEFAULT_TRAIN_TASKS, len(family.all_tasks))
+        if family.all_tasks is not None and count > len(family.all_tasks):
+            raise ValueError(
+                f"n_train_tasks is {count}, but {family.env_id} is a finite family of {len(family.all_tasks)} tasks; "
+                f"use at most {len(family.all_tasks)}, or None for all"
+            )
+        if self.relabel_fraction > 0 and not family.shared_dynamics:
+            raise ValueError(f"relabel_fraction must be 0: the tasks of {family.env_id} do not share dynamics")
+        self.env_id = family.env_id
+        self.task_space = family.task_space
+        self.reward_feature_dim = family.reward_feature_dim
+        self.train_tasks = family.sample_tasks(count, self.generators.child())
+        self.latent_means = np.zeros((count, self.latent_dim))
+        self.latent_variances = np.ones((count, self.latent_dim))
+
+    def _family_of(self, env: VecEnv) -> FamilyEnv:
+        """View of an environment, which must be of the model's own family once the model has one."""
+        family = FamilyEnv(env, self.horizon)
+        if self.train_tasks is not None:
+            family.check_same_family(self.task_space, self.reward_feature_dim)
+        return family
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """Change the environment, to one of the same family with any number of copies.
+
+        :raises ValueError: if the environment is of another family; the model then keeps its own
+        """
+        vec_env = self._wrap_env(env, self.verbose)
+        check_for_correct_spaces(vec_env, self.observation_space, self.action_space)
+        family = self._family_of(vec_env)
+        self.n_envs = vec_env.num_envs  # experience is kept per task, not per copy
+        super().set_env(vec_env, force_reset)
+        self._family = family
+
+    @property
+    def family(self) -> FamilyEnv:
+        """The environment as a task family.
+
+        :raises ValueError: if the model was loaded without an environment
+        """
+        if self._family is None:
+            if self.env is None:
+                raise ValueError("the model has no environment; give it one with set_env, or load it with env=...")
+            self._family = self._family_of(self.env)
+        return self._family
+
+    @property
+    def task_latents(self) -> np.ndarray:
+        """Posterior means of the training tasks' latents, (n_train_tasks, latent_dim)."""
+        assert self.latent_means is not None
+        return self.latent_means
+
+    @property
+    def aggregate_to_prior_kl(self) -> float:
+        """How far the training tasks' aggregate posterior is from N(0, I): KL of its moment-matched Gaussian, nats."""
+        assert self.latent_variances is not None
+        mean, second = self.task_latents.mean(axis=0), self.latent_variances.mean(axis=0) + self.task_latents.var(axis=0)
+        return 0.5 * float((mean**2 + second - 1.0 - np.log(second)).sum())
+
+    def sample_latents(self, n: int, rng: np.random.Generator, source: str = "prior") -> np.ndarray:
+        """Draw latents (n, latent_dim).
+
+        :param n: How many
+        :param rng: Generator to use
+        :param source: "prior": N(0, I). "aggregate": the training tasks' posteriors, and what lies between a task and its
+            nearest neighbours, so that tasks between the training tasks are covered but untrained regions are not
+        """
+        if source == "prior":
+            return rng.standard_normal((n, self.latent_dim))
+        if source != "aggregate":
+            raise ValueError(f'source must be "prior" or "aggregate", got {source!r}')
+        means, variances = self.task_latents, self.latent_variances
+        assert variances is not None
+        chosen = rng.integers(len(means), size=n)
+        draws = means[chosen]
+        n_neighbours = min(AGGREGATE_NEIGHBOURS, len(means) // 4)  # a family of few tasks has nothing in between
+        if n_neighbours:
+            distances = ((means[:, None, :] - means[None, :, :]) ** 2).sum(axis=2)
+            neighbours = distances.argsort(axis=1)[chosen, rng.integers(1, n_neighbours + 1, size=n)]
+            draws = draws + rng.uniform(size=(n, 1)) * (means[neighbours] - draws)
+        return draws + np.sqrt(variances[chosen]) * rng.standard_normal(draws.shape)
+
+    def predicted_returns(self, latents: np.ndarray, trajectories: Iterable[Any]) -> np.ndarray:
+        """Returns that the reward decoder predicts for trajectories, if each latent were the task's.
+
+        :param latents: (m, latent_dim)
+        :param trajectories: With ``observations`` (T + 1, obs_dim) and ``actions`` (T, action_dim) in the environment's units
+        :return: (m, number of trajectories)
+        """
+        columns = []
+        with th.no_grad():
+            latent_tensor = th.as_tensor(np.atleast_2d(latents), dtype=th.float32, device=self.device)
+            embeddings = self.policy.reward_embedding(latent_tensor)
+            for trajectory in trajectories:
+                obs = self.policy.standardise(th.as_tensor(trajectory.observations, dtype=th.float32, device=self.device))
+                actions = th.as_tensor(trajectory.actions, dtype=th.float32, device=self.device)
+                actions = self.policy.scale_action_batch(actions)
+                standardised = self.policy.decoder.for_embeddings(obs[:-1], actions, obs[1:], embeddings)
+                rewards = standardised * self.policy.reward_std + self.policy.reward_mean
+                columns.append(rewards.double().sum(dim=1))
+        return th.stack(columns, dim=1).cpu().numpy()
