@@ -60,6 +60,8 @@ def main() -> None:
         "-1",
         "--verbose",
         "0",
+        "--num-threads",
+        "1",  # networks of this size are faster on one
         "-P",
     )
     model = latest("poem-PointGoal-v0.zip", out / "logs")

@@ -26,7 +26,8 @@ class AdaptationEvalCallback(EpochCallback):
     :param n_tasks: Held-out tasks; a finite family is evaluated on all its tasks
     :param record_at: Numbers of answers after which the adapted policy is measured
     :param n_episodes: Episodes of each task and measurement
-    :param best_model_save_path: Folder for ``best_model.zip``, the model of the highest return after the most answers
+    :param best_model_save_path: Folder for ``best_model.zip``, the model of the highest return after the most answers. A run
+        that is resumed with the same folder goes on comparing with it
     :param seed: Seed of the held-out tasks and of everything else here
     :param adaptation_kwargs: Options of :func:`sb3_poem.adaptation.adapt_tasks`, for instance ``inference``. A model without a
         similarity is asked random queries unless they say otherwise
@@ -57,6 +58,15 @@ class AdaptationEvalCallback(EpochCallback):
         self.best_return = -np.inf
         self.last_evaluation: dict[str, float] = {}
         self._env: TaskVecEnv | None = None
+
+    def _init_callback(self) -> None:
+        super()._init_callback()
+        if self._best_model is not None and self._best_model.exists():  # a run that goes on
+            self.best_return = getattr(self.model, "best_adapted_return", self.best_return)
+
+    @property
+    def _best_model(self) -> Path | None:
+        return None if self.best_model_save_path is None else self.best_model_save_path / "best_model.zip"
 
     def _make_env(self) -> tuple[TaskVecEnv, np.ndarray]:
         family = self.model.family
@@ -93,9 +103,9 @@ class AdaptationEvalCallback(EpochCallback):
             print(f"Evaluation after {self.model.num_timesteps} steps: {listing}")
         score = result.after(max(self.record_at))
         if score > self.best_return:
-            self.best_return = score
-            if self.best_model_save_path is not None:
-                self.model.save(self.best_model_save_path / "best_model.zip")
+            self.best_return = self.model.best_adapted_return = score
+            if self._best_model is not None:
+                self.model.save(self._best_model)
 
     def _coverage_loss(self, env: TaskVecEnv) -> float:
         """How far the prior is from what the policy was trained on, in return."""

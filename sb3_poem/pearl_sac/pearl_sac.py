@@ -144,9 +144,10 @@ class PEARLSAC(CollectingSAC):
         self._statistics_known = False
         self._family: FamilyEnv | None = None
         self._logs_pending = False
+        self.best_adapted_return = -np.inf  # kept with the model, for AdaptationEvalCallback
         super().__init__(
             policy,
-            self._vectorise(env, n_train_tasks),
+            self._vectorise(env, n_train_tasks, trajectories_per_task),
             learning_rate=learning_rate,
             buffer_size=buffer_size,
             learning_starts=learning_starts,

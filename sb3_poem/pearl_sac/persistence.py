@@ -1,5 +1,6 @@
 """How models and training runs are written and read: SB3's zip, checkpoints, and pretrained folders."""
 
+import contextlib
 import io
 import pathlib
 import zipfile
@@ -7,6 +8,7 @@ from collections.abc import Iterable
 from typing import Any, ClassVar, TypeVar, cast
 
 import gymnasium as gym
+import numpy as np
 import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.save_util import load_from_zip_file
@@ -19,6 +21,11 @@ from sb3_poem.common.pretrained import from_pretrained, save_pretrained
 SelfPersistent = TypeVar("SelfPersistent", bound="PersistentSAC")
 
 DEFAULT_TRAIN_TASKS = 120
+
+
+def default_train_tasks(all_tasks: np.ndarray | None) -> int:
+    """How many tasks to train on unless told: 120, or all of a smaller finite family."""
+    return DEFAULT_TRAIN_TASKS if all_tasks is None else min(DEFAULT_TRAIN_TASKS, len(all_tasks))
 
 
 class PersistentSAC(SAC):
@@ -51,17 +58,23 @@ class PersistentSAC(SAC):
     }
 
     @staticmethod
-    def _vectorise(env: GymEnv | str, n_train_tasks: int | None) -> GymEnv | str:
-        """A registered id of a family that has a vectorised version becomes one copy per training task."""
-        if isinstance(env, str):
-            import poem_envs  # noqa: F401
+    def _vectorise(env: GymEnv | str, n_train_tasks: int | None, trajectories_per_task: int = 1) -> GymEnv | str:
+        """A registered id of a family that has a vectorised version becomes one copy for each trajectory of an epoch, up to
+        one per task or :data:`DEFAULT_TRAIN_TASKS`, whichever is more.
+        """
+        if not isinstance(env, str):
+            return env
+        import poem_envs  # noqa: F401
 
-            spec = gym.spec(env)
-            if spec.vector_entry_point is not None:
-                from sb3_poem.common.vec_env import TaskVecEnv
+        if gym.spec(env).vector_entry_point is None:
+            return env
+        from sb3_poem.common.vec_env import TaskVecEnv
 
-                return TaskVecEnv.from_id(env, n_train_tasks or DEFAULT_TRAIN_TASKS)
-        return env
+        if n_train_tasks is None:
+            with contextlib.closing(gym.make(env)) as probe:
+                n_train_tasks = default_train_tasks(getattr(probe.unwrapped, "all_tasks", None))
+        n_copies = min(n_train_tasks * trajectories_per_task, max(n_train_tasks, DEFAULT_TRAIN_TASKS))
+        return TaskVecEnv.from_id(env, n_copies)
 
     def save(
         self,

@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.common.family import FamilyEnv
 from sb3_poem.common.random import Generators
-from sb3_poem.pearl_sac.persistence import DEFAULT_TRAIN_TASKS, PersistentSAC
+from sb3_poem.pearl_sac.persistence import PersistentSAC, default_train_tasks
 from sb3_poem.pearl_sac.policies import LatentPolicy
 
 AGGREGATE_NEIGHBOURS = 5
@@ -34,9 +34,7 @@ class TaskSAC(PersistentSAC):
     def _draw_tasks(self) -> None:
         assert self._family is not None, "a new model needs an environment"
         family = self._family
-        count = self.n_train_tasks
-        if count is None:
-            count = DEFAULT_TRAIN_TASKS if family.all_tasks is None else min(DEFAULT_TRAIN_TASKS, len(family.all_tasks))
+        count = default_train_tasks(family.all_tasks) if self.n_train_tasks is None else self.n_train_tasks
         if family.all_tasks is not None and count > len(family.all_tasks):
             raise ValueError(
                 f"n_train_tasks is {count}, but {family.env_id} is a finite family of {len(family.all_tasks)} tasks; "

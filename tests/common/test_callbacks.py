@@ -108,6 +108,20 @@ def test_evaluation_is_logged_and_changes_nothing(algorithm: type[PEARLSAC], tmp
     assert best.num_timesteps == (2 if returns[0] >= returns[1] else 3) * EPOCH
 
 
+def test_a_resumed_run_goes_on_comparing_with_its_best_model(tmp_path: Path) -> None:
+    model = small(POEMSAC)
+    model.learn(EPOCH, AdaptationEvalCallback(best_model_save_path=tmp_path / "best", **QUICK))
+    model.best_adapted_return = 0.0  # which nothing exceeds
+    model.save_checkpoint(tmp_path / "checkpoint.zip")
+    best = (tmp_path / "best" / "best_model.zip").read_bytes()
+    resumed = POEMSAC.load_checkpoint(tmp_path / "checkpoint.zip", POINT_GOAL)
+    resumed.learn(EPOCH, AdaptationEvalCallback(best_model_save_path=tmp_path / "best", **QUICK), reset_num_timesteps=False)
+    assert (tmp_path / "best" / "best_model.zip").read_bytes() == best
+    # another folder holds no model that it could be compared with
+    resumed.learn(EPOCH, AdaptationEvalCallback(best_model_save_path=tmp_path / "other", **QUICK), reset_num_timesteps=False)
+    assert (tmp_path / "other" / "best_model.zip").exists()
+
+
 def test_evaluation_of_a_finite_family_is_on_all_its_tasks() -> None:
     callback = AdaptationEvalCallback(n_tasks=5, record_at=(1,), n_episodes=1)
     model = small(POEMSAC, "poem/HalfCheetahFwdBack-v0", n_train_tasks=2)

@@ -471,3 +471,11 @@ def test_half_cheetah_forwards_and_backwards(algorithm: type[PEARLSAC]) -> None:
 def test_environments_of_one_copy_and_many_tasks() -> None:
     env = DummyVecEnv([lambda: gym.wrappers.TimeLimit(Walk(), 10)])
     assert small(POEMSAC, env, horizon=10, preference_source="rollout", n_train_tasks=4).learn(1).num_timesteps == 160
+
+
+def test_an_id_becomes_as_many_copies_as_an_epoch_has_trajectories() -> None:
+    finite = "poem/HalfCheetahFwdBack-v0"
+    assert POEMSAC("MlpPolicy", finite).n_envs == 2
+    assert POEMSAC("MlpPolicy", finite, trajectories_per_task=100).n_envs == 120  # in two waves
+    assert POEMSAC("MlpPolicy", POINT_GOAL, n_train_tasks=7, trajectories_per_task=2).n_envs == 14
+    assert POEMSAC("MlpPolicy", POINT_GOAL, n_train_tasks=130, trajectories_per_task=2).n_envs == 130
