@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from sb3_poem.common.files import write_atomically
 
 
 def generator_state(rng: np.random.Generator) -> dict[str, Any]:
@@ -41,21 +42,11 @@ def write_json_atomically(path: str | os.PathLike[str], data: dict[str, Any]) ->
     """
     Write JSON so that the file is either the old one or the whole new one, whatever happens in between.
 
-    :param path: The file; its folder must exist.
+    :param path: The file; missing folders are made.
     :param data: What to write.
+    :raises OSError: If it cannot be written.
     """
-    path = Path(path)
-    text = json.dumps(data, indent=1, allow_nan=False)
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
-    try:
-        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    write_atomically(Path(path), json.dumps(data, indent=1, allow_nan=False).encode())
 
 
 def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
