@@ -61,7 +61,7 @@ def main() -> None:
         "--verbose",
         "0",
         "--num-threads",
-        "1",  # networks of this size are faster on one
+        "1",  # as the time in the README was measured
         "-P",
     )
     model = latest("poem-PointGoal-v0.zip", out / "logs")
