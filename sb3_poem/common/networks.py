@@ -6,20 +6,20 @@ in the hundreds lose their differences in eight bits of mantissa.
 
 import itertools
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch as th
 from torch import nn
-from torch.autograd.function import once_differentiable
 from torch.nn.functional import linear, softplus
+
+from sb3_poem.common.low_precision import LowPrecisionMLP
 
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
 MIN_FACTOR_VARIANCE = 1e-7
 
 
 class MLP(nn.Module):
-    """Multi-layer perceptron with a float32 output layer.
+    """Multi-layer perceptron.
 
     :param in_dim: Width of the input
     :param out_dim: Width of the output
@@ -33,46 +33,36 @@ class MLP(nn.Module):
         self.activation = nn.ReLU(inplace=True) if activation_fn is nn.ReLU else activation_fn()
         self.hidden = nn.ModuleList(nn.Linear(width, next_width) for width, next_width in itertools.pairwise(widths))
         self.output = nn.Linear(widths[-1], out_dim)
-        #: Copies of the hidden layers in another arithmetic, while :class:`MixedPrecision` holds
-        self.stand_ins: list[nn.Linear] | None = None
+        #: The hidden layers in another arithmetic, while :class:`MixedPrecision` holds
+        self.low_precision: LowPrecisionMLP | None = None
 
-    def forward(self, x: th.Tensor, frozen: bool = False) -> th.Tensor:
-        """Map (..., in_dim) to (..., out_dim), float32.
+    def forward(self, *parts: th.Tensor, frozen: bool = False) -> th.Tensor:
+        """Map (..., in_dim), in one or more parts, to (..., out_dim), float32.
 
-        :param x: Input
-        :param frozen: Do not build a graph to the parameters; gradients still reach ``x``
+        :param parts: Input, split along its last dimension
+        :param frozen: Do not build a graph to the parameters; gradients still reach the input
         """
+        return self.evaluate(self.inputs(*parts), frozen)
+
+    def inputs(self, *parts: th.Tensor) -> th.Tensor:
+        """Put an input together for :meth:`evaluate`; networks of one shape may share it."""
+        if self.low_precision is not None:
+            return self.low_precision.inputs(parts)
+        return th.cat(parts, dim=-1) if len(parts) > 1 else parts[0]
+
+    def evaluate(self, x: th.Tensor, frozen: bool = False) -> th.Tensor:
+        """:meth:`forward` of an input that :meth:`inputs` has put together."""
+        if self.low_precision is not None:
+            return self.low_precision.evaluate(x, frozen)
         h = x.reshape(-1, x.shape[-1])  # a product of two dimensions is no view, so that activations may work in place
-        for layer in self.hidden if self.stand_ins is None else self.stand_ins:
-            assert isinstance(layer, nn.Linear)
-            weight, bias = _parameters(layer, frozen)
-            h = self.activation(linear(h.to(weight.dtype), weight, bias))
-        weight, bias = _parameters(self.output, frozen)
-        out = linear(h, weight, bias) if h.dtype == weight.dtype else _OutputLayer.apply(h, weight, bias)
-        return out.view(*x.shape[:-1], -1)
+        for layer in self.hidden:
+            h = self.activation(_linear(h, layer, frozen))
+        return _linear(h, self.output, frozen).view(*x.shape[:-1], -1)
 
 
-def _parameters(layer: nn.Linear, frozen: bool) -> tuple[th.Tensor, th.Tensor]:
-    return (layer.weight.detach(), layer.bias.detach()) if frozen else (layer.weight, layer.bias)
-
-
-class _OutputLayer(th.autograd.Function):
-    """Float32 outputs of hidden values in less; gradients go back in the arithmetic of the hidden layers."""
-
-    @staticmethod
-    def forward(ctx: Any, h: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:
-        ctx.save_for_backward(h, weight)
-        return linear(h.float(), weight, bias)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: th.Tensor) -> tuple[th.Tensor | None, ...]:  # type: ignore[override]
-        h, weight = ctx.saved_tensors
-        low = grad.to(h.dtype)
-        grad_weight = grad_bias = None
-        if ctx.needs_input_grad[1]:
-            grad_weight, grad_bias = (low.t() @ h).float(), grad.sum(dim=0)
-        return low @ weight.to(h.dtype), grad_weight, grad_bias
+def _linear(x: th.Tensor, layer: nn.Module, frozen: bool) -> th.Tensor:
+    assert isinstance(layer, nn.Linear)
+    return linear(x, layer.weight.detach(), layer.bias.detach()) if frozen else layer(x)
 
 
 class ContextEncoder(nn.Module):
@@ -125,7 +115,7 @@ class LatentActor(nn.Module):
 
     def distribution(self, obs: th.Tensor, embedding: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Mean and log standard deviation before squashing, each (..., action_dim)."""
-        mean, log_std = self.mlp(th.cat([obs, embedding], dim=-1)).chunk(2, dim=-1)
+        mean, log_std = self.mlp(obs, embedding).chunk(2, dim=-1)
         return mean, log_std.clamp(LOG_STD_MIN, LOG_STD_MAX)
 
     def forward(
@@ -176,8 +166,9 @@ class LatentCritic(nn.Module):
 
         :param frozen: Do not build a graph to the parameters; gradients still reach the inputs
         """
-        x = th.cat([obs, actions, latents], dim=-1)
-        return th.stack([member(x, frozen) for member in self.members]).squeeze(-1)
+        members: list[MLP] = list(self.members)  # type: ignore[arg-type]
+        x = members[0].inputs(obs, actions, latents)
+        return th.stack([member.evaluate(x, frozen) for member in members]).squeeze(-1)
 
 
 class RewardDecoder(nn.Module):
@@ -202,7 +193,7 @@ class RewardDecoder(nn.Module):
 
     def forward(self, obs: th.Tensor, actions: th.Tensor, next_obs: th.Tensor, embedding: th.Tensor) -> th.Tensor:
         """Predicted standardised rewards (...) of transitions (..., dim)."""
-        return self.mlp(th.cat([obs, actions, next_obs, embedding], dim=-1)).squeeze(-1)
+        return self.mlp(obs, actions, next_obs, embedding).squeeze(-1)
 
     @th.no_grad()
     def for_embeddings(self, obs: th.Tensor, actions: th.Tensor, next_obs: th.Tensor, embeddings: th.Tensor) -> th.Tensor:

@@ -1,11 +1,11 @@
 """Arithmetic of hidden layers."""
 
-import copy
 from typing import Any
 
 import torch as th
 from torch import nn
 
+from sb3_poem.common.low_precision import LowPrecisionMLP
 from sb3_poem.common.networks import MLP
 
 PRECISIONS = ("auto", "bf16", "fp32")
@@ -32,41 +32,35 @@ def hidden_dtype(precision: str, device_type: str) -> th.dtype:
 
 
 class MixedPrecision:
-    """Runs the hidden layers of all perceptrons of a module in another arithmetic, on weights that stay float32.
+    """Runs the hidden layers of all rectified perceptrons of a module in another arithmetic, on weights that stay float32.
 
     Within the context, copies of the layers compute; :meth:`refresh` brings them up to date, and :meth:`collect_gradients`
-    takes their gradients back to the float32 weights, each for all layers at once. That takes fewer operations than autocast,
-    which casts every weight, bias and gradient on its own.
+    takes their gradients back to the float32 weights, each for all layers at once.
 
-    :param module: Module that holds the perceptrons
+    :param module: Module that holds the perceptrons; those with another activation than ReLU stay float32
     :param dtype: Arithmetic of their hidden layers; float32 changes nothing
     """
 
     def __init__(self, module: nn.Module, dtype: th.dtype) -> None:
-        networks = [part for part in module.modules() if isinstance(part, MLP)]
-        self._networks = networks if dtype != th.float32 else []
-        self._stand_ins: list[list[nn.Linear]] = [
-            [copy.deepcopy(layer).to(dtype) for layer in network.hidden]  # type: ignore[misc]
-            for network in self._networks
-        ]
-        pairs = [
-            pair
-            for network, layers in zip(self._networks, self._stand_ins, strict=True)
-            for original, layer in zip(network.hidden, layers, strict=True)
-            for pair in zip(original.parameters(), layer.parameters(), strict=True)
-        ]
-        self._originals: list[th.Tensor] = [original for original, _ in pairs]
-        self._copies: list[th.Tensor] = [layer for _, layer in pairs]
-        self._trained = [(original, layer) for original, layer in pairs if original.requires_grad]
+        self._networks: list[tuple[MLP, LowPrecisionMLP]] = []
+        if dtype != th.float32:
+            self._networks = [
+                (part, LowPrecisionMLP(list(part.hidden), part.output, dtype))  # type: ignore[arg-type]
+                for part in module.modules()
+                if isinstance(part, MLP) and isinstance(part.activation, nn.ReLU) and len(part.hidden)
+            ]
+        self._pairs = [pair for _, network in self._networks for pair in network.pairs]
+        self._originals: list[th.Tensor] = [original for original, _, _ in self._pairs]
+        self._copies: list[th.Tensor] = [copy.detach()[place] for _, copy, place in self._pairs]
 
     def __enter__(self) -> "MixedPrecision":
-        for network, layers in zip(self._networks, self._stand_ins, strict=True):
-            network.stand_ins = layers
+        for part, network in self._networks:
+            part.low_precision = network
         return self
 
     def __exit__(self, *exception: Any) -> None:
-        for network in self._networks:
-            network.stand_ins = None
+        for part, _ in self._networks:
+            part.low_precision = None
 
     def refresh(self) -> None:
         """Bring the copies up to date with the float32 weights."""
@@ -77,14 +71,15 @@ class MixedPrecision:
     def collect_gradients(self) -> None:
         """Move the gradients of the copies to the float32 weights."""
         targets, sources = [], []
-        for original, layer in self._trained:
-            if layer.grad is None:
-                original.grad = None
+        for original, copy, place in self._pairs:
+            if copy.grad is None:
+                if copy.requires_grad:
+                    original.grad = None
                 continue
             if original.grad is None:
                 original.grad = th.empty_like(original)
             targets.append(original.grad)
-            sources.append(layer.grad)
-            layer.grad = None
+            sources.append(copy.grad[place])
+            copy.grad = None
         if targets:
             th._foreach_copy_(targets, sources)

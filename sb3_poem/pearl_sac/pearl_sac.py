@@ -199,11 +199,11 @@ class PEARLSAC(CollectingSAC):
         history: dict[str, list[th.Tensor]] = {}
         policy = self.policy
         networks = nn.ModuleList([policy.encoder, policy.decoder, policy.actor, policy.critic, policy.critic_target])
-        with MixedPrecision(networks, hidden_dtype(self.precision, self.device.type)) as precision:
+        with MixedPrecision(networks, self.hidden_dtype) as precision:
             for _ in range(gradient_steps):
                 precision.refresh()
                 loss, metrics = self._losses(self._sample_meta_batch(batch_size))
-                self._optimise(loss, precision)
+                metrics["gradient_norm"] = self._optimise(loss, precision)
                 self._update_entropy_coefficient(metrics["entropy"])
                 if self._n_updates % self.target_update_interval == 0:
                     self._update_targets()
@@ -218,16 +218,26 @@ class PEARLSAC(CollectingSAC):
         self._record_latent_statistics()
         self._measure_decoder()
 
-    def _optimise(self, loss: th.Tensor, precision: MixedPrecision) -> None:
-        if not th.isfinite(loss):
-            raise ValueError(
-                f"the training loss is {loss.item()} at update {self._n_updates}; no network was changed by it. "
-                "A lower learning_rate or reward_scale usually helps."
-            )
+    @property
+    def hidden_dtype(self) -> th.dtype:
+        """Type of the hidden layers' arithmetic in training."""
+        return hidden_dtype(self.precision, self.device.type)
+
+    def _optimise(self, loss: th.Tensor, precision: MixedPrecision) -> th.Tensor:
+        """One step of the optimiser; returns the norm of the gradient."""
         self.policy.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         precision.collect_gradients()
+        gradients = [p.grad for group in self.policy.optimizer.param_groups for p in group["params"] if p.grad is not None]
+        norm = nn.utils.get_total_norm(gradients, foreach=True)
+        # the gradient is looked at too, because a ReLU may turn NaN to 0 on the way to the loss
+        if not th.isfinite(loss.detach() + norm):
+            raise ValueError(
+                f"the training loss is {loss.item()} and the norm of its gradient {norm.item()} at update {self._n_updates}; "
+                "no network was changed by it. A lower learning_rate or reward_scale usually helps."
+            )
         self.policy.optimizer.step()
+        return norm
 
     def _update_targets(self) -> None:
         targets: list[th.Tensor] = list(self.policy.critic_target.parameters())

@@ -33,10 +33,11 @@ def test_another_name_is_refused(name: str) -> None:
         hidden_dtype(name, "cpu")
 
 
-@pytest.fixture
-def mlp() -> MLP:
+@pytest.fixture(params=[(6, [64, 64]), (16, [20, 50])], ids=str)  # widths that are padded, and that are not
+def mlp(request: pytest.FixtureRequest) -> MLP:
     th.manual_seed(0)
-    return MLP(6, 3, [64, 64])
+    in_dim, widths = request.param
+    return MLP(in_dim, 3, widths)
 
 
 def gradients(network: nn.Module) -> dict[str, th.Tensor]:
@@ -44,7 +45,7 @@ def gradients(network: nn.Module) -> dict[str, th.Tensor]:
 
 
 def test_bfloat16_is_close_to_float32_and_is_not_it(mlp: MLP) -> None:
-    x = th.randn(100, 6)
+    x = th.randn(100, mlp.hidden[0].in_features)
     exact = mlp(x)
     exact.pow(2).sum().backward()
     expected = gradients(mlp)
@@ -62,7 +63,7 @@ def test_bfloat16_is_close_to_float32_and_is_not_it(mlp: MLP) -> None:
 
 
 def test_hidden_layers_are_those_of_autocast(mlp: MLP) -> None:
-    x = th.randn(100, 6)
+    x = th.randn(100, mlp.hidden[0].in_features)
     hidden = nn.Sequential(mlp.hidden[0], nn.ReLU(), mlp.hidden[1], nn.ReLU())
     with th.autocast("cpu", dtype=th.bfloat16):
         expected = hidden(x)
@@ -86,7 +87,7 @@ def test_values_in_the_hundreds_keep_their_differences() -> None:
 
 
 def test_copies_follow_the_weights(mlp: MLP) -> None:
-    x = th.randn(10, 6)
+    x = th.randn(10, mlp.hidden[0].in_features)
     with MixedPrecision(mlp, th.bfloat16) as precision:
         precision.refresh()
         before = mlp(x)
@@ -98,7 +99,7 @@ def test_copies_follow_the_weights(mlp: MLP) -> None:
 
 
 def test_float32_changes_nothing(mlp: MLP) -> None:
-    x = th.randn(10, 6)
+    x = th.randn(10, mlp.hidden[0].in_features)
     expected = mlp(x)
     with MixedPrecision(mlp, th.float32) as precision:
         precision.refresh()

@@ -1,0 +1,235 @@
+"""One gradient step of POEM with all its losses: ours, a plain implementation's, SB3's SAC, and the matrix products alone.
+
+python benchmarks/bench_gradient_step.py [--sizes small paper] [--threads 2] [--device cpu]
+
+Contenders take turns within one run; a figure is the median of their turns. *plain* is the same mathematics in eager float32
+(`plain_poem.py`; its losses are compared with ours first). *SAC* is Stable-Baselines3's own on as many transitions: it has no
+encoder, decoder, embeddings or preferences. *products* is the time of `torch.mm` for every matrix product of our step, on
+operands of the same shapes, strides and type. What happens once an epoch (posteriors, the decoder's error) is timed on its own
+and subtracted.
+"""
+
+import argparse
+import time
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from measuring import take_turns, write_results
+from plain_poem import PlainPOEM
+from stable_baselines3 import SAC
+from stable_baselines3.common.logger import configure
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from sb3_poem import POEMSAC
+from sb3_poem.common.precision import MixedPrecision
+from sb3_poem.pearl_sac import losses
+
+SIZES: dict[str, dict[str, Any]] = {
+    "small": {"tasks": 16, "batch": 128, "widths": [256, 256], "steps": 20},
+    "paper": {"tasks": 32, "batch": 256, "widths": [300, 300, 300], "steps": 4},
+}
+CONTEXT_SIZE, N_TRAIN_TASKS, HORIZON = 128, 120, 200
+
+
+def poem(size: dict[str, Any], precision: str, device: str) -> POEMSAC:
+    """A model with an epoch of data, ready for gradient steps."""
+    model = POEMSAC(
+        "MlpPolicy",
+        "poem/HalfCheetahVel-v0",
+        gradient_steps=0,
+        n_train_tasks=N_TRAIN_TASKS,
+        meta_batch_size=size["tasks"],
+        batch_size=size["batch"],
+        context_size=CONTEXT_SIZE,
+        policy_kwargs={"net_arch": {"pi": size["widths"], "qf": size["widths"]}},
+        precision=precision,
+        seed=0,
+        device=device,
+    )
+    return model.learn(N_TRAIN_TASKS * HORIZON)
+
+
+def sac(size: dict[str, Any], device: str) -> SAC:
+    """SB3's own SAC with as many transitions in its buffer."""
+    model = SAC(
+        "MlpPolicy",
+        gym.make("HalfCheetah-v5"),
+        policy_kwargs={"net_arch": size["widths"]},
+        buffer_size=N_TRAIN_TASKS * HORIZON,
+        seed=0,
+        device=device,
+    )
+    model.set_logger(configure(None, []))
+    assert model.replay_buffer is not None
+    rng = np.random.default_rng(0)
+    for _ in range(N_TRAIN_TASKS * HORIZON):
+        obs, next_obs = rng.normal(size=(2, 1, 17))
+        model.replay_buffer.add(obs, next_obs, rng.uniform(-1, 1, (1, 6)), rng.normal(size=1), np.zeros(1), [{}])
+    return model
+
+
+def compare_losses(model: POEMSAC, plain: PlainPOEM, size: dict[str, Any]) -> dict[str, float]:
+    """The plain implementation's losses against ours on the same batch and noise; returns the relative differences.
+
+    :raises AssertionError: if one differs by more than float32 explains
+    """
+    batch = model._sample_meta_batch(size["batch"])
+    shape = batch.transitions.actions.shape
+    noises = [th.randn(size["tasks"], model.latent_dim), th.randn(shape), th.randn(shape)]
+    theirs = plain.losses(list(batch.transitions[:5]), batch.context, batch.context_rewards, batch.returns, noises)
+    with th.no_grad():
+        mean, variance = model.policy.encoder(batch.context)
+        embeddings = model._embed(mean + variance.sqrt() * noises[0])
+        data, alpha = model._standardise(batch.transitions), model._entropy_coefficient()
+        scale = 1.0 / model.policy.reward_std
+        critic = losses.critic_loss(model.policy, data, embeddings, alpha, model.gamma, scale, noises[1])
+        actor, log_prob = losses.actor_loss(model.policy, data, embeddings, alpha, noises[2])
+        decoder = model._decoder_loss(batch, data, embeddings)
+        preference = model._embedding_loss(batch, embeddings)[1]["preference_loss"]
+        ours = [critic, actor, decoder, losses.kl_to_prior(mean, variance).mean(), preference, log_prob]
+    names = ("critic", "actor", "decoder", "kl", "preference", "log_prob")
+    differences = {
+        name: abs(a.item() - b.item()) / max(abs(b.item()), 1e-3) for name, a, b in zip(names, ours, theirs, strict=True)
+    }
+    assert max(differences.values()) < 1e-3, differences
+    return differences
+
+
+class Products(TorchDispatchMode):
+    """Notes the operands of all matrix products that run within it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.operands: Counter[tuple[Any, ...]] = Counter()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = func.overloadpacket.__name__
+        if name in ("mm", "addmm"):
+            self._note(*args[-2:])
+        elif name == "_linear_pointwise":
+            self._note(args[0], args[1].t())
+        return func(*args, **(kwargs or {}))
+
+    def _note(self, left: th.Tensor, right: th.Tensor) -> None:
+        self.operands[tuple((tuple(x.shape), x.stride(), x.dtype, x.device.type) for x in (left, right))] += 1
+
+    def contender(self) -> Callable[[], None]:
+        """All of the products by ``torch.mm``, one after another."""
+        pairs = []
+        for (left, right), count in self.operands.items():
+            one, two = (strided(*operand) for operand in (left, right))
+            pairs.append((one, two, th.empty(one.shape[0], two.shape[1], dtype=one.dtype, device=one.device), count))
+
+        def run() -> None:
+            for one, two, out, count in pairs:
+                for _ in range(count):
+                    th.mm(one, two, out=out)
+
+        return run
+
+    @property
+    def operations(self) -> float:
+        """Floating-point operations."""
+        return sum(2.0 * left[0][0] * left[0][1] * right[0][1] * count for (left, right), count in self.operands.items())
+
+
+def strided(shape: tuple[int, ...], stride: tuple[int, ...], dtype: th.dtype, device: str) -> th.Tensor:
+    """Random numbers in a tensor of the same layout."""
+    x = th.empty_strided(shape, stride, dtype=dtype, device=device)
+    return x.copy_(th.randn(shape, device=device))
+
+
+def products_of_a_step(model: POEMSAC, size: dict[str, Any]) -> Products:
+    """The matrix products of one gradient step."""
+    policy, products = model.policy, Products()
+    networks = th.nn.ModuleList([policy.encoder, policy.decoder, policy.actor, policy.critic, policy.critic_target])
+    with MixedPrecision(networks, model.hidden_dtype) as precision:
+        precision.refresh()
+        batch = model._sample_meta_batch(size["batch"])
+        with products:
+            model._losses(batch)[0].backward()
+    policy.optimizer.zero_grad(set_to_none=True)
+    return products
+
+
+def measure(name: str, device: str, turns: int) -> dict[str, Any]:
+    """One size: milliseconds a step of every contender."""
+    size = SIZES[name]
+    n, steps = size["tasks"] * size["batch"], size["steps"]
+    fast, exact = poem(size, "auto", device), poem(size, "fp32", device)
+    plain, plain_sac = PlainPOEM(exact), sac(size, device)
+    differences = compare_losses(exact, plain, size) if device == "cpu" else {}
+    products = products_of_a_step(fast, size)
+
+    def synchronised(run: Callable[[], Any]) -> Callable[[], Any]:
+        def timed() -> None:
+            run()
+            if device != "cpu":
+                th.cuda.synchronize()
+
+        return timed
+
+    contenders = {
+        "ours": (lambda: fast.train(steps, size["batch"]), steps),
+        "ours, float32": (lambda: exact.train(steps, size["batch"]), steps),
+        "end of an epoch": (lambda: fast.train(0, size["batch"]), 1),
+        "end of an epoch, float32": (lambda: exact.train(0, size["batch"]), 1),
+        "SAC": (lambda: plain_sac.train(steps, n), steps),
+        "products": (products.contender(), 1),
+    }
+    if device == "cpu":
+        contenders["plain"] = (lambda: plain.step(size["tasks"], size["batch"]), 1)
+    seconds = take_turns({key: synchronised(run) for key, (run, _) in contenders.items()}, turns)
+    for key, end in (("ours", "end of an epoch"), ("ours, float32", "end of an epoch, float32")):
+        seconds[key] -= seconds[end]  # posteriors and decoder are measured once an epoch, not in a step
+    milliseconds = {key: 1e3 * seconds[key] / contenders[key][1] for key in contenders}
+    return {
+        "size": {key: value for key, value in size.items() if key != "steps"} | {"context": CONTEXT_SIZE},
+        "arithmetic of hidden layers": str(fast.hidden_dtype),
+        "milliseconds": milliseconds,
+        "faster than plain": milliseconds.get("plain", float("nan")) / milliseconds["ours"],
+        "faster than SAC": milliseconds["SAC"] / milliseconds["ours"],
+        "share of the products rate": milliseconds["products"] / milliseconds["ours"],
+        "gigaflop a step": products.operations / 1e9,
+        "relative differences of the losses from plain": differences,
+    }
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sizes", nargs="+", choices=SIZES, default=list(SIZES))
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--turns", type=int, default=5)
+    parser.add_argument("--device", default="cpu")
+    arguments = parser.parse_args()
+    started, rows, results = time.perf_counter(), [], []
+    for threads in arguments.threads:
+        th.set_num_threads(threads)
+        for name in arguments.sizes:
+            result = {"name": name, "threads": threads, **measure(name, arguments.device, arguments.turns)}
+            results.append(result)
+            shown = result["milliseconds"]
+            cells = [f"{shown[key]:.1f}" if key in shown else "" for key in COLUMNS]
+            ratios = [f"{result[key]:.1f}x" for key in ("faster than plain", "faster than SAC")]
+            rows.append([name, str(threads), *cells, *ratios, f"{100 * result['share of the products rate']:.0f} %"])
+    header = [
+        "size",
+        "threads",
+        *(f"{key}, ms" for key in COLUMNS),
+        "ours to plain",
+        "ours to SAC",
+        "share of the products' rate",
+    ]
+    suffix = "" if arguments.device == "cpu" else f"-{arguments.device}"
+    write_results(f"gradient-step{suffix}", __doc__, header, rows, results, time.perf_counter() - started)
+
+
+COLUMNS = ("ours", "ours, float32", "plain", "SAC", "products")
+
+if __name__ == "__main__":
+    main()
