@@ -77,9 +77,8 @@ def compare_losses(model: POEMSAC, plain: PlainPOEM, size: dict[str, Any]) -> di
 
     :raises AssertionError: if one differs by more than float32 explains
     """
-    batch = model._sample_meta_batch(size["batch"])
-    shape = batch.transitions.actions.shape
-    noises = [th.randn(size["tasks"], model.latent_dim), th.randn(shape), th.randn(shape)]
+    batch = model._sample_meta_batches(1, size["batch"])[0]
+    noises = [batch.latent_noise, batch.next_action_noise, batch.action_noise]
     theirs = plain.losses(list(batch.transitions[:5]), batch.context, batch.context_rewards, batch.returns, noises)
     with th.no_grad():
         mean, variance = model.policy.encoder(batch.context)
@@ -149,7 +148,7 @@ def products_of_a_step(model: POEMSAC, size: dict[str, Any]) -> Products:
     networks = th.nn.ModuleList([policy.encoder, policy.decoder, policy.actor, policy.critic, policy.critic_target])
     with MixedPrecision(networks, model.hidden_dtype) as precision:
         precision.refresh()
-        batch = model._sample_meta_batch(size["batch"])
+        batch = model._sample_meta_batches(1, size["batch"])[0]
         with products:
             model._losses(batch)[0].backward()
     policy.optimizer.zero_grad(set_to_none=True)

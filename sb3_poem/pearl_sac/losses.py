@@ -15,7 +15,8 @@ class MetaBatch(NamedTuple):
     """What one gradient step sees of a meta-batch of tasks.
 
     task_ids (tasks,), transitions: a :class:`TaskBatch` (tasks, batch, ...), context (tasks, context_size, context_dim),
-    context_rewards (tasks, context_size), returns (tasks, tasks): J[i, j], NaN where unknown.
+    context_rewards (tasks, context_size), returns (tasks, tasks): J[i, j], NaN where unknown; standard normal draws for the
+    latents (tasks, latent_dim), the actions and the next actions (tasks, batch, action_dim).
     """
 
     task_ids: th.Tensor
@@ -23,6 +24,9 @@ class MetaBatch(NamedTuple):
     context: th.Tensor
     context_rewards: th.Tensor
     returns: th.Tensor
+    latent_noise: th.Tensor
+    action_noise: th.Tensor
+    next_action_noise: th.Tensor
 
 
 class TaskEmbeddings(NamedTuple):

@@ -14,14 +14,16 @@ from sb3_poem.common.family import FamilyEnv
 from sb3_poem.common.precision import MixedPrecision, hidden_dtype
 from sb3_poem.common.random import Generators
 from sb3_poem.pearl_sac import losses
-from sb3_poem.pearl_sac.collecting import MIN_STD, CollectingSAC
+from sb3_poem.pearl_sac.collecting import MIN_STD
+from sb3_poem.pearl_sac.cuda_graph import GraphedStep
 from sb3_poem.pearl_sac.losses import MetaBatch, TaskEmbeddings
 from sb3_poem.pearl_sac.policies import LatentPolicy, MlpPolicy
+from sb3_poem.pearl_sac.sampling import SamplingSAC
 
 SelfPEARLSAC = TypeVar("SelfPEARLSAC", bound="PEARLSAC")
 
 
-class PEARLSAC(CollectingSAC):
+class PEARLSAC(SamplingSAC):
     """Context-based meta-RL on soft actor-critic (PEARL, https://arxiv.org/abs/1903.08254).
 
     Training alternates between an epoch's collection, in which every training task is rolled out under its own latest
@@ -200,16 +202,18 @@ class PEARLSAC(CollectingSAC):
         policy = self.policy
         networks = nn.ModuleList([policy.encoder, policy.decoder, policy.actor, policy.critic, policy.critic_target])
         with MixedPrecision(networks, self.hidden_dtype) as precision:
-            for _ in range(gradient_steps):
-                precision.refresh()
-                loss, metrics = self._losses(self._sample_meta_batch(batch_size))
-                metrics["gradient_norm"] = self._optimise(loss, precision)
-                self._update_entropy_coefficient(metrics["entropy"])
-                if self._n_updates % self.target_update_interval == 0:
-                    self._update_targets()
-                self._n_updates += 1
-                for name, value in metrics.items():
-                    history.setdefault(name, []).append(value.detach())
+
+            def step(batch: MetaBatch) -> dict[str, th.Tensor]:
+                return self._gradient_step(batch, precision)
+
+            if self.device.type == "cuda" and self.target_update_interval == 1:
+                step = GraphedStep(step, optimizers)
+            for block in self._meta_batch_blocks(gradient_steps, batch_size):
+                for batch in block:
+                    for name, value in step(batch).items():
+                        history.setdefault(name, []).append(value)
+                    self._n_updates += 1
+                self._check_finite(history["gradient_norm"][-len(block) :])
         self._refresh_posteriors()
         self.logger.record("time/updates_per_second", gradient_steps / max(time.perf_counter() - started, 1e-9))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
@@ -218,26 +222,50 @@ class PEARLSAC(CollectingSAC):
         self._record_latent_statistics()
         self._measure_decoder()
 
+    def _gradient_step(self, batch: MetaBatch, precision: MixedPrecision) -> dict[str, th.Tensor]:
+        """One step of all networks on a meta-batch; returns what to log."""
+        precision.refresh()
+        loss, metrics = self._losses(batch)
+        metrics["gradient_norm"] = self._optimise(loss, precision)
+        self._update_entropy_coefficient(metrics["entropy"])
+        if self._n_updates % self.target_update_interval == 0:
+            self._update_targets()
+        return {name: value.detach() for name, value in metrics.items()}
+
     @property
     def hidden_dtype(self) -> th.dtype:
         """Type of the hidden layers' arithmetic in training."""
         return hidden_dtype(self.precision, self.device.type)
 
     def _optimise(self, loss: th.Tensor, precision: MixedPrecision) -> th.Tensor:
-        """One step of the optimiser; returns the norm of the gradient."""
-        self.policy.optimizer.zero_grad(set_to_none=True)
+        """One step of the optimiser; returns the norm of the gradient, not finite where the loss is not."""
+        optimizer = self.policy.optimizer
+        optimizer.zero_grad(set_to_none=True)
         loss.backward()
         precision.collect_gradients()
-        gradients = [p.grad for group in self.policy.optimizer.param_groups for p in group["params"] if p.grad is not None]
-        norm = nn.utils.get_total_norm(gradients, foreach=True)
-        # the gradient is looked at too, because a ReLU may turn NaN to 0 on the way to the loss
-        if not th.isfinite(loss.detach() + norm):
-            raise ValueError(
-                f"the training loss is {loss.item()} and the norm of its gradient {norm.item()} at update {self._n_updates}; "
-                "no network was changed by it. A lower learning_rate or reward_scale usually helps."
-            )
-        self.policy.optimizer.step()
+        gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
+        # the gradient is looked at as well as the loss, because a ReLU may turn NaN to 0 on the way there
+        norm = nn.utils.get_total_norm(gradients, foreach=True) + 0.0 * loss.detach()
+        if self.device.type == "cpu":
+            self._check_finite([norm], done=0)
+        else:  # the device is not waited for: it leaves out the step itself, and the block's end tells
+            optimizer.found_inf = (~th.isfinite(norm)).float()  # type: ignore[attr-defined]
+        optimizer.step()
         return norm
+
+    def _check_finite(self, gradient_norms: list[th.Tensor], done: int | None = None) -> None:
+        """
+        :param gradient_norms: Of the latest updates
+        :param done: How many of them are counted in ``_n_updates``; None: all
+        :raises ValueError: if one is not finite
+        """
+        finite = th.isfinite(th.stack(gradient_norms))
+        if not finite.all():
+            first = self._n_updates - (len(gradient_norms) if done is None else done) + int(finite.int().argmin())
+            raise ValueError(
+                f"the training loss or its gradient is not finite at update {first}; no network was changed by it. "
+                "A lower learning_rate or reward_scale usually helps."
+            )
 
     def _update_targets(self) -> None:
         targets: list[th.Tensor] = list(self.policy.critic_target.parameters())
@@ -245,51 +273,9 @@ class PEARLSAC(CollectingSAC):
         with th.no_grad():
             th._foreach_lerp_(targets, sources, self.tau)
 
-    def _choose_tasks(self) -> np.ndarray:
-        """Indices of a meta-batch, without repetition: a repeated task would give preference pairs without a difference."""
-        assert self.train_tasks is not None
-        n_tasks = len(self.train_tasks)
-        return self.generators.numpy.choice(n_tasks, size=min(self.meta_batch_size, n_tasks), replace=False)
-
-    def _sample_meta_batch(self, batch_size: int) -> MetaBatch:
-        assert self.context is not None
-        chosen = self._choose_tasks()
-        generator, device = self.generators.torch, self.device
-        task_ids = th.as_tensor(chosen, device=device)
-        sources = task_ids[:, None].expand(-1, batch_size)
-        n_foreign = round(self.relabel_fraction * batch_size)
-        if n_foreign:
-            foreign = th.randint(self.replay_buffer.n_tasks, (len(chosen), n_foreign), generator=generator, device=device)
-            sources = th.cat([sources[:, n_foreign:], foreign], dim=1)
-        transitions = self.replay_buffer.sample_rows(sources, generator)
-        if n_foreign:
-            transitions = self._relabel(transitions, chosen, n_foreign)
-        context = self.context
-        steps = context.transitions.shape[1]
-        picks = th.randint(steps, (len(chosen), self.context_size), generator=generator, device=device)
-        rows = (task_ids[:, None] * steps + picks).view(-1)
-        shape = (len(chosen), self.context_size)
-        return MetaBatch(
-            task_ids,
-            transitions,
-            context.transitions.view(-1, context.transitions.shape[-1]).index_select(0, rows).view(*shape, -1),
-            context.rewards.view(-1).index_select(0, rows).view(shape),
-            context.returns[task_ids][:, task_ids],
-        )
-
-    def _relabel(self, transitions: TaskBatch, chosen: np.ndarray, n_foreign: int) -> TaskBatch:
-        """Replace the rewards of the last ``n_foreign`` transitions of every task by the task's own."""
-        assert self.train_tasks is not None
-        features = transitions.features[:, -n_foreign:].cpu().numpy()
-        own = self.family.compute_reward(self.train_tasks[chosen][:, None, :], features)
-        rewards = transitions.rewards.clone()
-        rewards[:, -n_foreign:] = th.as_tensor(own, dtype=th.float32, device=self.device)
-        return transitions._replace(rewards=rewards)
-
-    def _encode(self, context: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def _encode(self, context: th.Tensor, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Latents (tasks, d) by reparameterisation, and the KL of their posteriors to N(0, I), (tasks,)."""
         mean, variance = self.policy.encoder(context)
-        noise = th.randn(mean.shape, generator=self.generators.torch, device=self.device)
         return mean + variance.sqrt() * noise, losses.kl_to_prior(mean, variance)
 
     def _embed(self, latents: th.Tensor) -> TaskEmbeddings:
@@ -298,12 +284,12 @@ class PEARLSAC(CollectingSAC):
 
     def _losses(self, batch: MetaBatch) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """Sum of all losses of a meta-batch, and what to log of them."""
-        latents, kl = self._encode(batch.context)
+        latents, kl = self._encode(batch.context, batch.latent_noise)
         embeddings = self._embed(latents)
         transitions = self._standardise(batch.transitions)
         alpha = self._entropy_coefficient()
-        critic_loss = self._critic_loss(transitions, embeddings, alpha)
-        actor_loss, log_prob = self._actor_loss(transitions, embeddings, alpha)
+        critic_loss = self._critic_loss(transitions, embeddings, alpha, batch.next_action_noise)
+        actor_loss, log_prob = losses.actor_loss(self.policy, transitions, embeddings, alpha, batch.action_noise)
         decoder_loss = self._decoder_loss(batch, transitions, embeddings)
         kl_loss = kl.mean()
         embedding_loss, embedding_metrics = self._embedding_loss(batch, embeddings)
@@ -338,7 +324,8 @@ class PEARLSAC(CollectingSAC):
         if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
             assert isinstance(self.target_entropy, float)
             # the gradient of log_ent_coef * (entropy - target_entropy)
-            self.log_ent_coef.grad = (entropy.detach() - self.target_entropy).view_as(self.log_ent_coef)
+            gradient = (entropy.detach() - self.target_entropy).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
+            self.log_ent_coef.grad = gradient.view_as(self.log_ent_coef)
             self.ent_coef_optimizer.step()
 
     def _standardise(self, batch: TaskBatch) -> TaskBatch:
@@ -347,15 +334,9 @@ class PEARLSAC(CollectingSAC):
             observations=standardise(batch.observations), next_observations=standardise(batch.next_observations)
         )
 
-    def _noise(self, batch: TaskBatch) -> th.Tensor:
-        return th.randn(batch.actions.shape, generator=self.generators.torch, device=self.device)
-
-    def _critic_loss(self, batch: TaskBatch, embeddings: TaskEmbeddings, alpha: th.Tensor) -> th.Tensor:
+    def _critic_loss(self, batch: TaskBatch, embeddings: TaskEmbeddings, alpha: th.Tensor, noise: th.Tensor) -> th.Tensor:
         scale = 1.0 / self.policy.reward_std if self.reward_scale == "auto" else self.reward_scale
-        return losses.critic_loss(self.policy, batch, embeddings, alpha, self.gamma, scale, self._noise(batch))  # type: ignore[arg-type]
-
-    def _actor_loss(self, batch: TaskBatch, embeddings: TaskEmbeddings, alpha: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        return losses.actor_loss(self.policy, batch, embeddings, alpha, self._noise(batch))
+        return losses.critic_loss(self.policy, batch, embeddings, alpha, self.gamma, scale, noise)  # type: ignore[arg-type]
 
     def _decoder_loss(self, batch: MetaBatch, transitions: TaskBatch, embeddings: TaskEmbeddings) -> th.Tensor:
         """On context transitions (eq. 4); with relabelling on the batch of transitions instead, which holds other tasks'

@@ -179,7 +179,7 @@ def test_a_loss_that_is_not_finite_changes_no_weight(algorithm: type[PEARLSAC]) 
     model = small(algorithm).learn(300)
     before = parameters(model)
     model.context.transitions[:] = float("nan")  # latents, and with them all losses
-    with pytest.raises(ValueError, match=r"norm of its gradient nan at update 5; no network was changed by it"):
+    with pytest.raises(ValueError, match=r"loss or its gradient is not finite at update 5; no network was changed by it"):
         model.train(3, 16)
     assert not differing(before, parameters(model))
 
@@ -188,7 +188,7 @@ def test_a_reward_that_overflows_changes_no_weight(algorithm: type[PEARLSAC]) ->
     model = small(algorithm).learn(300)
     before = parameters(model)
     model.replay_buffer.rows[:, :, 6] = 1e30  # squared: infinity
-    with pytest.raises(ValueError, match=r"the training loss is .* at update 5; no network was changed by it"):
+    with pytest.raises(ValueError, match=r"loss or its gradient is not finite at update 5; no network was changed by it"):
         model.train(3, 16)
     assert not differing(before, parameters(model))
 

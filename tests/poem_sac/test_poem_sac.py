@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_poem import PEARLSAC, POEMSAC
 from sb3_poem.common.vec_env import TaskVecEnv
-from sb3_poem.pearl_sac.losses import TaskEmbeddings
+from sb3_poem.pearl_sac.losses import TaskEmbeddings, actor_loss
 
 
 def nearly_deterministic(model: PEARLSAC) -> PEARLSAC:
@@ -109,7 +109,7 @@ def test_meta_batches_are_whole_groups() -> None:
     model = small(POEMSAC, preference_source="rollout", n_train_tasks=14, meta_batch_size=9, preference_group_size=4).learn(1)
     assert [len(group) for group in model._groups] == [5, 5, 4]
     for _ in range(5):
-        batch = model._sample_meta_batch(8)
+        batch = model._sample_meta_batches(1, 8)[0]
         chosen = set(batch.task_ids.tolist())
         inside = [group for group in model._groups if chosen & set(group)]
         assert len(inside) == 2
@@ -248,7 +248,7 @@ def test_posteriors_are_the_encoders_of_the_context() -> None:
 @pytest.mark.parametrize(("fraction", "n_foreign"), [(0.0, 0), (0.25, 4), (1.0, 16)])
 def test_a_share_of_every_batch_is_relabelled(fraction: float, n_foreign: int) -> None:
     model = small(POEMSAC, walks(4), horizon=10, relabel_fraction=fraction).learn(1)
-    batch = model._sample_meta_batch(16)
+    batch = model._sample_meta_batches(1, 16)[0]
     tasks = model.train_tasks[batch.task_ids.numpy()]
     features = batch.transitions.features.numpy()
     truth = -np.abs(features[..., 0] - tasks) - 0.01 * features[..., 1] ** 2
@@ -316,7 +316,7 @@ def gradients(model: PEARLSAC, **weights: float) -> set[str]:
     for name in ("kl_coef", "reward_coef", "policy_coef", "preference_coef"):
         if hasattr(model, name):
             setattr(model, name, weights.get(name, 0.0))
-    loss, _ = model._losses(model._sample_meta_batch(16))
+    loss, _ = model._losses(model._sample_meta_batches(1, 16)[0])
     model.policy.zero_grad()
     loss.backward()
     return {
@@ -340,13 +340,13 @@ def test_each_loss_trains_what_the_paper_says() -> None:
 
 
 def encoder_gradient(model: PEARLSAC, batch: Any, name: str) -> float:
-    latents, kl = model._encode(batch.context)
+    latents, kl = model._encode(batch.context, batch.latent_noise)
     embeddings, transitions = model._embed(latents), model._standardise(batch.transitions)
     losses = {
-        "actor": lambda: model._actor_loss(transitions, embeddings, th.ones(()))[0],
+        "actor": lambda: actor_loss(model.policy, transitions, embeddings, th.ones(()), batch.action_noise)[0],
         "decoder": lambda: model._decoder_loss(batch, transitions, embeddings),
         "preference": lambda: model._embedding_loss(batch, embeddings)[0],
-        "critic": lambda: model._critic_loss(transitions, embeddings, th.ones(())),
+        "critic": lambda: model._critic_loss(transitions, embeddings, th.ones(()), batch.next_action_noise),
         "kl": lambda: kl.mean(),
     }
     model.policy.zero_grad()
@@ -358,7 +358,7 @@ def encoder_gradient(model: PEARLSAC, batch: Any, name: str) -> float:
 
 def test_which_losses_reach_the_encoder() -> None:
     poem, pearl = small(POEMSAC).learn(EPOCH), small(PEARLSAC).learn(EPOCH)
-    batch, other = poem._sample_meta_batch(16), pearl._sample_meta_batch(16)
+    batch, other = poem._sample_meta_batches(1, 16)[0], pearl._sample_meta_batches(1, 16)[0]
     for name in ("actor", "decoder", "preference", "critic", "kl"):
         assert encoder_gradient(poem, batch, name) > 0, name
     for name in ("decoder", "critic", "kl"):
@@ -368,10 +368,11 @@ def test_which_losses_reach_the_encoder() -> None:
 
 def test_the_actors_loss_does_not_train_the_critics() -> None:
     model = small(POEMSAC).learn(EPOCH)
-    batch = model._sample_meta_batch(16)
-    latents, _ = model._encode(batch.context)
+    batch = model._sample_meta_batches(1, 16)[0]
+    latents, _ = model._encode(batch.context, batch.latent_noise)
     model.policy.zero_grad()
-    model._actor_loss(model._standardise(batch.transitions), model._embed(latents), th.ones(()))[0].backward()
+    transitions, embeddings = model._standardise(batch.transitions), model._embed(latents)
+    actor_loss(model.policy, transitions, embeddings, th.ones(()), batch.action_noise)[0].backward()
     assert all(parameter.grad is None for parameter in model.policy.critic.parameters())
     assert all(parameter.grad is None for parameter in model.policy.critic_target.parameters())
 
@@ -383,7 +384,7 @@ def test_kl_is_that_of_two_normals() -> None:
     context = model.context.transitions
     with th.no_grad():
         mean, variance = model.policy.encoder(context)
-        _, kl = model._encode(context)
+        _, kl = model._encode(context, th.zeros(len(context), model.latent_dim))
     expected = kl_divergence(Normal(mean, variance.sqrt()), Normal(th.zeros(5), th.ones(5))).sum(dim=1)
     th.testing.assert_close(kl, expected, rtol=1e-4, atol=1e-5)
 
@@ -391,14 +392,12 @@ def test_kl_is_that_of_two_normals() -> None:
 def test_targets_are_bootstrapped_except_at_an_early_end() -> None:
     """The critics' loss against soft Bellman targets computed here, with gamma and alpha far from trivial."""
     model = small(POEMSAC, walks(4, edge=0.4), horizon=10, gamma=0.9, ent_coef=0.3).learn(120)
-    batch = model._sample_meta_batch(16).transitions
+    meta_batch = model._sample_meta_batches(1, 16)[0]
+    batch, noise = meta_batch.transitions, meta_batch.next_action_noise
     assert 0 < batch.terminated.sum() < batch.terminated.numel()
     policy, latents = model.policy, th.randn(6, 5)
-    state = model.generators.torch.get_state()
     alpha = model._entropy_coefficient()
-    loss = model._critic_loss(model._standardise(batch), model._embed(latents), alpha)
-    model.generators.torch.set_state(state)
-    noise = th.randn(6, 16, 1, generator=model.generators.torch)
+    loss = model._critic_loss(model._standardise(batch), model._embed(latents), alpha, noise)
     total = 0.0
     with th.no_grad():
         for i in range(6):

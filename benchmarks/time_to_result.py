@@ -1,0 +1,120 @@
+"""How long does training take until ten answers are enough? The clock stops for evaluations.
+
+python benchmarks/time_to_result.py [--env poem/HalfCheetahVel-v0] [--target -46] [--seeds 0 1 2]
+
+Trains with the hyperparameters of `zoo_configs/poem_sac.yml` (or `--conf`). After the epochs that `--from-step` and `--every`
+name, the model is adapted to 30 test tasks by ten error-free answers each; training ends when their mean return reaches the
+target.
+"""
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+import yaml
+from measuring import write_results
+from rl_zoo3.utils import linear_schedule
+
+from sb3_poem import POEMSAC
+from sb3_poem.adaptation.evaluation import evaluate_adaptation
+from sb3_poem.common.callbacks import EpochCallback
+from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.vec_env import TaskVecEnv
+
+N_TASKS, N_EPISODES, N_QUERIES = 30, 10, 10
+
+
+class Clock(EpochCallback):
+    """Times training, evaluates between epochs, and ends it at the target.
+
+    :param env_id: The family
+    :param target: Mean return that ends training
+    :param rules: Inference rules, any of which may reach it
+    :param test_seed: Seed of the test tasks
+    :param from_step: Environment steps before the first evaluation
+    :param every: Epochs between two evaluations
+    """
+
+    def __init__(self, env_id: str, target: float, rules: list[str], test_seed: int, from_step: int, every: int) -> None:
+        super().__init__(every)
+        self.target, self.rules, self.test_seed, self.from_step = target, rules, test_seed, from_step
+        self.env = TaskVecEnv.from_id(env_id, 2 * N_TASKS)
+        self.tasks = FamilyEnv(self.env).sample_tasks(N_TASKS, np.random.default_rng([test_seed, 77]))
+        self.seconds, self.started = 0.0, time.perf_counter()
+        self.evaluations: list[dict[str, Any]] = []
+        self.reached = False
+
+    def _on_epoch(self) -> None:
+        if self.reached or self.num_timesteps < self.from_step:
+            return
+        self.seconds += time.perf_counter() - self.started
+        found = {"seconds": self.seconds, "env_steps": self.model.num_timesteps, "updates": self.model._n_updates}
+        for rule in self.rules:
+            result = evaluate_adaptation(
+                self.model,
+                self.env,
+                self.tasks,
+                record_at=(N_QUERIES,),
+                n_episodes=N_EPISODES,
+                seed=self.test_seed,
+                inference=rule,
+            )
+            found[rule] = result.after(N_QUERIES)
+        self.evaluations.append(found)
+        self.reached = max(found[rule] for rule in self.rules) >= self.target
+        print({key: round(value, 1) for key, value in found.items()}, flush=True)
+        self.started = time.perf_counter()
+
+    def _on_step(self) -> bool:
+        return not self.reached
+
+
+def train(env_id: str, entry: dict[str, Any], seed: int, clock: Clock, device: str) -> None:
+    """Train with an entry of hyperparameters until the clock ends it."""
+    entry = dict(entry)
+    n_timesteps, policy, n_envs = int(entry.pop("n_timesteps")), entry.pop("policy"), entry.pop("n_envs")
+    if isinstance(entry.get("policy_kwargs"), str):
+        entry["policy_kwargs"] = eval(entry["policy_kwargs"])  # as rl_zoo3 does
+    rate = entry.get("learning_rate")
+    if isinstance(rate, str):
+        entry["learning_rate"] = linear_schedule(rate.removeprefix("lin_"))
+    model = POEMSAC(policy, TaskVecEnv.from_id(env_id, n_envs), seed=seed, device=device, **entry)
+    clock.started = time.perf_counter()
+    model.learn(n_timesteps, callback=clock, progress_bar=False)
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--env", default="poem/HalfCheetahVel-v0")
+    parser.add_argument("--target", type=float, default=-46.0)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--rules", nargs="+", default=["paper", "bayes"])
+    parser.add_argument("--from-step", type=int, default=0)
+    parser.add_argument("--every", type=int, default=1)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--conf", type=Path, default=Path(__file__).parents[1] / "zoo_configs" / "poem_sac.yml")
+    arguments = parser.parse_args()
+    th.set_num_threads(arguments.threads)
+    entry = yaml.safe_load(arguments.conf.read_text())[arguments.env]
+    started, results, rows = time.perf_counter(), [], []
+    for seed in arguments.seeds:
+        clock = Clock(arguments.env, arguments.target, arguments.rules, 300 + seed, arguments.from_step, arguments.every)
+        train(arguments.env, entry, seed, clock, arguments.device)
+        last = clock.evaluations[-1]
+        results.append({"seed": seed, "reached": clock.reached, "evaluations": clock.evaluations, "entry": entry})
+        shown = [f"{last[rule]:.1f}" for rule in arguments.rules]
+        counts = [f"{last['env_steps']:,}", f"{last['updates']:,}"]
+        rows.append([str(seed), "yes" if clock.reached else "no", f"{last['seconds']:.0f}", *counts, *shown])
+    header = ["seed", f"reached {arguments.target:g}", "seconds", "environment steps", "updates", *arguments.rules]
+    family = arguments.env.split("/")[-1].split("-")[0]
+    suffix = "" if arguments.device == "cpu" else f"-{arguments.device}"
+    write_results(f"time-to-result-{family}{suffix}", __doc__, header, rows, results, time.perf_counter() - started)
+
+
+if __name__ == "__main__":
+    main()

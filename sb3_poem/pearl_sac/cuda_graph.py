@@ -1,0 +1,65 @@
+"""A gradient step as one CUDA graph."""
+
+from collections.abc import Callable
+
+import torch as th
+
+from sb3_poem.common.buffers import TaskBatch
+from sb3_poem.pearl_sac.losses import MetaBatch
+
+EAGER_STEPS = 3
+
+Step = Callable[[MetaBatch], dict[str, th.Tensor]]
+
+
+class GraphedStep:
+    """Runs a step, and from the fourth on replays it: thousands of small kernels then cost one launch.
+
+    Everything that the step reads and does not change must stay where it is between calls, but for the meta-batch, which is
+    copied to where the graph reads it.
+
+    :param step: Maps a meta-batch to metrics, without waiting for the device
+    :param optimizers: Optimisers that it calls; they are told to keep their state on the device
+    """
+
+    def __init__(self, step: Step, optimizers: list[th.optim.Optimizer]) -> None:
+        self._step = step
+        self._calls = 0
+        self._stream = th.cuda.Stream()
+        self._graph = th.cuda.CUDAGraph()
+        self._batch: MetaBatch | None = None
+        self._metrics: dict[str, th.Tensor] = {}
+        for optimizer in optimizers:
+            for group in optimizer.param_groups:
+                group["capturable"] = True
+            for parameter, state in optimizer.state.items():
+                state["step"] = th.as_tensor(state["step"], dtype=th.float32, device=parameter.device)
+
+    def __call__(self, batch: MetaBatch) -> dict[str, th.Tensor]:
+        self._calls += 1
+        if self._batch is not None and any(
+            old.shape != new.shape for old, new in zip(tensors(self._batch), tensors(batch), strict=True)
+        ):
+            return self._step(batch)
+        if self._calls <= EAGER_STEPS:  # capture demands that libraries have been set up on a stream other than the default
+            self._stream.wait_stream(th.cuda.current_stream())
+            with th.cuda.stream(self._stream):
+                metrics = self._step(batch)
+            th.cuda.current_stream().wait_stream(self._stream)
+            return metrics
+        if self._batch is None:
+            self._batch = batch._replace(
+                **{name: field.clone() for name, field in batch._asdict().items() if isinstance(field, th.Tensor)},
+                transitions=TaskBatch(*(field.clone() for field in batch.transitions)),
+            )
+            with th.cuda.graph(self._graph):
+                self._metrics = self._step(self._batch)
+        else:
+            th._foreach_copy_(tensors(self._batch), tensors(batch))
+        self._graph.replay()
+        return {name: value.clone() for name, value in self._metrics.items()}
+
+
+def tensors(batch: MetaBatch) -> list[th.Tensor]:
+    """All tensors of a meta-batch."""
+    return [*batch.transitions, *(field for field in batch if isinstance(field, th.Tensor))]

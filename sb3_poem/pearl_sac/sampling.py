@@ -1,0 +1,98 @@
+"""Meta-batches: what gradient steps see of the tasks' experience."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch as th
+
+from sb3_poem.common.buffers import TaskBatch
+from sb3_poem.pearl_sac.collecting import CollectingSAC
+from sb3_poem.pearl_sac.losses import MetaBatch
+
+#: Bytes of transitions that are drawn at once: few enough to stay in the cache; on a GPU the number of draws is what costs
+BYTES_AT_ONCE = {"cpu": 2**20, "cuda": 2**28}
+
+
+class SamplingSAC(CollectingSAC):
+    """Draws meta-batches from replay buffers and contexts; a base of :class:`PEARLSAC`.
+
+    Several are drawn at once: indices, relabelled rewards and noise then cost as many operations as for one.
+    """
+
+    meta_batch_size: int
+    context_size: int
+    relabel_fraction: float
+
+    def _choose_tasks(self) -> np.ndarray:
+        """Indices of a meta-batch, without repetition: a repeated task would give preference pairs without a difference."""
+        assert self.train_tasks is not None
+        n_tasks = len(self.train_tasks)
+        return self.generators.numpy.choice(n_tasks, size=min(self.meta_batch_size, n_tasks), replace=False)
+
+    def _meta_batch_blocks(self, n: int, batch_size: int) -> Iterator[list[MetaBatch]]:
+        """``n`` meta-batches, in blocks that are drawn at once."""
+        step_bytes = self.meta_batch_size * batch_size * 4 * sum(self.replay_buffer.widths)
+        at_once = max(1, BYTES_AT_ONCE.get(self.device.type, BYTES_AT_ONCE["cpu"]) // step_bytes)
+        for start in range(0, n, at_once):
+            yield self._sample_meta_batches(min(at_once, n - start), batch_size)
+
+    def _sample_meta_batches(self, n: int, batch_size: int) -> list[MetaBatch]:
+        """Draw ``n`` meta-batches of ``batch_size`` transitions a task."""
+        assert self.context is not None
+        choices = [self._choose_tasks() for _ in range(n)]
+        sizes = [len(choice) for choice in choices]
+        chosen = np.concatenate(choices)
+        task_ids = th.as_tensor(chosen, device=self.device)  # (n * tasks,)
+        transitions = self._sample_transitions(task_ids, chosen, batch_size)
+        context, context_rewards = self._sample_contexts(task_ids)
+        action_dim = transitions.actions.shape[-1]
+        noise = self._standard_normal(len(chosen), 2 * batch_size * action_dim + self.latent_dim)
+        latent_noise, *action_noises = noise.split([self.latent_dim, batch_size * action_dim, batch_size * action_dim], dim=1)
+        split = (
+            field.split(sizes)
+            for field in (
+                task_ids,
+                *transitions,
+                context,
+                context_rewards,
+                latent_noise,
+                *(part.reshape(-1, batch_size, action_dim) for part in action_noises),
+            )
+        )
+        n_fields = len(TaskBatch._fields)
+        batches = []
+        for ids, *rest in zip(*split, strict=True):
+            transitions, (context, context_rewards, *noises) = TaskBatch(*rest[:n_fields]), rest[n_fields:]
+            returns = self.context.returns[ids][:, ids]
+            batches.append(MetaBatch(ids, transitions, context, context_rewards, returns, *noises))
+        return batches
+
+    def _sample_transitions(self, task_ids: th.Tensor, chosen: np.ndarray, batch_size: int) -> TaskBatch:
+        """``batch_size`` transitions for each task, ``relabel_fraction`` of them other tasks' with the task's own rewards."""
+        generator, device = self.generators.torch, self.device
+        sources = task_ids[:, None].expand(-1, batch_size)
+        n_foreign = round(self.relabel_fraction * batch_size)
+        if not n_foreign:
+            return self.replay_buffer.sample_rows(sources, generator)
+        assert self.train_tasks is not None
+        foreign = th.randint(self.replay_buffer.n_tasks, (len(chosen), n_foreign), generator=generator, device=device)
+        transitions = self.replay_buffer.sample_rows(th.cat([sources[:, n_foreign:], foreign], dim=1), generator)
+        features = transitions.features[:, -n_foreign:].cpu().numpy()
+        own = self.family.compute_reward(self.train_tasks[chosen][:, None, :], features)
+        rewards = transitions.rewards.clone()
+        rewards[:, -n_foreign:] = th.as_tensor(own, dtype=th.float32, device=device)
+        return transitions._replace(rewards=rewards)
+
+    def _sample_contexts(self, task_ids: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """``context_size`` transitions of the last epoch for each task, and their rewards."""
+        assert self.context is not None
+        transitions, rewards = self.context.transitions, self.context.rewards
+        steps = transitions.shape[1]
+        shape = (len(task_ids), self.context_size)
+        picks = th.randint(steps, shape, generator=self.generators.torch, device=self.device)
+        rows = (task_ids[:, None] * steps + picks).view(-1)
+        context = transitions.view(-1, transitions.shape[-1]).index_select(0, rows).view(*shape, -1)
+        return context, rewards.view(-1).index_select(0, rows).view(shape)
+
+    def _standard_normal(self, *shape: int) -> th.Tensor:
+        return th.randn(shape, generator=self.generators.torch, device=self.device)

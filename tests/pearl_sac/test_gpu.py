@@ -1,0 +1,76 @@
+"""Training on a CUDA device: `pytest -m gpu`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch as th
+from meta_toys import EPOCH, small
+
+from sb3_poem import PEARLSAC, POEMSAC
+from sb3_poem.pearl_sac import pearl_sac
+
+pytestmark = [pytest.mark.gpu, pytest.mark.parametrize("algorithm", [PEARLSAC, POEMSAC])]
+
+
+def on_gpu(algorithm: type[PEARLSAC], **arguments: Any) -> PEARLSAC:
+    return small(algorithm, device="cuda", **arguments)
+
+
+def weights(model: PEARLSAC) -> dict[str, th.Tensor]:
+    return {name: value.detach().clone() for name, value in model.policy.state_dict().items()}
+
+
+def test_replayed_steps_are_the_eager_ones(algorithm: type[PEARLSAC], monkeypatch: pytest.MonkeyPatch) -> None:
+    graphed = on_gpu(algorithm, precision="fp32", gradient_steps=20).learn(EPOCH)
+    monkeypatch.setattr(pearl_sac, "GraphedStep", lambda step, optimizers: step)
+    eager = on_gpu(algorithm, precision="fp32", gradient_steps=20).learn(EPOCH)
+    assert graphed._n_updates == eager._n_updates == 20
+    for name, value in weights(eager).items():
+        th.testing.assert_close(weights(graphed)[name], value, rtol=1e-3, atol=1e-4, msg=name)
+    assert graphed.log_ent_coef.item() == pytest.approx(eager.log_ent_coef.item(), rel=1e-3)
+
+
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+def test_everything_is_trained(algorithm: type[PEARLSAC], precision: str) -> None:
+    model = on_gpu(algorithm, precision=precision).learn(EPOCH)
+    before = weights(model)
+    model.learn(EPOCH, reset_num_timesteps=False)
+    trained = [name for name in before if name.endswith("weight")]
+    assert all((weights(model)[name] != before[name]).any() for name in trained)
+    assert all(value.isfinite().all() for value in weights(model).values())
+
+
+def test_a_step_waits_for_nothing(algorithm: type[PEARLSAC], monkeypatch: pytest.MonkeyPatch) -> None:
+    step = PEARLSAC._gradient_step
+
+    def watched(self: PEARLSAC, *arguments: Any) -> dict[str, th.Tensor]:
+        th.cuda.set_sync_debug_mode("error")
+        try:
+            return step(self, *arguments)
+        finally:
+            th.cuda.set_sync_debug_mode("default")
+
+    monkeypatch.setattr(PEARLSAC, "_gradient_step", watched)
+    on_gpu(algorithm).learn(EPOCH)
+
+
+def test_a_loss_that_is_not_finite_changes_no_weight(algorithm: type[PEARLSAC]) -> None:
+    model = on_gpu(algorithm).learn(EPOCH)
+    model.context.transitions[:] = float("nan")
+    before = weights(model)
+    with pytest.raises(ValueError, match="loss or its gradient is not finite at update 5"):
+        model.train(6, 16)
+    for name, value in weights(model).items():
+        if not name.startswith("critic_target"):
+            assert th.equal(value, before[name]), name
+    assert model.log_ent_coef.isfinite().all()
+
+
+def test_a_checkpoint_continues(algorithm: type[PEARLSAC], tmp_path: Any) -> None:
+    model = on_gpu(algorithm).learn(EPOCH)
+    model.save(tmp_path / "model.zip")
+    loaded = algorithm.load(tmp_path / "model.zip", env=model.get_env(), device="cuda")
+    loaded.learn(EPOCH, reset_num_timesteps=False)
+    assert loaded._n_updates == 10
