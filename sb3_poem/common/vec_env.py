@@ -31,11 +31,12 @@ class TaskVecEnv(VecEnv):
     It steps all copies at once, and gives the same observations, rewards and infos. ``infos[i]`` holds
     ``"reward_features"``, and as ``Monitor`` and ``DummyVecEnv`` have them ``"TimeLimit.truncated"``,
     ``"terminal_observation"`` and ``"episode"``. ``get_attr`` and ``env_method`` see each copy as a single
-    :class:`poem_envs.TaskFamily`.
+    :class:`poem_envs.TaskFamily`. What else the family's infos hold, such as ``"is_success"``, is there too.
 
     :param env_fns: One function a copy that returns an environment. Only the first is called: all copies are made alike, from
         its registration and arguments. If its ``Monitor`` has a file, the episodes of all copies are written to that file.
-    :param nthread: Number of threads of a MuJoCo family; None for the family's default (all cores).
+    :param nthread: Number of threads (or processes, as the family has it) to step with; None for the family's default (all
+        cores).
     :raises ValueError: If the environment is no task family, has no vectorised version, was not made by ``gym.make``, was
         given a task already, or is inside a wrapper other than ``TimeLimit``, ``OrderEnforcing``, ``PassiveEnvChecker`` and
         ``Monitor``.
@@ -122,6 +123,9 @@ class TaskVecEnv(VecEnv):
         infos: list[dict[str, Any]] = [
             {"reward_features": row, "TimeLimit.truncated": cut} for row, cut in zip(features, cut_short.tolist(), strict=True)
         ]
+        for key in vector_infos.keys() - {"reward_features", "final_obs", "_final_obs"}:  # "success" and the like
+            for info, value in zip(infos, vector_infos[key], strict=True):
+                info[key] = value
         dones = terminations | truncations
         for index in np.flatnonzero(dones).tolist():
             infos[index]["terminal_observation"] = vector_infos["final_obs"][index]
