@@ -307,7 +307,7 @@ class MetaWorldML10Env(MetaWorldEnv):
             manipulation, placement = self._place(task, np.random.default_rng(0))
             if np.any(task[1 + len(placement) :] != 0.0):
                 raise ValueError(
-                    f"{name}={task.tolist()}: a placement of {manipulation!r} is {len(placement)} numbers, and zeros after them"
+                    f"{name}={task.tolist()}: a placement of {manipulation!r} is {len(placement)} numbers, then zeros"
                 )
             check_placement(manipulation, placement, name)
         return checked

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from poem_envs.core import TaskFamily
@@ -192,6 +193,20 @@ class TaskVecEnv(VecEnv):
         if self._monitor is not None and self._monitor.results_writer is not None:
             raise TypeError("a TaskVecEnv whose Monitor writes to a file cannot be pickled; make it without monitor_dir")
         return {**self.__dict__, "_monitor": None}
+
+
+def make_task_vec_env(env_id: str, n_envs: int, max_sequential: int = 8, **env_kwargs: Any) -> VecEnv:
+    """
+    Copies of a registered family: a :class:`TaskVecEnv`, or a ``DummyVecEnv`` of a family without a vectorised version.
+
+    :param env_id: As for ``gym.make``
+    :param n_envs: Number of copies
+    :param max_sequential: The most copies that a ``DummyVecEnv`` steps one after another
+    :param env_kwargs: Arguments of the environment
+    """
+    if gym.spec(env_id).vector_entry_point is not None:
+        return TaskVecEnv.from_id(env_id, n_envs, **env_kwargs)
+    return DummyVecEnv([functools.partial(gym.make, env_id, **env_kwargs)] * min(n_envs, max_sequential))
 
 
 class _CopyView:
