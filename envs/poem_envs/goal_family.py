@@ -55,6 +55,7 @@ class GoalFamily(ReplayFamily):
     :raises ValueError: if the environment is not goal-conditioned; the message says what is missing
     """
 
+    metadata = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012 (Gymnasium declares it so)
     _simulator_attributes = ("env", "_goal_env")
 
     def __init__(
