@@ -75,7 +75,7 @@ def check_spaces(make: MakeFamily, seed: int) -> None:
     assert ok, f"task_space must be a Box of shape (task_dim,) and dtype float64, but is {space}"
     assert isinstance(space, spaces.Box)
     dim = getattr(env, "reward_feature_dim", None)
-    ok = isinstance(dim, (int, np.integer)) and dim >= 1
+    ok = bool(isinstance(dim, (int, np.integer)) and dim >= 1)
     assert ok, f"reward_feature_dim must be a whole number from 1 on, but is {dim!r}"
     if env.all_tasks is not None:
         tasks = np.asarray(env.all_tasks)
