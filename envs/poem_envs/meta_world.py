@@ -11,7 +11,15 @@ from gymnasium import spaces
 
 from poem_envs.process_vector import ProcessFamilyVector
 from poem_envs.replay import ReplayFamily
-from poem_envs.sawyer import PlacementRefusedError, Sawyer, checked_manipulation, load_metaworld, placements_of
+from poem_envs.sawyer import (
+    PlacementRefusedError,
+    Sawyer,
+    checked_manipulation,
+    give_back_sawyer,
+    load_metaworld,
+    placements_of,
+    take_sawyer,
+)
 
 OBSERVATION_DIM = 39
 #: Manipulations whose goal is nothing but a place that the hand is to reach.
@@ -33,7 +41,7 @@ class MetaWorldEnv(ReplayFamily):
     """
 
     metadata = {"render_modes": ["human", "rgb_array", "depth_array"], "render_fps": 80}  # noqa: RUF012
-    _simulator_attributes = ("_sawyers", "_sawyer")
+    _simulator_attributes = ("_sawyer",)
 
     def __init__(
         self,
@@ -57,7 +65,6 @@ class MetaWorldEnv(ReplayFamily):
         self._build()
 
     def _build(self) -> None:
-        self._sawyers: dict[str, Sawyer] = {}
         self._sawyer: Sawyer | None = None
 
     def _place(self, task: np.ndarray, rng: np.random.Generator) -> tuple[str, np.ndarray]:
@@ -71,11 +78,11 @@ class MetaWorldEnv(ReplayFamily):
     def _begin_simulation(self, rng: np.random.Generator) -> np.ndarray:
         assert self._task is not None
         manipulation, placement = self._place(self._task, rng)
-        if manipulation not in self._sawyers:
-            self._sawyers[manipulation] = Sawyer(manipulation, self.render_task, **self._render_arguments)
-        self._sawyer = self._sawyers[manipulation]
+        if self._sawyer is None or self._sawyer.manipulation != manipulation:
+            self._release_sawyer()
+            self._sawyer = take_sawyer(manipulation, **self._render_arguments)
         self._success = False
-        return self._sawyer.reset(placement)
+        return self._sawyer.reset(placement, self.render_task)
 
     def _step_simulation(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
         assert self._sawyer is not None
@@ -118,9 +125,14 @@ class MetaWorldEnv(ReplayFamily):
 
     def close(self) -> None:
         """Free what rendering and simulation hold."""
-        for sawyer in self._sawyers.values():
-            sawyer.env.close()
-        self._build()
+        if self._sawyer is not None:
+            self._sawyer.env.close()  # closes its windows, which a later rendering would open again
+        self._release_sawyer()
+
+    def _release_sawyer(self) -> None:
+        if self._sawyer is not None:
+            give_back_sawyer(self._sawyer)
+            self._sawyer = None
 
 
 class MetaWorldML1Env(MetaWorldEnv):

@@ -70,23 +70,24 @@ class Sawyer:
     been made, bit for bit, however often it was used before.
 
     :param manipulation: its name, without ``-v3``
-    :param render_arguments: ``render_mode``, ``camera_name``, ``camera_id``, ``width`` and ``height``, as Meta-World has them
-    :param show_goal: whether rendering shows where the goal is
+    :param render_arguments: ``render_mode``, ``camera_name``, ``width`` and ``height``, as Meta-World has them
     """
 
-    def __init__(self, manipulation: str, show_goal: bool = False, **render_arguments: Any) -> None:
+    def __init__(self, manipulation: str, **render_arguments: Any) -> None:
+        self.manipulation = manipulation
+        self.render_arguments = render_arguments
         self.env = _environment_class(manipulation)(**render_arguments)
         self.env._set_task_called = True  # placements are set here, without Meta-World's pickled tasks
         self.env.max_path_length = np.inf  # time limits are a wrapper's
         self.env._get_state_rand_vec = self._take_placement
-        self.show_goal = show_goal
         self._placement: np.ndarray | None = None
 
-    def reset(self, placement: np.ndarray) -> np.ndarray:
+    def reset(self, placement: np.ndarray, show_goal: bool = False) -> np.ndarray:
         """
         Begin an episode.
 
         :param placement: Meta-World's ``rand_vec``, ``(placement_dim,)``
+        :param show_goal: whether rendering shows where the goal is
         :return: the observation, ``(39,)``
         :raises PlacementRefusedError: if Meta-World would not have it
         """
@@ -97,7 +98,7 @@ class Sawyer:
             self._placement = placement.copy()
             observation = env.reset_model()
         for name, _ in env._target_site_config:
-            env.model.site(name).rgba[3] = float(self.show_goal)
+            env.model.site(name).rgba[3] = float(show_goal)
         env._prev_obs = observation[:18].copy()
         observation = observation.copy()
         observation[18:36] = env._prev_obs
@@ -143,6 +144,26 @@ class Sawyer:
             raise PlacementRefusedError("Meta-World refuses the placement: it places object and goal too near to each other")
         placement, self._placement = self._placement, None
         return placement
+
+
+# Simulators at rest, by what they were made with. An environment whose tasks are different manipulations changes simulators
+# at its resets; without this, each of many environments would come to hold one for every manipulation.
+_at_rest: dict[tuple[Any, ...], list[Sawyer]] = {}
+
+
+def take_sawyer(manipulation: str, **render_arguments: Any) -> Sawyer:
+    """A simulator of a manipulation, made anew if none is at rest; arguments as :class:`Sawyer` has them."""
+    at_rest = _at_rest.get(_key(manipulation, render_arguments))
+    return at_rest.pop() if at_rest else Sawyer(manipulation, **render_arguments)
+
+
+def give_back_sawyer(sawyer: Sawyer) -> None:
+    """Let others have a simulator that is no longer used."""
+    _at_rest.setdefault(_key(sawyer.manipulation, sawyer.render_arguments), []).append(sawyer)
+
+
+def _key(manipulation: str, render_arguments: dict[str, Any]) -> tuple[Any, ...]:
+    return manipulation, *sorted(render_arguments.items())
 
 
 class Placements:

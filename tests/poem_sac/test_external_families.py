@@ -25,7 +25,7 @@ def test_preferences_are_relabelled_where_dynamics_are_shared(env_id):
 
 
 def test_preferences_of_ml10_are_measured_by_rollouts_that_count():
-    """An epoch runs four tasks, and the twelve pairs of the one group, each once; its returns are what those rollouts earned."""
+    """An epoch runs four tasks, and the twelve pairs of the one group, each once; its returns are theirs."""
     model = make_model("poem/MetaWorldML10-v0")
     returns: dict[tuple[int, int], float] = {}
     collected = model._collect
