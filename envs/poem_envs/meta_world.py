@@ -55,7 +55,7 @@ class MetaWorldEnv(ReplayFamily):
         super().__init__(**kwargs)
         self.observation_space = spaces.Box(-np.inf, np.inf, (OBSERVATION_DIM,), np.float64)
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
-        self._render_arguments = {
+        self._render_arguments: dict[str, Any] = {
             "render_mode": self.render_mode,
             "width": width,
             "height": height,
@@ -121,7 +121,10 @@ class MetaWorldEnv(ReplayFamily):
         """Render the current state as ``render_mode`` says: an image ``(height, width, 3)`` for ``"rgb_array"``."""
         if self._sawyer is None:
             raise RuntimeError("render() was called before the first reset()")
-        return self._sawyer.env.render()
+        image = self._sawyer.env.render()
+        # Meta-World's models have these cameras upside down.
+        upside_down = isinstance(image, np.ndarray) and (self._render_arguments["camera_name"] or "").startswith("corner")
+        return image[::-1, ::-1].copy() if upside_down else image
 
     def close(self) -> None:
         """Free what rendering and simulation hold."""

@@ -219,3 +219,17 @@ def test_a_state_can_be_restored(rng):
 @pytest.mark.parametrize("env_name", sawyer.manipulation_names())
 def test_every_manipulation_keeps_the_contract(env_name):
     check_task_family("poem/MetaWorldML1-v0", n_steps=6, env_name=env_name, width=64, height=64)
+
+
+def test_images_are_upright():
+    """The hand is lifted: what moves must move up in the image."""
+    env = make(render_mode="rgb_array", width=96, height=96, camera_name="corner")
+    env.reset(seed=0)
+    heights = []
+    for _ in range(2):
+        red, green, blue = env.render().astype(float).transpose(2, 0, 1)
+        heights.append(np.nonzero((red > 60) & (red > 2 * green) & (red > 2 * blue))[0].min())  # the arm's uppermost row
+        for _ in range(40):
+            env.step(np.array([0.0, 0.0, 1.0, 0.0]))
+    env.close()
+    assert heights[1] < heights[0]
