@@ -234,9 +234,10 @@ def check_vector_parity(env_id: str, env_kwargs: dict[str, Any], n_steps: int, s
         f"the vector_entry_point of {env_id} must make a poem_envs.TaskFamilyVector, but makes a {type(vector_env).__name__}; "
         "use functools.partial(poem_envs.ProcessFamilyVector, YourFamily)"
     )
-    singles = [gym.make(env_id, **arguments) for _ in range(n)]
+    singles = [_make(env_id, **env_kwargs) for _ in range(n)]  # whose time limit is counted here
+    lengths = np.zeros(n, dtype=int)
     advice = "must equal the single environment's bit for bit, but do not: let both run the same code"
-    tasks = np.stack([*_two_tasks(singles[0].unwrapped, seed)] * 2)[:n]
+    tasks = np.stack([*_two_tasks(singles[0], seed)] * 2)[:n]
     observations, _ = vector_env.reset(seed=seed)
     expected = np.stack([single.reset(seed=seed + i)[0] for i, single in enumerate(singles)])
     assert np.array_equal(observations, expected), f"observations of the vectorised version's reset {advice}"
@@ -244,16 +245,19 @@ def check_vector_parity(env_id: str, env_kwargs: dict[str, Any], n_steps: int, s
         if step == 1:
             vector_env.set_tasks(tasks)
             for single, task in zip(singles, tasks, strict=True):
-                single.unwrapped.set_task(task)  # type: ignore[attr-defined]
+                single.set_task(task)
         observations, rewards, terminations, truncations, infos = vector_env.step(actions)
         for i, single in enumerate(singles):
-            observation, reward, terminated, truncated, info = single.step(actions[i])
+            observation, reward, terminated, _, info = single.step(actions[i])
+            lengths[i] += 1
+            truncated = lengths[i] == horizon
             assert reward == rewards[i], f"rewards of the vectorised version {advice}"
             assert (terminated, truncated) == (terminations[i], truncations[i]), f"ends of the vectorised version {advice}"
             for key, value in info.items():
                 assert np.array_equal(value, infos[key][i]), f"infos[{key!r}] of the vectorised version {advice}"
             if terminated or truncated:
                 observation, _ = single.reset()
+                lengths[i] = 0
             assert np.array_equal(observation, observations[i]), f"observations of the vectorised version {advice}"
     vector_env.close()
     for single in singles:

@@ -428,3 +428,10 @@ def test_a_good_registration():
         check_task_family("test/Good-v0")
     finally:
         del gym.registry["test/Good-v0"]
+
+
+def test_an_import_of_rl_zoo3_changes_nothing():
+    """It replaces Gymnasium's TimeLimit by one that tells of time limits in another way."""
+    import rl_zoo3  # noqa: F401
+
+    check_task_family("poem/PointGoal-v0")
