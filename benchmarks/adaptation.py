@@ -97,6 +97,7 @@ def table(env_id: str, runs: list[dict[str, Any]]) -> str:
             lines.append("| " + " | ".join([*cells, f"{result['known_task_return']:.1f}"]) + " |")
         limit = [f"{value:.1f}" for value in run["adaptations"][-1]["limit"]]
         lines.append("| " + " | ".join([str(run["training"]["seed"]), "*limit*", "", *limit, ""]) + " |")
+    lines += success_table(runs)
     lines += [
         "",
         "| seed | environment steps | updates | wall time, s | preference accuracy | Kendall's tau |",
@@ -115,6 +116,20 @@ def table(env_id: str, runs: list[dict[str, Any]]) -> str:
     ]
     notes = sorted({run["training"]["note"] for run in runs if "note" in run["training"]})
     return "\n".join([*lines, *notes]) + "\n"
+
+
+def success_table(runs: list[dict[str, Any]]) -> list[str]:
+    """Markdown lines of the success rates beside the returns; none for a family that has no successes."""
+    if any("success_rate" not in result for run in runs for result in run["adaptations"]):
+        return []
+    header = ["seed", "rule", "candidates", *(f"k = {k}" for k in COLUMNS), "task known"]
+    lines = ["", "Success rate on the same episodes.", "", "| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
+    for run in runs:
+        for result in run["adaptations"]:
+            cells = [str(run["training"]["seed"]), result["inference"], result["candidates"]]
+            cells += [f"{rate:.2f}" for rate in [*result["success_rate"], result["known_task_success_rate"]]]
+            lines.append("| " + " | ".join(cells) + " |")
+    return lines
 
 
 def main() -> None:

@@ -53,6 +53,10 @@ class TaskDefinition:
     reward_feature_dim: int
     #: Whether tasks differ in the reward alone, so that one task's trajectories can be relabelled with another's rewards.
     shared_dynamics: bool = True
+    #: The names of the sets that tasks can be drawn from, of which the first is for training.
+    splits: tuple[str, ...] = ("train",)
+    #: The one that :meth:`sample_tasks` draws from.
+    split: str = "train"
 
     def sample_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draw tasks from the family's own distribution.
@@ -108,6 +112,16 @@ class TaskDefinition:
         """Where a copy's episode is, for error messages. Defined by the environment classes."""
         raise NotImplementedError
 
+    def _choose_split(self, split: str) -> None:
+        """Set :attr:`split`, or raise a ValueError that lists those that there are."""
+        if split not in self.splits:
+            raise ValueError(
+                f"split={split!r}: {type(self).__name__} has no such split of its tasks, it has "
+                f"{', '.join(map(repr, self.splits))}. Tasks that another generator draws are new ones too: "
+                "sample_tasks(n, np.random.default_rng(seed))"
+            )
+        self.split = split
+
     def _checked_tasks(self, tasks: npt.ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:
         """Return ``tasks`` as a fresh float64 array, or raise a ValueError that says what is wrong with them."""
         try:
@@ -161,10 +175,14 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray]):
     Neither choice touches the random numbers of the episode itself, so two tasks see the same start.
 
     **The info** of every step holds ``"reward_features"``, ``(reward_feature_dim,)`` float64: everything that rewards of this
-    family depend on (see :meth:`~TaskDefinition.compute_reward`).
+    family depend on (see :meth:`~TaskDefinition.compute_reward`). A family whose :meth:`_step_info` gives ``"success"``,
+    whether the step reached what the task asks for, has ``"is_success"`` there too, as SB3 calls it: whether any step of the
+    episode so far did. Training, evaluation and the command line then report success rates.
 
     :param render_mode: one of ``metadata["render_modes"]``, or None
     :param render_task: whether rendering shows the hidden task, for a developer who debugs
+    :param split: one of :attr:`splits`, to draw tasks from
+    :raises ValueError: if there is no such split or render mode
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (Gymnasium declares it so)
@@ -175,10 +193,12 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray]):
     _next_task: np.ndarray | None = None
     _elapsed_steps: int = 0
     _episode: int = 0
+    _succeeded: bool = False
     _reset_options: ClassVar[frozenset[str]] = frozenset({"task"})
 
-    def __init__(self, *, render_mode: str | None = None, render_task: bool = False) -> None:
+    def __init__(self, *, render_mode: str | None = None, render_task: bool = False, split: str = "train") -> None:
         check_render_mode(render_mode, self.metadata)
+        self._choose_split(split)
         self.render_mode = render_mode
         self.render_task = render_task
 
@@ -208,6 +228,7 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray]):
         super().reset(seed=seed)
         self._episode = 1 if seed is not None else self._episode + 1
         self._elapsed_steps = 0
+        self._succeeded = False
         if self._next_task is not None:
             self._task = self._next_task
         elif self._task is None or seed is not None:
@@ -234,7 +255,11 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray]):
         reward = float(self.compute_reward(self._task, features))
         if self.render_mode == "human":
             self.render()
-        return observation, reward, bool(terminated), False, {"reward_features": features}
+        info = {"reward_features": features, **self._step_info()}
+        if "success" in info:
+            self._succeeded = self._succeeded or bool(info["success"])
+            info["is_success"] = self._succeeded
+        return observation, reward, bool(terminated), False, info
 
     def _begin_episode(self, rng: np.random.Generator) -> np.ndarray:
         """Put the environment into a start state and return its observation, a new array."""
@@ -243,6 +268,10 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray]):
     def _simulate(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
         """Apply a valid action; return new arrays of observation and reward features, and whether the episode ended early."""
         raise NotImplementedError
+
+    def _step_info(self) -> dict[str, Any]:
+        """Further entries of the info of the step just taken, say ``{"success": True}``: none unless overridden."""
+        return {}
 
     def _describe_episode(self, copy: int = 0) -> str:
         """Where an episode is, for error messages."""

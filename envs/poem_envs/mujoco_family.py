@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
+from poem_envs.cores import available_cores
 from poem_envs.mujoco_integrator import Integrator
 from poem_envs.mujoco_rendering import StateRenderer
 from poem_envs.vector import BatchFamily, BatchTaskFamily, TaskFamilyVector
@@ -214,13 +215,6 @@ class MujocoTaskVectorEnv(MujocoFamily, TaskFamilyVector):
             raise ValueError(f"nthread={nthread!r} must be at least 1, or None for all cores")
         self._nthread = available_cores() if nthread is None else nthread
         super().__init__(**kwargs)
-
-
-def available_cores() -> int:
-    """The number of cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _model_path(xml_file: str) -> str:

@@ -64,6 +64,10 @@ class BatchFamily(TaskDefinition):
         """
         raise NotImplementedError
 
+    def _step_infos(self) -> dict[str, np.ndarray]:
+        """Further entries of the infos of the step just taken, a row for each copy: none unless overridden."""
+        return {}
+
     def _observations(self) -> np.ndarray:
         """The observations of all copies, ``(n, obs_dim)``, a new array."""
         raise NotImplementedError
@@ -103,6 +107,7 @@ class BatchTaskFamily(BatchFamily, TaskFamily):
     :param action_space: of the environment
     :param render_mode: one of ``metadata["render_modes"]``, or None
     :param render_task: whether rendering shows the hidden task
+    :param split: which tasks to draw, one of :attr:`splits`
     """
 
     def __init__(
@@ -112,8 +117,9 @@ class BatchTaskFamily(BatchFamily, TaskFamily):
         action_space: spaces.Box,
         render_mode: str | None = None,
         render_task: bool = False,
+        split: str = "train",
     ) -> None:
-        super().__init__(render_mode=render_mode, render_task=render_task)
+        super().__init__(render_mode=render_mode, render_task=render_task, split=split)
         self.observation_space = observation_space
         self.action_space = action_space
         self._allocate(1)
@@ -125,6 +131,9 @@ class BatchTaskFamily(BatchFamily, TaskFamily):
     def _simulate(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
         features, terminated = self._advance(action[None])
         return self._observations()[0], features[0], bool(terminated[0])
+
+    def _step_info(self) -> dict[str, Any]:
+        return {key: values[0] for key, values in self._step_infos().items()}
 
     def get_physics_state(self) -> np.ndarray:
         """The simulator's state, ``(state_dim,)``: enough to render this moment again, or to go on from it."""
@@ -156,7 +165,8 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
     - A copy whose episode ends is reset in the same step (``AutoresetMode.SAME_STEP``). ``infos["final_obs"]`` then holds
       ``(num_envs, obs_dim)``: the observation that each copy's step led to, which differs from the returned one for copies
       that were reset (``infos["_final_obs"]``, a mask). The key is there only if some copy was reset.
-    - ``infos["reward_features"]``, ``(num_envs, reward_feature_dim)``, is always that of the step just taken.
+    - ``infos["reward_features"]``, ``(num_envs, reward_feature_dim)``, is always that of the step just taken, as are
+      ``"success"`` and ``"is_success"``, ``(num_envs,)``, of a family that has them.
     - ``reset(seed=s)`` seeds copy ``i`` with ``s + i``; results equal those of single environments bit for bit.
 
     :param num_envs: number of copies
@@ -165,6 +175,7 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
     :param action_space: of one copy
     :param render_mode: ``"rgb_array"`` and the like; ``"human"`` for one copy only
     :param render_task: whether rendering shows the hidden tasks
+    :param split: which tasks to draw, one of :attr:`splits`
     """
 
     metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
@@ -179,8 +190,10 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
         render_task: bool = False,
+        split: str = "train",
     ) -> None:
         super().__init__()
+        self._choose_split(split)
         if num_envs < 1:
             raise ValueError(f"num_envs={num_envs!r} must be at least 1")
         if max_episode_steps is not None and max_episode_steps < 1:
@@ -204,6 +217,7 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         self._seeds: list[int] = []
         self._elapsed_steps = np.zeros(num_envs, dtype=np.int64)
         self._episodes = np.zeros(num_envs, dtype=np.int64)
+        self._succeeded = np.zeros(num_envs, dtype=bool)
         self._allocate(num_envs)
 
     @property
@@ -277,7 +291,10 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
             truncations = np.zeros(self.num_envs, dtype=bool)
         else:
             truncations = self._elapsed_steps >= self.max_episode_steps
-        infos: dict[str, Any] = {"reward_features": features}
+        infos: dict[str, Any] = {"reward_features": features, **self._step_infos()}
+        if "success" in infos:
+            self._succeeded |= infos["success"].astype(bool)
+            infos["is_success"] = self._succeeded.copy()
         done = terminations | truncations
         if done.any():
             infos["final_obs"], infos["_final_obs"] = observations, done
@@ -349,6 +366,7 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         chosen = copies[self._task_chosen[copies]]
         self._tasks[chosen] = self._next_tasks[chosen]
         self._elapsed_steps[copies] = 0
+        self._succeeded[copies] = False
         self._episodes[copies] += 1
         self._begin_episodes(copies, [self._rngs[copy] for copy in copies])
 

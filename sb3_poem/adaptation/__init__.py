@@ -3,8 +3,10 @@
 from sb3_poem.adaptation.adapter import PreferenceAdapter
 from sb3_poem.adaptation.evaluation import (
     AdaptationEvaluation,
+    EpisodeOutcomes,
     KnownTaskReturn,
     evaluate_adaptation,
+    evaluate_episodes,
     evaluate_latents,
     known_task_return,
     property_one,
@@ -23,6 +25,7 @@ __all__ = [
     "AdaptedPolicy",
     "BoltzmannNoise",
     "BoltzmannOracle",
+    "EpisodeOutcomes",
     "ExactNoise",
     "HumanOracle",
     "KnownTaskReturn",
@@ -39,6 +42,7 @@ __all__ = [
     "adapt_tasks",
     "best_codebook",
     "evaluate_adaptation",
+    "evaluate_episodes",
     "evaluate_latents",
     "information_limit",
     "known_task_return",

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.adaptation.evaluation import evaluate_adaptation, evaluate_latents, known_task_return, preference_order
 from sb3_poem.common.callbacks import EpochCallback
-from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.common.vec_env import make_task_vec_env
 
 
 class AdaptationEvalCallback(EpochCallback):
@@ -20,7 +21,8 @@ class AdaptationEvalCallback(EpochCallback):
     Logs ``eval/return_after_<k>_queries`` for each k, ``eval/known_task_return`` (the best of many latents for each
     task), ``eval/preference_accuracy`` and ``eval/kendall_tau`` of Property 1, ``eval/coverage_loss`` (the return that is
     lost by replacing each training task's latent by the nearest of 1,000 prior draws). It has its own generators:
-    training is the same with it and without it. Evaluation steps do not count as training steps.
+    training is the same with it and without it. Evaluation steps do not count as training steps. For a family whose infos say
+    whether a step was a success, ``eval/success_rate_after_<k>_queries`` and ``eval/known_task_success_rate`` too.
 
     :param every: Epochs between two evaluations
     :param n_tasks: Held-out tasks; a finite family is evaluated on all its tasks
@@ -57,7 +59,7 @@ class AdaptationEvalCallback(EpochCallback):
         self.adaptation_kwargs = dict(adaptation_kwargs or {})
         self.best_return = -np.inf
         self.last_evaluation: dict[str, float] = {}
-        self._env: TaskVecEnv | None = None
+        self._env: VecEnv | None = None
 
     def _init_callback(self) -> None:
         super()._init_callback()
@@ -68,7 +70,7 @@ class AdaptationEvalCallback(EpochCallback):
     def _best_model(self) -> Path | None:
         return None if self.best_model_save_path is None else self.best_model_save_path / "best_model.zip"
 
-    def _make_env(self) -> tuple[TaskVecEnv, np.ndarray]:
+    def _make_env(self) -> tuple[VecEnv, np.ndarray]:
         family = self.model.family
         if self._env is None:
             spec = family.env.get_attr("spec", indices=[0])[0]
@@ -78,7 +80,7 @@ class AdaptationEvalCallback(EpochCallback):
                     "register it, or call evaluate_adaptation with a vector environment of your own"
                 )
             limit = spec.max_episode_steps
-            self._env = TaskVecEnv.from_id(spec.id, 2 * self.n_tasks, max_episode_steps=limit, **spec.kwargs)
+            self._env = make_task_vec_env(spec.id, 2 * self.n_tasks, max_episode_steps=limit, **spec.kwargs)
         if family.all_tasks is not None and len(family.all_tasks) <= self.n_tasks:
             return self._env, family.all_tasks
         return self._env, family.sample_tasks(self.n_tasks, np.random.default_rng(self.seed))
@@ -92,6 +94,10 @@ class AdaptationEvalCallback(EpochCallback):
         known = known_task_return(self.model, env, tasks, **options)
         metrics = {f"return_after_{k}_queries": result.after(k) for k in self.record_at}
         metrics["known_task_return"] = known.mean_return
+        if result.success_rates is not None and known.success_rate is not None:
+            rates = zip(result.record_at, result.success_rates.tolist(), strict=True)
+            metrics.update({f"success_rate_after_{k}_queries": rate for k, rate in rates})
+            metrics["known_task_success_rate"] = known.success_rate
         metrics["coverage_loss"] = self._coverage_loss(env)
         if hasattr(self.model, "similarity"):
             metrics["preference_accuracy"], metrics["kendall_tau"] = preference_order(self.model, known)
@@ -107,7 +113,7 @@ class AdaptationEvalCallback(EpochCallback):
             if self._best_model is not None:
                 self.model.save(self._best_model)
 
-    def _coverage_loss(self, env: TaskVecEnv) -> float:
+    def _coverage_loss(self, env: VecEnv) -> float:
         """How far the prior is from what the policy was trained on, in return."""
         assert self.model.train_tasks is not None
         rng = np.random.default_rng(self.seed)

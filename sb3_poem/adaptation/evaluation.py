@@ -12,10 +12,27 @@ from sb3_poem.adaptation.limits import information_limit
 from sb3_poem.adaptation.lockstep import OracleFactory, adapt_tasks
 from sb3_poem.adaptation.oracles import ReturnOracle, compute_reward
 from sb3_poem.adaptation.preference import Preference
-from sb3_poem.common.rollouts import rollout_features
+from sb3_poem.common.rollouts import rollout_features, rollout_outcomes
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
+
+
+# Latents to try for each task, where every one must be rolled out in every task, and where one rollout serves all of them.
+LATENTS_WITH_OWN_DYNAMICS, LATENTS_WITH_SHARED_DYNAMICS = 30, 300
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeOutcomes:
+    """
+    What the episodes of some latents on some tasks came to.
+
+    :param returns: (n, n_episodes) true returns.
+    :param successes: (n, n_episodes), whether an episode was a success; None for a family that does not say.
+    """
+
+    returns: np.ndarray
+    successes: np.ndarray | None
 
 
 def evaluate_latents(
@@ -28,7 +45,22 @@ def evaluate_latents(
     deterministic: bool = True,
 ) -> np.ndarray:
     """
-    True returns of latents on tasks: an episode's rewards up to its end, early or not, not discounted.
+    True returns of latents on tasks, (n, n_episodes): those of :func:`evaluate_episodes`, with the same arguments.
+    """
+    return evaluate_episodes(model, vec_env, latents, tasks, n_episodes, seed, deterministic).returns
+
+
+def evaluate_episodes(
+    model: Any,
+    vec_env: VecEnv,
+    latents: np.ndarray,
+    tasks: np.ndarray,
+    n_episodes: int = 10,
+    seed: int = 0,
+    deterministic: bool = True,
+) -> EpisodeOutcomes:
+    """
+    True returns of latents on tasks: an episode's rewards up to its end, early or not, not discounted; and successes.
 
     Episode e of row i always starts from the same seed, so the same rows with other latents are compared on equal starts.
 
@@ -39,7 +71,7 @@ def evaluate_latents(
     :param n_episodes: Episodes per row.
     :param seed: Where the episodes' reset seeds start.
     :param deterministic: Whether policies act by their mode.
-    :return: (n, n_episodes).
+    :return: Returns and successes, each (n, n_episodes).
     :raises ValueError: If shapes do not fit or an episode is not finite.
     """
     latents, tasks = np.asarray(latents, dtype=np.float64), np.asarray(tasks, dtype=np.float64)
@@ -52,11 +84,15 @@ def evaluate_latents(
         raise ValueError(f"`n_episodes` must be at least 1, but is {n_episodes}")
     n = len(latents)
     rows = np.tile(np.arange(n), n_episodes)
-    features = rollout_features(model, vec_env, latents[rows], tasks[rows], seed, deterministic)
+    outcomes = rollout_outcomes(model, vec_env, latents[rows], tasks[rows], seed, deterministic)
     returns = [
-        float(np.sum(compute_reward(vec_env, tasks[row], episode))) for row, episode in zip(rows, features, strict=True)
+        float(np.sum(compute_reward(vec_env, tasks[row], outcome.reward_features)))
+        for row, outcome in zip(rows, outcomes, strict=True)
     ]
-    return np.array(returns).reshape(n_episodes, n).T
+    successes = None
+    if all(outcome.success is not None for outcome in outcomes):
+        successes = np.array([outcome.success for outcome in outcomes], dtype=bool).reshape(n_episodes, n).T
+    return EpisodeOutcomes(np.array(returns).reshape(n_episodes, n).T, successes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +105,8 @@ class AdaptationEvaluation:
     :param latents: (n_tasks, len(record_at), latent_dim) the estimates.
     :param returns: (n_tasks, len(record_at), n_episodes).
     :param preferences: A task's answers in order.
+    :param successes: (n_tasks, len(record_at), n_episodes), whether an episode was a success; None for a family that does
+        not say.
     """
 
     tasks: np.ndarray
@@ -76,6 +114,7 @@ class AdaptationEvaluation:
     latents: np.ndarray
     returns: np.ndarray
     preferences: list[list[Preference]]
+    successes: np.ndarray | None = None
 
     @property
     def task_returns(self) -> np.ndarray:
@@ -86,6 +125,11 @@ class AdaptationEvaluation:
     def mean_returns(self) -> np.ndarray:
         """(len(record_at),) means over tasks and episodes."""
         return self.returns.mean(axis=(0, 2))
+
+    @property
+    def success_rates(self) -> np.ndarray | None:
+        """(len(record_at),) shares of successful episodes; None for a family that does not say."""
+        return None if self.successes is None else self.successes.mean(axis=(0, 2))
 
     def after(self, n_answers: int) -> float:
         """
@@ -103,15 +147,20 @@ class AdaptationEvaluation:
         """
         JSON-ready data.
 
-        :return: Every task's mean return after every recorded number of answers, and the means.
+        :return: Every task's mean return, and success rate if there are successes, after every recorded number of answers;
+            and the means.
         """
-        return {
+        data: dict[str, Any] = {
             "queries": list(self.record_at),
             "mean_return": self.mean_returns.tolist(),
             "tasks": self.tasks.tolist(),
             "task_returns": self.task_returns.tolist(),
             "answers": [[answer.value for answer in answers] for answers in self.preferences],
         }
+        if self.successes is not None:
+            data["success_rate"] = self.successes.mean(axis=(0, 2)).tolist()
+            data["task_success_rates"] = self.successes.mean(axis=2).tolist()
+        return data
 
 
 def evaluate_adaptation(
@@ -157,13 +206,14 @@ def evaluate_adaptation(
         **options,
     )
     start, deterministic = evaluation_seed(seed), options.get("deterministic", True)
-    returns = [
-        evaluate_latents(model, vec_env, latents, adapted.tasks, n_episodes, start, deterministic)
+    outcomes = [
+        evaluate_episodes(model, vec_env, latents, adapted.tasks, n_episodes, start, deterministic)
         for latents in tqdm(adapted.latents.swapaxes(0, 1), unit="evaluation", disable=not progress_bar)
     ]
-    return AdaptationEvaluation(
-        adapted.tasks, adapted.record_at, adapted.latents, np.stack(returns, axis=1), adapted.preferences
-    )
+    returns = np.stack([outcome.returns for outcome in outcomes], axis=1)
+    known = [outcome.successes for outcome in outcomes if outcome.successes is not None]
+    successes = np.stack(known, axis=1) if len(known) == len(outcomes) else None
+    return AdaptationEvaluation(adapted.tasks, adapted.record_at, adapted.latents, returns, adapted.preferences, successes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,6 +226,7 @@ class KnownTaskReturn:
     :param latents: (n_tasks, latent_dim) those latents.
     :param candidate_latents: (n_latents, latent_dim) all that were tried.
     :param candidate_returns: (n_tasks, n_latents) their returns on every task (J).
+    :param successes: (n_tasks, n_episodes), of the episodes of ``returns``; None for a family that does not say.
     """
 
     tasks: np.ndarray
@@ -183,11 +234,17 @@ class KnownTaskReturn:
     latents: np.ndarray
     candidate_latents: np.ndarray
     candidate_returns: np.ndarray
+    successes: np.ndarray | None = None
 
     @property
     def mean_return(self) -> float:
         """Mean over tasks and episodes."""
         return float(self.returns.mean())
+
+    @property
+    def success_rate(self) -> float | None:
+        """Share of successful episodes; None for a family that does not say."""
+        return None if self.successes is None else float(self.successes.mean())
 
     def limit(self, k: int) -> float:
         """
@@ -203,7 +260,7 @@ def known_task_return(
     model: Any,
     vec_env: VecEnv,
     tasks: np.ndarray,
-    n_latents: int = 300,
+    n_latents: int | None = None,
     n_episodes: int = 10,
     seed: int = 0,
     *,
@@ -221,7 +278,8 @@ def known_task_return(
     :param model: A trained model.
     :param vec_env: A vector environment of the task family.
     :param tasks: (n_tasks, task_dim).
-    :param n_latents: How many latents to try.
+    :param n_latents: How many latents to try; None for 300, or for 30 where tasks do not share their dynamics and every latent
+        must be rolled out in every task.
     :param n_episodes: Fresh episodes per winner.
     :param seed: Of the draws and the episodes.
     :param source: Where latents come from: "prior", "aggregate", or "both" in equal parts.
@@ -231,13 +289,15 @@ def known_task_return(
     :raises ValueError: If an argument is out of its range.
     """
     tasks = np.asarray(tasks, dtype=np.float64)
+    if n_latents is None:
+        n_latents = LATENTS_WITH_SHARED_DYNAMICS if _dynamics_are_shared(vec_env) else LATENTS_WITH_OWN_DYNAMICS
     if n_latents < 1:
         raise ValueError(f"`n_latents` must be at least 1, but is {n_latents}")
     candidates = _draw_latents(model, n_latents, source, np.random.default_rng([seed, 2]))
     returns = return_matrix(model, vec_env, tasks, candidates, selection_episodes, evaluation_seed(seed, 1), deterministic)
     best = candidates[np.argmax(returns, axis=1)]
-    fresh = evaluate_latents(model, vec_env, best, tasks, n_episodes, evaluation_seed(seed), deterministic)
-    return KnownTaskReturn(tasks, fresh, best, candidates, returns)
+    fresh = evaluate_episodes(model, vec_env, best, tasks, n_episodes, evaluation_seed(seed), deterministic)
+    return KnownTaskReturn(tasks, fresh.returns, best, candidates, returns, fresh.successes)
 
 
 def return_matrix(
@@ -264,7 +324,7 @@ def return_matrix(
     :raises ValueError: If shapes do not fit or an episode is not finite.
     """
     tasks, latents = np.asarray(tasks, dtype=np.float64), np.asarray(latents, dtype=np.float64)
-    if not bool(vec_env.get_attr("shared_dynamics", indices=[0])[0]):
+    if not _dynamics_are_shared(vec_env):
         rows = np.repeat(tasks, len(latents), axis=0)
         returns = evaluate_latents(model, vec_env, np.tile(latents, (len(tasks), 1)), rows, n_episodes, seed, deterministic)
         return returns.mean(axis=1).reshape(len(tasks), len(latents))
@@ -331,6 +391,10 @@ def evaluation_seed(seed: int, stream: int = 0) -> int:
     :return: A non-negative 30-bit integer.
     """
     return int(np.random.SeedSequence([seed, 3, stream]).generate_state(1)[0] >> 2)
+
+
+def _dynamics_are_shared(vec_env: VecEnv) -> bool:
+    return bool(vec_env.get_attr("shared_dynamics", indices=[0])[0])
 
 
 def _draw_latents(model: Any, n: int, source: str, rng: np.random.Generator) -> np.ndarray:

@@ -27,7 +27,7 @@ from sb3_poem.adaptation import (
     ReturnOracle,
     TaskOracle,
     evaluate_adaptation,
-    evaluate_latents,
+    evaluate_episodes,
     known_task_return,
 )
 from sb3_poem.adaptation.evaluation import evaluation_seed
@@ -37,12 +37,12 @@ from sb3_poem.cli.outputs import check_output
 from sb3_poem.cli.report import Report, describe_task
 from sb3_poem.common.family import FamilyEnv
 from sb3_poem.common.rollouts import rollout_latents
-from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.common.video import side_by_side, write_video
 
 DEFAULT_TASKS = 30
-# Copies that step in lockstep; those of a family without a vector version step in turn.
-VECTORISED_COPIES, SINGLE_COPIES = 60, 8
+# Copies that step in lockstep.
+VECTORISED_COPIES = 60
 # Episodes per latent when looking for a task's best: the fewer, the more luck counts in the limit.
 SELECTION_EPISODES = 3
 # Test tasks come from a stream of their own, so that no seed gives the tasks that a model was trained on.
@@ -118,9 +118,7 @@ class Adaptation:
         self.tasks = self._choose_tasks(family)
 
     def _make_env(self) -> VecEnv:
-        if gym.spec(self.env_id).vector_entry_point is not None:
-            return TaskVecEnv.from_id(self.env_id, VECTORISED_COPIES, **self.env_kwargs)
-        return DummyVecEnv([partial(gym.make, self.env_id, **self.env_kwargs)] * SINGLE_COPIES)
+        return make_task_vec_env(self.env_id, VECTORISED_COPIES, **self.env_kwargs)
 
     def _choose_tasks(self, family: FamilyEnv) -> np.ndarray:
         """The test tasks, (n_tasks, task_dim). Those of a finite family are repeated in turn: each is one adaptation more."""
@@ -193,10 +191,12 @@ class Adaptation:
         """Measure the latents (n_records, latent_dim) that one task went through."""
         tasks = np.repeat(self.tasks, len(latents), axis=0)
         with self.console.status("Measuring the returns"):
-            returns = evaluate_latents(
+            outcomes = evaluate_episodes(
                 self.model, self.env, latents, tasks, self.arguments.episodes, evaluation_seed(self.seed)
             )
-        return AdaptationEvaluation(self.tasks, tuple(range(len(latents))), latents[None], returns[None], [answers])
+        successes = None if outcomes.successes is None else outcomes.successes[None]
+        records = tuple(range(len(latents)))
+        return AdaptationEvaluation(self.tasks, records, latents[None], outcomes.returns[None], [answers], successes)
 
     def report(self, evaluation: AdaptationEvaluation) -> None:
         """Print and write what was asked for."""

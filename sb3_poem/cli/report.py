@@ -41,16 +41,20 @@ class Report:
         return [self.known.limit(n) for n in self.evaluation.record_at]
 
     def table(self) -> Table:
-        """Return, its standard error over tasks, and the limit after each number of answers."""
+        """Return, its standard error over tasks, the limit and, where a family has it, the success rate after each answer."""
         table = Table(title=self.title, caption="limit: the most that any method can earn from so many error-free answers")
-        for name in ("answers", "return", "std. error", "limit"):
+        rates = self.evaluation.success_rates
+        for name in ("answers", "return", "std. error", "limit", *(() if rates is None else ("success rate",))):
             table.add_column(name, justify="right")
         returns = self.evaluation.task_returns
         errors = returns.std(axis=0, ddof=1) / np.sqrt(len(returns)) if len(returns) > 1 else np.full(returns.shape[1], np.nan)
-        for n, mean, error, limit in zip(self.evaluation.record_at, returns.mean(axis=0), errors, self.limits, strict=True):
-            table.add_row(str(n), f"{mean:.1f}", "" if np.isnan(error) else f"{error:.1f}", f"{limit:.1f}")
+        means = returns.mean(axis=0)
+        for row, (n, mean, error, limit) in enumerate(zip(self.evaluation.record_at, means, errors, self.limits, strict=True)):
+            rate = [] if rates is None else [f"{rates[row]:.2f}"]
+            table.add_row(str(n), f"{mean:.1f}", "" if np.isnan(error) else f"{error:.1f}", f"{limit:.1f}", *rate)
         table.add_section()
-        table.add_row("task known", f"{self.known.mean_return:.1f}", "", "")
+        rate = [] if self.known.success_rate is None else [f"{self.known.success_rate:.2f}"]
+        table.add_row("task known", f"{self.known.mean_return:.1f}", "", "", *rate)
         return table
 
     def to_dict(self) -> dict[str, Any]:
@@ -63,6 +67,7 @@ class Report:
             "limit": self.limits,
             "known_task_return": self.known.mean_return,
             "known_task_returns": self.known.returns.mean(axis=1).tolist(),
+            **({} if self.known.success_rate is None else {"known_task_success_rate": self.known.success_rate}),
         }
 
     def write(self, console: Console, json_file: Path | None, plot_file: Path | None) -> None:

@@ -58,6 +58,54 @@ def rollout_latents(
     ]
 
 
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """
+    What evaluation needs to know of an episode.
+
+    :param reward_features: (T, feat_dim).
+    :param success: Whether any of its steps was a success; None where the environment's infos do not say (``"is_success"``).
+    """
+
+    reward_features: np.ndarray
+    success: bool | None
+
+
+def rollout_outcomes(
+    model: Any,
+    vec_env: VecEnv,
+    latents: np.ndarray,
+    tasks: np.ndarray | None = None,
+    seed: int | Sequence[int] = 0,
+    deterministic: bool = True,
+    *,
+    max_steps: int | None = None,
+) -> list[Outcome]:
+    """
+    As :func:`rollout_latents`, but keep each episode's outcome only: for evaluation, where observations would
+    take hundreds of megabytes (Humanoid).
+
+    :param model: See :func:`rollout_latents`.
+    :param vec_env: See :func:`rollout_latents`.
+    :param latents: (n, latent_dim).
+    :param tasks: (n, task_dim) or None.
+    :param seed: One seed a rollout, or one integer.
+    :param deterministic: Whether the policies act by their mode.
+    :param max_steps: Where an episode is cut.
+    :return: n outcomes, in the order of the latents.
+    :raises ValueError: As :func:`rollout_latents`, and if the environment gives no reward features.
+    """
+    outcomes = []
+    for episode in _episodes(model, vec_env, latents, tasks, seed, deterministic, False, max_steps, keep=False):
+        if episode.reward_features is None:
+            raise ValueError(
+                'the environment gives no info["reward_features"], from which returns are computed; '
+                "it must be a task family (poem_envs.TaskFamily)"
+            )
+        outcomes.append(Outcome(episode.reward_features, episode.success))
+    return outcomes
+
+
 def rollout_features(
     model: Any,
     vec_env: VecEnv,
@@ -69,28 +117,10 @@ def rollout_features(
     max_steps: int | None = None,
 ) -> list[np.ndarray]:
     """
-    As :func:`rollout_latents`, but keep each episode's reward features only: for evaluation, where observations would
-    take hundreds of megabytes (Humanoid).
-
-    :param model: See :func:`rollout_latents`.
-    :param vec_env: See :func:`rollout_latents`.
-    :param latents: (n, latent_dim).
-    :param tasks: (n, task_dim) or None.
-    :param seed: One seed a rollout, or one integer.
-    :param deterministic: Whether the policies act by their mode.
-    :param max_steps: Where an episode is cut.
-    :return: n arrays (T_i, feat_dim).
-    :raises ValueError: As :func:`rollout_latents`, and if the environment gives no reward features.
+    The reward features of each episode's :func:`rollout_outcomes`, n arrays (T_i, feat_dim), with the same arguments.
     """
-    features = []
-    for episode in _episodes(model, vec_env, latents, tasks, seed, deterministic, False, max_steps, keep=False):
-        if episode.reward_features is None:
-            raise ValueError(
-                'the environment gives no info["reward_features"], from which returns are computed; '
-                "it must be a task family (poem_envs.TaskFamily)"
-            )
-        features.append(episode.reward_features)
-    return features
+    outcomes = rollout_outcomes(model, vec_env, latents, tasks, seed, deterministic, max_steps=max_steps)
+    return [outcome.reward_features for outcome in outcomes]
 
 
 def policy_actions(model: Any, observations: np.ndarray, latents: np.ndarray, deterministic: bool) -> np.ndarray:
@@ -114,6 +144,7 @@ class _Episode:
     latent: np.ndarray
     reward_features: np.ndarray | None
     frames: list[np.ndarray] | None
+    success: bool | None
 
 
 def _episodes(
@@ -204,6 +235,7 @@ def _wave(
     seen = [observations.copy()] if keep else []
     taken: list[np.ndarray] = []
     features: list[np.ndarray | None] = []
+    successes: list[bool | None] = [None] * copies
     last_observations = observations.copy()
     images: list[list[np.ndarray]] = [[] for _ in range(copies)]
     if frames:
@@ -214,6 +246,9 @@ def _wave(
         raw_observations, _, dones, infos = vec_env.step(actions)
         observations = _flat_observations(raw_observations)
         features.append(_reward_features(vec_env, infos, running))
+        for copy in np.flatnonzero(running):
+            if "is_success" in infos[copy]:
+                successes[copy] = bool(infos[copy]["is_success"])
         after = observations.copy()
         for copy in np.flatnonzero(dones & running):
             after[copy] = infos[copy]["terminal_observation"]
@@ -243,6 +278,7 @@ def _wave(
             latent=latents[row].copy(),
             reward_features=None if stacked_features is None else stacked_features[row, :used].copy(),
             frames=images[row] if frames else None,
+            success=successes[row],
         )
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from poem_envs.core import TaskFamily
@@ -31,11 +32,12 @@ class TaskVecEnv(VecEnv):
     It steps all copies at once, and gives the same observations, rewards and infos. ``infos[i]`` holds
     ``"reward_features"``, and as ``Monitor`` and ``DummyVecEnv`` have them ``"TimeLimit.truncated"``,
     ``"terminal_observation"`` and ``"episode"``. ``get_attr`` and ``env_method`` see each copy as a single
-    :class:`poem_envs.TaskFamily`.
+    :class:`poem_envs.TaskFamily`. What else the family's infos hold, such as ``"is_success"``, is there too.
 
     :param env_fns: One function a copy that returns an environment. Only the first is called: all copies are made alike, from
         its registration and arguments. If its ``Monitor`` has a file, the episodes of all copies are written to that file.
-    :param nthread: Number of threads of a MuJoCo family; None for the family's default (all cores).
+    :param nthread: Number of threads (or processes, as the family has it) to step with; None for the family's default (all
+        cores).
     :raises ValueError: If the environment is no task family, has no vectorised version, was not made by ``gym.make``, was
         given a task already, or is inside a wrapper other than ``TimeLimit``, ``OrderEnforcing``, ``PassiveEnvChecker`` and
         ``Monitor``.
@@ -122,6 +124,9 @@ class TaskVecEnv(VecEnv):
         infos: list[dict[str, Any]] = [
             {"reward_features": row, "TimeLimit.truncated": cut} for row, cut in zip(features, cut_short.tolist(), strict=True)
         ]
+        for key in vector_infos.keys() - {"reward_features", "final_obs", "_final_obs"}:  # "success" and the like
+            for info, value in zip(infos, vector_infos[key], strict=True):
+                info[key] = value
         dones = terminations | truncations
         for index in np.flatnonzero(dones).tolist():
             infos[index]["terminal_observation"] = vector_infos["final_obs"][index]
@@ -188,6 +193,20 @@ class TaskVecEnv(VecEnv):
         if self._monitor is not None and self._monitor.results_writer is not None:
             raise TypeError("a TaskVecEnv whose Monitor writes to a file cannot be pickled; make it without monitor_dir")
         return {**self.__dict__, "_monitor": None}
+
+
+def make_task_vec_env(env_id: str, n_envs: int, max_sequential: int = 8, **env_kwargs: Any) -> VecEnv:
+    """
+    Copies of a registered family: a :class:`TaskVecEnv`, or a ``DummyVecEnv`` of a family without a vectorised version.
+
+    :param env_id: As for ``gym.make``
+    :param n_envs: Number of copies
+    :param max_sequential: The most copies that a ``DummyVecEnv`` steps one after another
+    :param env_kwargs: Arguments of the environment
+    """
+    if gym.spec(env_id).vector_entry_point is not None:
+        return TaskVecEnv.from_id(env_id, n_envs, **env_kwargs)
+    return DummyVecEnv([functools.partial(gym.make, env_id, **env_kwargs)] * min(n_envs, max_sequential))
 
 
 class _CopyView:

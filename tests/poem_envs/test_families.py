@@ -1,7 +1,5 @@
-"""The contract of a task family, on every registered one."""
+"""The families that step in batches, beyond the contract of all families (tests/test_family_contract.py)."""
 
-import copy
-import pickle
 import warnings
 
 import gymnasium as gym
@@ -111,37 +109,11 @@ def test_finite_families(env_id, members, rng):
     assert env.task == env.all_tasks[1]
 
 
-def test_sampling_depends_on_the_given_generator_alone(env_id):
+def test_wrong_numbers_of_tasks(env_id):
     env = make(env_id)
-    env.reset(seed=1)
-    before = copy.deepcopy(env.np_random.bit_generator.state)
-    first = env.sample_tasks(2, np.random.default_rng(5))
-    assert np.array_equal(first, env.sample_tasks(2, np.random.default_rng(5)))
-    assert env.np_random.bit_generator.state == before
     for n in (0, -1, 1.5, True):
         with pytest.raises(ValueError, match="n="):
             env.sample_tasks(n, np.random.default_rng(5))
-
-
-def test_a_task_takes_effect_at_the_next_reset(env_id, rng):
-    env = make(env_id)
-    assert env.task is None
-    first, second = two_tasks(env, rng)
-    env.set_task(first)
-    assert env.task is None
-    env.reset(seed=0)
-    assert np.array_equal(env.task, first)
-    env.set_task(second)
-    action = random_actions(env, 1, rng)[0]
-    _, reward, _, _, info = env.step(action)
-    assert np.array_equal(env.task, first)
-    assert reward == env.compute_reward(first, info["reward_features"])
-    env.reset()
-    assert np.array_equal(env.task, second)
-    env.reset(options={"task": first})
-    assert np.array_equal(env.task, first)
-    env.reset(seed=3)
-    assert np.array_equal(env.task, first)  # a chosen task stays chosen
 
 
 def test_the_task_cannot_be_changed_from_outside(env_id, rng):
@@ -184,28 +156,6 @@ def test_wrong_tasks(env_id, wrong):
             env.reset(options={"task": wrong})
     env.reset()
     assert np.array_equal(env.task, before)
-
-
-def test_observations_hide_the_task(env_id, rng):
-    env = make(env_id)
-    first, second = two_tasks(env, rng)
-    actions = random_actions(env, 25, rng)
-    seen, rewards, features = run(env, actions, seed=11, options={"task": first})
-    seen_again, other_rewards, other_features = run(env, actions, seed=11, options={"task": second})
-    assert np.array_equal(seen, seen_again)
-    assert np.array_equal(features, other_features)
-    assert not np.array_equal(rewards, other_rewards)
-
-
-def test_relabelling_is_exact(env_id, rng):
-    """Rewards of one task, computed from the features logged in another, equal those experienced, to the last bit."""
-    env = make(env_id)
-    tasks = env.sample_tasks(2, rng)
-    actions = random_actions(env, 25, rng)
-    results = [run(env, actions, seed=4, options={"task": task}) for task in tasks]
-    experienced = np.stack([rewards for _, rewards, _ in results])
-    relabelled = env.compute_reward(tasks[:, None], results[0][2])
-    assert np.array_equal(experienced, relabelled)
 
 
 def test_compute_reward_broadcasts_to_the_same_bits(env_id, rng):
@@ -274,20 +224,6 @@ def test_unknown_render_mode(env_id):
         make(env_id).__class__(render_mode="ascii")
 
 
-@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
-def test_copies_go_on_alike(env_id, duplicate, rng):
-    env = make(env_id)
-    actions = random_actions(env, 8, rng)
-    run(env, actions, seed=2)
-    twin = duplicate(env)
-    for action in actions:
-        mine, theirs = env.step(action), twin.step(action)
-        assert np.array_equal(mine[0], theirs[0])
-        assert mine[1:4] == theirs[1:4]
-    assert np.array_equal(env.reset()[0], twin.reset()[0])
-    assert np.array_equal(env.task, twin.task)
-
-
 def test_a_state_can_be_restored(env_id, rng):
     env = make(env_id)
     actions = random_actions(env, 6, rng)
@@ -308,8 +244,8 @@ def test_a_state_can_be_restored(env_id, rng):
         env.set_physics_state(np.full_like(states[0], np.nan))
 
 
-def test_closing_twice(env_id):
-    env = make(env_id)
-    env.reset(seed=0)
-    env.close()
-    env.close()
+def test_a_split_that_there_is_not(env_id):
+    with pytest.raises(ValueError, match=r"split='test': .* it has 'train'"):
+        make(env_id, split="test")
+    with pytest.raises(ValueError, match=r"split='test'"):
+        gym.make_vec(env_id, num_envs=2, vectorization_mode="vector_entry_point", split="test")

@@ -1,0 +1,293 @@
+"""Goal-conditioned environments as task families: the desired goal becomes the hidden task."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from poem_envs.core import BOUNDS_TOLERANCE
+from poem_envs.replay import ReplayFamily
+
+GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
+GOAL_SITE = "target"
+SetGoal = Callable[[gym.Env, np.ndarray], None]
+
+
+class GoalFamily(ReplayFamily):
+    """
+    The task family of a goal-conditioned environment, such as those of gymnasium-robotics.
+
+    The environment must be what HER takes: observations are a dictionary of ``"observation"``, ``"achieved_goal"`` and
+    ``"desired_goal"``, and ``compute_reward(achieved_goal, desired_goal, info)`` is its reward, sparse or dense. Then
+
+    - the observation is ``"observation"``, and ``"achieved_goal"`` behind it if asked for; ``"desired_goal"`` is left out;
+    - a task is a desired goal, drawn as the environment's own reset draws it;
+    - the reward features are the achieved goal, and rewards of any task are ``compute_reward`` of it;
+    - ``"is_success"`` or ``"success"`` of the environment's info is the family's ``"success"``.
+
+    An example::
+
+        gym.register(
+            "my/FetchSlide-v0",
+            entry_point=lambda **kwargs: GoalFamily("FetchSlide-v4", **kwargs),
+            max_episode_steps=50,
+        )
+
+    The environment's resets must depend on their seed alone. Time limits of its registration are left to the family's own.
+
+    :param env: an id, or a function that makes the environment
+    :param observe_achieved_goal: whether the observation holds the achieved goal, which is needed unless
+        ``"observation"`` says where the agent is by itself
+    :param set_goal: gives the environment a goal after its reset, so that its own info and images follow it: called as
+        ``set_goal(env.unwrapped, goal)``; None sets the attribute ``goal``, as gymnasium-robotics has it
+    :param goal_low: lower bounds of the goals, ``(goal_dim,)``; None takes those of ``desired_goal``
+    :param goal_high: upper bounds
+    :param render_mode: as the environment has them
+    :param render_task: whether rendering shows the goal. If not, MuJoCo sites that mark it are made invisible, and whatever
+        else the environment draws for its goal is drawn at the achieved goal
+    :param env_kwargs: further arguments of the environment
+    :raises ValueError: if the environment is not goal-conditioned; the message says what is missing
+    """
+
+    metadata = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012 (Gymnasium declares it so)
+    _simulator_attributes = ("env", "_goal_env")
+
+    def __init__(
+        self,
+        env: str | Callable[..., gym.Env],
+        *,
+        observe_achieved_goal: bool = True,
+        set_goal: SetGoal | None = None,
+        goal_low: npt.ArrayLike | None = None,
+        goal_high: npt.ArrayLike | None = None,
+        render_mode: str | None = None,
+        render_task: bool = False,
+        split: str = "train",
+        **env_kwargs: Any,
+    ) -> None:
+        if isinstance(env, gym.Env):
+            raise ValueError(
+                f"env={env} is an environment, but goals are drawn from a second copy of it: pass its id, or a function that "
+                "makes it"
+            )
+        self._source, self._set_goal_function = env, set_goal
+        self._env_kwargs = env_kwargs if render_mode is None else {**env_kwargs, "render_mode": render_mode}
+        self._observe_achieved_goal = observe_achieved_goal
+        self._goal_env: gym.Env | None = None
+        self._success: bool | None = None
+        self._achieved_goal = np.zeros(0)
+        self._build()
+        self.metadata = {**self.env.metadata}
+        super().__init__(render_mode=render_mode, render_task=render_task, split=split)
+        self._define_spaces(goal_low, goal_high)
+        self._rewards_broadcast = self._check_reward()
+
+    def _define_spaces(self, goal_low: npt.ArrayLike | None, goal_high: npt.ArrayLike | None) -> None:
+        space: Any = self.env.observation_space  # a Dict of flat boxes, as check_goal_env saw to
+        goal = space["desired_goal"]
+        low, high = (
+            np.broadcast_to(np.asarray(own if given is None else given, dtype=np.float64), goal.shape)
+            for own, given in ((goal.low, goal_low), (goal.high, goal_high))
+        )
+        self.task_space = spaces.Box(low, high, dtype=np.float64)
+        self.reward_feature_dim = goal.shape[0]
+        parts = [space[key] for key in GOAL_KEYS[: 1 + self._observe_achieved_goal]]
+        low, high = (np.concatenate([getattr(part, bound) for part in parts]) for bound in ("low", "high"))
+        self.observation_space = spaces.Box(low.astype(np.float64), high.astype(np.float64), dtype=np.float64)
+        assert isinstance(self.env.action_space, spaces.Box)
+        self.action_space = self.env.action_space
+
+    def _make(self) -> gym.Env:
+        if isinstance(self._source, str):
+            env = gym.make(self._source, disable_env_checker=True, **self._env_kwargs)
+        else:
+            env = self._source(**self._env_kwargs)
+        check_goal_env(env)
+        return env.unwrapped  # the family checks actions itself, and a time limit of its own ends episodes
+
+    def _build(self) -> None:
+        self.env = self._make()
+        self._goal_env = None
+
+    def _check_reward(self) -> bool:
+        """Whether ``compute_reward`` takes many goals at once; if not, it is called for one after another.
+
+        :raises ValueError: if it cannot be called, or the environment cannot be given a goal
+        """
+        goals = self._goals_of_resets(self.env, range(2))
+        try:
+            one_by_one = [self._own_reward(goals[i : i + 1], goals[:1]) for i in range(2)]
+        except Exception as error:
+            raise ValueError(
+                f"{self.env}.compute_reward(achieved_goal, desired_goal, info) fails for goals of shape (1, {goals.shape[1]}) "
+                f"and an empty info: {type(error).__name__}: {error}. It must be a function of the two goals"
+            ) from error
+        self._place_goal(goals[0])
+        try:
+            together = self._own_reward(goals, goals[[0, 0]])
+        except Exception:
+            return False
+        return together.shape == (2,) and np.array_equal(together, np.concatenate(one_by_one))
+
+    def _own_reward(self, achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
+        compute_reward: Callable[..., Any] = self.env.compute_reward  # type: ignore[attr-defined]
+        return np.atleast_1d(np.asarray(compute_reward(achieved, desired, {}), dtype=np.float64))
+
+    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
+        tasks, features = np.broadcast_arrays(tasks, features)
+        desired = np.ascontiguousarray(tasks).reshape(-1, tasks.shape[-1])
+        achieved = np.ascontiguousarray(features).reshape(desired.shape)
+        if self._rewards_broadcast:
+            rewards = self._own_reward(achieved, desired)
+        else:
+            rows = [self._own_reward(a[None], d[None]) for a, d in zip(achieved, desired, strict=True)]
+            rewards = np.concatenate(rows) if rows else np.empty(0)
+        return rewards.reshape(tasks.shape[:-1])
+
+    def _draw_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        if self._goal_env is None:
+            self._goal_env = self._make()
+        return self._goals_of_resets(self._goal_env, rng.integers(2**31, size=n).tolist())
+
+    def _goals_of_resets(self, env: gym.Env, seeds: Iterable[int]) -> np.ndarray:
+        """The goals that the environment draws itself, ``(seeds, goal_dim)``."""
+        goals = np.stack([env.reset(seed=seed)[0]["desired_goal"] for seed in seeds]).astype(np.float64)
+        outside = (goals < self.task_space.low - BOUNDS_TOLERANCE) | (goals > self.task_space.high + BOUNDS_TOLERANCE)
+        if outside.any():
+            raise ValueError(
+                f"goal_low and goal_high span {self.task_space}, but {self.env} draws the goal "
+                f"{goals[outside.any(axis=1)][0].tolist()}; widen them"
+            )
+        return goals
+
+    def _place_goal(self, goal: np.ndarray) -> None:
+        if self._set_goal_function is not None:
+            self._set_goal_function(self.env, goal.copy())
+            return
+        if not hasattr(self.env, "goal"):
+            raise ValueError(
+                f"{self.env} has no attribute 'goal' to set; pass set_goal=f, a function that gives the environment a goal: "
+                "f(env, goal)"
+            )
+        self.env.goal = goal.astype(np.asarray(self.env.goal).dtype)
+        if hasattr(self.env, "update_target_site_pos"):
+            self.env.update_target_site_pos()
+
+    def _observation(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        keys = GOAL_KEYS[: 1 + self._observe_achieved_goal]
+        return np.concatenate([observation[key] for key in keys]).astype(np.float64)
+
+    def _begin_simulation(self, rng: np.random.Generator) -> np.ndarray:
+        assert self._task is not None
+        observation, _ = self.env.reset(seed=int(rng.integers(2**31)))
+        self._place_goal(self._task)
+        self._success, self._achieved_goal = None, observation["achieved_goal"].copy()
+        return self._observation(observation)
+
+    def _step_simulation(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+        assert self._task is not None
+        observation, reward, terminated, _, info = self.env.step(action.astype(self.action_space.dtype))
+        self._check_step(observation, float(reward))
+        success = info.get("success", info.get("is_success"))
+        self._success, self._achieved_goal = None if success is None else bool(success), observation["achieved_goal"].copy()
+        return self._observation(observation), observation["achieved_goal"].astype(np.float64), bool(terminated)
+
+    def _check_step(self, observation: dict[str, np.ndarray], reward: float) -> None:
+        assert self._task is not None
+        if not np.allclose(observation["desired_goal"], self._task, rtol=0.0, atol=1e-5):
+            raise RuntimeError(
+                f"{self.env} was given the goal {self._task}, but {self._describe_episode()} shows the desired goal "
+                f"{observation['desired_goal']}: the goal must stay for the whole episode (in gymnasium-robotics' mazes: "
+                "reset_target=False), and set_goal must set what 'desired_goal' shows"
+            )
+        features = observation["achieved_goal"].astype(np.float64)
+        expected = float(self._reward(self._task, features))
+        if not np.isclose(reward, expected, rtol=1e-4, atol=1e-5):
+            raise RuntimeError(
+                f"{self.env} gave the reward {reward} at {self._describe_episode()}, but its compute_reward(achieved_goal, "
+                f"desired_goal, info) gives {expected}: rewards must depend on the two goals alone to be relabelled"
+            )
+
+    def _step_info(self) -> dict[str, Any]:
+        return {} if self._success is None else {"success": self._success}
+
+    def render(self) -> Any:
+        """Render the current state as the environment does."""
+        if self._task is None:
+            raise RuntimeError("render() was called before the first reset()")
+        with unchanged_physics(self.env):
+            if self.render_task:
+                return self.env.render()
+            hide_goal_sites(self.env)
+            self._place_goal(self._achieved_goal)
+            image = self.env.render()
+            self._place_goal(self._task)
+            return image
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.env.close()
+        if self._goal_env is not None:
+            self._goal_env.close()
+            self._goal_env = None
+
+
+@contextlib.contextmanager
+def unchanged_physics(env: gym.Env) -> Iterator[None]:
+    """Put a MuJoCo environment back into its present state afterwards: some let a rendering change the solver's warm start."""
+    model, data = getattr(env, "model", None), getattr(env, "data", None)
+    if model is None or data is None:
+        yield
+        return
+    import mujoco
+
+    spec = mujoco.mjtState.mjSTATE_INTEGRATION
+    state = np.empty(mujoco.mj_stateSize(model, spec))
+    mujoco.mj_getState(model, data, state, spec)
+    yield
+    mujoco.mj_setState(model, data, state, spec)
+
+
+def hide_goal_sites(env: gym.Env) -> None:
+    """Make the sites invisible by which MuJoCo environments of gymnasium-robotics mark the goal."""
+    model: Any = getattr(env, "model", None)
+    for site in range(0 if model is None else model.nsite):
+        if model.site(site).name.startswith(GOAL_SITE):
+            model.site(site).rgba[3] = 0.0
+
+
+def check_goal_env(env: gym.Env) -> None:
+    """
+    Refuse what is no goal-conditioned environment.
+
+    :param env: the environment
+    :raises ValueError: if its spaces are others, or ``compute_reward`` is missing; the message says what is needed
+    """
+    bare, space = env.unwrapped, env.observation_space
+    if not isinstance(space, spaces.Dict) or any(key not in space.spaces for key in GOAL_KEYS):
+        found = f"a Dict of {sorted(space.spaces)}" if isinstance(space, spaces.Dict) else str(space)
+        raise ValueError(
+            f"{bare} is not goal-conditioned: its observation space must be a Dict of {', '.join(map(repr, GOAL_KEYS))}, "
+            f"but is {found}"
+        )
+    for key in GOAL_KEYS:
+        if not isinstance(space[key], spaces.Box) or len(space[key].shape or ()) != 1:
+            raise ValueError(f"{bare}: the space of {key!r} must be a flat Box, but is {space[key]}")
+    if space["achieved_goal"].shape != space["desired_goal"].shape:
+        raise ValueError(
+            f"{bare}: 'achieved_goal' and 'desired_goal' must have the same shape, but have "
+            f"{space['achieved_goal'].shape} and {space['desired_goal'].shape}"
+        )
+    if not isinstance(env.action_space, spaces.Box):
+        raise ValueError(f"{bare}: the action space must be a Box, but is {env.action_space}")
+    if not callable(getattr(bare, "compute_reward", None)):
+        raise ValueError(
+            f"{bare} has no compute_reward(achieved_goal, desired_goal, info), by which rewards of other goals are computed; "
+            "define it as gymnasium_robotics.core.GoalEnv does"
+        )

@@ -1,0 +1,379 @@
+"""Meta-World's meta-learning benchmarks as task families: placements of one manipulation (ML1), or of ten (ML10)."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from poem_envs.process_vector import ProcessFamilyVector
+from poem_envs.replay import ReplayFamily
+from poem_envs.sawyer import (
+    PlacementRefusedError,
+    Sawyer,
+    checked_manipulation,
+    give_back_sawyer,
+    load_metaworld,
+    placements_of,
+    take_sawyer,
+)
+
+OBSERVATION_DIM = 39
+#: Manipulations whose goal is nothing but a place that the hand is to reach.
+REACHING = ("reach", "reach-wall")
+TARGET_RADIUS = 0.05
+# What Meta-World keeps between a puck and a goal, in the plane.
+PUCK_TO_GOAL = 0.15
+
+
+class MetaWorldEnv(ReplayFamily):
+    """What ML1 and ML10 have in common: observations, actions, simulators and their rendering.
+
+    :param render_mode: ``"rgb_array"``, ``"human"`` or ``"depth_array"``
+    :param render_task: whether rendering shows the goal
+    :param split: which tasks to draw
+    :param width: of rendered images, pixels
+    :param height: of rendered images, pixels
+    :param camera_name: one of Meta-World's cameras
+    """
+
+    metadata = {"render_modes": ["human", "rgb_array", "depth_array"], "render_fps": 80}  # noqa: RUF012
+    _simulator_attributes = ("_sawyer",)
+
+    def __init__(
+        self,
+        *,
+        width: int = 480,
+        height: int = 480,
+        camera_name: str | None = "corner2",
+        **kwargs: Any,
+    ) -> None:
+        load_metaworld()
+        super().__init__(**kwargs)
+        self.observation_space = spaces.Box(-np.inf, np.inf, (OBSERVATION_DIM,), np.float64)
+        self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
+        self._render_arguments: dict[str, Any] = {
+            "render_mode": self.render_mode,
+            "width": width,
+            "height": height,
+            "camera_name": camera_name,
+        }
+        self._success = False
+        self._build()
+
+    def _build(self) -> None:
+        self._sawyer: Sawyer | None = None
+
+    def _place(self, task: np.ndarray, rng: np.random.Generator) -> tuple[str, np.ndarray]:
+        """The manipulation and the placement, ``(placement_dim,)``, of an episode."""
+        raise NotImplementedError
+
+    def _features(self, reward: float) -> np.ndarray:
+        """The reward features of the step just taken, of which Meta-World's own reward is given."""
+        raise NotImplementedError
+
+    def _begin_simulation(self, rng: np.random.Generator) -> np.ndarray:
+        assert self._task is not None
+        manipulation, placement = self._place(self._task, rng)
+        if self._sawyer is None or self._sawyer.manipulation != manipulation:
+            self._release_sawyer()
+            self._sawyer = take_sawyer(manipulation, **self._render_arguments)
+        self._success = False
+        return self._sawyer.reset(placement, self.render_task)
+
+    def _step_simulation(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+        assert self._sawyer is not None
+        try:
+            observation, reward, self._success = self._sawyer.step(action)
+        except FloatingPointError as error:
+            raise RuntimeError(
+                f"the simulation of {type(self).__name__} diverged at {self._describe_episode()}: {error}"
+            ) from error
+        return observation, self._features(reward), False
+
+    def _step_info(self) -> dict[str, Any]:
+        return {"success": self._success}
+
+    def get_physics_state(self) -> np.ndarray:
+        """The simulator's state, ``(state_dim,)``: enough to go on from it in an episode of the same task and start."""
+        if self._sawyer is None:
+            raise RuntimeError("get_physics_state() was called before the first reset()")
+        return self._sawyer.get_state()
+
+    def set_physics_state(self, state: npt.ArrayLike) -> None:
+        """Put the simulator into a state of :meth:`get_physics_state`. The task stays.
+
+        :param state: ``(state_dim,)``
+        :raises ValueError: if it has another shape or is not finite
+        """
+        shape = self.get_physics_state().shape
+        array = np.array(state, dtype=np.float64)
+        if array.shape != shape or not np.isfinite(array).all():
+            raise ValueError(f"state={state!r} must be finite and have shape {shape}, as get_physics_state() returns it")
+        assert self._sawyer is not None
+        self._sawyer.set_state(array)
+        self._restart_from(array)
+
+    def render(self) -> Any:
+        """Render the current state as ``render_mode`` says: an image ``(height, width, 3)`` for ``"rgb_array"``."""
+        if self._sawyer is None:
+            raise RuntimeError("render() was called before the first reset()")
+        image = self._sawyer.env.render()
+        # Meta-World's models have these cameras upside down.
+        upside_down = isinstance(image, np.ndarray) and (self._render_arguments["camera_name"] or "").startswith("corner")
+        return image[::-1, ::-1].copy() if upside_down else image
+
+    def close(self) -> None:
+        """Free what rendering and simulation hold."""
+        if self._sawyer is not None:
+            self._sawyer.env.close()  # closes its windows, which a later rendering would open again
+        self._release_sawyer()
+
+    def _release_sawyer(self) -> None:
+        if self._sawyer is not None:
+            give_back_sawyer(self._sawyer)
+            self._sawyer = None
+
+
+class MetaWorldML1Env(MetaWorldEnv):
+    r"""
+    ## Description
+    One manipulation of Meta-World (Yu et al. 2019), with a Sawyer arm, in many placements of its object and its goal: the
+    benchmark ML1. The goal is hidden as Meta-World hides it, by zeros in the observation.
+
+    ## Task
+    For `reach` and `reach-wall` the position of the goal, `(x, y, z)` in metres, uniform on Meta-World's box for it. The puck,
+    which the reward of these two does not depend on, is placed anew in every episode.
+
+    For every other manipulation the placement that Meta-World calls `rand_vec`: the position of the object and, for some,
+    that of the goal. It is drawn as Meta-World draws it. Observations show the object, as Meta-World's do.
+
+    `split="train"` and `split="test"` are different draws from the same distribution; the benchmark takes 50 of each:
+    `sample_tasks(50, rng)`.
+
+    ## Action Space
+    The action space is a `Box(-1, 1, (4,), float32)`: a movement of the hand in x, y and z, by up to a centimetre, and the
+    effort that closes the gripper.
+
+    ## Observation Space
+    The observation space is a `Box(-Inf, Inf, (39,), float64)`, that of Meta-World.
+
+    | Num   | Observation                                                                     |
+    | ----- | ------------------------------------------------------------------------------- |
+    | 0-2   | position of the hand                                                            |
+    | 3     | how far the gripper is open                                                     |
+    | 4-17  | positions and quaternions of up to two objects, padded with zeros               |
+    | 18-35 | the same of the step before                                                     |
+    | 36-38 | zeros, in place of the goal                                                     |
+
+    ## Rewards
+    Meta-World's own (version 2), between 0 and 10, and its `success` in the info.
+
+    For `reach` and `reach-wall` the tasks share their dynamics and the reward features are the position of the gripper's
+    centre, `(x, y, z)`: the reward of any goal is a function of it. The rewards of the other manipulations depend on the
+    placement through the simulator's state, and so does what follows an action. There `shared_dynamics` is False and the
+    one reward feature is the reward of the task that was played, which says nothing about other tasks.
+
+    ## Starting State
+    Meta-World's: the hand moves to its initial position. It depends on the task alone, but for the puck of `reach` and
+    `reach-wall`. The puck's box is cut to where Meta-World accepts it together with any goal (at least 0.15 m away), so that
+    the start says nothing about the goal.
+
+    ## Episode End
+    There is no early end. `gymnasium.make` truncates episodes after 200 steps.
+
+    ## Arguments
+    ```python
+    import gymnasium as gym
+    env = gym.make("poem_envs:poem/MetaWorldML1-v0", env_name="push")
+    ```
+
+    | Parameter         | Type     | Default     | Description                                                     |
+    | ----------------- | -------- | ----------- | --------------------------------------------------------------- |
+    | `env_name`        | **str**  | `"reach"`   | One of Meta-World's 50 manipulations, with or without `-v3`     |
+    | `split`           | **str**  | `"train"`   | `"train"` or `"test"`                                           |
+    | `render_mode`     | **str**  | `None`      | `"rgb_array"`, `"human"` or `"depth_array"`                     |
+    | `render_task`     | **bool** | `False`     | Whether rendering shows the goal                                |
+    | `width`, `height` | **int**  | `480`       | Size of the rendered image, pixels                              |
+    | `camera_name`     | **str**  | `"corner2"` | One of Meta-World's cameras                                     |
+
+    ## Version History
+    * v0: Initial version
+    """
+
+    splits = ("train", "test")
+
+    def __init__(self, *, env_name: str = "reach", split: str = "train", **kwargs: Any) -> None:
+        load_metaworld()
+        self.env_name = checked_manipulation(env_name)
+        if split == "held-out":
+            raise ValueError(
+                "split='held-out': poem/MetaWorldML1-v0 has one manipulation and holds none back; it has 'train' and 'test' "
+                "placements. poem/MetaWorldML10-v0 holds back five manipulations"
+            )
+        super().__init__(split=split, **kwargs)
+        placements = placements_of(self.env_name)
+        low, high = placements.low, placements.high
+        self._reaching = self.env_name in REACHING
+        self.shared_dynamics = self._reaching
+        self.reward_feature_dim = 3 if self._reaching else 1
+        if self._reaching:
+            self._puck_low, self._puck_high = low[:3].copy(), high[:3].copy()
+            self._puck_high[1] = min(high[1], low[4] - PUCK_TO_GOAL)
+            low, high = low[3:], high[3:]
+        self._hand_init_pos = placements.hand_init_pos
+        self.task_space = spaces.Box(low, high, dtype=np.float64)
+
+    def _draw_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        rng = split_stream(rng, self.splits.index(self.split))
+        draws = np.stack([placements_of(self.env_name).draw(rng) for _ in range(n)])
+        return draws[:, 3:] if self._reaching else draws
+
+    def _checked_tasks(self, tasks: npt.ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:
+        checked = super()._checked_tasks(tasks, shape, name)
+        if not self._reaching:
+            for placement in checked.reshape(-1, checked.shape[-1]):
+                check_placement(self.env_name, placement, name)
+        return checked
+
+    def _place(self, task: np.ndarray, rng: np.random.Generator) -> tuple[str, np.ndarray]:
+        if not self._reaching:
+            return self.env_name, task
+        return self.env_name, np.concatenate([rng.uniform(self._puck_low, self._puck_high), task])
+
+    def _features(self, reward: float) -> np.ndarray:
+        assert self._sawyer is not None
+        return self._sawyer.env.tcp_center.copy() if self._reaching else np.array([reward])
+
+    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
+        if not self._reaching:
+            return np.broadcast_to(features[..., 0], np.broadcast_shapes(tasks.shape[:-1], features.shape[:-1])).copy()
+        beyond = np.maximum(_distance(features, tasks) - TARGET_RADIUS, 0.0)
+        relative = beyond / _distance(self._hand_init_pos, tasks)
+        return 10.0 / (1.0 + 9.0 * relative * relative)  # 0.1 of the full reward at the distance of the start
+
+
+class MetaWorldML10Env(MetaWorldEnv):
+    r"""
+    ## Description
+    Ten manipulations of Meta-World (Yu et al. 2019), each in many placements: the benchmark ML10. Which of them it is, and
+    where the goal is, is hidden; see :class:`MetaWorldML1Env` for observations, actions, start and end, which are the same.
+
+    ## Task
+    `(manipulation, placement)`, a `Box` of shape `(7,)`: the number of the manipulation in `manipulations`, and Meta-World's
+    `rand_vec` for it, padded with zeros. `sample_tasks` draws manipulations in equal parts.
+
+    | `split`      | Manipulations                                                                                 |
+    | ------------ | --------------------------------------------------------------------------------------------- |
+    | `"train"`    | 0-9: reach, push, pick-place, door-open, drawer-close, button-press-topdown, peg-insert-side, |
+    |              | window-open, sweep, basketball                                                                |
+    | `"test"`     | the same ten, in other placements                                                             |
+    | `"held-out"` | 10-14, which ML10 keeps back: drawer-open, door-close, shelf-place, sweep-into, lever-pull    |
+
+    ## Rewards
+    Meta-World's own (version 2), between 0 and 10, and its `success` in the info. The tasks have different dynamics:
+    `shared_dynamics` is False, and the one reward feature is the reward of the task that was played, which says nothing about
+    other tasks. POEM measures what one task's policy earns in another by running it there (`preference_source="rollout"`).
+
+    ## Arguments
+    `split`, and those of :class:`MetaWorldML1Env` but `env_name`.
+
+    ## Version History
+    * v0: Initial version
+    """
+
+    splits = ("train", "test", "held-out")
+    shared_dynamics = False
+    reward_feature_dim = 1
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        table = load_metaworld().ML10_V3
+        trained, held_out = ([name.removesuffix("-v3") for name in table[part]] for part in ("train", "test"))
+        #: The names of the manipulations, by number.
+        self.manipulations = [*trained, *held_out]
+        self._numbers = (
+            np.arange(len(trained), len(self.manipulations)) if self.split == "held-out" else np.arange(len(trained))
+        )
+        bounds = [placements_of(name) for name in self.manipulations]
+        self._placement_dims = [len(placements.low) for placements in bounds]
+        width = max(self._placement_dims)
+        low = np.min([_padded(placements.low, width) for placements in bounds], axis=0)
+        high = np.max([_padded(placements.high, width) for placements in bounds], axis=0)
+        last = len(self.manipulations) - 1.0
+        self.task_space = spaces.Box(np.concatenate([[0.0], low]), np.concatenate([[last], high]), dtype=np.float64)
+
+    def _draw_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        rng = split_stream(rng, self.splits.index(self.split))
+        rounds = -(-n // len(self._numbers))
+        numbers = np.concatenate([rng.permutation(self._numbers) for _ in range(rounds)])[:n]
+        width = self.task_space.shape[0] - 1
+        draws = [_padded(placements_of(self.manipulations[number]).draw(rng), width) for number in numbers]
+        return np.column_stack([numbers, draws])
+
+    def _checked_tasks(self, tasks: npt.ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:
+        checked = super()._checked_tasks(tasks, shape, name)
+        for task in checked.reshape(-1, checked.shape[-1]):
+            if abs(task[0] - round(task[0])) > 1e-6:
+                raise ValueError(f"{name}={task.tolist()} must begin with a manipulation's number, a whole one")
+            manipulation, placement = self._place(task, np.random.default_rng(0))
+            if np.any(task[1 + len(placement) :] != 0.0):
+                raise ValueError(
+                    f"{name}={task.tolist()}: a placement of {manipulation!r} is {len(placement)} numbers, then zeros"
+                )
+            check_placement(manipulation, placement, name)
+        return checked
+
+    def _place(self, task: np.ndarray, rng: np.random.Generator) -> tuple[str, np.ndarray]:
+        number = round(task[0])
+        return self.manipulations[number], task[1 : 1 + self._placement_dims[number]].copy()
+
+    def _features(self, reward: float) -> np.ndarray:
+        return np.array([reward])
+
+    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(features[..., 0], np.broadcast_shapes(tasks.shape[:-1], features.shape[:-1])).copy()
+
+
+#: The vectorised :class:`MetaWorldML1Env`: same arguments, and those of ``ProcessFamilyVector``.
+MetaWorldML1VectorEnv = functools.partial(ProcessFamilyVector, MetaWorldML1Env)
+#: The vectorised :class:`MetaWorldML10Env`.
+MetaWorldML10VectorEnv = functools.partial(ProcessFamilyVector, MetaWorldML10Env)
+
+
+def split_stream(rng: np.random.Generator, split: int) -> np.random.Generator:
+    """A generator of a split's own, so that equal generators give different tasks in different splits.
+
+    :param rng: which determines it; the first split draws from it directly
+    :param split: the number of the split
+    """
+    return rng if split == 0 else np.random.default_rng([split, *rng.integers(2**32, size=4)])
+
+
+def check_placement(manipulation: str, placement: np.ndarray, name: str) -> None:
+    """
+    :raises ValueError: if Meta-World has no such placement of the manipulation
+    """
+    placements = placements_of(manipulation)
+    low, high = placements.low, placements.high
+    if np.any(placement < low - 1e-6) or np.any(placement > high + 1e-6):
+        raise ValueError(f"{name}: placement {placement.tolist()} of {manipulation!r} must be inside {low} to {high}")
+    try:
+        placements.check(placement)
+    except PlacementRefusedError as error:
+        raise ValueError(
+            f"{name}: placement {placement.tolist()} of {manipulation!r}: {error}; draw one by sample_tasks"
+        ) from error
+
+
+def _distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Euclidean distance of points ``(..., 3)``, by elementwise operations alone."""
+    x, y, z = (np.array(first[..., i]) - np.array(second[..., i]) for i in range(3))
+    return np.sqrt(x * x + y * y + z * z)
+
+
+def _padded(values: np.ndarray, width: int) -> np.ndarray:
+    return np.concatenate([values, np.zeros(width - len(values))])

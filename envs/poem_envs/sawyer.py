@@ -1,0 +1,227 @@
+"""Meta-World's Sawyer manipulations, made reproducible: a start depends on the placement alone."""
+
+from __future__ import annotations
+
+import copy
+import difflib
+import functools
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import mujoco
+import numpy as np
+
+SUPPORTED = "metaworld >= 3.1, < 4"
+
+
+def load_metaworld() -> Any:
+    """
+    Meta-World's table of environments.
+
+    :return: the module ``metaworld.env_dict``
+    :raises ImportError: if Meta-World is absent, or of a version whose environments differ
+    """
+    try:
+        found = version("metaworld")
+    except PackageNotFoundError:
+        raise ImportError(f"the Meta-World families need {SUPPORTED}; install it: pip install 'metaworld>=3.1,<4'") from None
+    major, minor = (int(part) for part in found.split(".")[:2])
+    if major != 3 or minor < 1:
+        raise ImportError(
+            f"the Meta-World families need {SUPPORTED}, but metaworld {found} is installed, whose rewards and placements are "
+            "others; install it: pip install 'metaworld>=3.1,<4'"
+        )
+    import metaworld.env_dict
+
+    return metaworld.env_dict
+
+
+def manipulation_names() -> list[str]:
+    """Meta-World's manipulations, without the ``-v3`` that all of them end with."""
+    return sorted(name.removesuffix("-v3") for name in load_metaworld().ALL_V3_ENVIRONMENTS)
+
+
+def checked_manipulation(env_name: str) -> str:
+    """
+    The name of a manipulation, without ``-v3``.
+
+    :param env_name: with it or without
+    :raises ValueError: if there is none of that name; the message lists the nearest
+    """
+    known = manipulation_names()
+    name = env_name.removesuffix("-v3") if isinstance(env_name, str) else env_name
+    if name in known:
+        return name
+    near = difflib.get_close_matches(str(name), known, n=5, cutoff=0.4)
+    hint = f"did you mean {', '.join(map(repr, near))}?" if near else f"choose one of {', '.join(known)}"
+    raise ValueError(f"env_name={env_name!r} is none of Meta-World's {len(known)} manipulations; {hint}")
+
+
+class PlacementRefusedError(ValueError):
+    """Meta-World would redraw the placement, for example because object and goal are too near to each other."""
+
+
+class Sawyer:
+    """
+    One manipulation, in any placement.
+
+    Meta-World's own reset leaves some starts depending on the episode before: it computes them from data that the simulator
+    has not brought up to date since objects were moved. Here a reset is what Meta-World does in an environment that has just
+    been made, bit for bit, however often it was used before.
+
+    :param manipulation: its name, without ``-v3``
+    :param render_arguments: ``render_mode``, ``camera_name``, ``width`` and ``height``, as Meta-World has them
+    """
+
+    def __init__(self, manipulation: str, **render_arguments: Any) -> None:
+        self.manipulation = manipulation
+        self.render_arguments = render_arguments
+        self.env = _environment_class(manipulation)(**render_arguments)
+        self.env._set_task_called = True  # placements are set here, without Meta-World's pickled tasks
+        self.env.max_path_length = np.inf  # time limits are a wrapper's
+        self.env._get_state_rand_vec = self._take_placement
+        self._placement: np.ndarray | None = None
+
+    def reset(self, placement: np.ndarray, show_goal: bool = False) -> np.ndarray:
+        """
+        Begin an episode.
+
+        :param placement: Meta-World's ``rand_vec``, ``(placement_dim,)``
+        :param show_goal: whether rendering shows where the goal is
+        :return: the observation, ``(39,)``
+        :raises PlacementRefusedError: if Meta-World would not have it
+        """
+        env = self.env
+        # The first pass moves bodies in the model, which the second one's quantities then follow from.
+        for _ in range(2):
+            mujoco.mj_resetData(env.model, env.data)
+            self._placement = placement.copy()
+            observation = env.reset_model()
+        for name, _ in env._target_site_config:
+            env.model.site(name).rgba[3] = float(show_goal)
+        env._prev_obs = observation[:18].copy()
+        observation = observation.copy()
+        observation[18:36] = env._prev_obs
+        return observation
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool]:
+        """
+        Take a step.
+
+        :param action: ``(4,)`` float64
+        :return: the observation ``(39,)``, Meta-World's reward, and whether the step was a success
+        :raises FloatingPointError: if the simulation diverges
+        """
+        env = self.env
+        before = env.data.time
+        observation, reward, _, _, info = env.step(action)
+        # MuJoCo resets a simulation that blows up, with no more than a warning; its clock tells.
+        if env.data.time <= before or not (np.isfinite(observation).all() and np.isfinite(reward)):
+            raise FloatingPointError("MuJoCo met a state that is not finite or too large")
+        return observation, float(reward), bool(info["success"])
+
+    def get_state(self) -> np.ndarray:
+        """All that determines how the episode goes on, besides the placement, ``(state_dim,)``."""
+        return np.concatenate([self._get_mujoco_state(), self.env._prev_obs])
+
+    def set_state(self, state: np.ndarray) -> None:
+        """Put the simulator into a state of :meth:`get_state`, within an episode of the same placement."""
+        env, spec = self.env, mujoco.mjtState.mjSTATE_INTEGRATION
+        n_previous = len(env._prev_obs)
+        mujoco.mj_setState(env.model, env.data, state[:-n_previous], spec)
+        mujoco.mj_forward(env.model, env.data)  # brings positions up to date, and changes the solver's warm start
+        mujoco.mj_setState(env.model, env.data, state[:-n_previous], spec)
+        env._prev_obs = state[-n_previous:].copy()
+
+    def _get_mujoco_state(self) -> np.ndarray:
+        spec = mujoco.mjtState.mjSTATE_INTEGRATION
+        state = np.empty(mujoco.mj_stateSize(self.env.model, spec))
+        mujoco.mj_getState(self.env.model, self.env.data, state, spec)
+        return state
+
+    def _take_placement(self) -> np.ndarray:
+        if self._placement is None:
+            raise PlacementRefusedError("Meta-World refuses the placement: it places object and goal too near to each other")
+        placement, self._placement = self._placement, None
+        return placement
+
+
+# Simulators at rest, by what they were made with. An environment whose tasks are different manipulations changes simulators
+# at its resets; without this, each of many environments would come to hold one for every manipulation.
+_at_rest: dict[tuple[Any, ...], list[Sawyer]] = {}
+
+
+def take_sawyer(manipulation: str, **render_arguments: Any) -> Sawyer:
+    """A simulator of a manipulation, made anew if none is at rest; arguments as :class:`Sawyer` has them."""
+    at_rest = _at_rest.get(_key(manipulation, render_arguments))
+    return at_rest.pop() if at_rest else Sawyer(manipulation, **render_arguments)
+
+
+def give_back_sawyer(sawyer: Sawyer) -> None:
+    """Let others have a simulator that is no longer used."""
+    _at_rest.setdefault(_key(sawyer.manipulation, sawyer.render_arguments), []).append(sawyer)
+
+
+def _key(manipulation: str, render_arguments: dict[str, Any]) -> tuple[Any, ...]:
+    return manipulation, *sorted(render_arguments.items())
+
+
+class Placements:
+    """
+    Which placements a manipulation has, as Meta-World draws them. It needs an environment for that, whose arm stays still.
+
+    :param manipulation: its name, without ``-v3``
+    """
+
+    def __init__(self, manipulation: str) -> None:
+        self._sawyer = Sawyer(manipulation)
+        env = self._sawyer.env
+        self._own_draw = type(env)._get_state_rand_vec
+        env._reset_hand = lambda steps=50: setattr(env, "init_tcp", env.tcp_center)
+        env._freeze_rand_vec, env.seeded_rand_vec = False, True
+        #: Where the hand begins, ``(3,)``.
+        self.hand_init_pos = np.array(env.hand_init_pos, dtype=np.float64)
+        #: Bounds, each ``(placement_dim,)``.
+        self.low = env._random_reset_space.low.astype(np.float64)
+        self.high = env._random_reset_space.high.astype(np.float64)
+
+    def draw(self, rng: np.random.Generator) -> np.ndarray:
+        """Draw a placement as Meta-World does, ``(placement_dim,)``."""
+        env = self._sawyer.env
+        env.np_random = rng
+        env._get_state_rand_vec = lambda: self._own_draw(env)
+        env.reset_model()
+        return np.array(env._last_rand_vec, dtype=np.float64)
+
+    def check(self, placement: np.ndarray) -> None:
+        """
+        :raises PlacementRefusedError: if Meta-World would redraw the placement
+        """
+        self._sawyer.env._get_state_rand_vec = self._sawyer._take_placement
+        self._sawyer._placement = placement.copy()
+        self._sawyer.env.reset_model()
+
+
+@functools.cache
+def placements_of(manipulation: str) -> Placements:
+    """The placements of a manipulation; they are kept, since an environment takes long to make."""
+    return Placements(manipulation)
+
+
+@functools.cache
+def _environment_class(manipulation: str) -> type:
+    """Meta-World's class, with models that are copied rather than compiled anew: 16 ms in place of 230."""
+    base: Any = load_metaworld().ALL_V3_ENVIRONMENTS[f"{manipulation}-v3"]
+    compiled: dict[str, mujoco.MjModel] = {}
+
+    class Environment(base):
+        def _initialize_simulation(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
+            if self.fullpath not in compiled:
+                model, _ = super()._initialize_simulation()
+                compiled[self.fullpath] = model
+            model = copy.deepcopy(compiled[self.fullpath])
+            model.vis.global_.offwidth = max(model.vis.global_.offwidth, self.width)
+            model.vis.global_.offheight = max(model.vis.global_.offheight, self.height)
+            return model, mujoco.MjData(model)
+
+    return Environment

@@ -1,0 +1,123 @@
+"""Families vectorised over processes."""
+
+import copy
+import os
+import pickle
+import signal
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from poem_envs import ProcessFamilyVector, TaskFamily
+
+
+class Walk(TaskFamily):
+    """Its observation tells the process that it runs in, behind what matters."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+    task_space = spaces.Box(-1.0, 1.0, (1,), np.float64)
+    reward_feature_dim = 1
+
+    def __init__(self, step_length=0.1, **kwargs):
+        super().__init__(**kwargs)
+        self.step_length = step_length
+
+    def _begin_episode(self, rng):
+        self.x = rng.normal(0.0, 0.1, size=1)
+        return np.append(self.x, os.getpid())
+
+    def _simulate(self, action):
+        if action[0] == 0.125:
+            raise ArithmeticError(f"no such step at {self._describe_episode()}")
+        if action[0] == 0.375:
+            os.kill(os.getpid(), signal.SIGKILL)
+        self.x = self.x + self.step_length * action
+        return np.append(self.x, os.getpid()), self.x.copy(), bool(abs(self.x[0]) > 0.3)
+
+    def _step_info(self):
+        return {"success": bool(self.x[0] > 0.1)}
+
+    def _reward(self, tasks, features):
+        return -np.abs(features[..., 0] - tasks[..., 0])
+
+
+def run(envs, actions, seed=3):
+    """What happens, without the process numbers."""
+    observations, _ = envs.reset(seed=seed)
+    seen = [observations[:, 0]]
+    for action in actions:
+        observations, rewards, terminations, truncations, infos = envs.step(action)
+        seen += [observations[:, 0], rewards, terminations, truncations, infos["success"], infos["is_success"], envs.tasks]
+    return seen
+
+
+def test_the_number_of_processes_changes_nothing(rng):
+    actions = rng.uniform(-1, 1, (40, 5, 1)).astype(np.float32)
+    results = []
+    for nthread in (1, 2, 3, 9):
+        envs = ProcessFamilyVector(Walk, num_envs=5, nthread=nthread, max_episode_steps=15, step_length=0.2)
+        processes = np.unique(envs.reset(seed=0)[0][:, 1])
+        assert len(processes) == min(nthread, 5)
+        assert os.getpid() in processes
+        results.append(run(envs, actions))
+        envs.close()
+    for other in results[1:]:
+        assert all(np.array_equal(one, two) for one, two in zip(results[0], other, strict=True))
+    assert any(done.any() for done in results[0][3::7])  # some episodes ended early
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda envs: pickle.loads(pickle.dumps(envs))])
+def test_copies_go_on_alike(duplicate, rng):
+    envs = ProcessFamilyVector(Walk, num_envs=4, nthread=2, max_episode_steps=6)
+    actions = rng.uniform(-1, 1, (9, 4, 1)).astype(np.float32)
+    run(envs, actions[:4])
+    twin = duplicate(envs)
+    for action in actions:
+        mine, theirs = envs.step(action), twin.step(action)
+        assert np.array_equal(mine[0][:, 0], theirs[0][:, 0])
+        assert np.array_equal(mine[1], theirs[1])
+    envs.close()
+    twin.close()
+
+
+@pytest.mark.parametrize("wrong", [0, 3])
+def test_an_error_names_the_copy_and_leaves_nothing_behind(wrong):
+    envs = ProcessFamilyVector(Walk, num_envs=4, nthread=2)
+    envs.reset(seed=10)
+    actions = np.zeros((4, 1))
+    envs.step(actions)
+    actions[wrong] = 0.125
+    message = rf"environment copy {wrong}: ArithmeticError: no such step at step 2 of episode 1 since reset\(seed=1{wrong}\)"
+    with pytest.raises(RuntimeError, match=message):
+        envs.step(actions)
+    expected = run(ProcessFamilyVector(Walk, num_envs=4, nthread=1), np.zeros((3, 4, 1)))
+    assert all(np.array_equal(a, b) for a, b in zip(run(envs, np.zeros((3, 4, 1))), expected, strict=True))
+    envs.close()
+
+
+def test_a_worker_that_was_killed_is_reported():
+    envs = ProcessFamilyVector(Walk, num_envs=2, nthread=2)
+    envs.reset(seed=0)
+    with pytest.raises(RuntimeError, match="worker process of the environment ended with exit status -9"):
+        envs.step(np.array([[0.375], [0.0]]))
+    envs.close()
+
+
+def test_closing_ends_the_workers():
+    envs = ProcessFamilyVector(Walk, num_envs=2, nthread=2)
+    worker = next(pid for pid in envs.reset(seed=0)[0][:, 1].astype(int) if pid != os.getpid())
+    envs.close()
+    envs.close()
+    with pytest.raises(ProcessLookupError):
+        os.kill(worker, 0)
+
+
+def test_constructor_arguments():
+    with pytest.raises(ValueError, match="nthread=0 must be at least 1"):
+        ProcessFamilyVector(Walk, num_envs=2, nthread=0)
+    with pytest.raises(ValueError, match="num_envs=0"):
+        ProcessFamilyVector(Walk, num_envs=0)
+    with pytest.raises(TypeError, match=r"makes a Box, but it must make a poem_envs\.TaskFamily"):
+        ProcessFamilyVector(lambda: Walk.task_space)
