@@ -255,3 +255,54 @@ def test_enjoy_without_a_display_says_what_to_do(monkeypatch: pytest.MonkeyPatch
         monkeypatch.delenv(name, raising=False)
     assert cli.main(["enjoy", "--env", "poem/PointGoal-v0"]) == 1
     assert "--no-render" in capsys.readouterr().err
+
+
+# ---------------------------------------------------------------- --resume
+
+
+class InterruptionError(Exception):
+    """Training was cut off."""
+
+
+def test_resume_finishes_the_interrupted_run_of_the_same_seed_as_if_nothing_had_happened(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # an epoch of this configuration takes 150 steps
+    flags = ("-c", config, "--eval-freq", "-1", "--save-freq", "150", "-params", "n_timesteps:600")
+    assert train("-f", tmp_path / "whole", *flags) == 0
+    logs = tmp_path / "logs"
+    monkeypatch.setattr(POEMSAC, "train", interrupted_at(POEMSAC.train, call=3))
+    with pytest.raises(InterruptionError):
+        train("-f", logs, *flags, "--resume")  # nothing to continue: starts
+    monkeypatch.undo()
+    assert train("-f", logs, "--seed", "1", *flags) == 0  # a newer run, of another seed
+    capsys.readouterr()
+    assert train("-f", logs, *flags, "--resume") == 0
+    assert "Resuming" in capsys.readouterr().out
+    one, two = (
+        POEMSAC.load(folder / "poem_sac" / run / "poem-PointGoal-v0.zip")
+        for folder, run in ((tmp_path / "whole", "poem-PointGoal-v0_1"), (logs, "poem-PointGoal-v0_3"))
+    )
+    assert one.num_timesteps == two.num_timesteps == 600
+    for ours, theirs in zip(one.policy.parameters(), two.policy.parameters(), strict=True):
+        assert ours.equal(theirs)
+    assert train("-f", logs, *flags, "--resume") == 0
+    assert "has finished already" in capsys.readouterr().out
+    assert not (logs / "poem_sac" / "poem-PointGoal-v0_4").exists()
+
+
+def interrupted_at(method, call: int):  # type: ignore[no-untyped-def]
+    calls = []
+
+    def wrapped(*arguments, **options):  # type: ignore[no-untyped-def]
+        calls.append(None)
+        if len(calls) == call:
+            raise InterruptionError
+        return method(*arguments, **options)
+
+    return wrapped
+
+
+def test_resume_finds_the_checkpoint_itself(capsys: pytest.CaptureFixture[str]) -> None:
+    assert train("--resume", "-i", "model.zip") != 0
+    assert "leave out either --resume or -i" in capsys.readouterr().err

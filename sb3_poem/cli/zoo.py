@@ -12,6 +12,7 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from sb3_poem.cli import has_display
 from sb3_poem.cli.experiment import make_experiment
 from sb3_poem.cli.models import ALGORITHMS
+from sb3_poem.cli.resume import resumed
 
 # Those of our own that differ from rl_zoo3's; what the user gives comes later, and wins.
 DEFAULTS = {
@@ -43,11 +44,20 @@ def run_zoo(command: str, arguments: Sequence[str]) -> None:
         raise OSError("there is no display to draw on: add --no-render, or see `sb3-poem adapt --video FILE`")
 
     if {"-h", "--help"} & set(arguments):
-        print(f"Defaults here: {' '.join(defaults)}\n")
+        print(f"Defaults here: {' '.join(defaults)}")
+        if command == "train":
+            print("--resume: go on with the last run of the same algorithm, environment and seed, if it did not finish")
+        print()
 
+    given = [*defaults, *arguments]
+    if command == "train" and "--resume" in arguments:
+        continued = resumed(given)
+        if continued is None:
+            return
+        given = continued
     # rl_zoo3's programs read the process's own arguments.
     own_arguments = sys.argv
-    sys.argv = [f"sb3-poem {command}", *defaults, *arguments]
+    sys.argv = [f"sb3-poem {command}", *given]
     zoo_train.ExperimentManager = make_experiment  # type: ignore[assignment,misc]
     try:
         zoo_train.train() if command == "train" else zoo_enjoy.enjoy()
