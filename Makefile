@@ -3,7 +3,7 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help run test test-all lint format venv rendering wheel clean
+.PHONY: help run test test-all lint format bench bench-gpu venv rendering wheel clean
 
 PYTHON ?= python3
 VENV := .venv
@@ -19,6 +19,8 @@ help:
 	@echo "make test-all  the default suite and the slow tests"
 	@echo "make lint      ruff and mypy"
 	@echo "make format    let ruff format the code"
+	@echo "make bench     the benchmarks of speed and memory; tables go to benchmarks/results/"
+	@echo "make bench-gpu the same of what runs on a CUDA device"
 	@echo "make venv      only set up $(VENV)"
 	@echo "make wheel     build the distribution in dist/"
 	@echo "make clean     remove what was built, and $(VENV)"
@@ -36,6 +38,16 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+bench: $(STAMP)
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[bench]'
+	for script in benchmarks/bench_*.py; do $(THREADS) $(BIN)/python "$$script"; done
+
+# The paper's hyperparameters, in the paper's own sizes.
+bench-gpu: $(STAMP)
+	$(BIN)/python -m pytest -m gpu $(PYTEST_ARGS)
+	$(BIN)/python benchmarks/bench_gradient_step.py --device cuda --threads 1
+	$(BIN)/python benchmarks/time_to_result.py --device cuda --conf zoo_configs/poem_sac_paper.yml
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .

@@ -25,6 +25,11 @@ RULES = (("paper", "prior"), ("paper", "aggregate"), ("bayes", "prior"), ("bayes
 COLUMNS = (0, 1, 2, 3, 5, 10)
 
 
+def family_of(env_id: str) -> str:
+    """AntGoal of poem/AntGoal-v0."""
+    return env_id.split("/")[-1].split("-")[0]
+
+
 def shown(command: list[str]) -> str:
     """A command as a reader types it."""
     return " ".join(["sb3-poem", *command])
@@ -141,8 +146,9 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, default=Path("logs/benchmark"), help="where models and checkpoints are kept")
     parser.add_argument("--train-args", nargs=argparse.REMAINDER, default=[], help="further arguments of sb3-poem train")
     arguments = parser.parse_args()
-    family = arguments.env_id.split("/")[-1].split("-")[0]
-    runs = []
+    family = family_of(arguments.env_id)
+    record = RESULTS / f"adaptation-{family}.json"
+    by_seed = {run["training"]["seed"]: run for run in json.loads(record.read_text())["runs"]} if record.exists() else {}
     for seed in arguments.seeds:
         folder = arguments.runs / family / f"seed{seed}"
         folder.mkdir(parents=True, exist_ok=True)
@@ -152,17 +158,16 @@ def main() -> None:
             adapt(arguments.env_id, model, rule, candidates, test_seed, folder / f"adapt-{rule}-{candidates}.json")
             for rule, candidates in RULES
         ]
-        runs.append(
-            {
-                "training": training,
-                "adaptations": adaptations,
-                "order": order_on_test_tasks(arguments.env_id, model, test_seed),
-            }
-        )
+        by_seed[seed] = {
+            "training": training,
+            "adaptations": adaptations,
+            "order": order_on_test_tasks(arguments.env_id, model, test_seed),
+        }
+        runs = [by_seed[key] for key in sorted(by_seed)]
         RESULTS.mkdir(exist_ok=True)
-        (RESULTS / f"adaptation-{family}.json").write_text(json.dumps({"env_id": arguments.env_id, "runs": runs}, indent=1))
-        (RESULTS / f"adaptation-{family}.md").write_text(table(arguments.env_id, runs))
-    print(table(arguments.env_id, runs))
+        record.write_text(json.dumps({"env_id": arguments.env_id, "runs": runs}, indent=1))
+        record.with_suffix(".md").write_text(table(arguments.env_id, runs))
+    print(record.with_suffix(".md").read_text())
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ and subtracted.
 """
 
 import argparse
-import time
+import statistics
 from collections import Counter
 from collections.abc import Callable
 from typing import Any
@@ -18,7 +18,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
-from measuring import take_turns, write_results
+from common import arguments, seconds_in_turns, table, write
 from plain_poem import PlainPOEM
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import configure
@@ -182,7 +182,8 @@ def measure(name: str, device: str, turns: int) -> dict[str, Any]:
     }
     if device == "cpu":
         contenders["plain"] = (lambda: plain.step(size["tasks"], size["batch"]), 1)
-    seconds = take_turns({key: synchronised(run) for key, (run, _) in contenders.items()}, turns)
+    turns_taken = seconds_in_turns({key: synchronised(run) for key, (run, _) in contenders.items()}, turns)
+    seconds = {key: statistics.median(values) for key, values in turns_taken.items()}
     for key, end in (("ours", "end of an epoch"), ("ours, float32", "end of an epoch, float32")):
         seconds[key] -= seconds[end]  # posteriors and decoder are measured once an epoch, not in a step
     milliseconds = {key: 1e3 * seconds[key] / contenders[key][1] for key in contenders}
@@ -198,37 +199,37 @@ def measure(name: str, device: str, turns: int) -> dict[str, Any]:
     }
 
 
-def main() -> None:
-    """Measure, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The script's own arguments."""
     parser.add_argument("--sizes", nargs="+", choices=SIZES, default=list(SIZES))
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--turns", type=int, default=5)
     parser.add_argument("--device", default="cpu")
-    arguments = parser.parse_args()
-    started, rows, results = time.perf_counter(), [], []
-    for threads in arguments.threads:
+
+
+def main() -> None:
+    """Measure, print, write."""
+    given = arguments(__doc__, add_arguments)
+    rows, results = [], []
+    for threads in given.threads:
         th.set_num_threads(threads)
-        for name in arguments.sizes:
-            result = {"name": name, "threads": threads, **measure(name, arguments.device, arguments.turns)}
+        for name in given.sizes:
+            result = {"name": name, "threads": threads, **measure(name, given.device, given.turns)}
             results.append(result)
             shown = result["milliseconds"]
-            cells = [f"{shown[key]:.1f}" if key in shown else "" for key in COLUMNS]
+            cells = [round(shown[key], 1) if key in shown else "" for key in COLUMNS]
             ratios = [f"{result[key]:.1f}x" for key in ("faster than plain", "faster than SAC")]
-            rows.append([name, str(threads), *cells, *ratios, f"{100 * result['share of the products rate']:.0f} %"])
-    header = [
-        "size",
-        "threads",
-        *(f"{key}, ms" for key in COLUMNS),
-        "ours to plain",
-        "ours to SAC",
-        "share of the products' rate",
-    ]
-    suffix = "" if arguments.device == "cpu" else f"-{arguments.device}"
-    write_results(f"gradient-step{suffix}", __doc__, header, rows, results, time.perf_counter() - started)
+            rows.append([name, threads, *cells, *ratios, f"{100 * result['share of the products rate']:.0f} %"])
+    ratios_of = ["ours to plain", "ours to SAC", "share of the products' rate"]
+    text = table(["size", "threads", *(f"{key}, ms" for key in COLUMNS), *ratios_of], rows)
+    suffix = "" if given.device == "cpu" else f"-{given.device}"
+    settings = {"turns": given.turns, "device": given.device, "context": CONTEXT_SIZE, "tasks": N_TRAIN_TASKS}
+    threads = max(given.threads) if given.device == "cpu" else 1
+    write(f"gradient-step{suffix}", "Gradient step", [DESCRIPTION, text], results, given.out, settings, threads)
 
 
 COLUMNS = ("ours", "ours, float32", "plain", "SAC", "products")
+DESCRIPTION = (__doc__ or "").split("\n\n")[-1].strip()
 
 if __name__ == "__main__":
     main()

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch as th
 import yaml
-from measuring import write_results
+from common import arguments, table, write
 from rl_zoo3.utils import linear_schedule
 
 from sb3_poem import POEMSAC
@@ -86,9 +86,8 @@ def train(env_id: str, entry: dict[str, Any], seed: int, clock: Clock, device: s
     model.learn(n_timesteps, callback=clock, progress_bar=False)
 
 
-def main() -> None:
-    """Measure, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The script's own arguments."""
     parser.add_argument("--env", default="poem/HalfCheetahVel-v0")
     parser.add_argument("--target", type=float, default=-46.0)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
@@ -98,23 +97,29 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--conf", type=Path, default=Path(__file__).parents[1] / "zoo_configs" / "poem_sac.yml")
-    arguments = parser.parse_args()
-    th.set_num_threads(arguments.threads)
-    entry = yaml.safe_load(arguments.conf.read_text())[arguments.env]
-    started, results, rows = time.perf_counter(), [], []
-    for seed in arguments.seeds:
-        clock = Clock(arguments.env, arguments.target, arguments.rules, 300 + seed, arguments.from_step, arguments.every)
-        train(arguments.env, entry, seed, clock, arguments.device)
+
+
+def main() -> None:
+    """Measure, print, write."""
+    given = arguments(__doc__, add_arguments)
+    th.set_num_threads(given.threads)
+    entry = yaml.safe_load(given.conf.read_text())[given.env]
+    results, rows = [], []
+    for seed in given.seeds:
+        clock = Clock(given.env, given.target, given.rules, 300 + seed, given.from_step, given.every)
+        train(given.env, entry, seed, clock, given.device)
         last = clock.evaluations[-1]
         results.append({"seed": seed, "reached": clock.reached, "evaluations": clock.evaluations, "entry": entry})
-        shown = [f"{last[rule]:.1f}" for rule in arguments.rules]
-        counts = [f"{last['env_steps']:,}", f"{last['updates']:,}"]
-        rows.append([str(seed), "yes" if clock.reached else "no", f"{last['seconds']:.0f}", *counts, *shown])
-    header = ["seed", f"reached {arguments.target:g}", "seconds", "environment steps", "updates", *arguments.rules]
-    family = arguments.env.split("/")[-1].split("-")[0]
-    suffix = "" if arguments.device == "cpu" else f"-{arguments.device}"
-    write_results(f"time-to-result-{family}{suffix}", __doc__, header, rows, results, time.perf_counter() - started)
+        returns = [f"{last[rule]:.1f}" for rule in given.rules]
+        reached = "yes" if clock.reached else "no"
+        rows.append([seed, reached, round(last["seconds"]), last["env_steps"], last["updates"], *returns])
+    text = table(["seed", f"reached {given.target:g}", "seconds", "environment steps", "updates", *given.rules], rows)
+    name = f"time-to-result-{given.env.split('/')[-1].split('-')[0]}{'' if given.device == 'cpu' else f'-{given.device}'}"
+    settings = {key: str(value) for key, value in vars(given).items() if key not in ("out", "conf")}
+    write(name, f"Time to {given.target:g} on {given.env}", [DESCRIPTION, text], results, given.out, settings, given.threads)
 
+
+DESCRIPTION = (__doc__ or "").split("\n\n")[-1].strip()
 
 if __name__ == "__main__":
     main()

@@ -42,8 +42,9 @@ class NoiseModel(Protocol):
 
 
 def _logistic(x: np.ndarray, slope: np.ndarray | float) -> np.ndarray:
-    with np.errstate(over="ignore"):  # to infinity, which is as good as 500
-        return 1.0 / (1.0 + np.exp(-np.clip(x * slope, -500.0, 500.0)))
+    x = np.asarray(x)  # stays float32 if it is
+    with np.errstate(over="ignore"):  # to infinity, which is as good as 80: lapses hide what is left of the other answer
+        return 1.0 / (1.0 + np.exp(np.clip(x * np.asarray(-slope, dtype=x.dtype), -80.0, 80.0)))
 
 
 def _with_lapse(probability: np.ndarray) -> np.ndarray:

@@ -10,6 +10,9 @@ from sb3_poem.adaptation.noise import NoiseModel
 
 QUERY_RULES = ("worst-case", "information-gain", "random")
 
+# Differences that are compared at a time: with a thousand candidates all pairs' would take gigabytes.
+BLOCK_ENTRIES = 2**17
+
 
 def tolerance(epsilon: float) -> float:
     """
@@ -31,12 +34,20 @@ def worst_case_sizes(similarities: np.ndarray, epsilon: float, weights: np.ndarr
     :param weights: (m,) a latent's weight; None counts each as one.
     :return: (n (n - 1) / 2,), in the order of ``numpy.triu_indices(n, 1)``.
     """
-    difference = pair_differences(similarities)
-    slack = tolerance(epsilon)
-    survives_first, survives_second = difference >= -slack, difference <= slack
-    if weights is None:
-        return np.maximum(np.count_nonzero(survives_first, axis=1), np.count_nonzero(survives_second, axis=1))
-    return np.maximum(survives_first @ weights, survives_second @ weights)
+    first, second = _pairs(similarities.shape[1])
+    rows, slack = _policy_rows(similarities), tolerance(epsilon)
+    sizes = np.empty(len(first), dtype=np.int64 if weights is None else np.float64)
+    block = max(1, BLOCK_ENTRIES // len(similarities))
+    for start in range(0, len(first), block):
+        some = slice(start, start + block)
+        difference = rows[first[some]] - rows[second[some]]
+        survives_first, survives_second = difference >= -slack, difference <= slack
+        if weights is None:
+            larger = np.maximum(np.count_nonzero(survives_first, axis=1), np.count_nonzero(survives_second, axis=1))
+        else:
+            larger = np.maximum(survives_first @ weights, survives_second @ weights)
+        sizes[some] = larger
+    return sizes
 
 
 def worst_case_pair(similarities: np.ndarray, epsilon: float, weights: np.ndarray | None = None) -> tuple[int, int]:
@@ -62,6 +73,7 @@ def information_gains(probabilities: np.ndarray, weights: np.ndarray) -> np.ndar
     :param weights: (m,) summing to one.
     :return: (pairs,) in nats.
     """
+    weights = weights.astype(probabilities.dtype, copy=False)
     return _entropy(probabilities @ weights) - _entropy(probabilities) @ weights
 
 
@@ -103,8 +115,10 @@ def pair_differences(values: np.ndarray) -> np.ndarray:
         1)``.
     """
     first, second = _pairs(values.shape[1])
-    rows = np.ascontiguousarray(values.T)  # whole rows are gathered several times as fast as columns
-    return rows[first] - rows[second]
+    rows = _policy_rows(values)
+    differences = rows[first]
+    differences -= rows[second]
+    return differences
 
 
 def pair_at(index: int, n: int) -> tuple[int, int]:
@@ -119,11 +133,18 @@ def pair_at(index: int, n: int) -> tuple[int, int]:
     return int(first[index]), int(second[index])
 
 
+def _policy_rows(values: np.ndarray) -> np.ndarray:
+    # Whole rows are gathered several times as fast as columns. Networks do not compute in more than float32 either.
+    return np.ascontiguousarray(values.T, dtype=np.float32)
+
+
 @lru_cache(maxsize=16)
 def _pairs(n: int) -> tuple[np.ndarray, np.ndarray]:
     return np.triu_indices(n, 1)
 
 
 def _entropy(probability: np.ndarray) -> np.ndarray:
-    p = np.clip(probability, 1e-12, 1.0 - 1e-12)
-    return -(p * np.log(p) + (1.0 - p) * np.log1p(-p))
+    smallest = np.finfo(probability.dtype).eps
+    p = np.clip(probability, smallest, 1.0 - smallest)
+    q = 1.0 - p
+    return -(p * np.log(p) + q * np.log(q))

@@ -10,6 +10,8 @@ from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.utils import get_device
 
 INITIAL_ROWS_PER_TASK = 1024
+# Steps of an action's 16-bit scale between 0 and 1.
+ACTION_UNITS = 2**15 - 1
 
 
 @dataclass
@@ -56,8 +58,10 @@ class TaskBatch(NamedTuple):
 class TaskReplayBuffer(ReplayBuffer):
     """Replay buffer with a ring of transitions for every training task.
 
-    All fields of a transition are one row of one tensor, so that a batch of any tasks is a single gather. Memory is taken as
-    it fills.
+    A transition's next observation is, but at the end of an episode or of a segment, the observation of the row that follows.
+    So it is stored once; a batch of any tasks is still a single gather, of rows that reach into their successors. What
+    follows an end is kept apart. Actions are stored in 16 bits (to within 1.6e-5 of their range from -1 to 1), all else as
+    float32. Memory is taken as it fills.
 
     :param buffer_size: Transitions kept per task
     :param observation_space: Flat Box
@@ -83,54 +87,56 @@ class TaskReplayBuffer(ReplayBuffer):
         self.optimize_memory_usage = False
         self.handle_timeout_termination = True
         assert isinstance(observation_space, spaces.Box)
-        obs_dim = int(observation_space.shape[0])
-        self.widths = [obs_dim, self.action_dim, obs_dim, 1, 1, feature_dim]
+        self.obs_dim = int(observation_space.shape[0])
+        #: Words of a row: observation, features, reward, mark of an end, actions (two a word)
+        self.widths = [self.obs_dim, feature_dim, 1, 1, (self.action_dim + 1) // 2]
         self.reset()
 
     def reset(self) -> None:
         """Forget everything."""
         super().reset()
-        self.rows = th.zeros(self.n_tasks, 0, sum(self.widths), device=self.device)
+        # One row more than there is room for, in which the first is repeated: it follows the last.
+        self.rows = th.zeros(self.n_tasks, 1, sum(self.widths), dtype=th.int32, device=self.device)
         self.counts = np.zeros(self.n_tasks, dtype=np.int64)
         self.positions = np.zeros(self.n_tasks, dtype=np.int64)
         self._counts_on_device = th.zeros(self.n_tasks, device=self.device)
+        # Observations after an end. A row's mark is the number of its own, negative if the episode terminated; 0 is no end.
+        self.ends = th.zeros(1, self.obs_dim, device=self.device)
+        self._free_ends = np.zeros(0, dtype=np.int32)
+
+    @property
+    def capacity(self) -> int:
+        """Transitions of a task that there is memory for."""
+        return self.rows.shape[1] - 1
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that are allocated."""
+        return sum(tensor.numel() * tensor.element_size() for tensor in (self.rows, self.ends))
 
     def size(self) -> int:
         """Transitions stored, over all tasks."""
         return int(self.counts.sum())
 
-    def _reserve(self, rows_per_task: int) -> None:
-        capacity = self.rows.shape[1]
-        if rows_per_task > capacity:
-            new_capacity = min(self.buffer_size, max(INITIAL_ROWS_PER_TASK, 2 * capacity, rows_per_task))
-            grown = th.zeros(self.n_tasks, new_capacity, self.rows.shape[2], device=self.device)
-            grown[:, :capacity] = self.rows
-            self.rows = grown
-
     def extend(self, segment: Segment) -> None:
         """Store a segment; the oldest transitions of a full task make room."""
-        rows = th.from_numpy(
-            np.concatenate(
-                [
-                    segment.observations,
-                    segment.actions,
-                    segment.next_observations,
-                    segment.rewards[..., None],
-                    segment.terminated[..., None],
-                    segment.features,
-                ],
-                axis=-1,
-            ).astype(np.float32)
-        ).to(self.device)
-        steps = min(rows.shape[1], self.buffer_size)
-        for task, task_rows in zip(segment.task_ids, rows[:, -steps:], strict=True):
-            start = int(self.positions[task])
-            self._reserve(min(start + steps, self.buffer_size))
-            head = min(steps, self.buffer_size - start)
-            self.rows[task, start : start + head] = task_rows[:head]
-            self.rows[task, : steps - head] = task_rows[head:]
+        steps = min(segment.observations.shape[1], self.buffer_size)
+        rows, is_end, terminated = self._pack(segment, steps)
+        next_observations = segment.next_observations[:, -steps:]
+        for copy, task in enumerate(segment.task_ids):
+            start, count = int(self.positions[task]), int(self.counts[task])
+            self._reserve(min(count + steps, self.buffer_size))
+            slots = th.from_numpy((start + np.arange(steps)) % self.buffer_size).to(self.device)
+            self._release_ends(self.rows[task, slots[self.buffer_size - count :]])
+            own_ends = np.flatnonzero(is_end[copy])
+            numbers = self._store_ends(next_observations[copy, own_ends])
+            marks = np.zeros(steps, dtype=np.int32)
+            marks[own_ends] = np.where(terminated[copy, own_ends], -numbers, numbers)
+            rows[copy, :, self._mark] = th.from_numpy(marks).to(self.device)
+            self.rows[task, slots] = rows[copy]
+            self.rows[task, -1] = self.rows[task, 0]
             self.positions[task] = (start + steps) % self.buffer_size
-            self.counts[task] = min(self.counts[task] + steps, self.buffer_size)
+            self.counts[task] = min(count + steps, self.buffer_size)
         self._counts_on_device = th.as_tensor(self.counts, dtype=th.float32, device=self.device)
         self.full = bool((self.counts == self.buffer_size).all())
 
@@ -142,15 +148,28 @@ class TaskReplayBuffer(ReplayBuffer):
         """
         uniform = th.rand(source_tasks.shape, generator=generator, device=self.device)
         slots = (uniform * self._counts_on_device[source_tasks]).long()
-        flat = source_tasks * self.rows.shape[1] + slots
-        rows = self.rows.view(-1, self.rows.shape[2]).index_select(0, flat.view(-1)).view(*flat.shape, -1)
-        obs, actions, next_obs, rewards, terminated, features = rows.split(self.widths, dim=-1)
-        return TaskBatch(obs, actions, next_obs, rewards.squeeze(-1), terminated.squeeze(-1), features)
+        return self._gather(source_tasks * self.rows.shape[1] + slots)
+
+    def transitions(self, task: int) -> TaskBatch:
+        """All transitions of a task, in the order of their slots: those of :class:`TaskBatch`, each (1, count, ...).
+
+        :param task: Index of the task
+        """
+        return self._gather(task * self.rows.shape[1] + th.arange(int(self.counts[task]), device=self.device)[None])
 
     def state(self) -> dict[str, Any]:
         """Everything needed to continue, without unused room."""
         used = int(self.counts.max()) if self.n_tasks else 0
-        return {"rows": self.rows[:, :used].clone(), "counts": self.counts.copy(), "positions": self.positions.copy()}
+        rows = self.rows[:, :used].clone()
+        for task_rows, count in zip(rows, self.counts.tolist(), strict=True):
+            task_rows[count:] = 0  # instead of whatever stood in this memory
+        return {
+            "rows": rows,
+            "counts": self.counts.copy(),
+            "positions": self.positions.copy(),
+            "ends": self.ends.clone(),
+            "free_ends": self._free_ends.copy(),
+        }
 
     def load_state(self, state: dict[str, Any]) -> None:
         """Continue from what :meth:`state` returned."""
@@ -159,9 +178,79 @@ class TaskReplayBuffer(ReplayBuffer):
         if used:
             self._reserve(used)
             self.rows[:, :used] = state["rows"].to(self.device)
-        self.counts, self.positions = state["counts"].copy(), state["positions"].copy()
+            self.rows[:, -1] = self.rows[:, 0]
+        self.counts, self.positions = np.array(state["counts"]), np.array(state["positions"])
+        self.ends, self._free_ends = state["ends"].to(self.device, copy=True), np.array(state["free_ends"])
         self._counts_on_device = th.as_tensor(self.counts, dtype=th.float32, device=self.device)
         self.full = bool((self.counts == self.buffer_size).all())
+
+    @property
+    def _mark(self) -> int:
+        return sum(self.widths[:3])
+
+    def _pack(self, segment: Segment, steps: int) -> tuple[th.Tensor, np.ndarray, np.ndarray]:
+        """Rows (copies, steps, words) without marks; which are ends, and which of these terminated, (copies, steps)."""
+        obs = segment.observations[:, -steps:].astype(np.float32, copy=False)
+        next_obs = segment.next_observations[:, -steps:].astype(np.float32, copy=False)
+        terminated = segment.terminated[:, -steps:] > 0
+        is_end = terminated.copy()
+        is_end[:, -1] = True
+        is_end[:, :-1] |= (next_obs[:, :-1] != obs[:, 1:]).any(axis=-1)
+        packed = np.zeros((*obs.shape[:2], sum(self.widths)), dtype=np.int32)
+        floats, mark = packed.view(np.float32), self._mark
+        floats[..., : self.obs_dim] = obs
+        floats[..., self.obs_dim : mark - 1] = segment.features[:, -steps:]
+        floats[..., mark - 1] = segment.rewards[:, -steps:]
+        actions = packed.view(np.int16)[..., 2 * (mark + 1) :][..., : self.action_dim]
+        np.rint(np.clip(segment.actions[:, -steps:], -1.0, 1.0) * ACTION_UNITS, out=actions, casting="unsafe")
+        return th.from_numpy(packed).to(self.device), is_end, terminated
+
+    def _gather(self, flat: th.Tensor) -> TaskBatch:
+        """Transitions (...) at row numbers (...) over all tasks."""
+        words, (all_rows, obs_dim) = sum(self.widths), (self.rows.shape[0] * self.rows.shape[1], self.obs_dim)
+        # the very last row repeats another and is never drawn, so that every row has a successor
+        with_successor = self.rows.as_strided((all_rows - 1, words + obs_dim), (words, 1))
+        rows = with_successor.index_select(0, flat.reshape(-1))
+        floats, mark = rows.view(th.float32), self._mark
+        marks = rows[:, mark].contiguous()  # what is dense is converted and searched several times as fast
+        ends = marks.nonzero().view(-1)
+        floats[:, words:].index_copy_(0, ends, self.ends.index_select(0, marks.index_select(0, ends).abs()))
+        terminated = (marks < 0).float()
+        actions = (rows[:, mark + 1 : words].contiguous().view(th.int16) * (1.0 / ACTION_UNITS))[:, : self.action_dim]
+        floats, shape = floats.unflatten(0, flat.shape), flat.shape
+        return TaskBatch(
+            floats[..., :obs_dim],
+            actions.unflatten(0, shape),
+            floats[..., words:],
+            floats[..., mark - 1],
+            terminated.view(shape),
+            floats[..., obs_dim : mark - 1],
+        )
+
+    def _reserve(self, rows_per_task: int) -> None:
+        capacity = self.capacity
+        if rows_per_task > capacity:
+            new_capacity = min(self.buffer_size, max(INITIAL_ROWS_PER_TASK, 2 * capacity, rows_per_task))
+            # not zeros: the system gives pages that nobody writes to no memory
+            grown = th.empty(self.n_tasks, new_capacity + 1, self.rows.shape[2], dtype=th.int32, device=self.device)
+            grown[:, :capacity] = self.rows[:, :capacity]
+            self.rows = grown
+
+    def _release_ends(self, overwritten: th.Tensor) -> None:
+        marks = overwritten[:, self._mark].cpu().numpy()
+        self._free_ends = np.concatenate([self._free_ends, np.abs(marks[marks != 0])])
+
+    def _store_ends(self, observations: np.ndarray) -> np.ndarray:
+        """Keep (n, obs_dim) in free places, and return their numbers."""
+        missing = len(observations) - len(self._free_ends)
+        if missing > 0:
+            used = len(self.ends)
+            added = max(missing, used // 4, INITIAL_ROWS_PER_TASK)
+            self.ends = th.cat([self.ends, self.ends.new_zeros(added, self.obs_dim)])
+            self._free_ends = np.concatenate([self._free_ends, np.arange(used, used + added, dtype=np.int32)])
+        numbers, self._free_ends = np.split(self._free_ends, [len(observations)])
+        self.ends[th.from_numpy(numbers).to(self.device)] = th.as_tensor(observations, dtype=th.float32, device=self.device)
+        return numbers
 
 
 @dataclass

@@ -58,9 +58,6 @@ def read_checkpoint(path: str | Path, algorithm: str) -> dict[str, Any]:
 
 def restore_stores(model: "PEARLSAC", state: dict[str, Any]) -> None:
     """Put a checkpoint's replay buffer and context into a model that was loaded from its archive."""
-    replay = state["replay_buffer"]
-    model.replay_buffer.load_state(
-        {"rows": replay["rows"], "counts": replay["counts"].numpy(), "positions": replay["positions"].numpy()}
-    )
+    model.replay_buffer.load_state(state["replay_buffer"])
     if state["context"] is not None:
         model.context = ContextStore(**{name: value.to(model.device) for name, value in state["context"].items()})

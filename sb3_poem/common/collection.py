@@ -15,6 +15,8 @@ def check_finite(name: str, values: np.ndarray, task_ids: np.ndarray, episodes: 
     """
     :raises ValueError: if any copy's values are NaN or infinite; names the copy, its task and its episode
     """
+    if np.isfinite(values.sum()):  # then all are; the sum of large finite values may overflow, which the lines below sort out
+        return
     finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
     if not finite.all():
         copy = int(np.argmin(finite))
@@ -83,7 +85,7 @@ def collect_segment(
         segment.observations[:, step] = obs
         segment.actions[:, step] = scaled_actions
         segment.next_observations[:, step] = next_obs
-        segment.rewards[:, step] = rewards
+        segment.rewards[:, step] = rewards.astype(np.float32)  # as most VecEnvs give them; SubprocVecEnv does not round
         segment.features[:, step] = features
         segment.first_episode[:, step] = in_first_episode
         in_first_episode &= ~dones

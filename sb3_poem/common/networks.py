@@ -194,25 +194,3 @@ class RewardDecoder(nn.Module):
     def forward(self, obs: th.Tensor, actions: th.Tensor, next_obs: th.Tensor, embedding: th.Tensor) -> th.Tensor:
         """Predicted standardised rewards (...) of transitions (..., dim)."""
         return self.mlp(obs, actions, next_obs, embedding).squeeze(-1)
-
-    @th.no_grad()
-    def for_embeddings(self, obs: th.Tensor, actions: th.Tensor, next_obs: th.Tensor, embeddings: th.Tensor) -> th.Tensor:
-        """Predicted standardised rewards (m, steps) of the same transitions (steps, dim) under each of m embeddings (m, d).
-
-        The first layer sees the transitions once, not m times, and one embedding at a time stays in the cache. No gradients.
-        """
-        activation, output = self.mlp.activation, self.mlp.output
-        first, *others = self.mlp.hidden
-        assert isinstance(first, nn.Linear)
-        transitions = th.cat([obs, actions, next_obs], dim=-1)
-        of_transitions, of_embeddings = first.weight.split([transitions.shape[-1], embeddings.shape[-1]], dim=1)
-        base = transitions @ of_transitions.T + first.bias  # (steps, width)
-        buffers = [th.empty_like(base), *(base.new_empty(len(base), layer.out_features) for layer in others)]  # type: ignore[arg-type]
-        rewards = base.new_empty(len(embeddings), len(base), 1)
-        for shift, reward in zip(embeddings @ of_embeddings.T, rewards, strict=True):
-            x = activation(th.add(base, shift, out=buffers[0]))
-            for layer, buffer in zip(others, buffers[1:], strict=True):
-                assert isinstance(layer, nn.Linear)
-                x = activation(th.addmm(layer.bias, x, layer.weight.T, out=buffer))
-            th.addmm(output.bias, x, output.weight.T, out=reward)
-        return rewards.squeeze(-1)

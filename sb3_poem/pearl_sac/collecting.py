@@ -69,13 +69,14 @@ class CollectingSAC(TaskSAC):
 
     def _collect(self, callback: BaseCallback, task_ids: np.ndarray, tasks: np.ndarray, latents: np.ndarray) -> Segment | None:
         family, noise_shape = self.family, (len(latents), int(self.action_space.shape[0]))  # type: ignore[index]
+        policy_action = self.policy.acting_on(latents)
 
         def act(obs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             if self.num_timesteps < self.learning_starts:
                 scaled = self.generators.numpy.uniform(-1.0, 1.0, noise_shape).astype(np.float32)
             else:
                 noise = th.randn(noise_shape, generator=self.generators.torch, device=self.device)
-                scaled = self.policy.act(obs, latents, noise)
+                scaled = policy_action(obs, noise)
             actions = np.clip(self.policy.unscale_action(scaled), self.action_space.low, self.action_space.high)  # type: ignore[attr-defined]
             return actions, scaled
 
@@ -84,7 +85,8 @@ class CollectingSAC(TaskSAC):
             callback.update_locals(step_locals)
             if not callback.on_step():
                 return False
-            self._update_info_buffer(step_locals["infos"], step_locals["dones"])
+            if step_locals["dones"].any():  # what it looks for comes with an episode's end
+                self._update_info_buffer(step_locals["infos"], step_locals["dones"])
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
             self._episode_num += int(step_locals["dones"].sum())
             return True

@@ -1,6 +1,6 @@
 """Policy of PEARLSAC: an actor, critics, a context encoder and a reward decoder that share one latent."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -155,11 +155,26 @@ class LatentPolicy(SACPolicy):
         :param latents: (n, latent_dim)
         :param noise: (n, action_dim) standard normal draws, None for the mean action
         """
+        return self.acting_on(latents)(obs, noise)
+
+    def acting_on(self, latents: np.ndarray) -> Callable[[np.ndarray, th.Tensor | None], np.ndarray]:
+        """:meth:`act` for latents that stay the same over many steps: what depends on them alone is computed once.
+
+        :param latents: (n, latent_dim)
+        :return: A function of ``obs`` and ``noise``
+        """
+        device = self.obs_mean.device
         with th.no_grad():
-            obs_tensor = th.as_tensor(obs, dtype=th.float32, device=self.device)
-            embedding = self.policy_embedding(th.as_tensor(latents, dtype=th.float32, device=self.device))
-            actions, _ = self.actor(self.standardise(obs_tensor), embedding, noise)
-        return actions.cpu().numpy()
+            embedding = self.policy_embedding(th.as_tensor(latents, dtype=th.float32, device=device))
+
+        def act(obs: np.ndarray, noise: th.Tensor | None) -> np.ndarray:
+            with th.no_grad():
+                standardised = self.standardise(th.as_tensor(obs, dtype=th.float32, device=device))
+                mean, log_std = self.actor.distribution(standardised, embedding)  # type: ignore[operator]
+                actions = mean if noise is None else th.addcmul(mean, log_std.exp(), noise)
+                return actions.tanh_().cpu().numpy()
+
+        return act
 
     def predict(
         self,

@@ -9,7 +9,9 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_poem.common.decoding import decoded_sums
 from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.precision import hidden_dtype
 from sb3_poem.common.random import Generators
 from sb3_poem.pearl_sac.persistence import PersistentSAC, default_train_tasks
 from sb3_poem.pearl_sac.policies import LatentPolicy
@@ -24,6 +26,7 @@ class TaskSAC(PersistentSAC):
     generators: Generators
     horizon: int | None
     latent_dim: int
+    precision: str
     n_train_tasks: int | None
     relabel_fraction: float
     train_tasks: np.ndarray | None
@@ -116,22 +119,43 @@ class TaskSAC(PersistentSAC):
             draws = draws + rng.uniform(size=(n, 1)) * (means[neighbours] - draws)
         return draws + np.sqrt(variances[chosen]) * rng.standard_normal(draws.shape)
 
-    def predicted_returns(self, latents: np.ndarray, trajectories: Iterable[Any]) -> np.ndarray:
+    def predicted_returns(self, latents: np.ndarray, trajectories: Iterable[Any], max_steps: int | None = None) -> np.ndarray:
         """Returns that the reward decoder predicts for trajectories, if each latent were the task's.
 
         :param latents: (m, latent_dim)
         :param trajectories: With ``observations`` (T + 1, obs_dim) and ``actions`` (T, action_dim) in the environment's units
+        :param max_steps: Of a longer trajectory only so many steps are decoded, evenly spaced, and the sum is scaled up;
+            None decodes all
         :return: (m, number of trajectories)
         """
-        columns = []
+        device, policy = self.device, self.policy
+        rows: list[th.Tensor] = []
+        lengths: list[int] = []
+        shares: list[float] = []  # of a trajectory's steps, one over
         with th.no_grad():
-            latent_tensor = th.as_tensor(np.atleast_2d(latents), dtype=th.float32, device=self.device)
-            embeddings = self.policy.reward_embedding(latent_tensor)
             for trajectory in trajectories:
-                obs = self.policy.standardise(th.as_tensor(trajectory.observations, dtype=th.float32, device=self.device))
-                actions = th.as_tensor(trajectory.actions, dtype=th.float32, device=self.device)
-                actions = self.policy.scale_action_batch(actions)
-                standardised = self.policy.decoder.for_embeddings(obs[:-1], actions, obs[1:], embeddings)
-                rewards = standardised * self.policy.reward_std + self.policy.reward_mean
-                columns.append(rewards.double().sum(dim=1))
-        return th.stack(columns, dim=1).cpu().numpy()
+                total = len(trajectory.actions)
+                steps = _evenly_spaced(total, max_steps)
+                obs, next_obs = (
+                    policy.standardise(th.as_tensor(trajectory.observations[at], dtype=th.float32, device=device))
+                    for at in (steps, steps + 1)
+                )
+                actions = th.as_tensor(trajectory.actions[steps], dtype=th.float32, device=device)
+                rows.append(th.cat([obs, policy.scale_action_batch(actions), next_obs], dim=1))
+                lengths.append(len(steps))
+                shares.append(total / max(len(steps), 1))
+            latent_tensor = th.as_tensor(np.atleast_2d(latents), dtype=th.float32, device=device)
+            embeddings = policy.reward_embedding(latent_tensor)
+            dtype = hidden_dtype(self.precision, device.type)
+            sums = decoded_sums(policy.decoder.mlp, th.cat(rows), lengths, embeddings, dtype).double()
+            sums = sums * policy.reward_std + policy.reward_mean * sums.new_tensor(lengths)
+            return (sums * sums.new_tensor(shares)).cpu().numpy()
+
+
+def _evenly_spaced(total: int, count: int | None) -> np.ndarray:
+    """At most ``count`` of ``total`` indices, at one distance, with what is left over at both ends."""
+    if count is None or total <= count:
+        return np.arange(total)
+    distance = -(-total // count)
+    chosen = np.arange(0, total, distance)
+    return chosen + (total - 1 - chosen[-1]) // 2

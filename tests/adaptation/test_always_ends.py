@@ -35,8 +35,9 @@ class RandomModel(SpeedModel):
         embeddings = [np.tanh(z @ w) for z, w in zip((task_latents, policy_latents), self.weights, strict=True)]
         return self.scale * embeddings[0] @ embeddings[1].T
 
-    def predicted_returns(self, latents, trajectories):
-        self.decoder_steps += len(latents) * sum(len(trajectory) for trajectory in trajectories)
+    def predicted_returns(self, latents, trajectories, max_steps=None):
+        steps = [len(trajectory) if max_steps is None else min(len(trajectory), max_steps) for trajectory in trajectories]
+        self.decoder_steps += len(latents) * sum(steps)
         features = np.stack([np.tanh(t.observations[:-1].sum(axis=0) + t.latent[:2]) for t in trajectories])
         return 10.0 * np.tanh(latents @ self.weights[0][:, :2]) @ features.T
 

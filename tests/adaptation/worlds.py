@@ -151,7 +151,9 @@ class SpeedModel:
         policy_embedding = np.stack([2.0 * speed, -(speed**2)], axis=1)
         return self.scale * reward_embedding @ policy_embedding.T
 
-    def predicted_returns(self, latents: np.ndarray, trajectories: Sequence[Trajectory]) -> np.ndarray:
+    def predicted_returns(
+        self, latents: np.ndarray, trajectories: Sequence[Trajectory], max_steps: int | None = None
+    ) -> np.ndarray:
         goals = self.speed(latents)
         columns = [
             -STEP_WEIGHT * np.abs(trajectory.observations[None, 1:, 1] - goals[:, None]).sum(axis=1)

@@ -9,44 +9,60 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_poem.common.buffers import INITIAL_ROWS_PER_TASK, Segment, TaskReplayBuffer
+from sb3_poem.common.buffers import INITIAL_ROWS_PER_TASK, Segment, TaskBatch, TaskReplayBuffer
 
 OBS = spaces.Box(-np.inf, np.inf, (2,), np.float64)
 ACTION = spaces.Box(-1.0, 1.0, (3,), np.float32)
-FIELDS = ("observations", "actions", "next_observations", "rewards", "terminated", "features")
-WIDTHS = (2, 3, 2, None, None, 4)
+WIDTHS = {"observations": 2, "actions": 3, "next_observations": 2, "rewards": 0, "terminated": 0, "features": 4}
 
 
 def make_buffer(size: int, n_tasks: int) -> TaskReplayBuffer:
     return TaskReplayBuffer(size, OBS, ACTION, "cpu", n_tasks=n_tasks, feature_dim=4)
 
 
+def fields_of(numbers: np.ndarray) -> dict[str, np.ndarray]:
+    """Every entry of a transition follows from its number and its column, so that a mix-up shows.
+
+    The observation after transition n is that of n + 1, unless n ends an episode: every seventh does, and every fourteenth
+    of all terminates.
+    """
+    numbers = np.asarray(numbers)
+    is_end = numbers % 7 == 3
+    return {
+        "observations": numbers[..., None] + np.arange(2) / 16.0,
+        "actions": (numbers[..., None] * 7 + np.arange(3)) % 32767 / 32767.0,
+        "next_observations": np.where(is_end, -numbers, numbers + 1)[..., None] + np.arange(2) / 16.0,
+        "rewards": numbers + 0.5,
+        "terminated": (numbers % 14 == 3).astype(np.float64),
+        "features": numbers[..., None] + np.arange(4) / 8.0,
+    }
+
+
 def segment_of(task_ids: list[int], numbers: np.ndarray) -> Segment:
-    """Every entry of a transition is its number plus a constant of its column, so that a mix-up shows."""
-    column, values = 0, {}
-    for name, width in zip(FIELDS, WIDTHS, strict=True):
-        columns = column + np.arange(width or 1)
-        value = numbers[..., None] + columns / 16.0
-        values[name] = value if width else value[..., 0]
-        column += width or 1
     copies, steps = numbers.shape
     return Segment(
-        task_ids=np.array(task_ids), first_episode=np.ones((copies, steps), bool), latents=np.zeros((copies, 1)), **values
+        task_ids=np.array(task_ids),
+        first_episode=np.ones((copies, steps), bool),
+        latents=np.zeros((copies, 1)),
+        **fields_of(numbers),
     )
 
 
-def row_of(number: float) -> list[float]:
-    return [number + column / 16.0 for column in range(sum(width or 1 for width in WIDTHS))]
-
-
-def numbers_in(batch: tuple[th.Tensor, ...]) -> np.ndarray:
+def numbers_in(batch: TaskBatch) -> np.ndarray:
     """Numbers of a batch's transitions, (tasks, batch); checks all columns."""
-    parts = [part if part.ndim == 3 else part[..., None] for part in batch]
-    assert [part.shape[-1] for part in parts] == [width or 1 for width in WIDTHS]
-    rows = th.cat(parts, dim=-1).numpy()
-    numbers = rows[..., 0]
-    assert np.array_equal(rows, numbers[..., None] + np.arange(rows.shape[-1]) / 16.0)
+    numbers = batch.observations[..., 0].double().numpy()
+    for name, expected in fields_of(numbers).items():
+        stored = getattr(batch, name).numpy()
+        assert stored.dtype == np.float32
+        if name == "actions":
+            np.testing.assert_allclose(stored, expected, rtol=0, atol=1.6e-5)
+        else:
+            assert np.array_equal(stored, expected.astype(np.float32)), name
     return numbers
+
+
+def stored_numbers(buffer: TaskReplayBuffer, task: int) -> list[float]:
+    return sorted(numbers_in(buffer.transitions(task))[0].tolist())
 
 
 class ListBuffer:
@@ -84,8 +100,7 @@ def test_is_a_ring_of_the_latest_transitions_of_each_task(
     assert buffer.size() == sum(map(len, truth.kept))
     assert buffer.full == all(len(kept) == size for kept in truth.kept)
     for task, kept in enumerate(truth.kept):
-        stored = buffer.rows[task, : len(kept)].tolist()
-        assert sorted(stored) == [row_of(number) for number in sorted(kept)]
+        assert stored_numbers(buffer, task) == sorted(kept)
         if kept:
             drawn = numbers_in(buffer.sample_rows(th.full((1, 40), task), th.Generator().manual_seed(counter)))
             assert set(drawn.ravel()) <= set(kept)
@@ -93,11 +108,11 @@ def test_is_a_ring_of_the_latest_transitions_of_each_task(
 
 def test_memory_grows_as_it_fills_and_stops_at_the_buffer_size() -> None:
     buffer = make_buffer(3000, 2)
-    assert buffer.rows.numel() == 0
+    assert buffer.capacity == 0
     capacities, numbers = [], np.zeros((1, 700))
     for _ in range(6):
         buffer.extend(segment_of([0], numbers))
-        capacities.append(buffer.rows.shape[1])
+        capacities.append(buffer.capacity)
     assert capacities == [INITIAL_ROWS_PER_TASK, 2 * INITIAL_ROWS_PER_TASK, 3000, 3000, 3000, 3000]
     assert buffer.counts.tolist() == [3000, 0]
     assert not buffer.full
@@ -107,10 +122,11 @@ def test_growth_keeps_what_was_there() -> None:
     buffer = make_buffer(10_000, 2)
     numbers = np.arange(2 * 900, dtype=np.float64).reshape(2, 900)
     buffer.extend(segment_of([0, 1], numbers))
-    before = buffer.rows[:, :900].clone()
-    buffer.extend(segment_of([1], numbers[:1]))
-    assert buffer.rows.shape[1] > INITIAL_ROWS_PER_TASK
-    assert th.equal(buffer.rows[:, :900], before)
+    assert buffer.capacity == INITIAL_ROWS_PER_TASK
+    buffer.extend(segment_of([1], numbers[:1] + 5000.0))
+    assert buffer.capacity > INITIAL_ROWS_PER_TASK
+    assert stored_numbers(buffer, 0) == numbers[0].tolist()
+    assert stored_numbers(buffer, 1) == [*numbers[1], *(numbers[0] + 5000.0)]
 
 
 def test_draws_are_uniform_over_a_tasks_own_transitions() -> None:
@@ -143,8 +159,8 @@ def test_state_leaves_unused_room_out_and_continues_alike() -> None:
     assert state["rows"].shape[1] == 1500
     restored = make_buffer(2000, 2)
     restored.load_state(state)
-    state["rows"].zero_()
-    state["counts"][:] = 0  # the buffer has its own copies
+    for value in state.values():
+        value[:] = 0  # the buffer has its own copies
     for one in (buffer, restored):
         one.extend(segment_of([1, 0], numbers[:, :900]))  # wraps
     sources = th.randint(2, (2, 64), generator=th.Generator().manual_seed(0))
@@ -165,9 +181,46 @@ def test_pickles_as_sb3s_save_replay_buffer_does() -> None:
     buffer = make_buffer(10, 1)
     buffer.extend(segment_of([0], np.arange(15.0)[None]))
     copy = pickle.loads(pickle.dumps(buffer))
-    assert th.equal(copy.rows, buffer.rows)
+    assert stored_numbers(copy, 0) == stored_numbers(buffer, 0) == list(range(5, 15))
     copy.extend(segment_of([0], np.arange(3.0)[None]))
-    assert not th.equal(copy.rows, buffer.rows)
+    assert stored_numbers(copy, 0) == [0, 1, 2, *range(8, 15)]
+    assert stored_numbers(buffer, 0) == list(range(5, 15))
+
+
+def test_ends_do_not_pile_up() -> None:
+    """What follows an end is kept as long as its transition is, and its place is used again."""
+    buffer = make_buffer(200, 3)
+    for _ in range(30):
+        buffer.extend(segment_of([0, 1, 2], np.arange(3 * 20, dtype=np.float64).reshape(3, 20)))
+    places = len(buffer.ends)
+    for _ in range(100):
+        buffer.extend(segment_of([0, 1, 2], np.arange(3 * 20, dtype=np.float64).reshape(3, 20)))
+    assert len(buffer.ends) == places
+
+
+def test_takes_three_fifths_of_the_memory_of_plain_transitions() -> None:
+    obs_dim, action_dim, steps, tasks = 27, 8, 200, 2
+    space, actions = spaces.Box(-np.inf, np.inf, (obs_dim,)), spaces.Box(-1.0, 1.0, (action_dim,))
+    buffer = TaskReplayBuffer(4000, space, actions, "cpu", n_tasks=tasks, feature_dim=3)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        states = rng.standard_normal((tasks, steps + 1, obs_dim)).astype(np.float32)
+        buffer.extend(
+            Segment(
+                task_ids=np.arange(tasks),
+                observations=states[:, :-1],
+                actions=rng.uniform(-1.0, 1.0, (tasks, steps, action_dim)),
+                next_observations=states[:, 1:],
+                rewards=np.zeros((tasks, steps)),
+                terminated=np.zeros((tasks, steps)),
+                features=np.zeros((tasks, steps, 3)),
+                first_episode=np.ones((tasks, steps), bool),
+                latents=np.zeros((tasks, 1)),
+            )
+        )
+    assert buffer.full
+    unused_ends = 4 * obs_dim * INITIAL_ROWS_PER_TASK  # room for a while
+    assert buffer.nbytes - unused_ends <= 0.6 * 4 * (2 * obs_dim + action_dim + 1) * buffer.size()
 
 
 def test_reset_forgets() -> None:

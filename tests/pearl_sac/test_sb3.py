@@ -84,9 +84,9 @@ def test_any_number_of_environments(algorithm: type[PEARLSAC], make_env: Any) ->
     assert model._n_updates == 5
     # the stored transitions are the tasks' own
     for task in range(N_TASKS):
-        rows = model.replay_buffer.rows[task, : counts[task]]
-        expected = model.family.compute_reward(model.train_tasks[task], rows[:, -2:].numpy())
-        np.testing.assert_allclose(rows[:, 6].numpy(), expected, atol=1e-5)
+        stored = model.replay_buffer.transitions(task)
+        expected = model.family.compute_reward(model.train_tasks[task], stored.features.numpy())
+        np.testing.assert_allclose(stored.rewards.numpy(), expected, atol=1e-5)
 
 
 def test_an_id_gets_a_copy_for_every_task(algorithm: type[PEARLSAC]) -> None:
@@ -110,7 +110,7 @@ def test_subprocesses(algorithm: type[PEARLSAC]) -> None:
 def test_early_ends_and_unsymmetric_actions(algorithm: type[PEARLSAC]) -> None:
     model = small(algorithm, walks(4, edge=0.4), horizon=10).learn(240)
     assert model.num_timesteps == 240
-    terminated = model.replay_buffer.rows[:, : model.replay_buffer.counts.min(), 6]
+    terminated = th.cat([model.replay_buffer.transitions(task).terminated for task in range(N_TASKS)], dim=1)
     assert 0 < terminated.sum() < terminated.numel()
     assert model._episode_num > 24
     actions, _ = model.predict(OBS, deterministic=False)
@@ -380,7 +380,9 @@ def test_replay_buffer_saves_alone(algorithm: type[PEARLSAC], tmp_path: Path) ->
     model.save_replay_buffer(tmp_path / "buffer")
     other = small(algorithm)
     other.load_replay_buffer(tmp_path / "buffer")
-    assert th.equal(other.replay_buffer.rows, model.replay_buffer.rows)
+    for task in range(N_TASKS):
+        stored = zip(other.replay_buffer.transitions(task), model.replay_buffer.transitions(task), strict=True)
+        assert all(th.equal(one, two) for one, two in stored)
     other.learn(EPOCH)
     assert other.replay_buffer.size() == 2 * EPOCH
 
@@ -566,7 +568,7 @@ def test_gradient_steps_and_learning_starts(algorithm: type[PEARLSAC]) -> None:
     assert small(algorithm, gradient_steps=-1, n_train_tasks=2).learn(1)._n_updates == 50
     model = small(algorithm, learning_starts=EPOCH).learn(2 * EPOCH)  # the first epoch acts at random and learns nothing
     assert model._n_updates == 5
-    first_actions = model.replay_buffer.rows[:, :25, 2:4]
+    first_actions = th.cat([model.replay_buffer.transitions(task).actions[:, :25] for task in range(N_TASKS)])
     assert first_actions.abs().max() < 1.0
     assert abs(first_actions.mean().item()) < 0.1
     assert first_actions.std().item() == pytest.approx(1 / np.sqrt(3), rel=0.1)
@@ -579,8 +581,8 @@ def test_horizons_per_task_and_epoch(algorithm: type[PEARLSAC]) -> None:
     assert model.context.transitions.shape[:2] == (N_TASKS, 75)
     assert (model.replay_buffer.counts == 75).all()
     # contexts are the tasks' own
-    raw = model.replay_buffer.rows[:, :75, 6]
-    assert sorted(model.context.rewards[4].tolist()) == pytest.approx(sorted(raw[4].tolist()), abs=1e-5)
+    raw = model.replay_buffer.transitions(4).rewards[0]
+    assert sorted(model.context.rewards[4].tolist()) == pytest.approx(sorted(raw.tolist()), abs=1e-5)
 
 
 @one_is_enough
@@ -757,6 +759,6 @@ def test_monitors_episode_info(algorithm: type[PEARLSAC], tmp_path: Path) -> Non
     episodes = list(model.ep_info_buffer)
     assert [episode["l"] for episode in episodes] == [25] * N_TASKS
     # copies end together, in waves of three tasks
-    own = model.replay_buffer.rows[:, :25, 6].sum(dim=1)
+    own = [model.replay_buffer.transitions(task).rewards.sum() for task in range(N_TASKS)]
     np.testing.assert_allclose([episode["r"] for episode in episodes], own, rtol=1e-4)
     assert len(list((tmp_path / "monitor").glob("*.monitor.csv"))) == 3

@@ -12,8 +12,15 @@ from meta_toys import EPOCH, N_TASKS, POINT_GOAL, TwoWalks, Walk, WindyWalk, par
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_poem import PEARLSAC, POEMSAC
+from sb3_poem.common.buffers import TaskBatch
 from sb3_poem.common.vec_env import TaskVecEnv
 from sb3_poem.pearl_sac.losses import TaskEmbeddings, actor_loss
+
+
+def transitions_of(model: PEARLSAC, start: int, stop: int) -> TaskBatch:
+    """Stored transitions of all tasks from slot ``start`` to ``stop``, fields (tasks, stop - start, ...)."""
+    stored = [model.replay_buffer.transitions(task) for task in range(model.replay_buffer.n_tasks)]
+    return TaskBatch(*(th.cat(parts)[:, start:stop] for parts in zip(*stored, strict=True)))
 
 
 def nearly_deterministic(model: PEARLSAC) -> PEARLSAC:
@@ -186,23 +193,26 @@ def test_contexts_are_standardised_transitions_with_the_critics_values() -> None
 
     model._replace_context = spy
     model.learn(EPOCH, reset_num_timesteps=False)
-    policy, rows = model.policy, model.replay_buffer.rows[:, 25:50]  # the second epoch's
+    policy, stored = model.policy, transitions_of(model, 25, 50)  # the second epoch's
     transitions = model.context.transitions
     assert transitions.shape == (N_TASKS, 25, 2 + 2 + 2 + 1 + 1)
-    standardised = [((rows[..., s] - policy.obs_mean) / policy.obs_std).clamp(-10, 10) for s in (slice(0, 2), slice(4, 6))]
+    standardised = [
+        ((obs - policy.obs_mean) / policy.obs_std).clamp(-10, 10) for obs in (stored.observations, stored.next_observations)
+    ]
     th.testing.assert_close(transitions[..., :2], standardised[0])
-    assert th.equal(transitions[..., 2:4], rows[..., 2:4])
+    th.testing.assert_close(transitions[..., 2:4], stored.actions, atol=1.6e-5, rtol=0)  # the buffer's actions have 16 bits
     th.testing.assert_close(transitions[..., 4:6], standardised[1])
-    th.testing.assert_close(model.context.rewards, rows[..., 6])
-    th.testing.assert_close(transitions[..., 6], (rows[..., 6] - rows[..., 6].mean()) / rows[..., 6].std(), atol=1e-5, rtol=0)
+    rewards = stored.rewards
+    th.testing.assert_close(model.context.rewards, rewards)
+    th.testing.assert_close(transitions[..., 6], (rewards - rewards.mean()) / rewards.std(), atol=1e-5, rtol=0)
     # Q of the critics before this epoch's updates, the smaller of two, each task under the latent that acted
     policy.critic.load_state_dict(before)
     with th.no_grad():
         values = th.stack(
             [
-                policy.critic(standardised[0][i], rows[i, :, 2:4], th.tensor(latents[0][i]).float().expand(25, -1)).min(dim=0)[
-                    0
-                ]
+                policy.critic(standardised[0][i], transitions[i, :, 2:4], th.tensor(latents[0][i]).float().expand(25, -1)).min(
+                    dim=0
+                )[0]
                 for i in range(N_TASKS)
             ]
         )
@@ -216,9 +226,9 @@ def test_values_are_zero_before_the_first_update() -> None:
 
 def test_observations_and_rewards_are_standardised_by_the_first_epoch() -> None:
     model = small(PEARLSAC, gradient_steps=1).learn(EPOCH)
-    first = model.replay_buffer.rows[:, :25].clone()
+    first = transitions_of(model, 0, 25)
     model.learn(EPOCH, reset_num_timesteps=False)
-    obs, rewards = first[..., :2].reshape(-1, 2).numpy(), first[..., 6].numpy()
+    obs, rewards = first.observations.reshape(-1, 2).numpy(), first.rewards.numpy()
     np.testing.assert_allclose(model.policy.obs_mean.numpy(), obs.mean(axis=0), atol=1e-5)
     np.testing.assert_allclose(model.policy.obs_std.numpy(), obs.std(axis=0), rtol=1e-4)
     assert model.policy.reward_mean.item() == pytest.approx(rewards.mean(), abs=1e-5)
@@ -227,7 +237,7 @@ def test_observations_and_rewards_are_standardised_by_the_first_epoch() -> None:
 
 def test_the_context_is_the_last_epochs_only() -> None:
     model = small(POEMSAC).learn(3 * EPOCH)
-    latest = model.replay_buffer.rows[:, 50:75, 6]
+    latest = transitions_of(model, 50, 75).rewards
     th.testing.assert_close(model.context.rewards, latest)
     own = latest.double().sum(dim=1)
     np.testing.assert_allclose(np.diagonal(model.context.returns.numpy()), own.numpy(), rtol=1e-5)
@@ -253,7 +263,9 @@ def test_a_share_of_every_batch_is_relabelled(fraction: float, n_foreign: int) -
     features = batch.transitions.features.numpy()
     truth = -np.abs(features[..., 0] - tasks) - 0.01 * features[..., 1] ** 2
     np.testing.assert_allclose(batch.transitions.rewards.numpy(), truth, atol=1e-5)  # own or relabelled, all fit the task
-    own = [set(map(tuple, model.replay_buffer.rows[task, :10, :2].tolist())) for task in batch.task_ids]
+    own = [
+        set(map(tuple, model.replay_buffer.transitions(int(task)).observations[0, :10].tolist())) for task in batch.task_ids
+    ]
     is_own = np.array([[tuple(obs) in own[i] for obs in row] for i, row in enumerate(batch.transitions.observations.tolist())])
     assert is_own[:, : 16 - n_foreign].all()
     if n_foreign:
@@ -418,7 +430,7 @@ def test_targets_are_bootstrapped_except_at_an_early_end() -> None:
 def test_predicted_returns_are_sums_of_decoded_rewards() -> None:
     from sb3_poem.common.trajectory import Trajectory
 
-    model = small(POEMSAC, walks(4), horizon=10).learn(120)
+    model = small(POEMSAC, walks(4), horizon=10, precision="fp32").learn(120)
     rng = np.random.default_rng(0)
     lengths, latents = (4, 9), rng.normal(size=(3, 5))
     trajectories = [Trajectory(rng.normal(size=(n + 1, 2)), rng.uniform(-2.0, 4.0, size=(n, 1)), np.zeros(5)) for n in lengths]

@@ -1,0 +1,101 @@
+"""Milliseconds of ``ask`` and ``tell`` without rollouts: latent dimensions, answers, candidates, rules, and 30 tasks at once.
+
+The model is untrained, of POEMSAC's default size; trajectories of 200 steps are random. Neither changes the work, but for
+how often particles thin out. Figures are the means over the first k questions.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import common
+import numpy as np
+import torch as th
+
+from sb3_poem import POEMSAC, Preference
+from sb3_poem.adaptation.options import AdaptationOptions, inference_rng
+from sb3_poem.common.trajectory import Trajectory
+
+DIMENSIONS, CANDIDATES = (5, 16, 32), (100, 1000)
+# With a thousand candidates a question of Algorithm 2 weighs half a million pairs: there ten have to do.
+ANSWERS = {100: (1, 10, 50), 1000: (1, 10)}
+RULES: dict[str, dict[str, Any]] = {
+    "bayes, decoder": {"inference": "bayes", "likelihood": "decoder"},
+    "bayes, similarity": {"inference": "bayes", "likelihood": "similarity"},
+    "paper": {"inference": "paper"},
+}
+STEPS = 200
+
+
+def make_model(latent_dim: int) -> POEMSAC:
+    model = POEMSAC("MlpPolicy", "poem/HalfCheetahVel-v0", n_train_tasks=2, latent_dim=latent_dim, seed=0, device="cpu")
+    model.predicted_rewards_error = 0.05  # a trained model's; an untrained one has measured none
+    model.latent_means = np.random.default_rng(0).standard_normal((120, latent_dim))
+    model.latent_variances = np.full((120, latent_dim), 0.01)
+    return model
+
+
+def trajectory(latent: np.ndarray, rng: np.random.Generator) -> Trajectory:
+    return Trajectory(rng.standard_normal((STEPS + 1, 17)), rng.uniform(-1.0, 1.0, (STEPS, 6)), latent)
+
+
+def milliseconds(model: POEMSAC, n_answers: int, n_tasks: int, seed: int, **options: Any) -> np.ndarray:
+    """Of ``ask`` and ``tell``, for all tasks together, (n_answers, 2)."""
+    settings = AdaptationOptions(n_queries=n_answers, **options)
+    inferences = [settings.make_inference(model, inference_rng(seed + i)) for i in range(n_tasks)]
+    rng = np.random.default_rng(seed)
+    taken = np.zeros((n_answers, 2))
+    for question in range(n_answers):
+        started = time.perf_counter()
+        pairs = [inference.ask_latents() for inference in inferences]
+        taken[question, 0] = time.perf_counter() - started
+        shown = [(trajectory(left, rng), trajectory(right, rng)) for left, right in pairs]
+        answers = [Preference.LEFT if rng.random() < 0.5 else Preference.RIGHT for _ in pairs]
+        started = time.perf_counter()
+        for inference, answer, (left, right) in zip(inferences, answers, shown, strict=True):
+            inference.tell(answer, left, right)
+        taken[question, 1] = time.perf_counter() - started
+    return 1000.0 * taken
+
+
+def main() -> None:
+    """Measure and write."""
+    options = common.arguments(__doc__, lambda parser: parser.add_argument("--repeats", type=int, default=3))
+    th.set_num_threads(1)
+    results: list[dict[str, Any]] = []
+    for dim in DIMENSIONS:
+        model = make_model(dim)
+        for n_candidates in CANDIDATES:
+            runs: dict[str, list[np.ndarray]] = {rule: [] for rule in RULES}
+            for repeat in range(options.repeats if n_candidates == CANDIDATES[0] else 1):
+                for rule, arguments in RULES.items():  # in turns
+                    runs[rule].append(
+                        milliseconds(model, max(ANSWERS[n_candidates]), 1, repeat, n_candidates=n_candidates, **arguments)
+                    )
+            for rule, taken in runs.items():
+                of_run = np.median(taken, axis=0)
+                result = {"rule": rule, "d": dim, "candidates": n_candidates, "worst": float(of_run.sum(axis=1).max())}
+                for k in ANSWERS[n_candidates]:
+                    result[f"k = {k}"] = float(of_run[:k].sum(axis=1).mean())
+                results.append(result)
+    model = make_model(5)
+    many = {rule: milliseconds(model, 10, 30, 0, **arguments).sum(axis=1).mean() for rule, arguments in RULES.items()}
+    header = ["rule", "d", "candidates", *(f"k = {k}" for k in ANSWERS[100]), "worst question"]
+    rows = [
+        [r["rule"], r["d"], r["candidates"], *(r.get(f"k = {k}", "not run") for k in ANSWERS[100]), r["worst"]]
+        for r in results
+    ]
+    sections = [
+        "Milliseconds of `ask` + `tell`, mean over the first k questions.",
+        common.table(header, rows),
+        "30 tasks at once, d = 5, 100 candidates, k = 10: milliseconds a question for all of them.",
+        common.table(["rule", "30 tasks", "each"], [[rule, float(ms), float(ms) / 30] for rule, ms in many.items()]),
+    ]
+    settings = {"threads of torch": 1, "steps of a trajectory": STEPS, "runs": options.repeats, "precision": "auto"}
+    data = {"one task": results, "30 tasks": {rule: float(value) for rule, value in many.items()}}
+    common.write("adaptation-speed", "Adaptation: time without rollouts", sections, data, options.out, settings)
+
+
+if __name__ == "__main__":
+    main()
