@@ -72,8 +72,8 @@ class Clock(EpochCallback):
         return not self.reached
 
 
-def train(env_id: str, entry: dict[str, Any], seed: int, clock: Clock, device: str) -> None:
-    """Train with an entry of hyperparameters until the clock ends it."""
+def train(env_id: str, entry: dict[str, Any], seed: int, clock: Clock, device: str) -> POEMSAC:
+    """Train with an entry of hyperparameters until the clock ends it; returns the model."""
     entry = dict(entry)
     n_timesteps, policy, n_envs = int(entry.pop("n_timesteps")), entry.pop("policy"), entry.pop("n_envs")
     if isinstance(entry.get("policy_kwargs"), str):
@@ -83,7 +83,7 @@ def train(env_id: str, entry: dict[str, Any], seed: int, clock: Clock, device: s
         entry["learning_rate"] = linear_schedule(rate.removeprefix("lin_"))
     model = POEMSAC(policy, TaskVecEnv.from_id(env_id, n_envs), seed=seed, device=device, **entry)
     clock.started = time.perf_counter()
-    model.learn(n_timesteps, callback=clock, progress_bar=False)
+    return model.learn(n_timesteps, callback=clock)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -96,6 +96,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--every", type=int, default=1)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--save", type=Path, help="folder for the models")
     parser.add_argument("--conf", type=Path, default=Path(__file__).parents[1] / "zoo_configs" / "poem_sac.yml")
 
 
@@ -107,7 +108,9 @@ def main() -> None:
     results, rows = [], []
     for seed in given.seeds:
         clock = Clock(given.env, given.target, given.rules, 300 + seed, given.from_step, given.every)
-        train(given.env, entry, seed, clock, given.device)
+        model = train(given.env, entry, seed, clock, given.device)
+        if given.save:
+            model.save(given.save / f"seed{seed}.zip")
         last = clock.evaluations[-1]
         results.append({"seed": seed, "reached": clock.reached, "evaluations": clock.evaluations, "entry": entry})
         returns = [f"{last[rule]:.1f}" for rule in given.rules]
@@ -115,7 +118,7 @@ def main() -> None:
         rows.append([seed, reached, round(last["seconds"]), last["env_steps"], last["updates"], *returns])
     text = table(["seed", f"reached {given.target:g}", "seconds", "environment steps", "updates", *given.rules], rows)
     name = f"time-to-result-{given.env.split('/')[-1].split('-')[0]}{'' if given.device == 'cpu' else f'-{given.device}'}"
-    settings = {key: str(value) for key, value in vars(given).items() if key not in ("out", "conf")}
+    settings = {key: str(value) for key, value in vars(given).items() if key not in ("out", "conf", "save")}
     write(name, f"Time to {given.target:g} on {given.env}", [DESCRIPTION, text], results, given.out, settings, given.threads)
 
 
