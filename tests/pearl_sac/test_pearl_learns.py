@@ -10,8 +10,11 @@ from sb3_poem.common.vec_env import TaskVecEnv
 
 
 def test_pearl_learns_point_goal() -> None:
-    """A fifth of the way from the best that a policy can do blindly to the best that there is (measured: 40 to 65 %)."""
-    model = PEARLSAC("MlpPolicy", POINT_GOAL, **LEARN).learn(LEARN_STEPS)
+    """
+    A fifth of the way from the best that a policy can do blindly to the best that there is. Measured: 70 %, but how soon the
+    latents begin to tell depends on the seed; another had come 12 % of the way by then.
+    """
+    model = PEARLSAC("MlpPolicy", POINT_GOAL, **LEARN).learn(2 * LEARN_STEPS)
     tasks, latents = model.train_tasks, model.task_latents
     env = TaskVecEnv.from_id(POINT_GOAL, len(tasks))
     own = evaluate_latents(model, env, latents, tasks, n_episodes=2, seed=5).mean()
