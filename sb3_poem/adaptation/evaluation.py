@@ -187,7 +187,7 @@ def evaluate_adaptation(
     :param n_episodes: Episodes per measurement.
     :param seed: Task i adapts with seed + i; the episodes' seeds follow from it too.
     :param progress_bar: Whether to show one.
-    :param options: Further options of :func:`adapt_tasks`.
+    :param options: Further options of :func:`adapt_tasks`; ``adapter`` chooses the method.
     :return: The returns.
     :raises ValueError: If an argument is out of its range.
     """
