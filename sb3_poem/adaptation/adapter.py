@@ -68,7 +68,7 @@ class PreferenceAdapter:
     """
 
     #: What one task's and many tasks' adaptation by this method are built from.
-    options_class: ClassVar[type] = AdaptationOptions
+    options_class: ClassVar[Any] = AdaptationOptions
 
     def __init__(
         self,
@@ -139,6 +139,8 @@ class PreferenceAdapter:
             oracle.bind(self.env)
         self.library = None if library is None else list(library)
         self.inference = options.make_inference(model, inference_rng(self.seed), self.library)
+        if hasattr(self.inference, "bind"):  # a method that is allowed to read rewards
+            self.inference.bind(self.env)
         self._pending: Query | None = None
         self._previous: tuple[Snapshot, Query] | None = None
 

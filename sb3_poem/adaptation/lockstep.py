@@ -85,6 +85,10 @@ def adapt_tasks(
     settings.check(model, vec_env, library)
     inferences = [settings.make_inference(model, inference_rng(seed + i), library) for i in range(len(tasks))]
 
+    for inference, task in zip(inferences, tasks, strict=True):
+        if hasattr(inference, "bind"):  # a method that is allowed to read rewards
+            inference.bind(vec_env, task)
+
     preferences: list[list[Preference]] = [[] for _ in tasks]
     latents = np.empty((len(tasks), len(kept), model.latent_dim))
     for query in tqdm(range(n_queries + 1), unit="query", disable=not progress_bar):

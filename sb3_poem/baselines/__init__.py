@@ -2,5 +2,6 @@
 
 from sb3_poem.baselines.anole import ANOLEAdapter
 from sb3_poem.baselines.fragments import replay_fragments, training_rollouts
+from sb3_poem.baselines.reward_oracle import RewardOracleAdapter
 
-__all__ = ["ANOLEAdapter", "replay_fragments", "training_rollouts"]
+__all__ = ["ANOLEAdapter", "RewardOracleAdapter", "replay_fragments", "training_rollouts"]

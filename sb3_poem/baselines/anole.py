@@ -254,7 +254,7 @@ class ANOLEAdapter(PreferenceAdapter):
         :meth:`ANOLEOptions.check`.
     """
 
-    options_class: ClassVar[type] = ANOLEOptions
+    options_class: ClassVar[Any] = ANOLEOptions
 
     def __init__(
         self,
