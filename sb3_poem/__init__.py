@@ -20,7 +20,7 @@ if TYPE_CHECKING:
         ReturnOracle,
     )
     from sb3_poem.adaptation.callback import AdaptationEvalCallback
-    from sb3_poem.baselines import ANOLEAdapter, RewardOracleAdapter
+    from sb3_poem.baselines import ANOLEAdapter, MAMLRewardAdapter, RewardOracleAdapter
     from sb3_poem.common.callbacks import TrainingCheckpointCallback
     from sb3_poem.common.vec_env import TaskVecEnv
     from sb3_poem.pearl_sac import PEARLSAC
@@ -32,6 +32,7 @@ _HOME = {
     "POEMSAC": "sb3_poem.poem_sac",
     "PEARLSAC": "sb3_poem.pearl_sac",
     "ANOLEAdapter": "sb3_poem.baselines",
+    "MAMLRewardAdapter": "sb3_poem.baselines",
     "RewardOracleAdapter": "sb3_poem.baselines",
     "PreferenceAdapter": "sb3_poem.adaptation",
     "Preference": "sb3_poem.adaptation",
@@ -52,6 +53,7 @@ __all__ = [
     "AdaptationEvalCallback",
     "BoltzmannOracle",
     "HumanOracle",
+    "MAMLRewardAdapter",
     "MistakeOracle",
     "Preference",
     "PreferenceAdapter",

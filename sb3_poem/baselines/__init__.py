@@ -2,6 +2,17 @@
 
 from sb3_poem.baselines.anole import ANOLEAdapter
 from sb3_poem.baselines.fragments import replay_fragments, training_rollouts
+from sb3_poem.baselines.maml_adapter import MAMLRewardAdapter, MAMLRewardModel
+from sb3_poem.baselines.maml_reward import MetaReward, meta_train_reward
 from sb3_poem.baselines.reward_oracle import RewardOracleAdapter
 
-__all__ = ["ANOLEAdapter", "RewardOracleAdapter", "replay_fragments", "training_rollouts"]
+__all__ = [
+    "ANOLEAdapter",
+    "MAMLRewardAdapter",
+    "MAMLRewardModel",
+    "MetaReward",
+    "RewardOracleAdapter",
+    "meta_train_reward",
+    "replay_fragments",
+    "training_rollouts",
+]

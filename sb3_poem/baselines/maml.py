@@ -19,8 +19,8 @@ class PreferencePairs(NamedTuple):
     """
     Pairs of fragments and which is better.
 
-    :param left: (..., pairs, steps, in_dim) transitions (s, a, s').
-    :param right: (..., pairs, steps, in_dim).
+    :param left: (..., pairs, steps, in_dim + 1) transitions as :class:`RewardNetwork` takes them.
+    :param right: (..., pairs, steps, in_dim + 1).
     :param label: (..., pairs) 1 where the left one is better, 0 where the right one is, 0.5 where neither is.
     """
 
@@ -43,15 +43,15 @@ class RewardNetwork(nn.Module):
         self.mlp = MLP(in_dim, 1, net_arch, nn.Tanh)
 
     def forward(self, transitions: th.Tensor) -> th.Tensor:
-        """(..., in_dim) -> (...)."""
-        return self.mlp(transitions).squeeze(-1)
+        """(..., in_dim + 1), the last entry 1, or 0 for what only fills up an episode that ended early -> (...)."""
+        return self.mlp(transitions[..., :-1]).squeeze(-1) * transitions[..., -1]
 
 
 def preference_loss(network: nn.Module, parameters: Parameters, pairs: PreferencePairs) -> th.Tensor:
     """
     Bradley-Terry cross-entropy of the sums of predicted rewards.
 
-    :param network: Maps (..., in_dim) to (...).
+    :param network: A :class:`RewardNetwork`.
     :param parameters: Its parameters, by name.
     :param pairs: Of one task.
     :return: The mean over the pairs.
