@@ -20,6 +20,7 @@ if TYPE_CHECKING:
         ReturnOracle,
     )
     from sb3_poem.adaptation.callback import AdaptationEvalCallback
+    from sb3_poem.baselines import ANOLEAdapter, MAMLRewardAdapter, RewardOracleAdapter
     from sb3_poem.common.callbacks import TrainingCheckpointCallback
     from sb3_poem.common.vec_env import TaskVecEnv
     from sb3_poem.pearl_sac import PEARLSAC
@@ -30,6 +31,9 @@ __version__ = Path(__file__).with_name("version.txt").read_text().strip()
 _HOME = {
     "POEMSAC": "sb3_poem.poem_sac",
     "PEARLSAC": "sb3_poem.pearl_sac",
+    "ANOLEAdapter": "sb3_poem.baselines",
+    "MAMLRewardAdapter": "sb3_poem.baselines",
+    "RewardOracleAdapter": "sb3_poem.baselines",
     "PreferenceAdapter": "sb3_poem.adaptation",
     "Preference": "sb3_poem.adaptation",
     "Query": "sb3_poem.adaptation",
@@ -45,14 +49,17 @@ _HOME = {
 __all__ = [
     "PEARLSAC",
     "POEMSAC",
+    "ANOLEAdapter",
     "AdaptationEvalCallback",
     "BoltzmannOracle",
     "HumanOracle",
+    "MAMLRewardAdapter",
     "MistakeOracle",
     "Preference",
     "PreferenceAdapter",
     "Query",
     "ReturnOracle",
+    "RewardOracleAdapter",
     "TaskVecEnv",
     "TrainingCheckpointCallback",
     "__version__",

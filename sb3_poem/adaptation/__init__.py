@@ -18,6 +18,7 @@ from sb3_poem.adaptation.noise import BoltzmannNoise, ExactNoise, MistakeNoise, 
 from sb3_poem.adaptation.oracles import BoltzmannOracle, MistakeOracle, ReturnOracle, TaskOracle
 from sb3_poem.adaptation.policy import AdaptedPolicy
 from sb3_poem.adaptation.preference import Preference, Query
+from sb3_poem.adaptation.rate_distortion import answer_capacity, rate_distortion_limit
 from sb3_poem.common.trajectory import Trajectory
 
 __all__ = [
@@ -40,6 +41,7 @@ __all__ = [
     "TaskOracle",
     "Trajectory",
     "adapt_tasks",
+    "answer_capacity",
     "best_codebook",
     "evaluate_adaptation",
     "evaluate_episodes",
@@ -47,4 +49,5 @@ __all__ = [
     "information_limit",
     "known_task_return",
     "property_one",
+    "rate_distortion_limit",
 ]

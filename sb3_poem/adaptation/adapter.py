@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 
-from sb3_poem.adaptation.bayes import BayesInference
-from sb3_poem.adaptation.environments import as_vec_env, check_model_fits
+from sb3_poem.adaptation.environments import as_vec_env
 from sb3_poem.adaptation.inference import Answer, Snapshot
 from sb3_poem.adaptation.noise import NoiseModel
 from sb3_poem.adaptation.options import AdaptationOptions, inference_rng, rollout_seed
@@ -24,7 +23,6 @@ from sb3_poem.common.trajectory import Trajectory
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
-FORMAT = "sb3_poem.PreferenceAdapter"
 FORMAT_VERSION = 1
 
 Oracle = Callable[[Trajectory, Trajectory], Any]
@@ -69,6 +67,9 @@ class PreferenceAdapter:
     :raises ValueError: If an argument is out of its range, or the model belongs to another environment.
     """
 
+    #: What one task's and many tasks' adaptation by this method are built from.
+    options_class: ClassVar[Any] = AdaptationOptions
+
     def __init__(
         self,
         model: Any,
@@ -88,27 +89,40 @@ class PreferenceAdapter:
         deterministic: bool = True,
         library: Sequence[Trajectory] | None = None,
     ) -> None:
-        if noise_model is None and oracle is not None:
-            noise_model = getattr(oracle, "noise_model", None)
-        options = AdaptationOptions(
-            n_queries,
-            inference,
-            query_rule,
-            n_candidates,
-            epsilon,
-            candidates,
-            likelihood,
-            decision,
-            noise_model,
-            deterministic,
+        options = self.make_options(
+            oracle,
+            n_queries=n_queries,
+            inference=inference,
+            query_rule=query_rule,
+            n_candidates=n_candidates,
+            epsilon=epsilon,
+            candidates=candidates,
+            likelihood=likelihood,
+            decision=decision,
+            noise_model=noise_model,
+            deterministic=deterministic,
         )
         self._start(model, env, options, oracle, seed, library)
+
+    @classmethod
+    def make_options(cls, oracle: Any = None, **options: Any) -> Any:
+        """
+        The options of an adaptation, which one task and many tasks share.
+
+        :param oracle: Who will answer.
+        :param options: Those of the constructor.
+        :return: An ``options_class``.
+        :raises ValueError: If an option is out of its range.
+        """
+        if options.get("noise_model") is None:
+            options["noise_model"] = getattr(oracle, "noise_model", None)
+        return cls.options_class(**options)
 
     def _start(
         self,
         model: Any,
         env: gym.Env | str | VecEnv,
-        options: AdaptationOptions,
+        options: Any,
         oracle: Oracle | None,
         seed: int | None,
         library: Sequence[Trajectory] | None,
@@ -119,12 +133,14 @@ class PreferenceAdapter:
         self.options = options
         self.seed = int(np.random.SeedSequence().generate_state(1)[0] >> 1) if seed is None else int(seed)
         self.env, self._owns_env = as_vec_env(env, render=bool(getattr(oracle, "needs_frames", False)))
-        check_model_fits(model, self.env)
+        options.check(model, self.env, library)
         self.oracle = oracle
         if oracle is not None and hasattr(oracle, "bind") and getattr(oracle, "env", None) is None:
             oracle.bind(self.env)
         self.library = None if library is None else list(library)
         self.inference = options.make_inference(model, inference_rng(self.seed), self.library)
+        if hasattr(self.inference, "bind"):  # a method that is allowed to read rewards
+            self.inference.bind(self.env)
         self._pending: Query | None = None
         self._previous: tuple[Snapshot, Query] | None = None
 
@@ -234,15 +250,19 @@ class PreferenceAdapter:
         if self._owns_env:
             self.env.close()
 
+    @classmethod
+    def _format(cls) -> str:
+        return f"sb3_poem.{cls.__name__}"
+
     @property
     def _needs_frames(self) -> bool:
         return bool(getattr(self.oracle, "needs_frames", False))
 
     def _make_query(self) -> Query:
-        if self.library is not None:
-            assert isinstance(self.inference, BayesInference)
+        library = self.inference.library
+        if library is not None:
             left, right = self.inference.ask_library()
-            return Query(self.library[left], self.library[right])
+            return Query(library[left], library[right])
         return self._roll_out(*self.inference.ask_latents())
 
     def _roll_out(self, left: np.ndarray, right: np.ndarray) -> Query:
@@ -264,7 +284,7 @@ class PreferenceAdapter:
         :return: A dictionary that :meth:`from_dict` reads.
         """
         return {
-            "format": FORMAT,
+            "format": self._format(),
             "version": FORMAT_VERSION,
             "model": {"latent_dim": int(self.model.latent_dim), "env_id": getattr(self.model, "env_id", None)},
             "seed": self.seed,
@@ -299,8 +319,8 @@ class PreferenceAdapter:
         :return: The adapter.
         :raises ValueError: If the data is broken, of another version, or belongs to another model.
         """
-        if data.get("format") != FORMAT:
-            raise ValueError(f"not a saved adaptation: `format` is {data.get('format')!r}, not {FORMAT!r}")
+        if data.get("format") != cls._format():
+            raise ValueError(f"not a saved adaptation: `format` is {data.get('format')!r}, not {cls._format()!r}")
         if data.get("version") != FORMAT_VERSION:
             raise ValueError(f"a saved adaptation of version {data.get('version')!r}; this program reads {FORMAT_VERSION}")
         try:
@@ -308,7 +328,7 @@ class PreferenceAdapter:
             if data["uses_library"] and library is None:
                 raise ValueError("this adaptation asks about a library of trajectories; pass the same `library` again")
             adapter = cls.__new__(cls)
-            options = AdaptationOptions.from_dict(data["options"])
+            options = cls.options_class.from_dict(data["options"])
             adapter._start(model, env, options, oracle, int(data["seed"]), library)
             answers = [Answer(Preference(item["preference"]), *_pair_from_dict(item)) for item in data["answers"]]
             adapter.inference.restore(Snapshot.from_dict(data["inference"]), answers)

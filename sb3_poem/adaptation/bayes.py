@@ -149,14 +149,9 @@ class BayesInference(LatentInference):
         return policies[first], policies[second]
 
     def ask_library(self) -> tuple[int, int]:
-        """
-        The two trajectories of the library to compare next.
-
-        :return: Two different indices.
-        :raises RuntimeError: If there is no library.
-        """
+        """See :class:`LatentInference`."""
         if self.library is None:
-            raise RuntimeError("there is no library to ask about; pass `library`")
+            return super().ask_library()
         if self.query_rule == "random":
             return draw_random_pair(len(self.library), self.rng)
         if self._library_returns is None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from sb3_poem.adaptation.limits import information_limit
 from sb3_poem.adaptation.lockstep import OracleFactory, adapt_tasks
+from sb3_poem.adaptation.noise import NoiseModel
 from sb3_poem.adaptation.oracles import ReturnOracle, compute_reward
 from sb3_poem.adaptation.preference import Preference
 from sb3_poem.common.rollouts import rollout_features, rollout_outcomes
@@ -186,7 +187,7 @@ def evaluate_adaptation(
     :param n_episodes: Episodes per measurement.
     :param seed: Task i adapts with seed + i; the episodes' seeds follow from it too.
     :param progress_bar: Whether to show one.
-    :param options: Further options of :func:`adapt_tasks`.
+    :param options: Further options of :func:`adapt_tasks`; ``adapter`` chooses the method.
     :return: The returns.
     :raises ValueError: If an argument is out of its range.
     """
@@ -246,14 +247,17 @@ class KnownTaskReturn:
         """Share of successful episodes; None for a family that does not say."""
         return None if self.successes is None else float(self.successes.mean())
 
-    def limit(self, k: int) -> float:
+    def limit(self, k: int, noise_model: NoiseModel | None = None) -> float:
         """
         The information limit for k answers within this repertoire, see :func:`information_limit`.
 
         :param k: Number of answers.
+        :param noise_model: How the oracle errs; None is an oracle that does not.
         :return: A mean return.
         """
-        return information_limit(self.candidate_returns, k)
+        ordered = self.tasks.shape[1] == 1
+        returns = self.candidate_returns[np.argsort(self.tasks[:, 0])] if ordered else self.candidate_returns
+        return information_limit(returns, k, noise_model=noise_model, ordered=ordered)
 
 
 def known_task_return(

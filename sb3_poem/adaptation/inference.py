@@ -85,6 +85,9 @@ class LatentInference(ABC):
     :raises ValueError: If an argument is out of its range.
     """
 
+    #: Trajectories to ask about; None where questions are new rollouts.
+    library: list[Trajectory] | None = None
+
     def __init__(
         self, model: Any, n_candidates: int, epsilon: float, candidates: str, query_rule: str, rng: np.random.Generator
     ) -> None:
@@ -104,6 +107,15 @@ class LatentInference(ABC):
 
         :return: Two latents (d,).
         """
+
+    def ask_library(self) -> tuple[int, int]:
+        """
+        The two trajectories of the library to compare next.
+
+        :return: Two different indices.
+        :raises RuntimeError: If there is no library.
+        """
+        raise RuntimeError("there is no library to ask about; pass `library`")
 
     @abstractmethod
     def tell(self, preference: Preference, left: Shown, right: Shown) -> None:

@@ -2,48 +2,64 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import combinations
 from math import comb
 
 import numpy as np
+
+from sb3_poem.adaptation.noise import NoiseModel
+from sb3_poem.adaptation.rate_distortion import answer_capacity, rate_distortion_limit
 
 # Up to this many codebooks are tried one by one; beyond, greedy choice and swaps.
 EXACT_CODEBOOKS = 5000
 MAX_SWAP_ROUNDS = 50
 
 
-def information_limit(returns: np.ndarray, k: int) -> float:
+def information_limit(returns: np.ndarray, k: int, *, noise_model: NoiseModel | None = None, ordered: bool = False) -> float:
     """
     The highest mean return that any method can reach with k binary answers.
 
     k answers tell at most 2^k tasks apart, so a method ends in one of at most 2^k policies; the best choice of those and,
-    for every task, the best of them, bounds it. Found exactly where all codebooks can be tried (or where there is one
-    policy for each task), else as a k-medoids optimum by greedy choice and swaps, which may lie slightly below the true
-    bound.
+    for every task, the best of them, bounds it (:func:`best_codebook`). Answers of an oracle that errs tell less than a
+    bit each: then the rate-distortion bound at the bits that they do tell applies (:func:`rate_distortion_limit`).
 
     The bound holds for the tasks that are given: with 30 test tasks it ends at the known-task return after five
-    answers. For a bound on the family take a dense grid of tasks.
+    answers. For a bound on the family take a dense grid of tasks. An answer of EQUAL, which tells a little more than
+    LEFT or RIGHT alone, is not provided for.
 
-    :param returns: (n_tasks, n_policies) return of each policy on each task.
+    :param returns: (n_tasks, n_policies) return of each policy on each task (J).
     :param k: Number of answers.
+    :param noise_model: How the oracle errs; None is an oracle that does not.
+    :param ordered: See :func:`best_codebook`.
     :return: The mean return over the tasks.
-    :raises ValueError: If the matrix is empty or not finite, or k is negative.
+    :raises ValueError: If the matrix is empty or not finite, k is negative, or the noise model is of an unknown kind.
     """
     if k < 0:
         raise ValueError(f"`k` must not be negative, but is {k}")
     returns = _check_returns(returns)
+    capacity = answer_capacity(noise_model, returns)
     n_tasks, n_policies = returns.shape
     if k >= 63 or 2**k >= min(n_tasks, n_policies):
-        return float(returns.max(axis=1).mean())
-    return float(returns[:, best_codebook(returns, 2**k)].max(axis=1).mean())
+        limit = float(returns.max(axis=1).mean())
+    else:
+        limit = _value(returns, best_codebook(returns, 2**k, ordered=ordered))
+    return limit if capacity == 1.0 else min(limit, rate_distortion_limit(returns, k * capacity))
 
 
-def best_codebook(returns: np.ndarray, size: int) -> np.ndarray:
+def best_codebook(returns: np.ndarray, size: int, *, ordered: bool = False) -> np.ndarray:
     """
-    The set of policies of a given size with the highest mean over tasks of the best return.
+    The set of policies of a given size with the highest mean over tasks of the best return (k-medoids on the matrix).
+
+    Found exactly where all sets can be tried, or by dynamic programming where tasks lie on a line (``ordered``); else by
+    greedy choice and swaps, which may lie slightly below the optimum.
 
     :param returns: (n_tasks, n_policies).
     :param size: How many policies, at least 1.
+    :param ordered: Whether the rows are in the order of a one-dimensional task parameter. The optimum is then found
+        among all ways to cut the line into ``size`` intervals, one policy each. That is exact if of any two policies the
+        one is better up to some task and the other from there on, as with a goal speed; noise in the returns
+        may break this, so the general search is tried too.
     :return: (min(size, n_policies),) policy indices, ascending.
     :raises ValueError: If the matrix is empty or not finite, or the size is below 1.
     """
@@ -56,13 +72,54 @@ def best_codebook(returns: np.ndarray, size: int) -> np.ndarray:
     if comb(n_policies, size) <= EXACT_CODEBOOKS:
         books = np.array(list(combinations(range(n_policies), size)))
         return books[np.argmax(returns[:, books].max(axis=2).mean(axis=0))]
-    return np.sort(_swap(returns, _greedy(returns, size)))
+    found = [_swap(returns, _greedy(returns, size))]
+    if ordered:
+        found.append(_fill(returns, best_intervals(returns, size), size))
+    return np.sort(max(found, key=lambda book: _value(returns, book)))
 
 
-def _greedy(returns: np.ndarray, size: int) -> np.ndarray:
-    best = np.full(len(returns), -np.inf)
-    chosen: list[int] = []
-    for _ in range(size):
+def best_intervals(returns: np.ndarray, size: int) -> np.ndarray:
+    """
+    The policies of the best cut of an ordered list of tasks into at most ``size`` intervals, by dynamic programming.
+
+    :param returns: (n_tasks, n_policies), rows in the order of the task parameter.
+    :param size: How many intervals at most.
+    :return: Policy indices, ascending and each once, at most ``size``.
+    """
+    n_tasks = len(returns)
+    sums = np.concatenate([np.zeros((1, returns.shape[1])), np.cumsum(returns, axis=0)])
+    # worth[s, t] is what the best policy for the tasks s, ..., t - 1 earns on them.
+    worth = np.full((n_tasks + 1, n_tasks + 1), -np.inf)
+    for start in range(n_tasks):
+        worth[start, start + 1 :] = (sums[start + 1 :] - sums[start]).max(axis=1)
+    best = np.full(n_tasks + 1, -np.inf)
+    best[0] = 0.0
+    cuts: list[np.ndarray] = []
+    for _ in range(min(size, n_tasks)):
+        totals = best[:, None] + worth
+        cuts.append(np.argmax(totals, axis=0))
+        best = totals.max(axis=0)
+    chosen, end = set(), n_tasks
+    for cut in reversed(cuts):
+        start = int(cut[end])
+        chosen.add(int(np.argmax(sums[end] - sums[start])))
+        end = start
+    return np.array(sorted(chosen))
+
+
+def _fill(returns: np.ndarray, chosen: np.ndarray, size: int) -> np.ndarray:
+    """Two intervals may share a policy; add others, the best first."""
+    return _greedy(returns, size, chosen) if len(chosen) < size else chosen
+
+
+def _value(returns: np.ndarray, book: np.ndarray) -> float:
+    return float(returns[:, book].max(axis=1).mean())
+
+
+def _greedy(returns: np.ndarray, size: int, first: Sequence[int] | np.ndarray = ()) -> np.ndarray:
+    chosen = [int(policy) for policy in first]
+    best = returns[:, chosen].max(axis=1) if chosen else np.full(len(returns), -np.inf)
+    for _ in range(size - len(chosen)):
         gains = np.maximum(returns, best[:, None]).mean(axis=0)
         gains[chosen] = -np.inf
         chosen.append(int(np.argmax(gains)))
@@ -73,7 +130,7 @@ def _greedy(returns: np.ndarray, size: int) -> np.ndarray:
 def _swap(returns: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     """Replace one policy at a time by the best other one, as long as that helps."""
     chosen = chosen.copy()
-    value = returns[:, chosen].max(axis=1).mean()
+    value = _value(returns, chosen)
     for _ in range(MAX_SWAP_ROUNDS):
         improved = False
         for position in range(len(chosen)):

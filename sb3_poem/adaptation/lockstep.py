@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sb3_poem.adaptation.environments import check_model_fits
-from sb3_poem.adaptation.options import AdaptationOptions, inference_rng, rollout_seed
+from sb3_poem.adaptation.adapter import PreferenceAdapter
+from sb3_poem.adaptation.options import inference_rng, rollout_seed
 from sb3_poem.adaptation.preference import Preference, as_preference
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
@@ -43,6 +43,7 @@ def adapt_tasks(
     tasks: np.ndarray,
     oracle_factory: OracleFactory,
     *,
+    adapter: type[PreferenceAdapter] = PreferenceAdapter,
     n_queries: int = 10,
     record_at: Sequence[int] | None = None,
     seed: int = 0,
@@ -53,7 +54,7 @@ def adapt_tasks(
     """
     Adapt a model to each of many tasks, with all rollouts of a question in lockstep.
 
-    Task i is adapted as ``PreferenceAdapter(model, env, seed=seed + i, ...)`` would alone: with the same candidates, questions
+    Task i is adapted as ``adapter(model, env, seed=seed + i, ...)`` would alone: with the same candidates, questions
     and reset seeds. (Matrix products may round otherwise in a batch than alone, in the last bits.) The tasks are set in
     ``vec_env`` for the rollouts, and known to the oracles; inference never sees them.
 
@@ -62,13 +63,14 @@ def adapt_tasks(
     :param tasks: (n_tasks, task_dim).
     :param oracle_factory: Called as ``oracle_factory(env=vec_env, task=task, seed=seed + i)``, gives task i's oracle. The
         oracles' classes will do, and ``functools.partial(MistakeOracle, 0.1)``.
+    :param adapter: The method: :class:`PreferenceAdapter`, or a baseline's adapter that ends in a latent.
     :param n_queries: Answers per task.
     :param record_at: Numbers of answers at which to keep the estimate; None keeps 0, 1, ..., n_queries.
     :param seed: Task i takes seed + i.
     :param library: See :class:`PreferenceAdapter`.
     :param progress_bar: Whether to show one.
-    :param options: Further options of :class:`PreferenceAdapter`: ``inference``, ``query_rule``, ``n_candidates``,
-        ``epsilon``, ``candidates``, ``likelihood``, ``decision``, ``noise_model``, ``deterministic``.
+    :param options: Further options of the adapter; for :class:`PreferenceAdapter` ``inference``, ``query_rule``,
+        ``n_candidates``, ``epsilon``, ``candidates``, ``likelihood``, ``decision``, ``noise_model``, ``deterministic``.
     :return: The estimates.
     :raises ValueError: If an argument is out of its range, or the model belongs to another environment.
     """
@@ -78,12 +80,14 @@ def adapt_tasks(
     if tasks.ndim != 2 or len(tasks) < 1:
         raise ValueError(f"`tasks` must have shape (n_tasks, task_dim) with at least one task, but has shape {tasks.shape}")
     kept = _check_record_at(record_at, n_queries)
-    check_model_fits(model, vec_env)
     oracles = [oracle_factory(env=vec_env, task=task, seed=seed + i) for i, task in enumerate(tasks)]
-    if options.get("noise_model") is None:
-        options["noise_model"] = getattr(oracles[0], "noise_model", None)
-    settings = AdaptationOptions(n_queries=n_queries, **options)
+    settings = adapter.make_options(oracles[0], n_queries=n_queries, **options)
+    settings.check(model, vec_env, library)
     inferences = [settings.make_inference(model, inference_rng(seed + i), library) for i in range(len(tasks))]
+
+    for inference, task in zip(inferences, tasks, strict=True):
+        if hasattr(inference, "bind"):  # a method that is allowed to read rewards
+            inference.bind(vec_env, task)
 
     preferences: list[list[Preference]] = [[] for _ in tasks]
     latents = np.empty((len(tasks), len(kept), model.latent_dim))
@@ -92,9 +96,9 @@ def adapt_tasks(
             latents[:, kept.index(query)] = [inference.estimate() for inference in inferences]
         if query == n_queries or query >= kept[-1]:
             break
-        pairs = [inference.ask_latents() for inference in inferences] if library is None else None
-        shown: list[Trajectory]
-        if pairs is not None:
+        shown: list[Trajectory] = []
+        if inferences[0].library is None:
+            pairs = [inference.ask_latents() for inference in inferences]
             seeds = [rollout_seed(seed + i, query) for i in range(len(tasks))]
             shown = rollout_latents(
                 model,
@@ -105,8 +109,8 @@ def adapt_tasks(
                 settings.deterministic,
             )
         else:
-            assert library is not None
-            shown = [library[index] for inference in inferences for index in inference.ask_library()]  # type: ignore[attr-defined]
+            for inference in inferences:
+                shown += [inference.library[index] for index in inference.ask_library()]
         for i, (inference, oracle) in enumerate(zip(inferences, oracles, strict=True)):
             left, right = shown[2 * i], shown[2 * i + 1]
             answer = as_preference(oracle(left, right))

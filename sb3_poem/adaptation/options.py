@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sb3_poem.adaptation.bayes import LIKELIHOODS, BayesInference
 from sb3_poem.adaptation.decisions import DECISIONS
+from sb3_poem.adaptation.environments import check_model_fits
 from sb3_poem.adaptation.inference import LatentInference, PaperInference
 from sb3_poem.adaptation.noise import NoiseModel, noise_model_from_dict
 from sb3_poem.common.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
 
 INFERENCES = ("bayes", "paper")
 # Nats between the aggregate posterior and N(0, I) up to which draws of the latter are as good as trained latents: measured
@@ -44,6 +48,17 @@ class AdaptationOptions:
             raise ValueError(f"`likelihood` must be one of {LIKELIHOODS} or None, but is {self.likelihood!r}")
         if self.decision not in DECISIONS:
             raise ValueError(f"`decision` must be one of {DECISIONS}, but is {self.decision!r}")
+
+    def check(self, model: Any, vec_env: VecEnv, library: Sequence[Trajectory] | None = None) -> None:
+        """
+        Refuse a model or an environment with which the method cannot run, before anything starts.
+
+        :param model: The model.
+        :param vec_env: The environment to adapt in.
+        :param library: See :class:`PreferenceAdapter`.
+        :raises ValueError: If they do not fit.
+        """
+        check_model_fits(model, vec_env)
 
     def _default_candidates(self, model: Any) -> str:
         """Algorithm 2's own prior, unless "bayes" would find it far from what the policy was trained on."""

@@ -83,8 +83,7 @@ class TaskOracle(ABC):
                 f"{type(self).__name__} computes returns from reward features, but the trajectory has none: its environment "
                 'gave no info["reward_features"]. Use an oracle that does not need them, such as HumanOracle.'
             )
-        task = _current_task(self.env) if self.task is None else self.task
-        value = float(np.sum(compute_reward(self.env, task, trajectory.reward_features)))
+        value = float(np.sum(step_rewards(self.env, self.task, trajectory)))
         if not np.isfinite(value):
             raise ValueError(f"the true return of a trajectory is {value}; its reward features are not finite")
         return value
@@ -185,6 +184,21 @@ def compute_reward(env: gym.Env | VecEnv, tasks: np.ndarray, features: np.ndarra
     :raises ValueError: If the environment is no task family.
     """
     return np.asarray(_call(env, "compute_reward", tasks, features), dtype=np.float64)
+
+
+def step_rewards(env: gym.Env | VecEnv, task: np.ndarray | None, trajectory: Trajectory) -> np.ndarray:
+    """
+    The true rewards of a trajectory.
+
+    :param env: A task family: a ``gym.Env``, or an SB3 ``VecEnv`` of them.
+    :param task: (task_dim,); None takes the one in effect in ``env`` (in a ``VecEnv``, in its first copy).
+    :param trajectory: It, with its reward features.
+    :return: (T,).
+    :raises ValueError: If it has no reward features, or the environment is no task family.
+    """
+    if trajectory.reward_features is None:
+        raise ValueError('the trajectory has no reward features: its environment gave no info["reward_features"]')
+    return compute_reward(env, _current_task(env) if task is None else task, trajectory.reward_features)
 
 
 def _current_task(env: gym.Env | VecEnv) -> np.ndarray:

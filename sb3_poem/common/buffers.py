@@ -150,6 +150,14 @@ class TaskReplayBuffer(ReplayBuffer):
         slots = (uniform * self._counts_on_device[source_tasks]).long()
         return self._gather(source_tasks * self.rows.shape[1] + slots)
 
+    def at(self, tasks: th.Tensor, slots: th.Tensor) -> TaskBatch:
+        """The transitions in some slots; following slots hold following steps, but at the end of an episode and of the ring.
+
+        :param tasks: (...) indices of tasks
+        :param slots: (...), below the tasks' ``counts``
+        """
+        return self._gather(tasks * self.rows.shape[1] + slots)
+
     def transitions(self, task: int) -> TaskBatch:
         """All transitions of a task, in the order of their slots: those of :class:`TaskBatch`, each (1, count, ...).
 

@@ -52,6 +52,7 @@ def save_pretrained(model: "PEARLSAC", folder: str | Path, card: dict[str, Any] 
         "n_critics": model.policy.n_critics,
         "reward_feature_dim": model.reward_feature_dim,
         "predicted_rewards_error": model.predicted_rewards_error,
+        "context_reward_statistics": model.context_reward_statistics,
         "num_timesteps": model.num_timesteps,
         "n_updates": model._n_updates,
         "card": card or {},
@@ -155,6 +156,8 @@ def from_pretrained(algorithm: type[Model], folder: str | Path, env: Any = None,
             setattr(model, name, tensors[name].numpy())
         for name in ("env_id", "reward_feature_dim", "predicted_rewards_error", "num_timesteps"):
             setattr(model, name, config[name])
+        if config.get("context_reward_statistics") is not None:
+            model.context_reward_statistics = tuple(config["context_reward_statistics"])
         model._n_updates, model.n_envs = config["n_updates"], 1
         model._statistics_known = True
         if model.target_entropy == "auto":  # which SAC would look up in the environment

@@ -21,6 +21,8 @@ class CollectingSAC(TaskSAC):
 
     replay_buffer: TaskReplayBuffer
     context: ContextStore | None
+    #: Mean and deviation by which the rewards in ``context`` are standardised; kept with the model, other than the context
+    context_reward_statistics: tuple[float, float] | None
     context_has_value: bool = False
     epoch: int
     trajectories_per_task: int
@@ -124,6 +126,7 @@ class CollectingSAC(TaskSAC):
             )
             actions = th.as_tensor(epoch.actions, device=self.device)
             rewards = th.as_tensor(epoch.rewards, dtype=th.float32, device=self.device)
+            self.context_reward_statistics = (float(rewards.mean()), max(float(rewards.std()), MIN_STD))
             parts = [obs, actions, next_obs, _standardised(rewards)[..., None]]
             if self.context_has_value:
                 parts.append(_standardised(self._context_values(obs, actions, epoch.latents))[..., None])

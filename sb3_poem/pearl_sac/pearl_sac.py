@@ -142,6 +142,7 @@ class PEARLSAC(SamplingSAC):
         self.latent_variances: np.ndarray | None = None
         self.predicted_rewards_error = float("nan")
         self.context: ContextStore | None = None
+        self.context_reward_statistics: tuple[float, float] | None = None
         self.epoch = 0
         self._statistics_known = False
         self._family: FamilyEnv | None = None

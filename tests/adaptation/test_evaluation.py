@@ -13,10 +13,8 @@ from sb3_poem.adaptation import (
     MistakeOracle,
     Preference,
     ReturnOracle,
-    best_codebook,
     evaluate_adaptation,
     evaluate_latents,
-    information_limit,
     known_task_return,
     property_one,
 )
@@ -30,47 +28,9 @@ def vec_env(n=10, **kwargs):
     return DummyVecEnv([lambda: SpeedEnv(**kwargs)] * n)
 
 
-@pytest.mark.parametrize("k", [0, 1, 2, 3, 5])
-def test_the_limit_on_a_line_is_150_over_2_to_the_k(k):
-    # Goals uniform on [0, 3], return -200 |v - goal|: 2^k speeds in the middles of equal parts, 0.75 / 2^k away on average.
-    grid = (np.arange(480) + 0.5) * 3 / 480
-    returns = -200 * np.abs(grid[:, None] - grid[None, :])
-    assert information_limit(returns, k) == pytest.approx(-150 / 2**k, rel=0.03)
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_the_codebook_against_brute_force(seed, monkeypatch):
-    returns = np.random.default_rng(seed).normal(size=(9, 11))
-    best = {
-        size: max(returns[:, book].max(axis=1).mean() for book in itertools.combinations(range(11), size))
-        for size in (1, 2, 4)
-    }
-    for size in (1, 2, 4):
-        assert returns[:, best_codebook(returns, size)].max(axis=1).mean() == pytest.approx(best[size])
-        assert information_limit(returns, int(np.log2(size))) == pytest.approx(best[size])
-    # The greedy choice with swaps alone: never better than the optimum, and hardly worse.
-    monkeypatch.setattr("sb3_poem.adaptation.limits.EXACT_CODEBOOKS", 0)
-    for size in (1, 2, 4):
-        book = best_codebook(returns, size)
-        assert len(set(book)) == size
-        value = returns[:, book].max(axis=1).mean()
-        assert best[size] - 0.1 <= value <= best[size] + 1e-12
-
-
-def test_enough_policies_or_tasks_are_trivial():
-    returns = np.random.default_rng(0).normal(size=(5, 40))
-    assert information_limit(returns, 3) == pytest.approx(returns.max(axis=1).mean())
-    assert information_limit(returns, 200) == pytest.approx(returns.max(axis=1).mean())
-    np.testing.assert_array_equal(best_codebook(returns, 99), np.arange(40))
-
-
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: information_limit(np.zeros((2, 2)), -1), "`k` must not be negative"),
-        (lambda: information_limit(np.zeros(3), 1), "`returns` must have shape"),
-        (lambda: information_limit(np.full((2, 2), np.nan), 1), "`returns` must be finite"),
-        (lambda: best_codebook(np.zeros((2, 2)), 0), "`size` must be at least 1"),
         (lambda: property_one(np.zeros((2, 3)), np.zeros((3, 2))), "must have the same shape"),
         (lambda: evaluate_latents(MODEL, vec_env(1), np.zeros((2, 5)), np.zeros((3, 1))), "equally many rows"),
         (lambda: evaluate_latents(MODEL, vec_env(1), np.zeros((2, 5)), np.ones((2, 1)), 0), "`n_episodes` must be"),

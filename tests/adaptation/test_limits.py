@@ -1,0 +1,200 @@
+"""The information limit against closed forms, brute force and another solver."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq, minimize
+
+from sb3_poem.adaptation import (
+    BoltzmannNoise,
+    ExactNoise,
+    MistakeNoise,
+    answer_capacity,
+    best_codebook,
+    information_limit,
+    rate_distortion_limit,
+)
+from sb3_poem.adaptation.limits import best_intervals
+
+N_GOALS = 480
+GRID = (np.arange(N_GOALS) + 0.5) * 3 / N_GOALS
+SPEEDS = -200 * np.abs(GRID[:, None] - GRID[None, :])
+
+
+def value(returns, book):
+    return returns[:, book].max(axis=1).mean()
+
+
+def entropy(p):
+    return 0.0 if p <= 0 or p >= 1 else -p * np.log2(p) - (1 - p) * np.log2(1 - p)
+
+
+@pytest.mark.parametrize("k", [0, 1, 2, 3, 5])
+def test_the_limit_on_a_line_is_150_over_2_to_the_k(k):
+    # Goals uniform on [0, 3], return -200 |v - goal|: 2^k speeds in the middles of equal parts, 0.75 / 2^k away on average.
+    grid = (np.arange(480) + 0.5) * 3 / 480
+    returns = -200 * np.abs(grid[:, None] - grid[None, :])
+    assert information_limit(returns, k) == pytest.approx(-150 / 2**k, rel=0.03)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_codebook_against_brute_force(seed, monkeypatch):
+    returns = np.random.default_rng(seed).normal(size=(9, 11))
+    best = {
+        size: max(returns[:, book].max(axis=1).mean() for book in itertools.combinations(range(11), size))
+        for size in (1, 2, 4)
+    }
+    for size in (1, 2, 4):
+        assert returns[:, best_codebook(returns, size)].max(axis=1).mean() == pytest.approx(best[size])
+        assert information_limit(returns, int(np.log2(size))) == pytest.approx(best[size])
+    # The greedy choice with swaps alone: never better than the optimum, and hardly worse.
+    monkeypatch.setattr("sb3_poem.adaptation.limits.EXACT_CODEBOOKS", 0)
+    for size in (1, 2, 4):
+        book = best_codebook(returns, size)
+        assert len(set(book)) == size
+        value = returns[:, book].max(axis=1).mean()
+        assert best[size] - 0.1 <= value <= best[size] + 1e-12
+
+
+def test_enough_policies_or_tasks_are_trivial():
+    returns = np.random.default_rng(0).normal(size=(5, 40))
+    assert information_limit(returns, 3) == pytest.approx(returns.max(axis=1).mean())
+    assert information_limit(returns, 200) == pytest.approx(returns.max(axis=1).mean())
+    np.testing.assert_array_equal(best_codebook(returns, 99), np.arange(40))
+
+
+@pytest.mark.parametrize("k", range(7))
+def test_on_a_line_dynamic_programming_finds_the_closed_form(k):
+    # On a grid the best speed for an interval of n goals is its median; its error is n / 4 cells, less 1 / (4 n) if n is odd.
+    # 2^k does not always divide 480; then the best cut has intervals of two lengths.
+    short, longer = N_GOALS // 2**k, N_GOALS % 2**k
+    lengths = np.full(2**k, short)
+    lengths[:longer] += 1
+    errors = sum(float(np.abs(np.arange(n) - n // 2).sum()) for n in lengths)
+    limit = information_limit(SPEEDS, k, ordered=True)
+    assert limit == pytest.approx(-200 * 3 / N_GOALS * errors / N_GOALS, rel=1e-9)
+    assert limit == pytest.approx(-150 / 2**k, rel=1e-9 if longer == 0 and short % 2 == 0 else 1e-2)
+    # The general solver on the same problem: never better, and hardly worse.
+    general = information_limit(SPEEDS, k)
+    assert 1.03 * limit <= general <= limit + 1e-9
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_dynamic_programming_against_brute_force_on_uneven_lines(seed):
+    rng = np.random.default_rng(seed)
+    goals, speeds = np.sort(rng.uniform(0, 3, 14)), rng.uniform(0, 3, 11)  # the policies need no order
+    returns = -(np.abs(goals[:, None] - speeds[None, :]) ** rng.uniform(1.0, 2.0))  # convex: two policies cross once
+    for size in (1, 2, 3, 4):
+        best = max(value(returns, book) for book in itertools.combinations(range(11), size))
+        book = best_intervals(returns, size)
+        assert len(book) <= size
+        assert value(returns, book) == pytest.approx(best)
+
+
+def test_an_order_that_means_nothing_does_no_harm(monkeypatch):
+    monkeypatch.setattr("sb3_poem.adaptation.limits.EXACT_CODEBOOKS", 0)
+    returns = np.random.default_rng(0).normal(size=(40, 30))
+    for size in (2, 4, 8):
+        book = best_codebook(returns, size, ordered=True)
+        assert len(set(book)) == size
+        assert value(returns, book) >= value(returns, best_codebook(returns, size))
+
+
+@pytest.mark.parametrize("bits", [0.0, 0.1, 0.5, 0.9, 1.0])
+def test_rate_distortion_of_a_fair_coin(bits):
+    # D(R) = h^-1(1 - R) (Cover & Thomas, theorem 10.3.1).
+    error = brentq(lambda p: entropy(p) - (1 - bits), 0.0, 0.5)
+    assert rate_distortion_limit(np.eye(2), bits) == pytest.approx(1 - error, abs=1e-4)
+
+
+@pytest.mark.parametrize("bits", [0.3, 1.0, 1.7])
+def test_rate_distortion_of_a_fair_die(bits):
+    # Hamming distortion on m equally likely letters: R(D) = log m - h(D) - D log(m - 1).
+    error = brentq(lambda p: np.log2(6) - entropy(p) - p * np.log2(5) - bits, 1e-12, 5 / 6)
+    assert rate_distortion_limit(7 * np.eye(6) - 3, bits) == pytest.approx(7 * (1 - error) - 3, abs=1e-3)
+
+
+def test_rate_distortion_against_another_solver():
+    returns = np.random.default_rng(3).normal(size=(4, 3))
+
+    def information(p):
+        p = p.reshape(4, 3)
+        return float((p * np.log2(np.maximum(p, 1e-300) / np.maximum(p.mean(axis=0), 1e-300))).sum() / 4)
+
+    for bits in (0.2, 0.6):
+        found = minimize(
+            lambda p: -(p.reshape(4, 3) * returns).sum() / 4,
+            np.full(12, 1 / 3) + 0.01 * np.random.default_rng(0).normal(size=12),
+            bounds=[(1e-9, 1)] * 12,
+            constraints=[
+                {"type": "eq", "fun": lambda p: p.reshape(4, 3).sum(axis=1) - 1},
+                {"type": "ineq", "fun": lambda p, bits=bits: bits - information(p)},
+            ],
+            method="SLSQP",
+            options={"maxiter": 500},
+        )
+        assert found.success
+        assert rate_distortion_limit(returns, bits) == pytest.approx(-found.fun, abs=2e-3)
+
+
+@pytest.mark.parametrize("bits", [1, 2, 3])
+def test_rate_distortion_on_a_line_lies_between_shannon_and_the_codebook(bits):
+    # Shannon's lower bound for absolute error: h(X) - log2(2 e D) <= R; and 2^R policies are one way to use R bits.
+    bound = rate_distortion_limit(SPEEDS[::4, ::4], bits)
+    assert -150 / 2**bits < bound < -200 * 3 / (2 * np.e) / 2**bits + 1.0
+
+
+def test_the_information_in_answers():
+    assert answer_capacity(None, SPEEDS) == answer_capacity(ExactNoise(), SPEEDS) == 1.0
+    assert answer_capacity(MistakeNoise(0.2), SPEEDS) == pytest.approx(1 - entropy(0.2))
+    assert answer_capacity(MistakeNoise(0.5), SPEEDS) == 0.0
+    assert answer_capacity(BoltzmannNoise(), SPEEDS) == pytest.approx(1 - entropy(1 / (1 + np.e)))
+    returns = np.array([[0.0, 3.0], [1.0, 0.0]])
+    assert answer_capacity(BoltzmannNoise(0.5), returns) == pytest.approx(1 - entropy(1 / (1 + np.exp(1.5))))
+    # No inputs in between carry more: the capacity of all probabilities in the range, found by brute force over two inputs.
+    left = np.linspace(0.2, 0.8, 31)
+    mixed = [
+        entropy(w * p + (1 - w) * q) - w * entropy(p) - (1 - w) * entropy(q)
+        for p, q, w in itertools.product(left, left, np.linspace(0, 1, 21))
+    ]
+    assert max(mixed) == pytest.approx(answer_capacity(MistakeNoise(0.2), returns), abs=1e-9)
+
+
+def test_noise_lowers_the_limit():
+    returns = SPEEDS[::8, ::8]
+    for k in (1, 3, 5):
+        exact, rare, often, none = (
+            information_limit(returns, k, noise_model=noise)
+            for noise in (None, MistakeNoise(0.01), MistakeNoise(0.2), MistakeNoise(0.5))
+        )
+        assert exact >= rare > often > none
+        assert none == pytest.approx(returns.mean(axis=0).max())
+        assert information_limit(returns, k, noise_model=ExactNoise()) == exact
+
+
+def test_majority_votes_stay_below_the_noisy_limit():
+    # Two tasks, one question asked three times: what the vote earns is what a method can reach.
+    for rate in (0.05, 0.2, 0.4):
+        right = (1 - rate) ** 3 + 3 * rate * (1 - rate) ** 2
+        assert right < information_limit(np.eye(2), 3, noise_model=MistakeNoise(rate)) + 1e-9
+
+
+class OtherNoise:
+    uses_return_unit = False
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: information_limit(np.zeros((2, 2)), -1), "`k` must not be negative"),
+        (lambda: information_limit(np.zeros(3), 1), "`returns` must have shape"),
+        (lambda: information_limit(np.full((2, 2), np.nan), 1), "`returns` must be finite"),
+        (lambda: information_limit(np.zeros((2, 2)), 1, noise_model=OtherNoise()), "`noise_model` must be .* OtherNoise"),
+        (lambda: best_codebook(np.zeros((2, 2)), 0), "`size` must be at least 1"),
+        (lambda: rate_distortion_limit(np.zeros((2, 2)), -0.1), "`bits` must not be negative"),
+    ],
+)
+def test_bad_arguments(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()

@@ -1,0 +1,76 @@
+"""MAML-reward's policy: SAC on a reward that is known, within the budget, and reproducible."""
+
+import numpy as np
+import pytest
+import torch as th
+from adaptation.worlds import SpeedEnv, SpeedModel
+from meta_toys import WindyWalk, small, walks
+
+from sb3_poem import PEARLSAC, MAMLRewardAdapter
+from sb3_poem.adaptation import ReturnOracle, adapt_tasks
+from sb3_poem.baselines import MAMLRewardModel, MetaReward
+from sb3_poem.common.rollouts import rollout_latents
+
+FAST = {"gradient_steps": 5, "batch_size": 16}
+
+
+@pytest.fixture(scope="module")
+def trained():
+    return small(PEARLSAC, walks(5), horizon=10, n_train_tasks=5, learning_starts=10**6).learn(2 * 50)
+
+
+@pytest.fixture
+def model(trained):
+    return MAMLRewardModel(MetaReward(trained.policy, (8,)), trained)
+
+
+def test_it_learns_a_reward_that_it_is_told(trained, model, monkeypatch):
+    # The adapted reward is replaced by the true one, "as far to the right as can be"; what is left is SAC.
+    monkeypatch.setattr(MetaReward, "rewards", lambda self, parameters, trajectory: trajectory.observations[1:, 0])
+    learning = {"gradient_steps": 80, "batch_size": 64, "learning_rate": 3e-3, "gamma": 0.9}
+    adapted = adapt_tasks(
+        model, walks(2), np.ones((1, 1)), ReturnOracle, n_queries=4, record_at=(0, 4), adapter=MAMLRewardAdapter, **learning
+    )
+    before, after = (t.observations[-1, 0] for t in rollout_latents(model, walks(2), adapted.latents[0]))
+    # The furthest that ten steps can go is 4, from a start near 0.
+    assert after > 3.0 > before
+
+
+def test_pairs_differ_and_the_budget_is_kept(model):
+    adapter = MAMLRewardAdapter(model, walks(1), n_queries=2, seed=0, oracle=lambda left, right: "left", **FAST)
+    query = adapter.ask()
+    assert np.abs(query.left.actions - query.right.actions).max() > 0.01
+    adapter.adapt()
+    assert adapter.inference.sac.replay_buffer.size() == 2 * 2 * 10
+    assert adapter.done
+
+
+def test_the_state_resumes_and_the_generators_stay(model):
+    env = walks(1)
+    adapter = MAMLRewardAdapter(model, env, n_queries=3, seed=0, oracle=lambda left, right: "left", **FAST)
+    adapter.ask()
+    states = np.random.get_state()[1].copy(), th.random.get_rng_state()  # noqa: NPY002
+    adapter.tell("left")
+    np.testing.assert_array_equal(np.random.get_state()[1], states[0])  # noqa: NPY002
+    assert th.equal(th.random.get_rng_state(), states[1])
+    resumed = MAMLRewardAdapter.from_json(adapter.to_json(), model, env, oracle=lambda left, right: "left")
+    obs = np.random.default_rng(0).normal(size=(6, 2))
+    first, second = (one.adapt().predict(obs)[0] for one in (adapter, resumed))
+    np.testing.assert_allclose(first, second, atol=1e-5)
+    start = MAMLRewardAdapter(model, env, n_queries=3, seed=0, **FAST).policy().predict(obs)[0]
+    assert np.abs(first - start).max() > 1e-3
+
+
+def test_what_will_not_do(trained, model):
+    with pytest.raises(ValueError, match="`model` must be a MAMLRewardModel, but is of type SpeedModel"):
+        MAMLRewardAdapter(SpeedModel(), SpeedEnv())
+    with pytest.raises(ValueError, match="a family whose tasks share their dynamics"):
+        MAMLRewardAdapter(model, walks(1, WindyWalk))
+    with pytest.raises(ValueError, match="`gradient_steps` must be at least 1, but is 0"):
+        MAMLRewardAdapter(model, walks(1), gradient_steps=0)
+    with pytest.raises(ValueError, match=r"`gamma` must lie in \[0, 1\], but is 1.5"):
+        MAMLRewardAdapter(model, walks(1), gamma=1.5)
+    with pytest.raises(ValueError, match="`learning_rate` must be positive"):
+        MAMLRewardAdapter(model, walks(1), learning_rate=0.0)
+    with pytest.raises(ValueError, match="`library` must be None"):
+        adapt_tasks(model, walks(1), np.zeros((1, 1)), ReturnOracle, adapter=MAMLRewardAdapter, library=[])
