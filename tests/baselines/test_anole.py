@@ -4,9 +4,9 @@ import itertools
 
 import numpy as np
 import pytest
-from adaptation.worlds import SpeedEnv, SpeedModel, SpeedVecEnv
 from meta_toys import Walk, WindyWalk, small, walks
 from stable_baselines3.common.vec_env import DummyVecEnv
+from worlds import SpeedEnv, SpeedModel, SpeedVecEnv
 
 import sb3_poem
 from sb3_poem import PEARLSAC, ANOLEAdapter

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch as th
-from adaptation.worlds import SpeedEnv, SpeedModel
 from meta_toys import WindyWalk, small, walks
+from worlds import SpeedEnv, SpeedModel
 
 from sb3_poem import PEARLSAC, MAMLRewardAdapter
 from sb3_poem.adaptation import ReturnOracle, adapt_tasks

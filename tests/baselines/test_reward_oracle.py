@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import torch as th
-from adaptation.worlds import SpeedEnv, SpeedModel
 from meta_toys import small, walks
 from stable_baselines3.common.vec_env import DummyVecEnv
+from worlds import SpeedEnv, SpeedModel
 
 from sb3_poem import PEARLSAC, POEMSAC, RewardOracleAdapter
 from sb3_poem.adaptation import Preference, ReturnOracle, adapt_tasks
