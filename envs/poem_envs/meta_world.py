@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+from poem_envs.headless import choose_headless_backend
 from poem_envs.process_vector import ProcessFamilyVector
 from poem_envs.replay import ReplayFamily
 from poem_envs.sawyer import (
@@ -121,6 +122,7 @@ class MetaWorldEnv(ReplayFamily):
         """Render the current state as ``render_mode`` says: an image ``(height, width, 3)`` for ``"rgb_array"``."""
         if self._sawyer is None:
             raise RuntimeError("render() was called before the first reset()")
+        choose_headless_backend()
         image = self._sawyer.env.render()
         # Meta-World's models have these cameras upside down.
         upside_down = isinstance(image, np.ndarray) and (self._render_arguments["camera_name"] or "").startswith("corner")

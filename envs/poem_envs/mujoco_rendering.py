@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import atexit
-import ctypes.util
-import logging
-import os
-import sys
 import weakref
 from typing import Any
 
 import mujoco
 import numpy as np
 
-_logger = logging.getLogger(__name__)
+from poem_envs.headless import choose_headless_backend
+
 _open_renderers: weakref.WeakSet[StateRenderer] = weakref.WeakSet()
 
 TASK_COLOUR = (0.16, 0.65, 0.27, 1.0)
@@ -66,7 +63,7 @@ class StateRenderer:
         mujoco.mj_setState(self._model, self._data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         mujoco.mj_forward(self._model, self._data)
         if render_mode != "human":
-            _choose_headless_backend()
+            choose_headless_backend()
         viewer = self._renderer._get_viewer(render_mode)
         viewer.make_context_current()  # another environment may have rendered since
         _close_at_exit(self)
@@ -93,19 +90,6 @@ def _close_at_exit(renderer: StateRenderer) -> None:
 def _close_open_renderers() -> None:
     for renderer in list(_open_renderers):
         renderer.close()
-
-
-def _choose_headless_backend() -> None:
-    """On a Linux machine without a display, let MuJoCo render through EGL or OSMesa, unless the user chose already."""
-    has_display = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
-    if sys.platform != "linux" or has_display or "MUJOCO_GL" in os.environ:
-        return
-    for backend, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
-        if ctypes.util.find_library(library):
-            os.environ["MUJOCO_GL"] = backend
-            _logger.info("no display: rendering with MUJOCO_GL=%s", backend)
-            return
-    raise RuntimeError("rendering on a machine without a display needs libEGL or libOSMesa: install libegl1 or libosmesa6")
 
 
 def arrow(start: np.ndarray, direction: tuple[float, float], length: float) -> dict[str, Any]:

@@ -1,0 +1,24 @@
+"""Off-screen rendering of MuJoCo on a machine without a display."""
+
+import ctypes.util
+import logging
+import os
+import sys
+
+_logger = logging.getLogger(__name__)
+
+
+def choose_headless_backend() -> None:
+    """On a Linux machine without a display, let MuJoCo render through EGL or OSMesa, unless the user chose already.
+
+    Left to itself, Gymnasium's renderer tries a window first, and goes on as if it had got one.
+    """
+    has_display = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+    if sys.platform != "linux" or has_display or "MUJOCO_GL" in os.environ:
+        return
+    for backend, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
+        if ctypes.util.find_library(library):
+            os.environ["MUJOCO_GL"] = backend
+            _logger.info("no display: rendering with MUJOCO_GL=%s", backend)
+            return
+    raise RuntimeError("rendering on a machine without a display needs libEGL or libOSMesa: install libegl1 or libosmesa6")
