@@ -192,7 +192,8 @@ class LatentPolicy(SACPolicy):
         :return: actions in the environment's units, and the latents (n, latent_dim)
         :raises ValueError: for observations or a state that are not finite or of another shape
         """
-        self.set_training_mode(False)
+        if self.training:  # walking all modules takes longer than a small batch's actions
+            self.set_training_mode(False)
         obs = np.asarray(observation, dtype=np.float32)
         single = obs.ndim == 1
         obs = np.atleast_2d(obs)
