@@ -77,6 +77,23 @@ def test_table_plot_and_video(model: tuple[POEMSAC, str], tmp_path: Path, capsys
     assert frames.shape[2] > frames.shape[1], "two clips beside each other"
 
 
+def test_the_environment_is_made_as_in_training(tmp_path: Path) -> None:
+    env = TaskVecEnv.from_id(ENV_ID, 12, step_length=0.09)
+    trained = POEMSAC("MlpPolicy", env, policy_kwargs={"net_arch": [16, 16]}, **SMALL).learn(300)
+    trained.save(tmp_path / "model.zip")
+    trained.save_pretrained(tmp_path / "folder")
+    for given, expected in (([], 0.09), (["--env-kwargs", "step_length:0.02"], 0.02)):
+        for name in ("model.zip", "folder"):
+            file = tmp_path / "result.json"
+            flags = ["--queries", 1, "--tasks", 2, "--episodes", 2, "--record", 0, "--seed", 5, "--json", file, *given]
+            assert adapt(str(tmp_path / name), *flags) == 0
+            result = json.loads(file.read_text())
+            assert result["env_kwargs"] == {"step_length": expected}
+            vec_env = TaskVecEnv.from_id(ENV_ID, 4, step_length=expected)
+            evaluation = evaluate_adaptation(trained, vec_env, np.array(result["tasks"]), record_at=[0], n_episodes=2, seed=5)
+            assert result["mean_return"] == pytest.approx(evaluation.mean_returns.tolist(), rel=1e-4)
+
+
 def test_same_seed_same_result_and_fresh_tasks(model: tuple[POEMSAC, str], tmp_path: Path) -> None:
     results = []
     for name, seed in (("a", 3), ("b", 3), ("c", 4)):

@@ -41,7 +41,13 @@ def _add_adapt_arguments(parser: argparse.ArgumentParser) -> None:
     model = parser.add_argument_group("what to adapt")
     model.add_argument("--model", required=True, help="a model's .zip, a pretrained folder, or the name of a shipped model")
     model.add_argument("--env", help="environment id (default: the one that the model was trained on)")
-    model.add_argument("--env-kwargs", nargs="+", metavar="KEY:VALUE", default=[], help="arguments of the environment")
+    model.add_argument(
+        "--env-kwargs",
+        nargs="+",
+        metavar="KEY:VALUE",
+        default=[],
+        help="arguments of the environment, over those that the model was trained with",
+    )
     model.add_argument("--gym-packages", nargs="+", metavar="MODULE", default=[], help="modules that register environments")
     model.add_argument("--device", default="cpu", help="PyTorch device (default: %(default)s)")
     # Small batches: more threads would mostly wait for one another, and for those that simulate.

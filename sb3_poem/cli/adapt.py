@@ -104,7 +104,8 @@ class Adaptation:
         if env_id is None:
             raise ValueError(f"--env is needed: {arguments.model} does not say on which environment it was trained")
         self.env_id: str = env_id
-        self.env_kwargs = parse_env_kwargs(arguments.env_kwargs)
+        trained_with = dict(self.model.env_kwargs) if env_id == self.model.env_id else {}
+        self.env_kwargs = {**trained_with, **parse_env_kwargs(arguments.env_kwargs)}
         self.env = self._make_env()
         if arguments.record and max(arguments.record) > arguments.queries:
             raise ValueError(f"--record {max(arguments.record)} is more than --queries {arguments.queries}")

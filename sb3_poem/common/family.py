@@ -6,6 +6,8 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_wrapper
 
+# Arguments that change how an environment is drawn, not what it is.
+DRAWING_ARGUMENTS = {"render_mode", "render_task"}
 REQUIRED_ATTRIBUTES = ("task_space", "all_tasks", "shared_dynamics", "reward_feature_dim")
 
 
@@ -34,6 +36,8 @@ class FamilyEnv:
         self.reward_feature_dim = int(self._get("reward_feature_dim"))
         spec = self._get("spec")
         self.env_id: str | None = None if spec is None else spec.id
+        given: dict[str, Any] = {} if spec is None else spec.kwargs
+        self.env_kwargs = {name: value for name, value in given.items() if name not in DRAWING_ARGUMENTS}
         limit = None if spec is None else spec.max_episode_steps
         steps = horizon if limit is None else limit
         if steps is None:

@@ -46,6 +46,7 @@ def save_pretrained(model: "PEARLSAC", folder: str | Path, card: dict[str, Any] 
         "format": FORMAT,
         "algorithm": type(model).__name__,
         "env_id": model.env_id,
+        "env_kwargs": dict(model.env_kwargs),
         "arguments": _arguments(model),
         "net_arch": model.policy.net_arch,
         "activation_fn": activation.__name__,
@@ -156,6 +157,7 @@ def from_pretrained(algorithm: type[Model], folder: str | Path, env: Any = None,
             setattr(model, name, tensors[name].numpy())
         for name in ("env_id", "reward_feature_dim", "predicted_rewards_error", "num_timesteps"):
             setattr(model, name, config[name])
+        model.env_kwargs = config.get("env_kwargs", {})
         if config.get("context_reward_statistics") is not None:
             model.context_reward_statistics = tuple(config["context_reward_statistics"])
         model._n_updates, model.n_envs = config["n_updates"], 1

@@ -1,6 +1,7 @@
 """The tasks of a meta-trained model: which it was trained on, their latents, and the environment that they come from."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ class TaskSAC(PersistentSAC):
     train_tasks: np.ndarray | None
     latent_means: np.ndarray | None
     latent_variances: np.ndarray | None
+    env_kwargs: Mapping[str, Any] = MappingProxyType({})  # models of an earlier version do not hold them
     _family: FamilyEnv | None
 
     def _draw_tasks(self) -> None:
@@ -46,6 +48,7 @@ class TaskSAC(PersistentSAC):
         if self.relabel_fraction > 0 and not family.shared_dynamics:
             raise ValueError(f"relabel_fraction must be 0: the tasks of {family.env_id} do not share dynamics")
         self.env_id = family.env_id
+        self.env_kwargs = family.env_kwargs
         self.task_space = family.task_space
         self.reward_feature_dim = family.reward_feature_dim
         self.train_tasks = family.sample_tasks(count, self.generators.child())
