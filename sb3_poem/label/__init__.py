@@ -1,0 +1,1 @@
+"""The page on which a person answers, and what it needs: sessions, their store, videos, beliefs."""
