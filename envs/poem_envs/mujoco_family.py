@@ -13,8 +13,8 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
 from poem_envs.cores import available_cores
-from poem_envs.mujoco_integrator import Integrator
 from poem_envs.mujoco_fast_rendering import FastRenderer
+from poem_envs.mujoco_integrator import Integrator
 from poem_envs.mujoco_rendering import StateRenderer
 from poem_envs.vector import BatchFamily, BatchTaskFamily, TaskFamilyVector
 
@@ -212,7 +212,12 @@ class MujocoFamily(BatchFamily):
             self._fast_renderer = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_integrator": None, "_renderer": None, "_fast_renderer": None}  # threads and windows are made anew when needed
+        return {
+            **self.__dict__,
+            "_integrator": None,
+            "_renderer": None,
+            "_fast_renderer": None,
+        }  # threads and windows are made anew when needed
 
 
 class MujocoTaskEnv(MujocoFamily, BatchTaskFamily):

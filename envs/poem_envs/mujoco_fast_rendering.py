@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import os
 from typing import Any
 
 import mujoco
@@ -39,7 +41,6 @@ class FastRenderer:
         camera_name: str | None,
         camera_config: dict[str, Any],
     ) -> None:
-        choose_headless_backend()
         self._model = model
         self._data = mujoco.MjData(model)
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
@@ -47,7 +48,7 @@ class FastRenderer:
         quality = model.vis.quality
         quality.offsamples = 0
         quality.numslices, quality.numstacks, quality.numquads = COARSE
-        self._context = mujoco.GLContext(width, height)
+        self._context = _make_context(width, height)
         self._context.make_current()
         self._scene = mujoco.MjvScene(model, MAX_GEOM)
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
@@ -114,3 +115,11 @@ class FastRenderer:
         colour = np.asarray(marker.get("rgba", (1.0, 1.0, 1.0, 1.0)), dtype=np.float32)
         mujoco.mjv_initGeom(geom, marker["type"], size, np.asarray(marker["pos"], dtype=np.float64), rotation, colour)
         self._scene.ngeom += 1
+
+
+def _make_context(width: int, height: int) -> Any:
+    """A graphics context off screen. ``mujoco.GLContext`` itself is fixed when MuJoCo is imported, which was long ago."""
+    choose_headless_backend()
+    backend = os.environ.get("MUJOCO_GL", "").lower()
+    module = importlib.import_module(f"mujoco.{backend}") if backend in ("egl", "osmesa") else mujoco
+    return module.GLContext(width, height)

@@ -12,7 +12,6 @@ import numpy as np
 from poem_envs.headless import choose_headless_backend
 
 
-
 class _Closable(Protocol):
     def close(self) -> None: ...
 

@@ -116,7 +116,9 @@ def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
         description="Feed the recorded answers to a model and a rule, and say how well these would have foretold them.",
     )
     _add_store_argument(replay)
-    replay.add_argument("--model", help="a model's .zip, a pretrained folder, or a shipped model (default: each session's own)")
+    replay.add_argument(
+        "--model", help="a model's .zip, a pretrained folder, or a shipped model (default: each session's own)"
+    )
     replay.add_argument("--inference", choices=("paper", "bayes"), default="bayes", help="default: %(default)s")
     replay.add_argument("--mistake-rate", type=float, default=0.05, help="default: %(default)s")
     replay.add_argument("--seed", type=_count(0), default=0, help="of the inference (default: %(default)s)")
@@ -125,7 +127,11 @@ def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _add_store_argument(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
-        "--store", type=Path, default=DEFAULT_STORE, metavar="FOLDER", help="where answers and videos are (default: %(default)s)"
+        "--store",
+        type=Path,
+        default=DEFAULT_STORE,
+        metavar="FOLDER",
+        help="where answers and videos are (default: %(default)s)",
     )
 
 

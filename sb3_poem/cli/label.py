@@ -46,8 +46,8 @@ def run_page(arguments: argparse.Namespace) -> None:
     token = secrets.token_urlsafe(24) if arguments.token else None
     if not is_loopback(arguments.host) and password is None and token is None:
         raise ValueError(
-            f"--host {arguments.host} lets other machines reach the page, where whoever comes can make this machine render and "
-            "read what it shows; add --token or --auth USER:PASSWORD"
+            f"--host {arguments.host} lets other machines reach the page, where whoever comes can make this machine render "
+            "and read what it shows; add --token or --auth USER:PASSWORD"
         )
     for package in arguments.gym_packages:
         importlib.import_module(package)
@@ -73,11 +73,15 @@ def run_page(arguments: argparse.Namespace) -> None:
     query = "" if token is None else f"/?token={token}"
     name = f"[{arguments.host}]" if ":" in arguments.host else arguments.host
     console.print(f"The page is at http://{name}:{port}{query}", soft_wrap=True, highlight=False)
-    console.print(f"Models: {', '.join(choice.name for choice in catalogue)}. Answers are kept in {store.path}.", soft_wrap=True, highlight=False)
+    console.print(
+        f"Models: {', '.join(choice.name for choice in catalogue)}. Answers are kept in {store.path}.",
+        soft_wrap=True,
+        highlight=False,
+    )
     if not is_loopback(arguments.host):
         console.print(
-            "Other machines can reach it: with the password or the token they can begin sessions and make this machine render. "
-            "The connection is not encrypted; put a proxy with TLS in front of it where others could listen.",
+            "Other machines can reach it: with the password or the token they can begin sessions and make this machine "
+            "render. The connection is not encrypted; put a proxy with TLS in front of it where others could listen.",
             highlight=False,
         )
     try:

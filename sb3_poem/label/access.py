@@ -41,8 +41,8 @@ class Access:
     :param user: With ``password``, the name that a browser asks for.
     :param password: See there.
     :param token: What the first address must carry as ``?token=``; a cookie remembers it.
-    :param hosts: Host names under which the server answers when neither is asked for, so that no foreign page can reach it by a
-        name of its own (DNS rebinding).
+    :param hosts: Host names under which the server answers when neither is asked for, so that no foreign page can reach it
+        by a name of its own (DNS rebinding).
     :param embedded: Whether pages of other origins may show this one in a frame (a notebook does).
     """
 
@@ -109,7 +109,9 @@ class Gate:
             return
         body = await self._body(headers, receive) if scope["method"] not in ("GET", "HEAD") else b""
         if body is None:
-            await PlainTextResponse(f"a request may hold {self.max_body} bytes at most\n", 413)(scope, receive, send_with_headers)
+            await PlainTextResponse(f"a request may hold {self.max_body} bytes at most\n", 413)(
+                scope, receive, send_with_headers
+            )
             return
         sent = False
 
@@ -146,7 +148,9 @@ class Gate:
         if headers.get("authorization") or b"token=" in scope["query_string"]:
             await asyncio.sleep(PAUSE_AFTER_WRONG_PASSWORD)
         asks = {"WWW-Authenticate": 'Basic realm="sb3-poem", charset="UTF-8"'} if access.password is not None else {}
-        return PlainTextResponse("this page needs the link with its token, or the password, of whoever started it\n", 401, asks)
+        return PlainTextResponse(
+            "this page needs the link with its token, or the password, of whoever started it\n", 401, asks
+        )
 
     async def _body(self, headers: Headers, receive: Receive) -> bytes | None:
         """The request's body, or None where it is too large, of which no more than the limit is read."""

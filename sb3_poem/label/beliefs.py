@@ -77,7 +77,10 @@ def sentence(picture: str, points: np.ndarray, weights: np.ndarray, estimate: np
     radius = weighted_quantiles(distances, weights, (SHARE,))[0]
     if picture == "place":
         x, y = estimate
-        return f"It believes that you mean a place near {x:.1f} across and {y:.1f} up, give or take {radius:.1f} {unit}".strip() + "."
+        return (
+            f"It believes that you mean a place near {x:.1f} across and {y:.1f} up, give or take {radius:.1f} {unit}".strip()
+            + "."
+        )
     return "Each dot is a behaviour that still fits your answers; the closer together they lie, the surer it is."
 
 

@@ -35,7 +35,9 @@ class Choice:
         return describe(self.env_id)
 
 
-def read_catalogue(model: str | None = None, env_id: str | None = None, env_kwargs: dict[str, Any] | None = None) -> list[Choice]:
+def read_catalogue(
+    model: str | None = None, env_id: str | None = None, env_kwargs: dict[str, Any] | None = None
+) -> list[Choice]:
     """
     The models of a folder.
 

@@ -88,9 +88,7 @@ class _Pages:
         session = await self._find(request)
         return self._html("session.html", session=session, description=describe(session.env_id), max_wish=MAX_WISH)
 
-    def session(
-        self, handler: Callable[[Request, Session], Awaitable[Response]]
-    ) -> Callable[[Request], Awaitable[Response]]:
+    def session(self, handler: Callable[[Request, Session], Awaitable[Response]]) -> Callable[[Request], Awaitable[Response]]:
         """A handler of requests that belong to the session of the address's token."""
 
         async def handle(request: Request) -> Response:
@@ -150,14 +148,13 @@ class _Pages:
 
     def _adapted_policy(self, session: Session) -> bytes:
         from sb3_poem.adaptation.policy import AdaptedPolicy
-        from sb3_poem.label.turns import load_choice
 
         answered = len(self.conversations.store.answers(session.id))
         turn = self.conversations.store.turn(session.id, "result", answered)
         choice = self.conversations.catalogue.get(session.model)
         if turn is None or choice is None:
             raise RefusedError("the policy can be downloaded once its result is shown")
-        return AdaptedPolicy(load_choice(choice), json.loads(turn["latent"])).to_bytes()
+        return AdaptedPolicy(self.conversations.load(choice), json.loads(turn["latent"])).to_bytes()
 
     async def _find(self, request: Request) -> Session:
         token = request.path_params["token"]

@@ -7,13 +7,14 @@ import json
 import logging
 import secrets
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from sb3_poem.label.catalogue import Choice
 from sb3_poem.label.store import RefusedError, Session, Store
-from sb3_poem.label.turns import Request
+from sb3_poem.label.turns import Request, load_choice
 from sb3_poem.label.workshop import LIKELY, POSSIBLE, WAITED_FOR, Job, Workshop
 
 _logger = logging.getLogger(__name__)
@@ -52,6 +53,7 @@ class Conversations:
     :param n_queries: Questions before the first result, and between results.
     :param max_sessions: How many people may be at work at once.
     :param seed: The next session's seed; None draws each.
+    :param load: Loads a chosen model, for the download of its adapted policy.
     """
 
     def __init__(
@@ -63,6 +65,7 @@ class Conversations:
         n_queries: int = 10,
         max_sessions: int = 16,
         seed: int | None = None,
+        load: Callable[[Choice], Any] = load_choice,
     ) -> None:
         self.store = store
         self.workshop = workshop
@@ -70,6 +73,7 @@ class Conversations:
         self.options = dict(options or {})
         self.n_queries = n_queries
         self.max_sessions = max_sessions
+        self.load = load
         self._seed = seed
         self._present: dict[int, _Presence] = {}
 
@@ -224,7 +228,9 @@ class Conversations:
                     self.workshop.discard(job)
                 del self._present[number]
         if len(self._present) >= self.max_sessions:
-            raise FullError(f"{self.max_sessions} people are at work already, which is as many as this server takes; come later")
+            raise FullError(
+                f"{self.max_sessions} people are at work already, which is as many as this server takes; come later"
+            )
 
     def _begin_turn(self, session: Session, answered: int, wanted: str) -> None:
         presence = self._present[session.id]

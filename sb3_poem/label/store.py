@@ -222,7 +222,17 @@ class Store:
             for row in self._all(query, session, before)
         ]
 
-    def add_turn(self, session: int, kind: str, number: int, last_answer: int | None, turn: Turn, video: str) -> bool:
+    def add_turn(
+        self,
+        session: int,
+        kind: str,
+        number: int,
+        last_answer: int | None,
+        turn: Turn,
+        video: str,
+        created: float | None = None,
+        shown: float | None = None,
+    ) -> bool:
         """
         Keep a turn, if the conversation still is where it was made for, and it has not been kept already.
 
@@ -232,11 +242,17 @@ class Store:
         :param last_answer: The number in the store of the last of these; None at the start.
         :param turn: The turn.
         :param video: Its file's name within ``videos/``.
+        :param created: When it was made, seconds since 1970; None is now.
+        :param shown: When it was shown; None is not yet.
         :return: Whether it was kept.
         """
-        columns = "session, kind, number, state, left_trajectory, right_trajectory, belief, latent, video, fps, frames, created"
-        row = (session, kind, number, *map(_json, (turn.state, turn.left, turn.right, turn.belief, turn.latent)))
-        row = (*row, video, turn.fps, turn.frames, time.time())
+        columns = (
+            "session, kind, number, state, left_trajectory, right_trajectory, belief, latent, video, fps, frames, created"
+        )
+        columns += ", shown"
+        contents = map(_json, (turn.state, turn.left, turn.right, turn.belief, turn.latent))
+        made = time.time() if created is None else created
+        row: tuple[Any, ...] = (session, kind, number, *contents, video, turn.fps, turn.frames, made, shown)
         with self._transaction() as connection:
             here = [answer["id"] for answer in self.answers(session)]
             if (here[number - 1] if 0 < number <= len(here) else None) != last_answer or number > len(here):
@@ -329,9 +345,7 @@ class Store:
             current = self.turn(session, "result", answered)
             if current is None or current["id"] != result or not (about.stopped or answered >= about.target):
                 raise RefusedError("this result is not the one that is shown; look again at the page")
-            connection.execute(
-                "UPDATE turns SET verdict = ?, verdict_time = ? WHERE id = ?", (verdict, time.time(), result)
-            )
+            connection.execute("UPDATE turns SET verdict = ?, verdict_time = ? WHERE id = ?", (verdict, time.time(), result))
             if verdict == "not quite":
                 connection.execute(
                     "UPDATE sessions SET stopped = 0, target = ? WHERE id = ?", (answered + about.step, session)

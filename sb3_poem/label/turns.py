@@ -19,11 +19,13 @@ import numpy as np
 from sb3_poem.adaptation.adapter import PreferenceAdapter
 from sb3_poem.adaptation.noise import MistakeNoise
 from sb3_poem.adaptation.options import rollout_seed
+from sb3_poem.adaptation.preference import Preference
 from sb3_poem.common.family import FamilyEnv
 from sb3_poem.common.rollouts import rollout_latents
+from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.label.beliefs import belief
 from sb3_poem.label.catalogue import Choice
-from sb3_poem.label.videos import HEIGHT, WIDTH, pair, fit, write_clip
+from sb3_poem.label.videos import HEIGHT, WIDTH, fit, pair, write_clip
 
 # The result's rollout starts as no question's does.
 RESULT_ROLLOUT = 1_000_000
@@ -67,7 +69,8 @@ class Turn:
     """
     A question, or a result, and what is believed there.
 
-    :param state: What the next turn is made from, beside the conversation.
+    :param state: What the next turn is made from, beside the conversation; None where none follows (at a terminal), as then
+        are belief and latent.
     :param left: The question's left trajectory; None in a result.
     :param right: The right one.
     :param belief: As :func:`sb3_poem.label.beliefs.belief` gives it.
@@ -76,11 +79,11 @@ class Turn:
     :param frames: Of the video.
     """
 
-    state: dict[str, Any]
+    state: dict[str, Any] | None
     left: dict[str, Any] | None
     right: dict[str, Any] | None
-    belief: dict[str, Any]
-    latent: list[float]
+    belief: dict[str, Any] | None
+    latent: list[float] | None
     fps: float
     frames: int
 
@@ -89,6 +92,10 @@ class _Watches:
     """Stands for the person where the adapter asks who answers: somebody who needs to see."""
 
     needs_frames = True
+
+    def __call__(self, left: Trajectory, right: Trajectory) -> Preference:
+        """Answers come through ``tell()``, when they come."""
+        raise RuntimeError("a person answers on the page; adapt() cannot ask")
 
 
 class Bench:
@@ -146,7 +153,12 @@ class Bench:
         n_queries = len(request.answers) + 2
         if request.state is None:
             return PreferenceAdapter(
-                self.model, self.env, oracle=_Watches(), seed=request.seed, n_queries=n_queries, **adapter_options(request.options)
+                self.model,
+                self.env,
+                oracle=_Watches(),
+                seed=request.seed,
+                n_queries=n_queries,
+                **adapter_options(request.options),
             )
         state = {**request.state, "options": {**request.state["options"], "n_queries": n_queries}}
         data = {**state, "answers": list(request.answers), "pending": request.pending}

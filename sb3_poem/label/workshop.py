@@ -45,7 +45,7 @@ class Job:
 
 class Workshop:
     """
-    Makes turns on an executor, on which never waits more than its workers can do at once. All methods belong to one event loop.
+    Makes turns on an executor, in the order of their urgency. All methods belong to one event loop.
 
     :param n_workers: How many turns are made at a time.
     :param make_executor: Makes the executor; None takes processes.
@@ -114,7 +114,7 @@ class Workshop:
         return len(self._waiting)
 
     async def close(self) -> None:
-        """Start nothing any more, and end the workers."""
+        """Start nothing any more, and end the workers once they have made what they are at."""
         self._closed = True
         for job in self._waiting:
             job.done.cancel()
@@ -122,7 +122,7 @@ class Workshop:
         for task in self._running:
             task.cancel()
         if self._executor is not None:
-            self._executor.shutdown(wait=False, cancel_futures=True)
+            await asyncio.to_thread(self._executor.shutdown, wait=True, cancel_futures=True)
 
     def _start_jobs(self) -> None:
         while self._waiting and len(self._running) < self.n_workers and not self._closed:

@@ -192,7 +192,8 @@ class LatentPolicy(SACPolicy):
         :return: actions in the environment's units, and the latents (n, latent_dim)
         :raises ValueError: for observations or a state that are not finite or of another shape
         """
-        self.set_training_mode(False)
+        if self.training:  # to set it, every module is visited: longer than a small network's forward pass takes
+            self.set_training_mode(False)
         obs = np.asarray(observation, dtype=np.float32)
         single = obs.ndim == 1
         obs = np.atleast_2d(obs)
