@@ -52,6 +52,7 @@ def bind(host: str, port: int) -> socket.socket:
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((host.strip("[]"), port))
+        listener.listen(128)  # who comes while the server starts waits, and is not turned away
     except OSError as error:
         listener.close()
         raise OSError(f"--host {host} --port {port}: {error.strerror or error}") from error

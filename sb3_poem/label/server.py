@@ -28,6 +28,8 @@ from sb3_poem.label.store import RefusedError, Session
 PAGE = Path(__file__).with_name("page")
 MAX_WISH = 2000
 LONGEST_TOKEN = 64
+# SQLite's whole numbers.
+LARGEST = 2**63 - 1
 
 
 def make_app(conversations: Conversations, access: Access | None = None) -> Starlette:
@@ -129,7 +131,8 @@ class _Pages:
         return JSONResponse({})
 
     async def video(self, request: Request, session: Session) -> Response:
-        path = await asyncio.to_thread(self.conversations.video, session, int(request.path_params["number"]))
+        number = int(request.path_params["number"])
+        path = await asyncio.to_thread(self.conversations.video, session, number) if number <= LARGEST else None
         if path is None:
             raise HTTPException(404)
         # What a turn shows never changes, and only this browser may keep it.
@@ -179,7 +182,7 @@ async def _fields(request: Request, **kinds: type) -> dict[str, Any]:
     if not isinstance(data, dict) or set(data) != set(kinds):
         raise HTTPException(400, f"the request must be a JSON object with {', '.join(kinds) or 'no fields'}")
     for name, kind in kinds.items():
-        if type(data[name]) is not kind or (kind is int and not 0 <= data[name] < 2**63):
+        if type(data[name]) is not kind or (kind is int and not 0 <= data[name] <= LARGEST):
             raise HTTPException(400, f"`{name}` must be {'a whole number' if kind is int else 'a text'}")
     return data
 

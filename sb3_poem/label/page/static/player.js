@@ -14,7 +14,7 @@ class Player {
     this.frames = 1;
     this.halves = 2;
     this.wantsToPlay = !window.matchMedia("(prefers-reduced-motion: reduce)").matches;
-    this.dragging = false;
+    this.drawn = -1;
     this.loading = 0;
     this.video.addEventListener("seeked", () => this.draw());
     this.video.addEventListener("loadeddata", () => this.draw());
@@ -23,7 +23,7 @@ class Player {
     controls.frame.addEventListener("input", () => this.seek(Number(controls.frame.value)));
     controls.speed.addEventListener("change", () => this.applySpeed());
     const tick = () => {
-      if (!this.video.paused) this.draw();
+      if (!this.video.paused && this.frame !== this.drawn) this.draw();
       requestAnimationFrame(tick);
     };
     requestAnimationFrame(tick);
@@ -103,6 +103,7 @@ class Player {
       canvas.getContext("2d").drawImage(this.video, index * part, 0, part, height, 0, 0, part, height);
     });
     const frame = this.frame;
+    this.drawn = frame;
     this.controls.frame.value = String(frame);
     const seconds = (frame / this.fps).toFixed(1);
     this.controls.moment.textContent = `${seconds} s`;
