@@ -72,6 +72,9 @@ def _add_adapt_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
     output = parser.add_argument_group("output")
+    output.add_argument(
+        "--store", type=Path, metavar="FOLDER", help="keep the answers of --oracle human where those of the page are"
+    )
     output.add_argument("--json", type=Path, metavar="FILE", help="write every task's returns, with versions and command")
     output.add_argument("--plot", type=Path, metavar="FILE", help="write the return against the queries (PNG, PDF, SVG)")
     output.add_argument("--video", type=Path, metavar="FILE", help="write one task before and after side by side (MP4, GIF)")

@@ -171,11 +171,11 @@ def begin(open_page: Callable[..., Any], server: Server, choice: Choice, task: f
 
 
 def returns(choice: Choice, latents: np.ndarray, task: float) -> np.ndarray:
-    """True returns of latents, the mean of ten episodes each."""
-    env = TaskVecEnv.from_id(choice.env_id, 10)
-    values = evaluate_latents(load_choice(choice), env, latents, np.full((len(latents), 1), task), 10, seed=77)
+    """True returns of latents, the mean of the same ten episodes each."""
+    env, model = TaskVecEnv.from_id(choice.env_id, 10), load_choice(choice)
+    values = [evaluate_latents(model, env, latent[None, :], np.array([[task]]), 10, seed=77).mean() for latent in latents]
     env.close()
-    return values.mean(axis=1)
+    return np.array(values)
 
 
 def oracles_latents(choice: Choice, task: float) -> np.ndarray:
