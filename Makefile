@@ -3,7 +3,7 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help run test test-all lint format bench bench-gpu venv rendering wheel clean
+.PHONY: help run label test test-all lint format bench bench-gpu venv rendering browser wheel clean
 
 PYTHON ?= python3
 VENV := .venv
@@ -15,6 +15,7 @@ THREADS := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
 help:
 	@echo "make run       meta-train a model, adapt it from ten preferences, show the result (files in $(OUT)/)"
+	@echo "make label     the page on which a person answers, on this machine"
 	@echo "make test      the default test suite"
 	@echo "make test-all  the default suite and the slow tests"
 	@echo "make lint      ruff and mypy"
@@ -28,10 +29,13 @@ help:
 run: $(STAMP) rendering
 	$(BIN)/python -m sb3_poem.demo --out $(OUT)
 
-test: $(STAMP) rendering
+label: $(STAMP) rendering
+	$(BIN)/python -m sb3_poem.cli label
+
+test: $(STAMP) rendering browser
 	$(THREADS) $(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
 
-test-all: $(STAMP) rendering
+test-all: $(STAMP) rendering browser
 	$(THREADS) $(BIN)/python -m pytest -n 2 -m "not gpu" $(PYTEST_ARGS)
 
 lint: $(STAMP)
@@ -61,7 +65,7 @@ $(STAMP): setup.cfg pyproject.toml constraints.txt
 		|| { echo "sb3_poem needs Python 3.10 or newer; name one with make PYTHON=..." >&2; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet -c constraints.txt torch
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev,label]'
 	@touch $@
 
 # MuJoCo draws off screen through EGL or OSMesa. Nothing else needs either, so their absence is no error.
@@ -72,6 +76,17 @@ rendering:
 			echo "Installed libegl1 and libgl1 for off-screen rendering."; \
 		else \
 			echo "Videos need off-screen OpenGL, which is missing here: apt-get install libegl1 libgl1 (or libosmesa6)." >&2; \
+		fi; \
+	fi
+
+# The tests of the page drive Chromium; where it cannot be had they are skipped, and say so.
+browser:
+	@if ! command -v chromium >/dev/null && ! command -v chromium-browser >/dev/null; then \
+		if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null \
+			&& apt-get update -qq && apt-get install -y -qq --no-install-recommends chromium >/dev/null; then \
+			echo "Installed chromium for the tests of the page."; \
+		else \
+			echo "The tests of the page need chromium and are skipped: apt-get install chromium." >&2; \
 		fi; \
 	fi
 

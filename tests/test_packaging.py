@@ -61,7 +61,8 @@ def test_every_tested_version_is_within_the_declared_ranges(setup_cfg: configpar
         if line and not line.startswith("#"):
             name, version = line.split("==")
             tested[canonicalize_name(name)] = version
-    declared = setup_cfg["options"]["install_requires"] + setup_cfg["options.extras_require"]["dev"]
+    extras = setup_cfg["options.extras_require"]
+    declared = setup_cfg["options"]["install_requires"] + extras["dev"] + extras["label"]
     requirements = [Requirement(line) for line in declared.splitlines() if line.strip() and not line.startswith("#")]
     assert len(requirements) > 20
     for requirement in requirements:

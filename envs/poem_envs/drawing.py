@@ -32,7 +32,10 @@ class Canvas:
         :param radius: in units of the plane
         :param colour: red, green, blue
         """
-        self._paint(np.hypot(self._x - x, self._y - y) - radius, colour)
+        reach = radius + 1.0 / self._per_unit  # beyond it no pixel is touched
+        rows = _span(np.abs(self._y[:, 0] - y) <= reach)
+        columns = _span(np.abs(self._x - x) <= reach)
+        self._paint(np.hypot(self._x[columns] - x, self._y[rows] - y) - radius, colour, rows, columns)
 
     def upper_half_circle(self, radius: float, line_width: float, colour: Colour) -> None:
         """Paint the line of the half-circle around the origin where y >= 0.
@@ -48,9 +51,21 @@ class Canvas:
         """What was painted, ``(height, width, 3)`` uint8."""
         return np.rint(self._pixels).astype(np.uint8)
 
-    def _paint(self, signed_distance: np.ndarray, colour: Colour) -> None:
-        coverage = np.clip(0.5 - signed_distance * self._per_unit, 0.0, 1.0)[..., None]
-        self._pixels += coverage * (np.array(colour, dtype=np.float64) - self._pixels)
+    def _paint(
+        self, signed_distance: np.ndarray, colour: Colour, rows: slice = slice(None), columns: slice = slice(None)
+    ) -> None:
+        """Paint where the distance to a shape's edge, ``(rows, columns)``, is negative inside it."""
+        coverage = np.clip(0.5 - signed_distance * self._per_unit, 0.0, 1.0)
+        touched = coverage > 0.0
+        window = self._pixels[rows, columns]
+        old = window[touched]
+        window[touched] = old + coverage[touched][:, None] * (np.array(colour, dtype=np.float64) - old)
+
+
+def _span(inside: np.ndarray) -> slice:
+    """The slice from the first to the last that is inside."""
+    places = np.flatnonzero(inside)
+    return slice(places[0], places[-1] + 1) if len(places) else slice(0, 0)
 
 
 class ImageWindow:

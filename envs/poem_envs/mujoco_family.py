@@ -13,11 +13,13 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
 from poem_envs.cores import available_cores
+from poem_envs.mujoco_fast_rendering import FastRenderer
 from poem_envs.mujoco_integrator import Integrator
 from poem_envs.mujoco_rendering import StateRenderer
 from poem_envs.vector import BatchFamily, BatchTaskFamily, TaskFamilyVector
 
 DEFAULT_SIZE = 480
+RENDER_QUALITIES = ("full", "fast")
 RENDER_MODES = ["human", "rgb_array", "depth_array", "rgbd_tuple"]
 
 
@@ -48,7 +50,9 @@ class MujocoFamily(BatchFamily):
     :param default_camera_config: attributes of the following camera, such as ``{"distance": 4.0}``, over the robot's own
     :param max_geom: as in Gymnasium
     :param visual_options: as in Gymnasium
+    :param render_quality: "full", or "fast": without shadows, reflections and antialiasing, for RGB images alone
     :raises OSError: if there is no such model file
+    :raises ValueError: if the rendering quality is unknown, or does not go with the render mode
     """
 
     #: Number of positions at the head of ``qpos`` that the observation leaves out.
@@ -60,6 +64,7 @@ class MujocoFamily(BatchFamily):
     _nthread: int = 0
     _integrator: Integrator | None = None
     _renderer: StateRenderer | None = None
+    _fast_renderer: FastRenderer | None = None
 
     def __init__(
         self,
@@ -74,8 +79,14 @@ class MujocoFamily(BatchFamily):
         default_camera_config: dict[str, Any] | None = None,
         max_geom: int = 1000,
         visual_options: dict[int, bool] | None = None,
+        render_quality: str = "full",
         **kwargs: Any,
     ) -> None:
+        if render_quality not in RENDER_QUALITIES:
+            raise ValueError(f"render_quality must be one of {RENDER_QUALITIES}, got {render_quality!r}")
+        render_mode = kwargs.get("render_mode")
+        if render_quality == "fast" and render_mode not in (None, "rgb_array"):
+            raise ValueError(f'render_quality="fast" goes with render_mode="rgb_array" alone, got {render_mode!r}')
         self.model = mujoco.MjModel.from_xml_path(_model_path(xml_file))
         if self.model.na:
             raise ValueError(f"xml_file={xml_file!r} has actuators with activations, which these environments do not handle")
@@ -83,15 +94,16 @@ class MujocoFamily(BatchFamily):
         self.reset_noise_scale = reset_noise_scale
         initial = mujoco.MjData(self.model)
         self.init_qpos, self.init_qvel = initial.qpos.copy(), initial.qvel.copy()
+        self._renders_fast = render_quality == "fast"
         self._render_arguments: dict[str, Any] = {
             "width": width,
             "height": height,
             "camera_id": camera_id,
             "camera_name": camera_name,
             "camera_config": {**self.camera_config, **(default_camera_config or {})},
-            "max_geom": max_geom,
-            "visual_options": visual_options,
         }
+        if not self._renders_fast:
+            self._render_arguments |= {"max_geom": max_geom, "visual_options": visual_options}
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.dt)}
         low, high = self.model.actuator_ctrlrange.astype(np.float32).T
         super().__init__(
@@ -179,9 +191,13 @@ class MujocoFamily(BatchFamily):
         self._states[copy] = state
 
     def _render_copy(self, copy: int, render_mode: str, task: np.ndarray | None) -> Any:
+        markers = [] if task is None else self._task_markers(task, self._qpos[copy, :3])
+        if self._renders_fast:
+            if self._fast_renderer is None:
+                self._fast_renderer = FastRenderer(self.model, **self._render_arguments)
+            return self._fast_renderer.render(self._states[copy], markers)
         if self._renderer is None:
             self._renderer = StateRenderer(self.model, **self._render_arguments)
-        markers = [] if task is None else self._task_markers(task, self._qpos[copy, :3])
         return self._renderer.render(self._states[copy], render_mode, markers)
 
     def _release(self) -> None:
@@ -191,9 +207,17 @@ class MujocoFamily(BatchFamily):
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
+        if self._fast_renderer is not None:
+            self._fast_renderer.close()
+            self._fast_renderer = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_integrator": None, "_renderer": None}  # threads and windows are made anew when needed
+        return {
+            **self.__dict__,
+            "_integrator": None,
+            "_renderer": None,
+            "_fast_renderer": None,
+        }  # threads and windows are made anew when needed
 
 
 class MujocoTaskEnv(MujocoFamily, BatchTaskFamily):

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import atexit
 import weakref
-from typing import Any
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
 
 from poem_envs.headless import choose_headless_backend
 
-_open_renderers: weakref.WeakSet[StateRenderer] = weakref.WeakSet()
+
+class _Closable(Protocol):
+    def close(self) -> None: ...
+
+
+_open_renderers: weakref.WeakSet[_Closable] = weakref.WeakSet()
 
 TASK_COLOUR = (0.16, 0.65, 0.27, 1.0)
 
@@ -66,7 +71,7 @@ class StateRenderer:
             choose_headless_backend()
         viewer = self._renderer._get_viewer(render_mode)
         viewer.make_context_current()  # another environment may have rendered since
-        _close_at_exit(self)
+        close_at_exit(self)
         if self._follows:
             viewer.cam.lookat[:2] = self._data.xpos[1, :2]
         for marker in markers:
@@ -77,14 +82,20 @@ class StateRenderer:
     def close(self) -> None:
         """Close windows and graphics contexts."""
         self._renderer.close()
-        _open_renderers.discard(self)
+        stays_closed(self)
 
 
-def _close_at_exit(renderer: StateRenderer) -> None:
+def close_at_exit(renderer: _Closable) -> None:
+    """Close a renderer when the program ends, if it still is open then."""
     # A graphics context must go before the library that made it, which ends itself at exit: so register after its import.
     if not _open_renderers:
         atexit.register(_close_open_renderers)
     _open_renderers.add(renderer)
+
+
+def stays_closed(renderer: _Closable) -> None:
+    """Undo :func:`close_at_exit`."""
+    _open_renderers.discard(renderer)
 
 
 def _close_open_renderers() -> None:

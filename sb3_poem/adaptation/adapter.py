@@ -330,12 +330,25 @@ class PreferenceAdapter:
             adapter = cls.__new__(cls)
             options = cls.options_class.from_dict(data["options"])
             adapter._start(model, env, options, oracle, int(data["seed"]), library)
-            answers = [Answer(Preference(item["preference"]), *_pair_from_dict(item)) for item in data["answers"]]
-            adapter.inference.restore(Snapshot.from_dict(data["inference"]), answers)
-            adapter._pending = None if data["pending"] is None else Query(*_pair_from_dict(data["pending"]))
         except (KeyError, TypeError) as error:
             raise ValueError(f"a saved adaptation that is incomplete or broken: {error!r}") from error
+        adapter.restore(data)
         return adapter
+
+    def restore(self, data: dict[str, Any]) -> None:
+        """
+        Go to where another adapter of the same model, options and seed stood when :meth:`to_dict` was called.
+
+        :param data: The dictionary.
+        :raises ValueError: If the data is broken.
+        """
+        try:
+            answers = [Answer(Preference(item["preference"]), *_pair_from_dict(item)) for item in data["answers"]]
+            pending = None if data["pending"] is None else Query(*_pair_from_dict(data["pending"]))
+            self.inference.restore(Snapshot.from_dict(data["inference"]), answers)
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"a saved adaptation that is incomplete or broken: {error!r}") from error
+        self._pending, self._previous = pending, None
 
     def to_json(self) -> str:
         """:meth:`to_dict` as a JSON text."""

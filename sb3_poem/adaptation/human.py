@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 from sb3_poem.adaptation.noise import MistakeNoise, NoiseModel
@@ -15,6 +17,29 @@ ANSWERS = {
     **dict.fromkeys(("r", "right", "2"), Preference.RIGHT),
     **dict.fromkeys(("e", "equal", "=", "can't tell", "cant tell", "?"), Preference.EQUAL),
 }
+
+
+@dataclass(frozen=True, eq=False)
+class HumanAnswer:
+    """
+    An answer, with all that is known of it.
+
+    :param preference: The answer.
+    :param left: The trajectory on the left.
+    :param right: That on the right.
+    :param video: The file in which both were shown.
+    :param fps: Its frames per second.
+    :param asked: When the question came up, seconds since 1970.
+    :param shown: When its video was ready.
+    """
+
+    preference: Preference
+    left: Trajectory
+    right: Trajectory
+    video: Path
+    fps: float
+    asked: float
+    shown: float
 
 
 class HumanOracle:
@@ -30,6 +55,8 @@ class HumanOracle:
     :param mistake_rate: How often a person is taken to err, for the Bayesian rule.
     :param read: Reads a line after showing a prompt; ``input`` by default.
     :param write: Shows a line; ``print`` by default.
+    :param record: Called with each :class:`HumanAnswer` as soon as it is understood; ``sb3_poem.label`` has one that keeps
+        them in the store of the web page.
     :raises ValueError: If the format is unknown.
     """
 
@@ -43,6 +70,7 @@ class HumanOracle:
         mistake_rate: float = 0.05,
         read: Callable[[str], str] = input,
         write: Callable[[str], None] = print,
+        record: Callable[[HumanAnswer], None] | None = None,
     ) -> None:
         if video_format not in ("gif", "mp4"):
             raise ValueError(f'`video_format` must be "gif" or "mp4", but is {video_format!r}')
@@ -53,6 +81,7 @@ class HumanOracle:
         self.n_asked = 0
         self._read = read
         self._write = write
+        self._record = record
 
     def __call__(self, left: Trajectory, right: Trajectory) -> Preference:
         """
@@ -64,7 +93,9 @@ class HumanOracle:
         :raises ValueError: If a trajectory has no frames.
         :raises RuntimeError: If the terminal is closed.
         """
+        asked = time.time()
         path = self._write_video(left, right)
+        shown = time.time()
         self._write(f"Query {self.n_asked}: {path}")
         while True:
             try:
@@ -73,6 +104,8 @@ class HumanOracle:
                 raise RuntimeError("no answer can be read: standard input is closed") from None
             answer = ANSWERS.get(line.strip().lower())
             if answer is not None:
+                if self._record is not None:
+                    self._record(HumanAnswer(answer, left, right, path, self.fps, asked, shown))
                 return answer
             self._write(f"{line.strip()!r} is no answer; type l, r or e.")
 

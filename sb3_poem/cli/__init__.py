@@ -1,5 +1,5 @@
 """
-The command line, ``sb3-poem``: train, enjoy and adapt.
+The command line, ``sb3-poem``: train, enjoy, adapt and label.
 
 This file only reads the command; what a command needs is imported when it runs, so that ``sb3-poem --help`` is immediate.
 """
@@ -23,7 +23,10 @@ examples:
   sb3-poem train --env poem/HalfCheetahVel-v0 --eval-freq 50000 -P
   sb3-poem adapt --model HalfCheetahVel --env poem/HalfCheetahVel-v0 --oracle return
   sb3-poem adapt --model logs/poem_sac/poem-AntGoal-v0_1/poem-AntGoal-v0.zip --env poem/AntGoal-v0 --oracle human
+  sb3-poem label
+  sb3-poem label export --out answers.parquet
 """
+DEFAULT_STORE = Path("label_data")
 
 
 def _count(minimum: int) -> type[int]:
@@ -75,9 +78,70 @@ def _add_adapt_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
     output = parser.add_argument_group("output")
+    output.add_argument(
+        "--store", type=Path, metavar="FOLDER", help="keep the answers of --oracle human where those of the page are"
+    )
     output.add_argument("--json", type=Path, metavar="FILE", help="write every task's returns, with versions and command")
     output.add_argument("--plot", type=Path, metavar="FILE", help="write the return against the queries (PNG, PDF, SVG)")
     output.add_argument("--video", type=Path, metavar="FILE", help="write one task before and after side by side (MP4, GIF)")
+
+
+def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
+    model = parser.add_argument_group("what is taught")
+    model.add_argument(
+        "--model", help="a pretrained folder, a folder of such, or the name of a shipped model (default: all that are shipped)"
+    )
+    model.add_argument("--env", help="environment id (default: the one that the model was trained on)")
+    model.add_argument("--env-kwargs", nargs="+", metavar="KEY:VALUE", default=[], help="arguments of the environment")
+    model.add_argument("--gym-packages", nargs="+", metavar="MODULE", default=[], help="modules that register environments")
+    model.add_argument("--queries", type=_count(1), default=10, help="questions before the result (default: %(default)s)")
+    model.add_argument("--inference", choices=("paper", "bayes"), default="bayes", help="default: %(default)s")
+    model.add_argument(
+        "--mistake-rate", type=float, default=0.05, help="how often people are taken to err (default: %(default)s)"
+    )
+    model.add_argument("--seed", type=_count(0), help="of every session (default: each has its own)")
+
+    server = parser.add_argument_group("the server")
+    server.add_argument("--host", default="127.0.0.1", help="default: %(default)s, which only this machine reaches")
+    server.add_argument("--port", type=_count(0), default=7860, help="default: %(default)s; 0 takes a free one")
+    server.add_argument("--auth", metavar="USER:PASSWORD", help="ask for a name and a password of at least 12 characters")
+    server.add_argument("--token", action="store_true", help="let in only who has the link with the token, which is printed")
+    server.add_argument("--allow-host", nargs="+", metavar="NAME", default=[], help="further names of this server")
+    server.add_argument(
+        "--max-sessions", type=_count(1), default=16, help="people who may be at work at once (default: %(default)s)"
+    )
+    server.add_argument("--workers", type=_count(1), default=2, help="processes that render (default: %(default)s)")
+    _add_store_argument(server)
+
+    commands = parser.add_subparsers(dest="label_command", metavar="{export,replay}")
+    export = commands.add_parser("export", help="write all answers as a data set", description="Write all answers.")
+    _add_store_argument(export)
+    export.add_argument("--out", type=Path, nargs="+", required=True, metavar="FILE", help="ends in .jsonl or .parquet")
+    export.add_argument("--trajectories", action="store_true", help="with observations, actions and reward features")
+    export.add_argument("--undone", action="store_true", help="with answers that were taken back")
+    replay = commands.add_parser(
+        "replay",
+        help="feed recorded answers to another model or rule",
+        description="Feed the recorded answers to a model and a rule, and say how well these would have foretold them.",
+    )
+    _add_store_argument(replay)
+    replay.add_argument(
+        "--model", help="a model's .zip, a pretrained folder, or a shipped model (default: each session's own)"
+    )
+    replay.add_argument("--inference", choices=("paper", "bayes"), default="bayes", help="default: %(default)s")
+    replay.add_argument("--mistake-rate", type=float, default=0.05, help="default: %(default)s")
+    replay.add_argument("--seed", type=_count(0), default=0, help="of the inference (default: %(default)s)")
+    replay.add_argument("--json", type=Path, metavar="FILE", help="write what was foretold, and the latents after each answer")
+
+
+def _add_store_argument(parser: argparse._ActionsContainer) -> None:
+    parser.add_argument(
+        "--store",
+        type=Path,
+        default=DEFAULT_STORE,
+        metavar="FOLDER",
+        help="where answers and videos are (default: %(default)s)",
+    )
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -89,7 +153,7 @@ def build_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="{train,enjoy,adapt}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="{train,enjoy,adapt,label}")
     for name, summary in ZOO_COMMANDS.items():
         commands.add_parser(name, help=summary, add_help=False)
     adapt = commands.add_parser(
@@ -98,6 +162,12 @@ def build_parser() -> argparse.ArgumentParser:
         description="Adapt a trained agent to unseen tasks by preference queries, and print what it earns after each.",
     )
     _add_adapt_arguments(adapt)
+    label = commands.add_parser(
+        "label",
+        help="open the page on which a person answers; export and replay their answers",
+        description="Open a web page on which people teach a trained agent their task by comparing videos.",
+    )
+    _add_label_arguments(label)
     return parser
 
 
@@ -137,6 +207,10 @@ def _run(arguments: argparse.Namespace, others: list[str]) -> int:
         with loading:
             from sb3_poem.cli.zoo import run_zoo
         run_zoo(arguments.command, others)
+    elif arguments.command == "label":
+        with loading:
+            from sb3_poem.cli.label import run_label
+        run_label(arguments)
     else:
         with loading:
             from sb3_poem.cli.adapt import run_adapt

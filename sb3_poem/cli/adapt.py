@@ -31,6 +31,7 @@ from sb3_poem.adaptation import (
     known_task_return,
 )
 from sb3_poem.adaptation.evaluation import evaluation_seed
+from sb3_poem.adaptation.human import HumanAnswer
 from sb3_poem.adaptation.oracles import compute_reward
 from sb3_poem.cli.models import load_model
 from sb3_poem.cli.outputs import check_output
@@ -62,6 +63,8 @@ def run_adapt(arguments: argparse.Namespace) -> None:
     check_output("--video", arguments.video, (".mp4", ".gif"))
     if arguments.oracle == "human" and arguments.task is None and arguments.plot is not None:
         raise ValueError("--plot needs returns, and with --oracle human only --task says by which goal to measure them")
+    if arguments.store is not None and arguments.oracle != "human":
+        raise ValueError(f"--store keeps a person's answers, but --oracle is {arguments.oracle}")
     for package in arguments.gym_packages:
         importlib.import_module(package)
     th.set_num_threads(arguments.num_threads)
@@ -168,8 +171,9 @@ class Adaptation:
         env = DummyVecEnv([partial(self._make_rendering_env, show_task=False)])
         if arguments.task is not None:
             env.env_method("set_task", self.tasks[0])
+        oracle = HumanOracle(record=self._recorder())
         adapter = PreferenceAdapter(
-            self.model, env, oracle=HumanOracle(), n_queries=arguments.queries, seed=self.seed, **self.options
+            self.model, env, oracle=oracle, n_queries=arguments.queries, seed=self.seed, **self.options
         )
         assert adapter.oracle is not None
         latents, answers = [adapter.policy().latent], []
@@ -187,6 +191,17 @@ class Adaptation:
         if arguments.video is not None:
             self._film(self.tasks[0], np.stack([latents[0], latents[-1]]), (0, len(answers)))
         return None
+
+    def _recorder(self) -> Callable[[HumanAnswer], None] | None:
+        """Keeps the person's answers in the store of the page, if ``--store`` names one."""
+        if self.arguments.store is None:
+            return None
+        from sb3_poem.label import Store, StoreRecorder
+
+        name = Path(self.arguments.model).name
+        return StoreRecorder(
+            Store(self.arguments.store), name, self.env_id, self.seed, dict(self.options), self.arguments.queries
+        )
 
     def _evaluate(self, latents: np.ndarray, answers: list[Preference]) -> AdaptationEvaluation:
         """Measure the latents (n_records, latent_dim) that one task went through."""

@@ -37,6 +37,24 @@ def save_pretrained(model: "PEARLSAC", folder: str | Path, card: dict[str, Any] 
     :raises ValueError: if the policy's activation is none of torch.nn's, which JSON could not name
     """
     folder = Path(folder)
+    config, tensors = model_contents(model, card)
+    contents = {  # all made before the first is written
+        WEIGHTS: tensors_to_bytes(tensors),
+        CONFIG: (config_text(config) + "\n").encode(),
+        CARD: _card_text(config).encode(),
+    }
+    for name, content in contents.items():
+        write_atomically(folder / name, content)
+
+
+def model_contents(model: "PEARLSAC", card: dict[str, Any] | None = None) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
+    """What a model is made of, from which :func:`build_model` makes it again.
+
+    :param model: A trained model
+    :param card: See :func:`save_pretrained`
+    :return: Its configuration, which :func:`config_text` writes, and its tensors by name
+    :raises ValueError: see :func:`save_pretrained`
+    """
     activation = model.policy.activation_fn
     if getattr(nn, activation.__name__, None) is not activation:
         raise ValueError(f"activation_fn must be one of torch.nn to be saved by its name, got {activation}")
@@ -62,14 +80,15 @@ def save_pretrained(model: "PEARLSAC", folder: str | Path, card: dict[str, Any] 
         space = getattr(model, name)
         tensors[f"{name}.low"], tensors[f"{name}.high"] = th.as_tensor(space.low), th.as_tensor(space.high)
         config[name] = {"dtype": str(space.dtype)}
-    tensors = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    contents = {  # all made before the first is written
-        WEIGHTS: tensors_to_bytes(tensors),
-        CONFIG: (json.dumps(config, indent=2, default=_to_json) + "\n").encode(),
-        CARD: _card_text(config).encode(),
-    }
-    for name, content in contents.items():
-        write_atomically(folder / name, content)
+    return config, {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+
+
+def config_text(config: dict[str, Any]) -> str:
+    """A configuration as JSON.
+
+    :param config: What :func:`model_contents` gave
+    """
+    return json.dumps(config, indent=2, default=_to_json)
 
 
 def _arguments(model: "PEARLSAC") -> dict[str, Any]:
@@ -148,6 +167,28 @@ def from_pretrained(algorithm: type[Model], folder: str | Path, env: Any = None,
         tensors = load_tensors(weights.read_bytes())
     except SafetensorError as error:
         raise ValueError(f"{weights} is truncated, or no safetensors file: {error}") from error
+    model = build_model(algorithm, config, tensors, str(folder), device)
+    if env is not None:
+        model.set_env(algorithm._vectorise(env, len(model.train_tasks)))  # type: ignore[arg-type]
+    return model
+
+
+def build_model(
+    algorithm: type[Model],
+    config: dict[str, Any],
+    tensors: dict[str, th.Tensor],
+    source: str,
+    device: th.device | str = "auto",
+) -> Model:
+    """Make a model from what :func:`model_contents` took it apart into.
+
+    :param algorithm: Class of the model
+    :param config: Its configuration
+    :param tensors: Its tensors
+    :param source: Where they come from, for the message
+    :param device: "auto", "cpu", "cuda"
+    :raises ValueError: if something is missing, or does not fit
+    """
     try:
         model = algorithm("MlpPolicy", None, device=device, _init_setup_model=False, **config["arguments"])  # type: ignore[arg-type]
         for name in SPACES:
@@ -172,7 +213,5 @@ def from_pretrained(algorithm: type[Model], folder: str | Path, env: Any = None,
         state |= {f"{DERIVED}{name.removeprefix('critic.')}": v for name, v in state.items() if name.startswith("critic.")}
         model.policy.load_state_dict(state)
     except (AttributeError, KeyError, TypeError, RuntimeError) as error:
-        raise ValueError(f"{folder} does not hold a complete {algorithm.__name__}: {error}") from error
-    if env is not None:
-        model.set_env(algorithm._vectorise(env, len(model.train_tasks)))  # type: ignore[arg-type]
+        raise ValueError(f"{source} does not hold a complete {algorithm.__name__}: {error}") from error
     return model

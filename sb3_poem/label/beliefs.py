@@ -1,0 +1,139 @@
+"""What the system believes, as a picture and a sentence for people: the posterior over latents, seen as tasks."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from sb3_poem.label.families import as_points, describe
+
+# Training tasks from which the task of a latent is read.
+NEIGHBOURS = 5
+# The sentence names the range that holds so much of the posterior.
+SHARE = 0.8
+
+
+def belief(adapter: Any, env_id: str) -> dict[str, Any]:
+    """
+    The posterior of an adapter, ready to draw.
+
+    :param adapter: A ``PreferenceAdapter``.
+    :param env_id: The environment's id, which says how tasks are drawn.
+    :return: JSON-ready: ``picture`` ("place", "speed", "direction" or "projection"), ``points`` (n, 1 or 2), ``weights`` (n,)
+        summing to one, ``estimate`` (the point of the policy that would be taken now), ``extent``, ``unit`` and ``sentence``.
+    """
+    latents, weights = posterior(adapter.inference)
+    description = describe(env_id)
+    everything = np.concatenate([latents, adapter.inference.estimate()[None, :]])
+    tasks = np.asarray(adapter.model.train_tasks, dtype=np.float64)
+    picture = description.picture
+    if picture == "projection":
+        points, extent = _projection(adapter.model, everything)
+    else:
+        points, extent = _points_of(adapter.model, everything, as_points(env_id, tasks)), description.extent
+    points, estimate = points[:-1], points[-1]
+    return {
+        "picture": picture,
+        "points": np.round(points, 4).tolist(),
+        "weights": np.round(weights, 6).tolist(),
+        "estimate": np.round(estimate, 4).tolist(),
+        "extent": float(extent),
+        "unit": description.unit,
+        "sentence": sentence(picture, points, weights, estimate, description.unit),
+    }
+
+
+def posterior(inference: Any) -> tuple[np.ndarray, np.ndarray]:
+    """
+    The latents that are still possible.
+
+    :param inference: A ``LatentInference``.
+    :return: Latents (n, d), and weights (n,) summing to one.
+    """
+    if hasattr(inference, "particles"):
+        return inference.particles, inference.weights
+    candidates = inference.candidates
+    return candidates, np.full(len(candidates), 1.0 / len(candidates))
+
+
+def sentence(picture: str, points: np.ndarray, weights: np.ndarray, estimate: np.ndarray, unit: str) -> str:
+    """
+    The posterior in words, for those who cannot see the picture, and those who would rather read.
+
+    :param picture: How it is drawn.
+    :param points: (n, 1 or 2).
+    :param weights: (n,) summing to one.
+    :param estimate: (1 or 2,).
+    :param unit: Of the numbers.
+    :return: One sentence.
+    """
+    if picture == "speed":
+        low, high = weighted_quantiles(points[:, 0], weights, ((1 - SHARE) / 2, (1 + SHARE) / 2))
+        return f"It believes that you want between {max(low, 0.0):.1f} and {high:.1f} {unit}."
+    if picture == "direction":
+        return _direction_sentence(points, weights)
+    distances = np.linalg.norm(points - estimate, axis=1)
+    radius = weighted_quantiles(distances, weights, (SHARE,))[0]
+    if picture == "place":
+        x, y = estimate
+        return (
+            f"It believes that you mean a place near {x:.1f} across and {y:.1f} up, give or take {radius:.1f} {unit}".strip()
+            + "."
+        )
+    return "Each dot is a behaviour that still fits your answers; the closer together they lie, the surer it is."
+
+
+def weighted_quantiles(values: np.ndarray, weights: np.ndarray, shares: tuple[float, ...]) -> list[float]:
+    """
+    Quantiles of a weighted sample.
+
+    :param values: (n,).
+    :param weights: (n,) summing to one.
+    :param shares: Each in [0, 1].
+    :return: The smallest value below or at which lies each share.
+    """
+    order = np.argsort(values)
+    cumulative = np.cumsum(weights[order])
+    places = np.searchsorted(cumulative, np.asarray(shares) * cumulative[-1])
+    return [float(values[order[min(place, len(order) - 1)]]) for place in places]
+
+
+def _direction_sentence(points: np.ndarray, weights: np.ndarray) -> str:
+    if np.abs(points[:, 1]).max() < 1e-9:  # one line: forward or backward
+        forward = float(weights[points[:, 0] >= 0].sum())
+        way, share = ("to the right", forward) if forward >= 0.5 else ("to the left", 1.0 - forward)
+        return f"It is {100 * share:.0f} % sure that you want it to run {way} in the video."
+    x, y = weights @ points
+    angle = np.arctan2(y, x)
+    away = np.abs(np.angle(np.exp(1j * (np.arctan2(points[:, 1], points[:, 0]) - angle))))
+    spread = np.degrees(weighted_quantiles(away, weights, (SHARE,))[0])
+    names = ("right", "far right", "away from you", "far left", "left", "near left", "towards you", "near right")
+    name = names[round(angle / (np.pi / 4)) % 8]
+    return f"It believes that you mean the direction {name} in the video, give or take {spread:.0f} degrees."
+
+
+def _points_of(model: Any, latents: np.ndarray, train_points: np.ndarray) -> np.ndarray:
+    """(m, 1 or 2) the tasks of latents (m, d): the mean of the nearest training tasks', the nearer the heavier."""
+    means, variances = np.asarray(model.latent_means), np.asarray(model.latent_variances)
+    spread = means.var(axis=0)
+    # What training has left unused says nothing of the task; there the prior's spread would drown the rest.
+    scale = np.sqrt(spread / np.maximum(spread + variances.mean(axis=0), 1e-12))
+    distances = np.linalg.norm((latents[:, None, :] - means[None, :, :]) * scale, axis=2)
+    nearest = np.argsort(distances, axis=1)[:, : min(NEIGHBOURS, len(means))]
+    closeness = 1.0 / (np.take_along_axis(distances, nearest, axis=1) + 1e-3)
+    closeness /= closeness.sum(axis=1, keepdims=True)
+    return np.einsum("mk,mkp->mp", closeness, train_points[nearest])
+
+
+def _projection(model: Any, latents: np.ndarray) -> tuple[np.ndarray, float]:
+    """(m, 2) latents on the plane in which the training tasks' latents differ most, and half the picture's width."""
+    means = np.asarray(model.latent_means)
+    centre = means.mean(axis=0)
+    axes = np.linalg.svd(means - centre, full_matrices=False)[2][:2]
+    if len(axes) < 2:
+        axes = np.eye(2, means.shape[1])
+    points, train_points = (latents - centre) @ axes.T, (means - centre) @ axes.T
+    if points.shape[1] < 2:
+        points = np.concatenate([points, np.zeros_like(points)], axis=1)
+    return points, 1.2 * max(float(np.abs(train_points).max()), float(np.abs(points).max()))

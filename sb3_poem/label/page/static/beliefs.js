@@ -1,0 +1,107 @@
+// Draws the posterior as people understand it: a speedometer, a compass, a map, or dots.
+"use strict";
+
+const SVG = "http://www.w3.org/2000/svg";
+
+function shape(parent, name, attributes, text) {
+  const element = document.createElementNS(SVG, name);
+  for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, String(value));
+  if (text !== undefined) element.textContent = text;
+  parent.appendChild(element);
+  return element;
+}
+
+const polar = (radius, angle) => [radius * Math.cos(angle), -radius * Math.sin(angle)];
+
+function arc(radius, from, to) {
+  const [x0, y0] = polar(radius, from);
+  const [x1, y1] = polar(radius, to);
+  return `M${x0} ${y0}A${radius} ${radius} 0 ${Math.abs(to - from) > Math.PI ? 1 : 0} ${to > from ? 0 : 1} ${x1} ${y1}`;
+}
+
+// Weights gathered into bins, smoothed a little, the highest being one.
+function histogram(values, weights, low, high, bins, circular) {
+  const counts = new Array(bins).fill(0);
+  values.forEach((value, index) => {
+    const place = Math.floor(((value - low) / (high - low)) * bins);
+    counts[Math.min(bins - 1, Math.max(0, place))] += weights[index];
+  });
+  const at = (i) => (circular ? counts[(i + bins) % bins] : counts[Math.min(bins - 1, Math.max(0, i))]);
+  const smooth = counts.map((count, i) => (at(i - 1) + 2 * count + at(i + 1)) / 4);
+  const highest = Math.max(...smooth, 1e-9);
+  return smooth.map((value) => value / highest);
+}
+
+function drawBelief(svg, belief) {
+  svg.replaceChildren();
+  if (!belief) return;
+  ({ speed: drawSpeed, direction: drawDirection, place: drawPlane, projection: drawPlane })[belief.picture](svg, belief);
+}
+
+function drawSpeed(svg, belief) {
+  svg.setAttribute("viewBox", "-110 -100 220 122");
+  const angle = (speed) => Math.PI * (1 - Math.min(1, Math.max(0, speed / belief.extent)));
+  const bins = 36;
+  shape(svg, "path", { d: arc(78, Math.PI, 0), class: "track" });
+  const heights = histogram(belief.points.map((p) => p[0]), belief.weights, 0, belief.extent, bins, false);
+  heights.forEach((height, i) => {
+    if (height < 0.02) return;
+    const from = Math.PI * (1 - i / bins);
+    shape(svg, "path", { d: arc(78, from, from - Math.PI / bins), class: "mass", "stroke-opacity": 0.12 + 0.88 * height });
+  });
+  for (let speed = 0; speed <= belief.extent; speed++) {
+    const [x, y] = polar(98, angle(speed));
+    shape(svg, "text", { x, y: y + 4, class: "tick" }, String(speed));
+  }
+  const [x, y] = polar(62, angle(belief.estimate[0]));
+  shape(svg, "line", { x1: 0, y1: 0, x2: x, y2: y, class: "needle" });
+  shape(svg, "circle", { cx: 0, cy: 0, r: 5, class: "hub" });
+  shape(svg, "text", { x: 0, y: 18, class: "tick" }, belief.unit);
+}
+
+function drawDirection(svg, belief) {
+  const line = belief.points.every((p) => Math.abs(p[1]) < 1e-6);
+  svg.setAttribute("viewBox", line ? "-120 -48 240 96" : "-110 -110 220 220");
+  if (line) {
+    const right = belief.points.reduce((sum, p, i) => sum + (p[0] >= 0 ? belief.weights[i] : 0), 0);
+    [[-1, 1 - right], [1, right]].forEach(([way, share]) => {
+      const d = `M${way * 8} -14H${way * 60}V-30L${way * 104} 0L${way * 60} 30V14H${way * 8}Z`;
+      shape(svg, "path", { d, class: "arrow-frame" });
+      shape(svg, "path", { d, class: "arrow", "fill-opacity": share });
+      shape(svg, "text", { x: way * 50, y: 5, class: share > 0.55 ? "tick over" : "tick" }, `${Math.round(100 * share)} %`);
+    });
+    return;
+  }
+  const bins = 48;
+  shape(svg, "circle", { cx: 0, cy: 0, r: 78, class: "track" });
+  const angles = belief.points.map((p) => Math.atan2(p[1], p[0]));
+  histogram(angles, belief.weights, -Math.PI, Math.PI, bins, true).forEach((height, i) => {
+    if (height < 0.02) return;
+    const from = -Math.PI + (2 * Math.PI * i) / bins;
+    shape(svg, "path", { d: arc(78, from, from + (2 * Math.PI) / bins), class: "mass", "stroke-opacity": 0.12 + 0.88 * height });
+  });
+  const [x, y] = polar(60, Math.atan2(belief.estimate[1], belief.estimate[0]));
+  shape(svg, "line", { x1: 0, y1: 0, x2: x, y2: y, class: "needle" });
+  shape(svg, "circle", { cx: 0, cy: 0, r: 5, class: "hub" });
+}
+
+function drawPlane(svg, belief) {
+  svg.setAttribute("viewBox", "-110 -110 220 220");
+  const scale = 100 / belief.extent;
+  shape(svg, "rect", { x: -104, y: -104, width: 208, height: 208, rx: 10, class: "map" });
+  if (belief.picture === "place") {
+    shape(svg, "path", { d: "M-104 0H104M0 -104V104", class: "grid" });
+    shape(svg, "circle", { cx: 0, cy: 0, r: 3, class: "start" });
+    shape(svg, "text", { x: 6, y: 14, class: "small" }, "start");
+  }
+  const heaviest = Math.max(...belief.weights);
+  belief.points.forEach((point, i) => {
+    const strength = belief.weights[i] / heaviest;
+    if (strength < 0.01) return;
+    const place = { cx: point[0] * scale, cy: -point[1] * scale };
+    shape(svg, "circle", { ...place, r: 7, class: "cloud", "fill-opacity": 0.05 + 0.22 * strength });
+  });
+  const [x, y] = [belief.estimate[0] * scale, -belief.estimate[1] * scale];
+  shape(svg, "circle", { cx: x, cy: y, r: 8, class: "ring" });
+  shape(svg, "circle", { cx: x, cy: y, r: 2.5, class: "hub" });
+}

@@ -1,0 +1,208 @@
+// The conversation. The server keeps all of it; this page shows where it stands and says what was clicked.
+"use strict";
+
+const POLL_MILLISECONDS = 150;
+const SLOW_AFTER_MILLISECONDS = 4000;
+const base = window.location.pathname.replace(/\/+$/, "");
+const byId = (id) => document.getElementById(id);
+const player = new Player(
+  [byId("left-screen"), byId("right-screen")],
+  { play: byId("play"), frame: byId("frame"), speed: byId("speed"), moment: byId("moment"), icon: byId("play-icon") },
+  showError,
+);
+let view = null;
+let shownTurn = null;
+let busy = false;
+let waitingSince = null;
+
+async function ask(path, body) {
+  const options = body === undefined ? {} : {
+    method: "POST",
+    headers: { "Content-Type": "application/json" },
+    body: JSON.stringify(body),
+  };
+  const response = await fetch(base + path, options);
+  const data = await response.json().catch(() => ({ error: `The server answers ${response.status}.` }));
+  if (!response.ok) {
+    const error = new Error(data.error || `The server answers ${response.status}.`);
+    error.status = response.status;
+    throw error;
+  }
+  return data;
+}
+
+function showError(message) {
+  byId("error").textContent = message || "";
+  byId("error").hidden = !message;
+}
+
+function say(text) {
+  byId("status").textContent = text;
+}
+
+const pause = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
+
+// Sends what the person did, then follows the conversation until something is shown again.
+async function act(path, body) {
+  if (busy) return;
+  busy = true;
+  showError("");
+  byId("board").classList.add("busy");
+  try {
+    await show(await ask(path, body));
+  } catch (error) {
+    // Out of step, perhaps because of another tab: see where the conversation is.
+    if (error.status !== 409) showError(connectionMessage(error));
+  }
+  await follow();
+  byId("board").classList.remove("busy");
+  busy = false;
+}
+
+function connectionMessage(error) {
+  return error.status === undefined ? "The server does not answer. Nothing that you answered is lost; trying again…" : error.message;
+}
+
+async function follow() {
+  for (;;) {
+    try {
+      const next = await ask("/state");
+      showError(next.failed || "");
+      await show(next);
+      if (next.phase !== "preparing") return;
+      await pause(POLL_MILLISECONDS);
+    } catch (error) {
+      showError(connectionMessage(error));
+      if (error.status !== undefined && error.status !== 503 && error.status < 500) return;
+      await pause(1000);
+    }
+  }
+}
+
+async function show(next) {
+  const changed = view === null || JSON.stringify(next.belief) !== JSON.stringify(view.belief);
+  view = next;
+  const { phase, answered, target, step } = next;
+  const waiting = phase === "preparing";
+  const result = phase === "result" || (waiting && answered >= target);
+  const accepted = result && next.turn && next.turn.verdict === "yes";
+  byId("board").dataset.phase = phase;
+  showProgress(waiting, answered, result);
+  showCount(answered, target, result);
+  if (changed && next.belief) {
+    drawBelief(byId("belief"), next.belief);
+    byId("belief-sentence").textContent = next.belief.sentence;
+  }
+  byId("undo").hidden = !next.can_undo;
+  byId("undo-text").textContent = phase === "result" && answered < target ? "Back to the questions" : "Undo the last answer";
+  byId("stop").hidden = phase !== "question" || answered === 0;
+  if (waiting) return;
+  if (next.turn.id !== shownTurn) {
+    await player.load(`${base}/video/${next.turn.id}`, next.turn.fps, next.turn.frames, phase === "question" ? 2 : 1);
+    shownTurn = next.turn.id;
+    if (phase === "question") say(`Question ${answered + 1} of ${target}.`);
+    else say("This is what it learned. Is this what you meant?");
+  }
+  byId("board").classList.toggle("single", phase === "result");
+  byId("answers").hidden = phase !== "question";
+  byId("result").hidden = phase !== "result";
+  byId("hint").hidden = phase !== "question" || answered > 2;
+  byId("task").textContent = phase === "question" ? "Which one is closer to what you want?"
+    : accepted ? "This is what it learned." : "This is what it learned. Is this what you meant?";
+  byId("left-screen").setAttribute("aria-label", phase === "question" ? "Left video" : "What it learned");
+  byId("thanks").hidden = !accepted;
+  byId("more").textContent = `Not quite – ask me ${step} more`;
+  document.querySelector('[data-verdict="yes"]').hidden = accepted;
+  if (phase === "result") {
+    byId("get-video").href = `${base}/video/${next.turn.id}`;
+    byId("get-answers").href = `${base}/answers.json`;
+    byId("get-policy").href = `${base}/policy.safetensors`;
+  }
+}
+
+function showProgress(waiting, answered, result) {
+  if (!waiting) waitingSince = null;
+  else if (waitingSince === null) waitingSince = performance.now();
+  byId("progress").hidden = !waiting;
+  const slow = waiting && performance.now() - waitingSince > SLOW_AFTER_MILLISECONDS;
+  const what = result ? "Filming what it learned" : answered === 0 ? "Preparing the first two videos" : "Preparing the next two videos";
+  byId("progress-text").textContent = slow ? `${what}. Your answers are safe; this takes a few seconds…` : `${what}…`;
+}
+
+function showCount(answered, target, result) {
+  byId("count").textContent = result ? `${answered} answer${answered === 1 ? "" : "s"}` : `${answered + 1} of ${target}`;
+  const dots = byId("dots");
+  dots.replaceChildren();
+  for (let i = Math.max(0, target - 10); i < target; i++) {
+    const dot = document.createElement("i");
+    dot.className = i < answered ? "full" : i === answered && !result ? "now" : "";
+    dots.appendChild(dot);
+  }
+}
+
+function answer(preference) {
+  if (busy || view === null || view.phase !== "question" || view.turn.id !== shownTurn) return;
+  const button = document.querySelector(`[data-preference="${preference}"]`);
+  button.classList.add("chosen");
+  setTimeout(() => button.classList.remove("chosen"), 400);
+  act("/answer", { question: view.turn.id, preference });
+}
+
+const undo = () => view && view.can_undo && act("/undo", { answered: view.answered });
+
+for (const button of document.querySelectorAll("[data-preference]")) {
+  button.addEventListener("click", () => answer(button.dataset.preference));
+}
+for (const button of document.querySelectorAll("[data-verdict]")) {
+  button.addEventListener("click", () => act("/verdict", { result: view.turn.id, verdict: button.dataset.verdict }));
+}
+byId("undo").addEventListener("click", undo);
+byId("stop").addEventListener("click", () => act("/stop", {}));
+
+const KEYS = {
+  ArrowLeft: () => answer("left"),
+  ArrowRight: () => answer("right"),
+  ArrowDown: () => answer("equal"),
+  u: undo,
+  U: undo,
+  ",": () => player.step(-1),
+  ".": () => player.step(1),
+};
+document.addEventListener("keydown", (event) => {
+  if (event.altKey || event.ctrlKey || event.metaKey || event.repeat) return;
+  if (event.target.closest("input, textarea, select")) return; // there the arrows mean something else
+  if (event.key === " " && !event.target.closest("button, a")) {
+    event.preventDefault();
+    player.toggle();
+  } else if (KEYS[event.key]) {
+    event.preventDefault();
+    KEYS[event.key]();
+  }
+});
+
+let wishTimer = null;
+async function saveWish() {
+  clearTimeout(wishTimer);
+  try {
+    await ask("/wish", { wish: byId("wish").value });
+  } catch (error) {
+    showError(connectionMessage(error));
+  }
+}
+byId("wish").addEventListener("input", () => {
+  clearTimeout(wishTimer);
+  wishTimer = setTimeout(saveWish, 600);
+});
+byId("wish").addEventListener("change", saveWish);
+
+// Another tab, or the back button, may have moved the conversation on.
+document.addEventListener("visibilitychange", () => {
+  if (document.visibilityState === "visible" && !busy) start();
+});
+
+async function start() {
+  busy = true;
+  await follow();
+  busy = false;
+}
+start();

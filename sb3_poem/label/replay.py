@@ -1,0 +1,108 @@
+"""Recorded answers, fed to another model or another rule of inference."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from sb3_poem.adaptation.adapter import PreferenceAdapter
+from sb3_poem.adaptation.inference import SIGNS
+from sb3_poem.adaptation.options import AdaptationOptions, inference_rng
+from sb3_poem.adaptation.preference import Preference
+from sb3_poem.common.rollouts import policy_actions
+from sb3_poem.common.trajectory import Trajectory
+from sb3_poem.label.beliefs import belief
+from sb3_poem.label.store import Session, Store
+from sb3_poem.label.turns import adapter_options
+
+# Latents of another model among which the one is sought that acts most like a recorded trajectory.
+N_CANDIDATES = 256
+
+
+class _Replayed:
+    """As much of an adapter as a belief is drawn from."""
+
+    def __init__(self, model: Any, inference: Any) -> None:
+        self.model = model
+        self.inference = inference
+
+
+def replay(
+    store: Store, session: Session, model: Any, options: dict[str, Any] | None = None, seed: int = 0, is_own: bool = True
+) -> dict[str, Any]:
+    """
+    Feed a session's answers to a model.
+
+    Before each answer the model foretells it: the side of larger predicted return for the policy that it would take so far.
+
+    :param store: The store.
+    :param session: The session.
+    :param model: A model whose observations and actions are those of the recorded trajectories.
+    :param options: Of the adaptation, as a session's; ``mistake_rate`` stands for the noise model.
+    :param seed: Of the inference.
+    :param is_own: Whether the session was recorded with this very model. If not, the latents that were shown are not this
+        model's: in their place come those of its own latents that act most alike.
+    :return: JSON-ready: ``session``, ``foretold`` of ``decided`` answers (those that are not "equal"), ``latents`` after 0,
+        1, ... answers, ``sentence`` (the belief in words) and ``action_error``, the root mean squared difference of the
+        actions of such latents from those recorded (None where no latents had to be replaced).
+    :raises ValueError: If the model does not fit the recorded trajectories.
+    """
+    made: AdaptationOptions = PreferenceAdapter.make_options(n_queries=1, **adapter_options(options or {}))
+    inference = made.make_inference(model, inference_rng(seed))
+    translator = None if is_own else _Translator(model, np.random.default_rng([seed, 1]))
+    latents, errors, foretold, decided = [inference.estimate()], [], 0, 0
+    for item in store.conversation(session.id, before=2**31):
+        preference = Preference(item["preference"])
+        left, right = (Trajectory.from_dict(item[side]) for side in ("left", "right"))
+        _check_fits(model, left)
+        if translator is not None:
+            (left, left_error), (right, right_error) = translator(left), translator(right)
+            errors += [left_error, right_error]
+        if preference is not Preference.EQUAL:
+            decided += 1
+            returns = model.predicted_returns(latents[-1][None, :], [left, right])[0]
+            foretold += bool(np.sign(returns[0] - returns[1]) == SIGNS[preference])
+        inference.tell(preference, left, right)
+        latents.append(inference.estimate())
+    return {
+        "session": session.id,
+        "model": session.model,
+        "foretold": foretold,
+        "decided": decided,
+        "latents": [latent.tolist() for latent in latents],
+        "sentence": belief(_Replayed(model, inference), session.env_id)["sentence"],
+        "action_error": float(np.sqrt(np.mean(np.square(errors)))) if errors else None,
+    }
+
+
+class _Translator:
+    """Gives a trajectory the latent of this model whose policy acts most as it was acted."""
+
+    def __init__(self, model: Any, rng: np.random.Generator) -> None:
+        self.model = model
+        training = np.asarray(model.task_latents, dtype=np.float64)
+        self.latents = np.concatenate([training, model.sample_latents(N_CANDIDATES, rng, source="aggregate")])
+
+    def __call__(self, trajectory: Trajectory) -> tuple[Trajectory, float]:
+        observations = trajectory.observations[:-1]
+        errors = [
+            float(np.sqrt(np.mean(np.square(self._actions(observations, latent) - trajectory.actions))))
+            for latent in self.latents
+        ]
+        best = int(np.argmin(errors))
+        moved = Trajectory(trajectory.observations, trajectory.actions, self.latents[best].copy(), trajectory.reward_features)
+        return moved, errors[best]
+
+    def _actions(self, observations: np.ndarray, latent: np.ndarray) -> np.ndarray:
+        return policy_actions(self.model, observations, np.tile(latent, (len(observations), 1)), deterministic=True)
+
+
+def _check_fits(model: Any, trajectory: Trajectory) -> None:
+    shown = (trajectory.observations.shape[1], trajectory.actions.shape[1])
+    taken = (model.observation_space.shape[0], model.action_space.shape[0])
+    if shown != taken:
+        raise ValueError(
+            f"the recorded trajectories have {shown[0]} observations and {shown[1]} actions, but the model takes {taken[0]} "
+            f"and {taken[1]}; replay to a model of the same robot"
+        )

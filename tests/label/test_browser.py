@@ -1,0 +1,351 @@
+"""The page in a real browser: a scripted person who looks at nothing but true returns."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sb3_poem.adaptation import PreferenceAdapter, ReturnOracle, evaluate_latents
+from sb3_poem.adaptation.noise import MistakeNoise
+from sb3_poem.common.trajectory import Trajectory
+from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.label.catalogue import Choice, read_catalogue
+from sb3_poem.label.store import Store
+from sb3_poem.label.turns import load_choice
+
+playwright_api = pytest.importorskip("playwright.sync_api", reason="the Python package playwright is not installed")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+pytestmark = [
+    pytest.mark.skipif(CHROMIUM is None, reason="no chromium: apt-get install chromium"),
+    pytest.mark.xdist_group("browser"),
+]
+SEED = 3
+DESKTOP, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
+SHOWN = "() => typeof view !== 'undefined' && view !== null && view.phase !== 'preparing' && !busy"
+
+
+class Server:
+    """``sb3-poem label`` in a process of its own, which may be killed and started again."""
+
+    def __init__(self, store: Path, model: str) -> None:
+        self.store, self.model, self.port = store, model, 0
+        self.start()
+
+    def start(self) -> None:
+        command = [sys.executable, "-m", "sb3_poem.cli", "label", "--model", self.model, "--port", str(self.port)]
+        command += ["--store", str(self.store), "--seed", str(SEED), "--workers", "1"]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        match = re.search(r"http://127\.0\.0\.1:(\d+)", line)
+        assert match is not None, line
+        self.port = int(match[1])
+        self.url = match[0]
+
+    def kill(self) -> None:
+        os.kill(self.process.pid, signal.SIGKILL)
+        self.process.wait()
+
+    def stop(self) -> None:
+        self.process.terminate()
+        try:
+            self.process.wait(timeout=20)
+        except subprocess.TimeoutExpired:
+            self.kill()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with playwright_api.sync_playwright() as playwright:
+        launched = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield launched
+        launched.close()
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    running = Server(tmp_path_factory.mktemp("label"), "PointGoal")
+    yield running
+    running.stop()
+
+
+@pytest.fixture
+def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
+    """A page of its own, which fails the test if a script of it failed or it asked another host for anything."""
+    contexts, problems = [], []
+
+    def opened(url: str, viewport: dict[str, int] = DESKTOP, **options: Any) -> Any:
+        # Films that play all the time would take this machine's processors from the server.
+        context = browser.new_context(viewport=viewport, reduced_motion="reduce", **options)
+        contexts.append(context)
+        page = context.new_page()
+        page.set_default_timeout(90_000)
+        page.on("pageerror", lambda error: problems.append(str(error)))
+        page.on("request", lambda request: foreign(request.url))
+        page.goto(url)
+        return page
+
+    def foreign(url: str) -> None:
+        if not url.startswith(("http://127.0.0.1:", "blob:", "data:")):
+            problems.append(f"asked for {url}")
+
+    yield opened
+    for context in contexts:
+        context.close()
+    assert problems == []
+
+
+class Person:
+    """Answers by the true return of what was shown, as an oracle that knows the task."""
+
+    def __init__(self, server: Server, page: Any, choice: Choice, task: float) -> None:
+        self.page = page
+        self.token = page.url.rpartition("/s/")[2]
+        self.task = np.array([task])
+        self.oracle = ReturnOracle(gym.make(choice.env_id), self.task)
+        self.store = server.store
+
+    def judge(self) -> str:
+        """The better side of the question that waits."""
+        store = Store(self.store)
+        session = store.find(self.token)
+        assert session is not None
+        turn = store.turn(session.id, "question", len(store.answers(session.id)))
+        assert turn is not None
+        row = store.whole_turn(turn["id"])
+        store.close()
+        assert row is not None
+        sides = [Trajectory.from_dict(json.loads(row[f"{side}_trajectory"])) for side in ("left", "right")]
+        return self.oracle(*sides).value
+
+    def answer(self, times: int = 1, keyboard: bool = False) -> None:
+        keys = {"left": "ArrowLeft", "right": "ArrowRight", "equal": "ArrowDown"}
+        for _ in range(times):
+            self.page.wait_for_function(SHOWN)
+            answered = self.answered()
+            preference = self.judge()
+            if keyboard:
+                self.page.keyboard.press(keys[preference])
+            else:
+                self.page.click(f"[data-preference={preference}]")
+            self.page.wait_for_function(f"() => view.answered === {answered + 1} && view.phase !== 'preparing' && !busy")
+
+    def answered(self) -> int:
+        return int(self.page.evaluate("() => view.answered"))
+
+    def stored(self) -> list[str]:
+        store = Store(self.store)
+        session = store.find(self.token)
+        assert session is not None
+        answers = [row["preference"] for row in store.answers(session.id)]
+        store.close()
+        return answers
+
+    def learned(self) -> np.ndarray:
+        store = Store(self.store)
+        session = store.find(self.token)
+        assert session is not None
+        turn = store.turn(session.id, "result", len(store.answers(session.id)))
+        store.close()
+        assert turn is not None
+        return np.array(json.loads(turn["latent"]))
+
+
+def begin(open_page: Callable[..., Any], server: Server, choice: Choice, task: float, **options: Any) -> Person:
+    page = open_page(server.url, **options)
+    page.click(f"button[value={choice.name}]")
+    page.wait_for_function(SHOWN)
+    return Person(server, page, choice, task)
+
+
+def returns(choice: Choice, latents: np.ndarray, task: float) -> np.ndarray:
+    """True returns of latents, the mean of the same ten episodes each."""
+    env, model = TaskVecEnv.from_id(choice.env_id, 10), load_choice(choice)
+    values = [evaluate_latents(model, env, latent[None, :], np.array([[task]]), 10, seed=77).mean() for latent in latents]
+    env.close()
+    return np.array(values)
+
+
+def oracles_latents(choice: Choice, task: float) -> np.ndarray:
+    """Before any answer, and after ten by ``ReturnOracle``."""
+    oracle = ReturnOracle(gym.make(choice.env_id), np.array([task]))
+    adapter = PreferenceAdapter(load_choice(choice), choice.env_id, oracle=oracle, seed=SEED, noise_model=MistakeNoise(0.05))
+    before = adapter.policy().latent
+    return np.stack([before, adapter.adapt().latent])
+
+
+def assert_learned(choice: Choice, person: Person, task: float) -> None:
+    before, by_oracle, by_person = returns(choice, np.vstack([oracles_latents(choice, task), person.learned()]), task)
+    # What ReturnOracle's ten answers gained, a person on the page must gain, but for a hundredth.
+    assert by_oracle > before
+    assert by_person >= by_oracle - 0.01 * (by_oracle - before), (before, by_oracle, by_person)
+
+
+def test_ten_clicks_teach_what_the_oracle_teaches(
+    open_page: Callable[..., Any], server: Server, point_goal: Choice, tmp_path: Path
+) -> None:
+    person = begin(open_page, server, point_goal, 2.2)
+    page = person.page
+    page.fill("#wish", "up and to the left")
+    before = page.text_content("#belief-sentence")
+    person.answer(10)
+    assert page.evaluate("() => view.phase") == "result"
+    assert page.text_content("#belief-sentence") != before
+    assert len(person.stored()) == 10
+    assert_learned(point_goal, person, 2.2)
+    page.click('[data-verdict="yes"]')
+    page.wait_for_selector("#thanks:visible")
+    for link, suffix in (("#get-video", ".mp4"), ("#get-answers", ".json"), ("#get-policy", ".safetensors")):
+        with page.expect_download() as download:
+            page.click(link)
+        path = tmp_path / download.value.suggested_filename
+        download.value.save_as(path)
+        assert path.suffix == suffix
+        assert path.stat().st_size > 500
+    assert json.loads((tmp_path / "answers.json").read_text())["wish"] == "up and to the left"
+
+
+def test_undo_and_reload_in_the_middle(open_page: Callable[..., Any], server: Server, point_goal: Choice) -> None:
+    person = begin(open_page, server, point_goal, 0.4)
+    page = person.page
+    person.answer(3)
+    sentences = page.text_content("#belief-sentence")
+    video = page.evaluate("() => view.turn.id")
+    page.reload()
+    page.wait_for_function(SHOWN)
+    assert (person.answered(), page.text_content("#belief-sentence")) == (3, sentences)
+    assert page.evaluate("() => view.turn.id") == video
+    for left in (2, 1, 0):
+        page.click("#undo")
+        page.wait_for_function(f"() => view.answered === {left} && !busy")
+    assert page.is_hidden("#undo")
+    assert person.stored() == []
+    person.answer(3)
+    assert page.text_content("#belief-sentence") == sentences
+    page.click("#stop")
+    page.wait_for_selector("#result:visible")
+    page.click("#undo")  # back to the questions
+    page.wait_for_selector("#answers:visible")
+    assert person.answered() == 3
+
+
+def test_two_people_and_a_second_tab(open_page: Callable[..., Any], server: Server, point_goal: Choice) -> None:
+    ann, ben = begin(open_page, server, point_goal, 0.3), begin(open_page, server, point_goal, 2.8)
+    assert ann.token != ben.token
+    tab = open_page(ann.page.url)
+    tab.wait_for_function(SHOWN)
+    for _ in range(2):
+        ann.answer()
+        ben.answer()
+    # The second tab of the same session still shows the first question: its answer is refused, and it catches up.
+    tab.keyboard.press("ArrowDown")
+    tab.wait_for_function("() => view.answered === 2 && view.phase === 'question' && !busy")
+    assert ann.stored() != ben.stored()
+    assert len(ann.stored()) == len(ben.stored()) == 2
+
+
+def test_the_keyboard_alone(open_page: Callable[..., Any], server: Server, point_goal: Choice) -> None:
+    page = open_page(server.url)
+    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    page.wait_for_url("**/s/*")
+    page.wait_for_function(SHOWN)
+    person = Person(server, page, point_goal, 1.0)
+    person.answer(2, keyboard=True)
+    page.keyboard.press("Space")
+    assert page.get_attribute("#play", "aria-label") == "Pause"
+    page.wait_for_function("() => player.frame > 2")
+    page.keyboard.press("Space")
+    assert page.get_attribute("#play", "aria-label") == "Play"
+    moment = page.input_value("#frame")
+    page.keyboard.press(".")
+    page.wait_for_function("before => document.querySelector('#frame').value !== before", arg=moment)
+    page.focus("#frame")
+    page.keyboard.press("ArrowRight")  # moves the film, and answers nothing
+    page.focus("#wish")
+    page.keyboard.type("left u right")
+    assert person.answered() == 2
+    page.keyboard.press("Tab")
+    page.evaluate("() => document.activeElement.blur()")
+    page.keyboard.press("u")
+    page.wait_for_function("() => view.answered === 1 && !busy")
+    for element in page.query_selector_all("button:visible, a:visible, input:visible, select:visible, textarea:visible"):
+        element.focus()
+        assert element.evaluate("element => element === document.activeElement")
+
+
+def test_both_halves_of_the_film_are_in_step(open_page: Callable[..., Any], server: Server, point_goal: Choice) -> None:
+    person = begin(open_page, server, point_goal, 1.0)
+    page = person.page
+    for frame in (0, 7, 24, 3):
+        page.evaluate("frame => player.seek(frame)", frame)
+        page.wait_for_function("frame => !player.video.seeking && player.frame === frame", arg=frame)
+    page.evaluate("() => player.seek(24)")
+    page.wait_for_function("() => !player.video.seeking && document.querySelector('#frame').value === '24'")
+    spread = page.evaluate(
+        """() => ['left', 'right'].map(side => {
+            const canvas = document.getElementById(side + '-screen');
+            const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
+            let blue = 0;
+            for (let i = 0; i < data.length; i += 4) blue += data[i + 2] - data[i] > 60;
+            return blue;
+        })"""
+    )
+    assert min(spread) > 20  # the dot is on either screen
+
+
+def test_a_phone(open_page: Callable[..., Any], server: Server, point_goal: Choice) -> None:
+    person = begin(open_page, server, point_goal, 2.0, viewport=PHONE, has_touch=True, is_mobile=True)
+    page = person.page
+    person.answer(1)
+    assert page.evaluate("() => document.documentElement.scrollWidth") <= PHONE["width"]
+    for selector in ("[data-preference=left]", "[data-preference=right]", "[data-preference=equal]", "#play"):
+        box = page.locator(selector).bounding_box()
+        assert box["height"] >= 44
+        assert box["y"] + box["height"] <= PHONE["height"]  # all that is needed is in sight
+
+
+def test_the_server_is_killed_in_the_middle(open_page: Callable[..., Any], point_goal: Choice, tmp_path: Path) -> None:
+    server = Server(tmp_path, "PointGoal")
+    try:
+        person = begin(open_page, server, point_goal, 2.5)
+        page = person.page
+        person.answer(2)
+        page.keyboard.press("ArrowLeft")
+        page.wait_for_function("() => view.answered === 3")  # kept, and what follows perhaps not yet made
+        server.kill()
+        assert len(person.stored()) == 3
+        server.start()
+        page.reload()
+        page.wait_for_function(SHOWN)
+        assert person.answered() == 3
+        page.click("#undo")
+        page.wait_for_function("() => view.answered === 2 && !busy")
+        person.answer(2)
+        assert len(person.stored()) == 4
+    finally:
+        server.stop()
+
+
+@pytest.mark.slow
+def test_a_running_robot_learns_its_speed(open_page: Callable[..., Any], tmp_path: Path) -> None:
+    choice = next(choice for choice in read_catalogue() if choice.name == "HalfCheetahVel")
+    server = Server(tmp_path, "HalfCheetahVel")
+    try:
+        person = begin(open_page, server, choice, 1.3)
+        person.answer(10)
+        assert_learned(choice, person, 1.3)
+    finally:
+        server.stop()

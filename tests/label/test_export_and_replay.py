@@ -1,0 +1,210 @@
+"""Answers as a data set, to other models and rules, from the terminal, and in a notebook."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from label_world import settled
+
+from sb3_poem import cli
+from sb3_poem.adaptation import HumanOracle, PreferenceAdapter, ReturnOracle
+from sb3_poem.adaptation.policy import AdaptedPolicy
+from sb3_poem.common.trajectory import Trajectory
+from sb3_poem.label import LabelWidget, StoreRecorder
+from sb3_poem.label.catalogue import Choice
+from sb3_poem.label.export import FIELDS, export, records
+from sb3_poem.label.replay import replay
+from sb3_poem.label.sessions import Conversations
+from sb3_poem.label.store import Session, Store
+from sb3_poem.label.turns import load_choice
+
+TASK = np.array([0.7])
+
+
+@pytest.fixture
+def answered(with_conversations: Callable[..., Any], store: Store, point_goal: Choice) -> Session:
+    """A session whose four answers are by true return; the first was given the wrong way, and taken back."""
+    oracle = ReturnOracle(gym.make(point_goal.env_id), TASK)
+
+    async def talk(conversations: Conversations) -> Session:
+        session = await conversations.find(await conversations.begin("PointGoal"))
+        assert session is not None
+        wrong_first = True
+        while len(store.answers(session.id)) < 4:
+            view = await settled(conversations, session)
+            row = store.whole_turn(view["turn"]["id"])
+            assert row is not None
+            sides = [Trajectory.from_dict(json.loads(row[f"{side}_trajectory"])) for side in ("left", "right")]
+            right = oracle(*sides).value
+            wrong = {"left": "right", "right": "left", "equal": "left"}[right]
+            await conversations.answer(session, view["turn"]["id"], wrong if wrong_first else right)
+            if wrong_first:
+                store.undo(session.id, 1)
+                wrong_first = False
+        return session
+
+    session = with_conversations(talk)
+    store.set_wish(session.id, 'right, "and" up\n☺')
+    return session
+
+
+def test_both_formats_hold_the_same_answers(answered: Session, store: Store, tmp_path: Path) -> None:
+    from pyarrow import parquet
+
+    assert export(store, tmp_path / "a.jsonl", trajectories=True) == 4
+    assert export(store, tmp_path / "a.parquet", trajectories=True) == 4
+    lines = [json.loads(line) for line in (tmp_path / "a.jsonl").read_text().splitlines()]
+    assert lines == parquet.read_table(tmp_path / "a.parquet").to_pylist()
+    asked = store.conversation(answered.id, 4)
+    for line, item in zip(lines, asked, strict=True):
+        left = Trajectory.from_dict(item["left"])
+        assert line["preference"] == item["preference"]
+        assert line["left_latent"] == left.latent.tolist()
+        np.testing.assert_array_equal(line["left_observations"], left.observations)
+        np.testing.assert_array_equal(line["left_actions"], left.actions)
+        assert Path(line["video"]).read_bytes()[4:8] == b"ftyp"
+        assert line["wish"] == 'right, "and" up\n☺'
+        assert line["asked"] <= line["answered"]
+    with_undone = list(records(store, undone=True))
+    assert [record["undone"] for record in with_undone] == [True, False, False, False, False]
+    assert set(with_undone[0]) == set(FIELDS)
+
+
+def test_replay_to_the_same_rule_ends_where_the_session_ended(answered: Session, store: Store, point_goal: Choice) -> None:
+    model = load_choice(point_goal)
+    result = replay(store, answered, model, {"mistake_rate": 0.05}, seed=answered.seed)
+    assert len(result["latents"]) == 5
+    assert result["action_error"] is None
+    assert result["decided"] <= 4
+    # Each rule and seed must come to latents that do what was asked for, better than the first.
+    other = replay(store, answered, model, {"inference": "paper"}, seed=1, is_own=False)
+    assert 0.0 <= other["action_error"] < 0.2  # the very latents are not among the candidates, like ones are
+    env = gym.make(point_goal.env_id)
+    for outcome in (result, other):
+        first, last = (_return(model, env, np.array(outcome["latents"][index])) for index in (0, -1))
+        assert last > first
+
+
+def _return(model: Any, env: gym.Env, latent: np.ndarray) -> float:
+    observation, _ = env.reset(seed=1, options={"task": TASK})
+    total, over = 0.0, False
+    while not over:
+        action, _ = model.predict(observation, state=latent, deterministic=True)
+        observation, reward, terminated, truncated, _ = env.step(action)
+        total, over = total + float(reward), terminated or truncated
+    return total
+
+
+def test_the_commands(answered: Session, store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, folder = tmp_path / "out.jsonl", str(store.folder)
+    assert cli.main(["label", "export", "--store", folder, "--out", str(out), "--undone"]) == 0
+    assert len(out.read_text().splitlines()) == 5
+    result = tmp_path / "replay.json"
+    assert cli.main(["label", "replay", "--store", folder, "--inference", "paper", "--json", str(result)]) == 0
+    assert "foretold" in capsys.readouterr().out
+    assert len(json.loads(result.read_text())["sessions"]) == 1
+    assert cli.main(["label", "replay", "--store", folder, "--model", "HalfCheetahVel"]) == 1
+    assert "same robot" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["export", "--store", "nowhere", "--out", "a.jsonl"], "no answers there"),
+        (["export", "--out", "a.csv"], "must end in .jsonl or .parquet"),
+        (["--host", "0.0.0.0"], "--host 0.0.0.0"),
+        (["--auth", "ann:short"], "at least 12 characters"),
+        (["--auth", "nobody"], "USER:PASSWORD"),
+        (["--model", "Nobody"], "PointGoal"),
+        (["--mistake-rate", "0.7"], "`rate`"),
+    ],
+)
+def test_wrong_commands_say_what_is_wrong(
+    arguments: list[str], words: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["label", *arguments]) == 1
+    assert words in capsys.readouterr().err
+
+
+def test_the_terminals_answers_are_in_the_same_store(store: Store, point_goal: Choice, tmp_path: Path) -> None:
+    replies = iter(["l", "nonsense", "e"])
+    recorder = StoreRecorder(store, "PointGoal", point_goal.env_id, seed=3, wish="left")
+    oracle = HumanOracle(tmp_path / "gifs", read=lambda _: next(replies), write=lambda _: None, record=recorder)
+    adapter = PreferenceAdapter(load_choice(point_goal), point_goal.env_id, oracle=oracle, seed=3, n_queries=2)
+    adapter.adapt()
+    kept = list(records(store))
+    assert [(record["source"], record["preference"], record["wish"]) for record in kept] == [
+        ("terminal", "left", "left"),
+        ("terminal", "equal", "left"),
+    ]
+    assert kept[1]["left_latent"] == adapter.answers[1].left.latent.tolist()
+    assert Path(kept[0]["video"]).read_bytes().startswith(b"GIF8")
+
+
+def test_the_widget_moves_the_adapter(point_goal: Choice, tmp_path: Path) -> None:
+    model = load_choice(point_goal)
+    env = gym.make(point_goal.env_id, render_mode="rgb_array", width=64, height=48)
+    adapter = PreferenceAdapter(model, env, seed=8, n_queries=3)
+    alone = PreferenceAdapter(model, point_goal.env_id, seed=8, n_queries=3)
+    widget = LabelWidget(adapter, tmp_path / "notebook")
+    try:
+        assert f'src="{widget.url}"' in widget._repr_html_()
+        for preference in ("right", "left", "left"):
+            question = _wait(widget.url, "question")
+            _post(f"{widget.url}/answer", {"question": question["turn"]["id"], "preference": preference})
+            alone.ask()
+            alone.tell(preference)
+        _wait(widget.url, "result")
+        np.testing.assert_array_equal(widget.policy().latent, alone.policy().latent)
+        assert adapter.done
+        assert [answer.preference for answer in adapter.answers] == [answer.preference for answer in alone.answers]
+        with urllib.request.urlopen(f"{widget.url}/policy.safetensors") as response:
+            np.testing.assert_array_equal(AdaptedPolicy.from_bytes(response.read()).latent, alone.policy().latent)
+    finally:
+        widget.close()
+    with pytest.raises(ValueError, match="fresh one"):
+        LabelWidget(alone)
+    with pytest.raises(ValueError, match="rgb_array"):
+        LabelWidget(PreferenceAdapter(model, point_goal.env_id))
+
+
+def _wait(url: str, phase: str) -> dict[str, Any]:
+    for _ in range(3000):
+        with urllib.request.urlopen(f"{url}/state") as response:
+            view = json.load(response)
+        if view["phase"] == phase:
+            return view
+        asyncio.run(asyncio.sleep(0.02))
+    raise AssertionError(f"no {phase} was shown")
+
+
+def _post(url: str, body: dict[str, Any]) -> None:
+    request = urllib.request.Request(url, json.dumps(body).encode(), {"Content-Type": "application/json"})
+    urllib.request.urlopen(request).close()
+
+
+def test_an_adapted_policy_is_one_file(point_goal: Choice, tmp_path: Path) -> None:
+    model = load_choice(point_goal)
+    latent = np.random.default_rng(0).standard_normal(model.latent_dim)
+    policy = AdaptedPolicy(model, latent)
+    path = tmp_path / "policy.safetensors"
+    policy.save_pretrained(path)
+    again = AdaptedPolicy.from_pretrained(path)
+    np.testing.assert_array_equal(again.latent, latent)
+    observations = np.random.default_rng(1).standard_normal((5, 2))
+    np.testing.assert_array_equal(again.predict(observations)[0], policy.predict(observations)[0])
+    content = path.read_bytes()
+    for broken in (b"", content[:100], content[:-10], b"x" * 200):
+        with pytest.raises(ValueError, match="truncated"):
+            AdaptedPolicy.from_bytes(broken)
+    with pytest.raises(ValueError, match="not an adapted policy"):
+        AdaptedPolicy.from_bytes((point_goal.folder / "model.safetensors").read_bytes())

@@ -1,0 +1,273 @@
+"""The server over HTTP: what it answers, and what a hostile client gets."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from label_world import make_conversations
+from starlette.testclient import TestClient
+
+from sb3_poem.adaptation.policy import AdaptedPolicy
+from sb3_poem.label.access import MAX_BODY, Access, is_loopback
+from sb3_poem.label.catalogue import Choice
+from sb3_poem.label.server import make_app
+from sb3_poem.label.store import Store
+
+HOST = "http://localhost"
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory, point_goal: Choice) -> Iterator[tuple[TestClient, Store]]:
+    store = Store(tmp_path_factory.mktemp("served"))
+    app = make_app(make_conversations(store, point_goal, n_queries=3, max_sessions=30))
+    with TestClient(app, base_url=HOST, follow_redirects=False) as client:
+        yield client, store
+    store.close()
+
+
+def begin(client: TestClient) -> str:
+    response = client.post("/start", data={"model": "PointGoal"})
+    assert response.status_code == 303
+    return response.headers["location"]
+
+
+def settled(client: TestClient, session: str) -> dict[str, Any]:
+    for _ in range(1500):
+        view = client.get(f"{session}/state").json()
+        if view["phase"] != "preparing":
+            return view
+        time.sleep(0.02)
+    raise AssertionError("nothing was shown")
+
+
+def test_a_whole_conversation(served: tuple[TestClient, Store], tmp_path: Path) -> None:
+    client, _ = served
+    assert "A dot that goes to a place" in client.get("/").text
+    session = begin(client)
+    assert client.get(session).status_code == 200
+    assert client.post(f"{session}/wish", json={"wish": "to the <b>right</b>"}).status_code == 200
+    for number, preference in enumerate(("left", "equal", "right")):
+        view = settled(client, session)
+        assert (view["phase"], view["answered"], view["target"]) == ("question", number, 3)
+        assert len(view["belief"]["points"]) == len(view["belief"]["weights"])
+        video = client.get(f"{session}/video/{view['turn']['id']}")
+        assert video.headers["content-type"] == "video/mp4"
+        assert video.content[4:8] == b"ftyp"
+        assert client.get(f"{session}/video/{view['turn']['id']}", headers={"Range": "bytes=0-9"}).status_code == 206
+        client.post(f"{session}/answer", json={"question": view["turn"]["id"], "preference": preference})
+    view = settled(client, session)
+    assert view["phase"] == "result"
+    response = client.post(f"{session}/verdict", json={"result": view["turn"]["id"], "verdict": "yes"})
+    assert response.json()["turn"]["verdict"] == "yes"
+    assert "&lt;b&gt;right" in client.get(session).text
+
+    answers = client.get(f"{session}/answers.json")
+    assert "attachment" in answers.headers["content-disposition"]
+    record = answers.json()
+    assert record["wish"] == "to the <b>right</b>"
+    assert [answer["preference"] for answer in record["answers"]] == ["left", "equal", "right"]
+    assert str(tmp_path.parent) not in answers.text  # no path of this machine
+
+    policy = AdaptedPolicy.from_bytes(client.get(f"{session}/policy.safetensors").content)
+    assert policy.model.env_id == "poem/PointGoal-v0"
+    direction, _ = policy.predict(np.zeros(2))
+    assert direction.shape == (2,)
+
+
+def test_wrong_tokens_find_nothing(served: tuple[TestClient, Store]) -> None:
+    client, _ = served
+    session = begin(client)
+    token = session.removeprefix("/s/")
+    for wrong in (token[:-1], token + "x", token[::-1], "x", "a" * 5000, "%00", "..%2f" + token, "*"):
+        for rest in ("", "/state", "/answers.json", "/policy.safetensors", "/video/1"):
+            assert client.get(f"/s/{wrong}{rest}").status_code == 404, wrong
+        assert client.post(f"/s/{wrong}/stop", json={}).status_code == 404
+
+
+def test_one_session_does_not_see_anothers_video(served: tuple[TestClient, Store]) -> None:
+    client, _ = served
+    mine, other = begin(client), begin(client)
+    turn = settled(client, other)["turn"]["id"]
+    assert client.get(f"{other}/video/{turn}").status_code == 200
+    assert client.get(f"{mine}/video/{turn}").status_code == 404
+    assert client.post(f"{mine}/answer", json={"question": turn, "preference": "left"}).status_code == 409
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        *("/static/../start.html", "/static/%2e%2e/start.html", "/static/..%2f..%2fstore.py", "/static/%2fetc/passwd"),
+        *("/static/....//....//etc/passwd", "//etc/passwd", "/static/", "/answers.sqlite", "/.env"),
+    ],
+)
+def test_no_path_leads_out(served: tuple[TestClient, Store], path: str) -> None:
+    response = served[0].get(path)
+    assert response.status_code in (404, 405)
+    assert "root:" not in response.text
+
+
+def test_video_numbers_that_are_names_lead_nowhere(served: tuple[TestClient, Store]) -> None:
+    client, _ = served
+    session = begin(client)
+    for name in ("../../answers.sqlite", "..%2f..%2fanswers.sqlite", "1.mp4", "-1", "%2fetc%2fpasswd", "99999999999999999999"):
+        assert client.get(f"{session}/video/{name}").status_code == 404, name
+
+
+def test_repeated_late_and_contradicting_posts(served: tuple[TestClient, Store]) -> None:
+    client, store = served
+    session = begin(client)
+    question = settled(client, session)["turn"]["id"]
+    body = {"question": question, "preference": "left"}
+    for _ in range(3):
+        assert client.post(f"{session}/answer", json=body).status_code == 200
+    assert settled(client, session)["answered"] == 1
+    assert client.post(f"{session}/answer", json={**body, "preference": "right"}).status_code == 409
+    assert client.post(f"{session}/answer", json={**body, "question": question + 1000}).status_code == 409
+    assert client.post(f"{session}/undo", json={"answered": 2}).status_code == 409
+    assert client.post(f"{session}/undo", json={"answered": 1}).status_code == 200
+    assert client.post(f"{session}/undo", json={"answered": 1}).status_code == 409
+    assert client.post(f"{session}/verdict", json={"result": question, "verdict": "yes"}).status_code == 409
+    found = store.find(session.removeprefix("/s/"))
+    assert found is not None
+    assert store.answers(found.id) == []
+
+
+@pytest.mark.parametrize(
+    ("content", "kind", "status"),
+    [
+        (b"{}", "application/json", 400),
+        (b"[]", "application/json", 400),
+        (b"null", "application/json", 400),
+        (b"{", "application/json", 400),
+        (b"\xff\xfe", "application/json", 400),
+        (b"[" * 8000, "application/json", 400),
+        (b'{"question": 1}', "application/json", 400),
+        (b'{"question": "1", "preference": "left"}', "application/json", 400),
+        (b'{"question": true, "preference": "left"}', "application/json", 400),
+        (b'{"question": 1e400, "preference": "left"}', "application/json", 400),
+        (b'{"question": -1, "preference": "left"}', "application/json", 400),
+        (b'{"question": 99999999999999999999999, "preference": "left"}', "application/json", 400),
+        (b'{"question": 1, "preference": ["left"]}', "application/json", 400),
+        (b'{"question": 1, "preference": "left", "more": 1}', "application/json", 400),
+        (b'{"question": 1, "preference": "middle"}', "application/json", 409),
+        (b'{"question": 1, "preference": "left"}', "text/plain", 415),
+        (b"question=1&preference=left", "application/x-www-form-urlencoded", 415),
+    ],
+)
+def test_bodies_that_are_no_answer(served: tuple[TestClient, Store], content: bytes, kind: str, status: int) -> None:
+    client, store = served
+    session = _shared(client)
+    response = client.post(f"{session}/answer", content=content, headers={"Content-Type": kind})
+    assert response.status_code == status
+    found = store.find(session.removeprefix("/s/"))
+    assert found is not None
+    assert store.answers(found.id) == []
+
+
+_sessions: dict[int, str] = {}
+
+
+def _shared(client: TestClient) -> str:
+    """One session for many requests that must not change it."""
+    if id(client) not in _sessions:
+        _sessions[id(client)] = begin(client)
+    return _sessions[id(client)]
+
+
+def test_huge_bodies_are_refused_declared_or_not(served: tuple[TestClient, Store]) -> None:
+    client, _ = served
+    session = _shared(client)
+    assert client.post(f"{session}/wish", json={"wish": "x" * MAX_BODY}).status_code == 413
+    assert client.post(f"{session}/wish", json={"wish": "x" * 2001}).status_code == 409
+    assert client.post(f"{session}/wish", json={"wish": "é" * 2000}).status_code == 200
+    assert client.post(f"{session}/wish", content=b"{}", headers={"Content-Length": "-5"}).status_code == 413
+    read = 0
+
+    def endless() -> Iterator[bytes]:
+        nonlocal read
+        while read < 64 * MAX_BODY:
+            read += 4096
+            yield b"x" * 4096
+
+    assert client.post(f"{session}/wish", content=endless()).status_code == 413
+
+
+def test_other_sites_cannot_post_and_other_names_are_not_answered(served: tuple[TestClient, Store]) -> None:
+    client, _ = served
+    session = _shared(client)
+    for headers in ({"Origin": "https://evil.example"}, {"Sec-Fetch-Site": "cross-site"}, {"Origin": "null"}):
+        assert client.post("/start", data={"model": "PointGoal"}, headers=headers).status_code == 403
+        assert client.post(f"{session}/stop", json={}, headers=headers).status_code == 403
+    assert client.get("/", headers={"Host": "evil.example"}).status_code == 421
+    assert client.get("/", headers={"Host": "127.0.0.1:7860"}).status_code == 200
+    assert client.post("/start", data={"model": "PointGoal"}, headers={"Origin": HOST}).status_code == 303
+
+
+def test_unknown_models_are_refused_and_no_path_is_one(served: tuple[TestClient, Store]) -> None:
+    client, _ = served
+    for name in ("", "Nobody", "../PointGoal", "/etc/passwd", "pretrained/PointGoal", "PointGoal\x00"):
+        assert client.post("/start", data={"model": name}).status_code == 409
+
+
+def test_pages_load_nothing_from_elsewhere(served: tuple[TestClient, Store]) -> None:
+    client, _ = served
+    static = Path(__file__).parents[2] / "sb3_poem/label/page"
+    for file in static.rglob("*.*"):
+        text = file.read_text().replace("http://www.w3.org/2000/svg", "")
+        assert "http://" not in text, file
+        assert "https://" not in text, file
+    response = client.get(_shared(client))
+    policy = response.headers["content-security-policy"]
+    assert "default-src 'none'" in policy
+    assert "script-src 'self';" in policy
+    assert "frame-ancestors 'none'" in policy
+    assert response.headers["cache-control"] == "no-store"
+    assert response.headers["x-content-type-options"] == "nosniff"
+
+
+@pytest.fixture
+def guarded(store: Store, point_goal: Choice) -> Iterator[TestClient]:
+    access = Access(user="ann", password="a long password", token="t" * 32)
+    with TestClient(make_app(make_conversations(store, point_goal), access), base_url=HOST, follow_redirects=False) as client:
+        yield client
+
+
+def test_a_password_or_a_token_is_asked_for(guarded: TestClient) -> None:
+    for path in ("/", "/static/style.css", "/s/x", "/s/x/state"):
+        response = guarded.get(path)
+        assert response.status_code == 401
+        assert response.headers["www-authenticate"].startswith("Basic")
+    assert guarded.get("/", auth=("ann", "wrong")).status_code == 401
+    assert guarded.get("/?token=wrong").status_code == 401
+    assert guarded.get("/", headers={"Authorization": "Basic %%%"}).status_code == 401
+    assert guarded.get("/", headers={"Cookie": "sb3_poem_access=wrong"}).status_code == 401
+    assert guarded.get("/", auth=("ann", "a long password")).status_code == 200
+    entry = guarded.get("/?token=" + "t" * 32)
+    assert entry.status_code == 303
+    assert entry.headers["location"] == "/"
+    assert "httponly" in entry.headers["set-cookie"].lower()
+    assert guarded.get("/").status_code == 200  # the client keeps the cookie
+
+
+@pytest.mark.parametrize(
+    ("host", "expected"),
+    [("127.0.0.1", True), ("127.8.9.1", True), ("localhost", True), ("::1", True), ("0.0.0.0", False), ("192.168.1.4", False)],
+)
+def test_loopback(host: str, expected: bool) -> None:
+    assert is_loopback(host) is expected
+
+
+def test_answers_json_is_strict_json(served: tuple[TestClient, Store]) -> None:
+    client, _ = served
+    text = client.get(f"{_shared(client)}/answers.json").text
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(constant)
+
+    assert json.loads(text, parse_constant=refuse)["answers"] == []

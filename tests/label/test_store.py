@@ -1,0 +1,183 @@
+"""The store: what is answered stays, in order, whatever happens."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sb3_poem.label.store import RefusedError, Store
+from sb3_poem.label.turns import Turn
+
+TRAJECTORY = {"observations": None}
+
+
+def turn() -> Turn:
+    return Turn({"n": 1}, dict(TRAJECTORY), dict(TRAJECTORY), {"sentence": "x"}, [0.0], 20.0, 5)
+
+
+def begin(store: Store, step: int = 10) -> tuple[int, str]:
+    session, token = store.create_session("M", "poem/PointGoal-v0", 1, {}, step)
+    assert store.add_turn(session.id, "question", 0, None, turn(), "0.mp4")
+    return session.id, token
+
+
+def answer(store: Store, session: int, preference: str) -> int:
+    """Answer the question that waits, and pose the next."""
+    number = len(store.answers(session))
+    question = store.turn(session, "question", number)
+    assert question is not None
+    given = store.add_answer(session, question["id"], preference)
+    assert store.add_turn(session, "question", number + 1, given, turn(), f"{number + 1}.mp4")
+    return int(question["id"])
+
+
+def preferences(store: Store, session: int) -> list[str]:
+    return [row["preference"] for row in store.answers(session)]
+
+
+def test_a_session_is_found_by_its_token_alone_and_the_file_does_not_hold_it(store: Store) -> None:
+    session, token = begin(store)
+    assert len(token) >= 40
+    found = store.find(token)
+    assert found is not None
+    assert found.id == session
+    for wrong in ("", token[:-1], token + "A", token.swapcase(), "' OR 1=1 --", "\x00"):
+        assert store.find(wrong) is None
+    store.close()
+    content = b"".join(file.read_bytes() for file in store.folder.glob("answers.sqlite*"))
+    assert token.encode() not in content
+    assert store.path.stat().st_mode & 0o077 == 0
+
+
+def test_repeated_answers_count_once_and_late_ones_are_refused(store: Store) -> None:
+    session, _ = begin(store)
+    first = answer(store, session, "left")
+    store.add_answer(session, first, "left")
+    assert preferences(store, session) == ["left"]
+    with pytest.raises(RefusedError, match="not the one that waits"):
+        store.add_answer(session, first, "right")
+    other, _ = begin(store)
+    waiting = store.turn(other, "question", 0)
+    assert waiting is not None
+    with pytest.raises(RefusedError):
+        store.add_answer(session, waiting["id"], "left")  # another session's question
+    with pytest.raises(RefusedError):
+        store.add_answer(session, 10**9, "left")
+    assert preferences(store, session) == ["left"]
+
+
+def test_undo_goes_back_to_the_first_question_and_keeps_a_record(store: Store) -> None:
+    session, _ = begin(store)
+    for preference in ("left", "right", "equal"):
+        answer(store, session, preference)
+    for answered in (3, 2, 1):
+        store.undo(session, answered)
+        with pytest.raises(RefusedError, match="moved on"):
+            store.undo(session, answered)  # a second click on the same button
+    with pytest.raises(RefusedError, match="no answer to take back"):
+        store.undo(session, 0)
+    assert preferences(store, session) == []
+    answer(store, session, "right")
+    assert preferences(store, session) == ["right"]
+    rows = list(store.records())
+    assert [(row["preference"], row["undone"] is not None) for row in rows] == [
+        ("left", True),
+        ("right", True),
+        ("equal", True),
+        ("right", False),
+    ]
+
+
+def test_a_turn_made_for_an_answer_that_was_taken_back_is_not_kept(store: Store) -> None:
+    session, _ = begin(store)
+    question = store.turn(session, "question", 0)
+    assert question is not None
+    given = store.add_answer(session, question["id"], "left")
+    store.undo(session, 1)
+    again = store.add_answer(session, question["id"], "right")
+    assert not store.add_turn(session, "question", 1, given, turn(), "late.mp4")
+    assert store.add_turn(session, "question", 1, again, turn(), "new.mp4")
+    assert not store.add_turn(session, "question", 1, again, turn(), "twice.mp4")
+
+
+def test_the_target_the_stop_and_the_verdict(store: Store) -> None:
+    session, _ = begin(store, step=2)
+    answer(store, session, "left")
+    store.stop(session)
+    waiting = store.turn(session, "question", 1)
+    assert waiting is not None
+    with pytest.raises(RefusedError, match="over for now"):
+        store.add_answer(session, waiting["id"], "left")
+    store.undo(session, 1)  # back to the questions; no answer is lost
+    assert preferences(store, session) == ["left"]
+    answer(store, session, "right")
+    last = store.turn(session, "question", 2)
+    assert last is not None
+    with pytest.raises(RefusedError, match="over for now"):
+        store.add_answer(session, last["id"], "left")
+    given = store.answers(session)[-1]["id"]
+    assert store.add_turn(session, "result", 2, given, turn(), "result.mp4")
+    result = store.turn(session, "result", 2)
+    assert result is not None
+    with pytest.raises(RefusedError):
+        store.judge(session, last["id"], "yes")
+    store.judge(session, result["id"], "not quite")
+    assert store.session(session).target == 4
+    with pytest.raises(RefusedError):
+        store.judge(session, result["id"], "not quite")  # a repeated click asks for no more
+    assert store.session(session).target == 4
+    answer(store, session, "left")
+
+
+def test_other_versions_are_refused(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.close()
+    connection = sqlite3.connect(store.path)
+    connection.execute("PRAGMA user_version = 99")
+    connection.close()
+    with pytest.raises(ValueError, match="version 99"):
+        Store(tmp_path)
+
+
+def test_videos_without_a_turn_are_removed(store: Store) -> None:
+    begin(store)
+    for name in ("0.mp4", "orphan.mp4", ".writing-x.mp4"):
+        (store.videos / name).write_bytes(b"x")
+    assert store.remove_orphans() == 2
+    assert [file.name for file in store.videos.iterdir()] == ["0.mp4"]
+
+
+WRITER = """
+import sys
+sys.path.insert(0, {tests!r})
+from test_store import answer, begin
+from sb3_poem.label.store import Store
+store = Store(sys.argv[1])
+session, _ = begin(store, step=10**6)
+for n in range(10**6):
+    preference = ("left", "right", "equal")[n % 3]
+    answer(store, session, preference)
+    print(preference, flush=True)
+"""
+
+
+def test_a_kill_loses_no_answer(tmp_path: Path) -> None:
+    code = WRITER.format(tests=str(Path(__file__).parent))
+    process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    said = [process.stdout.readline().strip() for _ in range(40)]
+    os.kill(process.pid, signal.SIGKILL)
+    said += process.stdout.read().split()
+    process.wait()
+    store = Store(tmp_path)
+    kept = preferences(store, 1)
+    store.close()
+    assert said[:40] == (["left", "right", "equal"] * 14)[:40]
+    assert kept[: len(said)] == said
+    assert len(kept) <= len(said) + 1  # the one that was kept and not yet said

@@ -1,0 +1,35 @@
+"""Fast rendering shows what full rendering shows."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import poem_envs  # noqa: F401
+from sb3_poem.cli import can_draw
+
+
+@pytest.mark.skipif(not can_draw(), reason="no off-screen OpenGL")
+@pytest.mark.parametrize("env_id", ["poem/HalfCheetahVel-v0", "poem/AntGoal-v0"])
+def test_the_same_scene_from_the_same_camera(env_id: str) -> None:
+    images = {}
+    for quality in ("full", "fast"):
+        options = {"width": 160, "height": 120, "render_mode": "rgb_array", "render_quality": quality, "render_task": True}
+        env = gym.make(env_id, **options)
+        env.reset(seed=1)
+        for _ in range(10):
+            env.step(np.zeros(env.action_space.shape, dtype=np.float32))
+        images[quality] = env.render().astype(np.float64)
+        env.close()
+    full, fast = images["full"], images["fast"]
+    assert fast.shape == full.shape == (120, 160, 3)
+    assert np.corrcoef(full.ravel(), fast.ravel())[0, 1] > 0.85  # shadows and edges differ
+    assert np.corrcoef(full.ravel(), fast[:, ::-1].ravel())[0, 1] < np.corrcoef(full.ravel(), fast.ravel())[0, 1]
+
+
+def test_it_renders_images_alone() -> None:
+    with pytest.raises(ValueError, match="render_quality"):
+        gym.make("poem/AntVel-v0", render_quality="best")
+    with pytest.raises(ValueError, match="rgb_array"):
+        gym.make("poem/AntVel-v0", render_quality="fast", render_mode="depth_array")
