@@ -51,7 +51,8 @@ class FastRenderer:
         self._context = _make_context(width, height)
         self._context.make_current()
         self._scene = mujoco.MjvScene(model, MAX_GEOM)
-        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+        flags = mujoco.mjtRndFlag
+        for flag in (flags.mjRND_SHADOW, flags.mjRND_REFLECTION, flags.mjRND_HAZE):
             self._scene.flags[flag] = 0
         self._resources = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         self._options = mujoco.MjvOption()

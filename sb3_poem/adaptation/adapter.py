@@ -255,8 +255,8 @@ class PreferenceAdapter:
         return f"sb3_poem.{cls.__name__}"
 
     @property
-    def _needs_frames(self) -> bool:
-        return bool(getattr(self.oracle, "needs_frames", False))
+    def _needs_frames(self) -> bool | int:
+        return getattr(self.oracle, "needs_frames", False)
 
     def _make_query(self) -> Query:
         library = self.inference.library

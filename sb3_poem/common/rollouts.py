@@ -23,7 +23,7 @@ def rollout_latents(
     seed: int | Sequence[int] = 0,
     deterministic: bool = True,
     *,
-    frames: bool = False,
+    frames: bool | int = False,
     max_steps: int | None = None,
 ) -> list[Trajectory]:
     """
@@ -41,7 +41,7 @@ def rollout_latents(
     :param tasks: (n, task_dim) to set before each rollout; None keeps the environment's own tasks as they are.
     :param seed: One seed a rollout, or one integer s: then rollout i takes s + i.
     :param deterministic: Whether the policies act by their mode. If not, the actions' noise follows the seeds too.
-    :param frames: Whether to render every step; the environment needs ``render_mode="rgb_array"``.
+    :param frames: Whether to render every step, or n to render every n-th; the environment needs ``render_mode="rgb_array"``.
     :param max_steps: Where an episode is cut if the environment does not end it; None takes ``model.horizon``.
     :return: n trajectories, in the order of the latents.
     :raises ValueError: On wrong shapes, and if an observation or an action is not finite; the episode is named.
@@ -154,7 +154,7 @@ def _episodes(
     tasks: np.ndarray | None,
     seed: int | Sequence[int],
     deterministic: bool,
-    frames: bool,
+    frames: int,
     max_steps: int | None,
     keep: bool,
 ) -> Iterator[_Episode]:
@@ -171,6 +171,8 @@ def _episodes(
     steps = model.horizon if max_steps is None else max_steps
     if steps < 1:
         raise ValueError(f"`max_steps` must be at least 1, but is {steps}")
+    if frames < 0:
+        raise ValueError(f"`frames` must be True, False, or at least 1, but is {frames}")
     if frames and vec_env.render_mode != "rgb_array":
         raise ValueError(
             f'rendering needs an environment made with render_mode="rgb_array", but this one has {vec_env.render_mode!r}'
@@ -213,7 +215,7 @@ def _wave(
     tasks: np.ndarray | None,
     seeds: list[int],
     deterministic: bool,
-    frames: bool,
+    frames: int,
     max_steps: int,
     keep: bool,
     first: int,
@@ -259,7 +261,7 @@ def _wave(
             taken.append(np.array(actions))
             seen.append(after)
         running = running & ~np.asarray(dones, dtype=bool)
-        if frames:
+        if frames and step % frames == 0:
             _add_images(images, vec_env, running)
         if not running.any():
             break

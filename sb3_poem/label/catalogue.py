@@ -44,7 +44,7 @@ def read_catalogue(
     :param model: A pretrained model's folder, a folder of such folders, or the name of a shipped model; None takes all that
         are shipped.
     :param env_id: The environment in which they are shown; None takes each model's own.
-    :param env_kwargs: Arguments of the environment.
+    :param env_kwargs: Arguments of the environment, over those that each model was trained with.
     :return: The models, by name.
     :raises FileNotFoundError: If there is none.
     :raises ValueError: If a model is broken, or does not say its environment.
@@ -62,6 +62,7 @@ def read_catalogue(
         chosen = env_id or config.get("env_id")
         if chosen is None:
             raise ValueError(f"--env is needed: {one} does not say on which environment it was trained")
-        arguments = tuple(sorted((env_kwargs or {}).items()))
+        trained_with = config.get("env_kwargs", {}) if chosen == config.get("env_id") else {}
+        arguments = tuple(sorted({**trained_with, **(env_kwargs or {})}.items()))
         choices.append(Choice(one.resolve().name, one.resolve(), config["algorithm"], chosen, arguments))
     return choices

@@ -22,6 +22,10 @@ _logger = logging.getLogger(__name__)
 PREFERENCES = ("left", "right", "equal")
 # A person who has not been heard of for so long has gone, and makes room for another.
 GONE_AFTER_SECONDS = 600.0
+# A person who watches is heard of at least so often: the page asks for its state when it is shown and when it answers.
+AT_WORK_SECONDS = 60.0
+# While more people are at work than turns can be made at a time, films show every second step: half the work.
+CROWDED_FILM_EVERY = 2
 # After a turn that could not be made: not at once again.
 RETRY_SECONDS = 5.0
 
@@ -189,9 +193,10 @@ class Conversations:
             raise RefusedError(
                 f"this session needs the model {session.model!r} in {session.env_id!r}, which this server was not started with"
             )
+        film_every = CROWDED_FILM_EVERY if self._is_crowded() else 1
         video = self.store.videos / f"{session.id}-{secrets.token_hex(12)}.mp4"
         if preference is None:
-            return Request(choice, session.seed, session.options, wanted, video)
+            return Request(choice, session.seed, session.options, wanted, video, film_every=film_every)
         row = self.store.turn(session.id, "question", number)
         question = None if row is None else self.store.whole_turn(row["id"])
         if question is None:
@@ -199,7 +204,7 @@ class Conversations:
         pending = {"left": json.loads(question["left_trajectory"]), "right": json.loads(question["right_trajectory"])}
         answers = self.store.conversation(session.id, number)
         state = json.loads(question["state"])
-        return Request(choice, session.seed, session.options, wanted, video, state, answers, pending, preference)
+        return Request(choice, session.seed, session.options, wanted, video, state, answers, pending, preference, film_every)
 
     def _look(self, number: int) -> tuple[Session, int, Any, Any]:
         """The session as it is now, its answers, the turn that should be shown, and the question before it."""
@@ -219,6 +224,10 @@ class Conversations:
             presence = self._present[session.id] = _Presence(time.monotonic())
         presence.seen = time.monotonic()
         return presence
+
+    def _is_crowded(self) -> bool:
+        since = time.monotonic() - AT_WORK_SECONDS
+        return sum(presence.seen > since for presence in list(self._present.values())) > self.workshop.n_workers
 
     def _make_room(self) -> None:
         now = time.monotonic()

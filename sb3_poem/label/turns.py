@@ -31,6 +31,8 @@ from sb3_poem.label.videos import HEIGHT, WIDTH, fit, pair, write_clip
 RESULT_ROLLOUT = 1_000_000
 # The hidden task of the environment, of which the person knows nothing, comes from a stream of its own.
 TASK_STREAM = 0x1ABE1
+# Frames per second that a film should not fall below.
+SMOOTH_FPS = 8.0
 #: Models that a process keeps.
 BENCHES = 4
 #: What an adapter's dictionary holds of its conversation; the rest is the ``state`` of a turn.
@@ -51,6 +53,7 @@ class Request:
     :param answers: The answers before that turn: ``preference``, ``left``, ``right``.
     :param pending: That turn's question: ``left``, ``right``.
     :param preference: The answer to it; None at the start, and to film the question again.
+    :param film_every: How many steps lie between two frames of the video, if it moves smoothly enough then.
     """
 
     choice: Choice
@@ -62,6 +65,7 @@ class Request:
     answers: Sequence[dict[str, Any]] = ()
     pending: dict[str, Any] | None = None
     preference: str | None = None
+    film_every: int = 1
 
 
 @dataclass(frozen=True)
@@ -89,9 +93,14 @@ class Turn:
 
 
 class _Watches:
-    """Stands for the person where the adapter asks who answers: somebody who needs to see."""
+    """
+    Stands for the person where the adapter asks who answers: somebody who needs to see.
 
-    needs_frames = True
+    :param film_every: See :class:`Request`.
+    """
+
+    def __init__(self, film_every: int) -> None:
+        self.needs_frames = film_every
 
     def __call__(self, left: Trajectory, right: Trajectory) -> Preference:
         """Answers come through ``tell()``, when they come."""
@@ -130,12 +139,13 @@ class Bench:
             query = adapter.ask()
             frames = pair(query.left.frames or [], query.right.frames or [])
         else:
-            frames = self._film(adapter, latent)
-        write_clip(frames, request.video, self.fps)
+            frames = self._film(adapter, latent, self._film_every(request))
+        fps = self.fps / self._film_every(request)
+        write_clip(frames, request.video, fps)
         data = adapter.to_dict()
         pending = data["pending"] or {"left": None, "right": None}
         state = {name: value for name, value in data.items() if name not in CONVERSATION}
-        return Turn(state, pending["left"], pending["right"], believed, latent.tolist(), self.fps, len(frames))
+        return Turn(state, pending["left"], pending["right"], believed, latent.tolist(), fps, len(frames))
 
     def warm_up(self) -> None:
         """Do once what only the first time is slow: the first image, the first action."""
@@ -155,19 +165,22 @@ class Bench:
             return PreferenceAdapter(
                 self.model,
                 self.env,
-                oracle=_Watches(),
+                oracle=_Watches(self._film_every(request)),
                 seed=request.seed,
                 n_queries=n_queries,
                 **adapter_options(request.options),
             )
         state = {**request.state, "options": {**request.state["options"], "n_queries": n_queries}}
         data = {**state, "answers": list(request.answers), "pending": request.pending}
-        return PreferenceAdapter.from_dict(data, self.model, self.env, oracle=_Watches())
+        return PreferenceAdapter.from_dict(data, self.model, self.env, oracle=_Watches(self._film_every(request)))
 
-    def _film(self, adapter: PreferenceAdapter, latent: np.ndarray) -> list[np.ndarray]:
+    def _film_every(self, request: Request) -> int:
+        return request.film_every if self.fps / request.film_every >= SMOOTH_FPS else 1
+
+    def _film(self, adapter: PreferenceAdapter, latent: np.ndarray, film_every: int) -> list[np.ndarray]:
         seed = rollout_seed(adapter.seed, RESULT_ROLLOUT)
         clip = rollout_latents(
-            self.model, self.env, latent[None, :], None, [seed], adapter.options.deterministic, frames=True
+            self.model, self.env, latent[None, :], None, [seed], adapter.options.deterministic, frames=film_every
         )[0]
         return [fit(frame) for frame in clip.frames or []]
 

@@ -151,8 +151,12 @@ def test_frames():
     frames = rollout_latents(MODEL, vec_env(1, render_mode="rgb_array"), LATENTS[:2], frames=True)[1].frames
     assert len(frames) == HORIZON  # the reset and every step but the last, after which the next episode has begun
     assert frames[0].shape == (16, 16, 3)
+    third = rollout_latents(MODEL, vec_env(1, render_mode="rgb_array"), LATENTS[:2], frames=3)[1].frames
+    np.testing.assert_array_equal(third, frames[::3])
     with pytest.raises(ValueError, match="render_mode"):
         rollout_latents(MODEL, vec_env(1), LATENTS[:1], frames=True)
+    with pytest.raises(ValueError, match="frames"):
+        rollout_latents(MODEL, vec_env(1, render_mode="rgb_array"), LATENTS[:1], frames=-1)
 
 
 def test_stochastic_actions_are_reproducible_and_leave_torch_alone():

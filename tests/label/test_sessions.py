@@ -12,6 +12,7 @@ from label_world import settled
 
 from sb3_poem.adaptation.adapter import PreferenceAdapter
 from sb3_poem.adaptation.noise import MistakeNoise
+from sb3_poem.label import turns
 from sb3_poem.label.catalogue import Choice
 from sb3_poem.label.sessions import Conversations, FullError
 from sb3_poem.label.store import RefusedError, Session, Store
@@ -173,3 +174,19 @@ def test_no_more_people_than_the_server_takes(with_conversations: Callable[..., 
             await conversations.begin("../PointGoal")
 
     with_conversations(talk, max_sessions=1)
+
+
+def test_films_show_every_second_step_while_more_people_are_at_work_than_workers(
+    with_conversations: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(turns, "SMOOTH_FPS", 2.0)
+
+    def last_ones_film(people: int) -> dict[str, Any]:
+        async def talk(conversations: Conversations) -> dict[str, Any]:
+            sessions = [(await begin(conversations))[0] for _ in range(people)]
+            return (await settled(conversations, sessions[-1]))["turn"]
+
+        return with_conversations(talk)
+
+    alone, crowded = last_ones_film(1), last_ones_film(2)  # of one worker
+    assert (crowded["fps"], crowded["frames"]) == (alone["fps"] / 2, -(-alone["frames"] // 2))
