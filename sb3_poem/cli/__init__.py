@@ -1,5 +1,5 @@
 """
-The command line, ``sb3-poem``: train, enjoy and adapt.
+The command line, ``sb3-poem``: train, enjoy, adapt and benchmark.
 
 This file only reads the command; what a command needs is imported when it runs, so that ``sb3-poem --help`` is immediate.
 """
@@ -13,6 +13,7 @@ from pathlib import Path
 import gymnasium
 
 from sb3_poem import __version__
+from sb3_poem.cli.benchmark_arguments import add_benchmark
 
 ZOO_COMMANDS = {
     "train": "meta-train an agent (rl_zoo3's train, with poem_sac and pearl_sac)",
@@ -83,7 +84,7 @@ def build_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="{train,enjoy,adapt}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="{train,enjoy,adapt,benchmark}")
     for name, summary in ZOO_COMMANDS.items():
         commands.add_parser(name, help=summary, add_help=False)
     adapt = commands.add_parser(
@@ -92,6 +93,7 @@ def build_parser() -> argparse.ArgumentParser:
         description="Adapt a trained agent to unseen tasks by preference queries, and print what it earns after each.",
     )
     _add_adapt_arguments(adapt)
+    add_benchmark(commands, _count)
     return parser
 
 
@@ -131,6 +133,10 @@ def _run(arguments: argparse.Namespace, others: list[str]) -> int:
         with loading:
             from sb3_poem.cli.zoo import run_zoo
         run_zoo(arguments.command, others)
+    elif arguments.command == "benchmark":
+        with loading:
+            from sb3_poem.cli.benchmark import run_benchmark
+        return run_benchmark(arguments)
     else:
         with loading:
             from sb3_poem.cli.adapt import run_adapt
