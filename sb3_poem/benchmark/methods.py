@@ -12,6 +12,10 @@ QUERY_RULES = ("worst-case", "information-gain", "random")
 DEFAULT_QUERY_RULE = {"paper": "worst-case", "bayes": "information-gain"}
 INFERENCE_LABELS = {"paper": "POEM (paper)", "bayes": "POEM (Bayes)"}
 
+# Outer steps of MAML-reward's meta-training, with what differs for a family.
+META_ITERATIONS = 500
+META_ITERATIONS_OF = {"PointGoal": 100}
+
 SHARED_DYNAMICS_REASONS = {
     "anole": "ANOLE asks which fragment of the training tasks is better on the new task, and here these show another world",
     "maml": "MAML-reward learns from what tasks say of each other's fragments",

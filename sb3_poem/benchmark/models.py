@@ -23,7 +23,7 @@ from sb3_poem.adaptation.state import read_json, write_json_atomically
 from sb3_poem.baselines import MAMLRewardModel, MetaReward, meta_train_reward
 from sb3_poem.benchmark.hyperparameters import TrainingPlan, training_plan
 from sb3_poem.benchmark.locks import locked
-from sb3_poem.benchmark.methods import VARIANTS
+from sb3_poem.benchmark.methods import META_ITERATIONS, META_ITERATIONS_OF, VARIANTS
 from sb3_poem.benchmark.provenance import provenance
 from sb3_poem.benchmark.suites import ModelKey
 from sb3_poem.common.pretrained import CONFIG, WEIGHTS, read_config
@@ -284,7 +284,9 @@ class ModelLibrary:
                     f"hand over its {CHECKPOINT} instead"
                 )
             started = time.time()
-            reward = meta_train_reward(model, fragment_length=fragment_length(model.horizon), seed=key.seed)
+            iterations = META_ITERATIONS_OF.get(key.family, META_ITERATIONS)
+            length = fragment_length(model.horizon)
+            reward = meta_train_reward(model, iterations, fragment_length=length, seed=key.seed)
         finally:
             env.close()
         folder = self.folder(key)
@@ -293,6 +295,7 @@ class ModelLibrary:
         info = {
             "source": "derived",
             "base": base_info,
+            "hyperparameters": {"n_iterations": iterations, "fragment_length": length},
             "env_steps": base_info["env_steps"],
             "updates": base_info["updates"],
             "seconds": round(time.time() - started, 1),

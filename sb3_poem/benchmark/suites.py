@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from sb3_poem.benchmark.methods import EPSILONS, METHODS, QUERY_RULES, Method, find_method
@@ -202,18 +202,24 @@ class Cell:
 @dataclass(frozen=True)
 class Entry:
     """
-    Methods that a suite compares under the same conditions.
+    Methods that a suite compares under the same conditions: a table, and a figure.
 
+    :param name: Of the comparison; part of its figures' names.
+    :param title: As in reports.
     :param methods: Their names.
     :param oracles: Who answers.
     :param record_at: See :class:`Budget`.
-    :param curves: Whether the methods are measured along the training too.
+    :param curves: With whose answers the methods are measured along the training too.
+    :param by_inference: Whether figures have a row for each of POEM's inference rules.
     """
 
+    name: str
+    title: str
     methods: tuple[str, ...]
     oracles: tuple[OracleSpec, ...] = (EXACT,)
     record_at: tuple[int, ...] = RECORD_AT
-    curves: bool = False
+    curves: tuple[OracleSpec, ...] = ()
+    by_inference: bool = False
 
 
 @dataclass(frozen=True)
@@ -225,7 +231,9 @@ class Suite:
     :param title: As in reports.
     :param families: What it runs on unless told otherwise.
     :param entries: What it compares.
+    :param references: Methods that say what the models' policies could earn, for the limits in the tables.
     :param snapshots: In how many equal parts the training is cut for measurements along it; 1 measures its end only.
+    :param budget: Unless told otherwise.
     :param overrides: Options of adapters by kind of method, where the suite differs from their defaults.
     """
 
@@ -233,13 +241,15 @@ class Suite:
     title: str
     families: tuple[str, ...]
     entries: tuple[Entry, ...]
+    references: tuple[str, ...]
     snapshots: int = 5
+    budget: Budget = Budget()
     overrides: dict[str, tuple[tuple[str, Any], ...]] = field(default_factory=dict)
 
     @property
     def methods(self) -> tuple[str, ...]:
         """All that it compares, each once."""
-        return tuple(dict.fromkeys(name for entry in self.entries for name in entry.methods))
+        return tuple(dict.fromkeys([name for entry in self.entries for name in entry.methods] + [*self.references]))
 
     def cells(
         self,
@@ -256,7 +266,7 @@ class Suite:
         :param env_ids: Families.
         :param seeds: Seeds.
         :param methods: Only these; None: all.
-        :param budget: Other numbers of tasks and episodes; ``record_at`` is the entries' own.
+        :param budget: Numbers of tasks and episodes, if not the suite's own; ``record_at`` is the entries'.
         :param training: See :class:`Training`.
         :param snapshots: See the class; None takes the suite's own.
         :return: The cells.
@@ -265,32 +275,43 @@ class Suite:
         for name in methods or ():
             if find_method(name).name not in self.methods:
                 raise ValueError(f"--methods {name} is not in the suite {self.name!r}, which has: {', '.join(self.methods)}")
-        budget, training = budget or Budget(), training or Training()
+        budget, training = budget or self.budget, training or Training()
         parts = self.snapshots if snapshots is None else snapshots
         cells: dict[str, Cell] = {}
         for env_id in env_ids:
             for seed in seeds:
-                for entry in self.entries:
-                    for name in entry.methods:
-                        if methods and name not in methods:
-                            continue
-                        for oracle in entry.oracles:
-                            for cell in self._one(entry, Cell(env_id, name, seed, oracle, budget, training), parts):
-                                cells.setdefault(cell.key, cell)
+                for entry in (*self.entries, Entry("references", "", self.references)):
+                    for cell in self.entry_cells(entry, env_id, seed, budget, training, parts):
+                        if not methods or cell.method in methods:
+                            cells.setdefault(cell.key, cell)
         return list(cells.values())
 
-    def _one(self, entry: Entry, cell: Cell, parts: int) -> list[Cell]:
-        """The cell at the end of the training, and those along it."""
-        kind = cell.definition.kind
-        overrides = self.overrides.get(kind, ())
+    def entry_cells(
+        self, entry: Entry, env_id: str, seed: int, budget: Budget, training: Training, snapshots: int
+    ) -> list[Cell]:
+        """
+        The cells of one entry, for one family and seed.
 
-        def at(record_at: tuple[int, ...], snapshot: float | None) -> Cell:
-            budget = Budget(cell.budget.tasks, cell.budget.episodes, record_at, cell.budget.task_seed)
-            return Cell(cell.env_id, cell.method, cell.seed, cell.oracle, budget, cell.training, snapshot, overrides)
-
-        cells = [at(entry.record_at, None)]
-        if entry.curves and kind not in WITHOUT_CURVE:
-            cells += [at(entry.record_at[-1:], round(part / parts, 4)) for part in range(1, parts)]
+        :param entry: The entry.
+        :param env_id: The family.
+        :param seed: The seed.
+        :param budget: See :meth:`cells`.
+        :param training: See :meth:`cells`.
+        :param snapshots: See the class.
+        :return: The cells.
+        """
+        cells = []
+        for name in entry.methods:
+            kind = METHODS[name].kind
+            overrides = self.overrides.get(kind, ())
+            for oracle in entry.oracles:
+                moments: list[tuple[float | None, tuple[int, ...]]] = [(None, entry.record_at)]
+                if oracle in entry.curves and kind not in WITHOUT_CURVE:
+                    shares = [round(part / snapshots, 4) for part in range(1, snapshots)]
+                    moments += [(share, entry.record_at[-1:]) for share in shares]
+                for share, record_at in moments:
+                    spent = replace(budget, record_at=record_at)
+                    cells.append(Cell(env_id, name, seed, oracle, spent, training, share, overrides))
         return cells
 
 
@@ -305,7 +326,10 @@ def family_id(name: str) -> str:
 
 
 _ABLATED = ("poem-inner", "poem-pearl-context", "poem-d2", "poem-d10")
-_RULES = tuple(name for i in ("paper", "bayes") for rule in QUERY_RULES if (name := f"poem-{i}-{rule}") in METHODS)
+_BOTH = ("poem-bayes", "poem-paper")
+_DESIGNS = (*_BOTH, *(f"{variant}-{inference}" for variant in _ABLATED for inference in ("bayes", "paper")))
+# A rule's own way of asking has no name of its own.
+_RULES = (*_BOTH, *(name for i in ("bayes", "paper") for rule in QUERY_RULES if (name := f"poem-{i}-{rule}") in METHODS))
 _EPSILON_METHODS = tuple(f"poem-paper-epsilon-{epsilon:g}" for epsilon in EPSILONS)
 
 SUITES = {
@@ -315,38 +339,42 @@ SUITES = {
             "table3",
             "Methods under exact answers (Table 3; figures 5, 9, 10)",
             PAPER_FAMILIES,
-            (Entry(TABLE_METHODS, curves=True), Entry(TABLE_REFERENCES)),
+            (Entry("methods", "Methods", TABLE_METHODS, curves=(EXACT,)),),
+            TABLE_REFERENCES,
         ),
         Suite(
             "noise",
             "Methods under answers with errors (figures 6, 11)",
             CHEETAHS,
-            (Entry(TABLE_METHODS, NOISES), Entry(TABLE_METHODS, (BOLTZMANN,), curves=True), Entry(TABLE_REFERENCES)),
+            (Entry("methods", "Methods", TABLE_METHODS, NOISES, curves=(BOLTZMANN,)),),
+            TABLE_REFERENCES,
         ),
         Suite(
             "ablation",
             "Ablations of POEM (figures 7, 12, 13)",
             CHEETAHS,
             (
-                Entry(("poem-bayes", "poem-paper"), curves=True),
-                Entry(tuple(f"{variant}-{i}" for variant in _ABLATED for i in ("bayes", "paper")), curves=True),
-                Entry(_RULES),
-                Entry(("poem-bayes", "poem-paper"), record_at=tuple(range(21))),
-                Entry(("known-task", *(f"known-task-{variant}" for variant in _ABLATED))),
+                Entry("design", "Similarity, context and latent dimension", _DESIGNS, curves=(EXACT,), by_inference=True),
+                Entry("rules", "Query rules", _RULES, by_inference=True),
+                Entry("queries", "Number of queries", ("poem-bayes", "poem-paper"), record_at=tuple(range(21))),
             ),
+            ("known-task", *(f"known-task-{variant}" for variant in _ABLATED)),
         ),
         Suite(
             "epsilon",
             "Tolerance of the paper's rule (figures 14, 15)",
             CHEETAHS,
-            (Entry(_EPSILON_METHODS, (EXACT, BOLTZMANN)), Entry(("known-task",))),
+            (Entry("tolerance", "Tolerance epsilon", _EPSILON_METHODS, (EXACT, BOLTZMANN)),),
+            ("known-task",),
         ),
         Suite(
             "smoke",
             "All methods on a small family",
             ("PointGoal",),
-            (Entry(TABLE_METHODS, curves=True), Entry(TABLE_METHODS, (BOLTZMANN,)), Entry(TABLE_REFERENCES)),
+            (Entry("methods", "Methods", TABLE_METHODS, (EXACT, BOLTZMANN), curves=(EXACT,)),),
+            TABLE_REFERENCES,
             snapshots=3,
+            budget=Budget(tasks=10, episodes=5),
             # The networks of SAC are as large here as elsewhere, and a point needs fewer steps.
             overrides={"maml": (("gradient_steps", 20),)},
         ),

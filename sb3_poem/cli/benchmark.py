@@ -47,8 +47,8 @@ def _run(arguments: argparse.Namespace) -> int:
     )
     store = Store(arguments.store) if not arguments.list or arguments.store.exists() else None
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
-    budget = Budget(arguments.tasks, arguments.episodes)
     suite = SUITES[arguments.suite]
+    budget = Budget(arguments.tasks or suite.budget.tasks, arguments.episodes or suite.budget.episodes)
     plan = make_plan(
         suite, library, store, arguments.families, arguments.methods, seeds, budget, training, arguments.snapshots
     )

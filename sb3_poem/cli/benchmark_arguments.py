@@ -74,8 +74,8 @@ def _add_run_arguments(parser: argparse.ArgumentParser, count: Count) -> None:
     )
 
     budget = parser.add_argument_group("budget, which every record notes")
-    budget.add_argument("--tasks", type=count(1), default=30, help="test tasks (default: %(default)s)")
-    budget.add_argument("--episodes", type=count(1), default=10, help="per task and measurement (default: %(default)s)")
+    budget.add_argument("--tasks", type=count(1), help="test tasks (default: the suite's, 30 but for smoke)")
+    budget.add_argument("--episodes", type=count(1), help="per task and measurement (default: the suite's, 10 but for smoke)")
     budget.add_argument("--timesteps", type=count(1), help="of every training (default: zoo_configs/)")
     budget.add_argument(
         "--params",
