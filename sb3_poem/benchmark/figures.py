@@ -135,7 +135,9 @@ def _draw_samples(
             returns = mine[0].at(last)
             assert returns is not None
             level = float(returns.mean())
-            axes.axhline(level, color=_colour(entry, method), linestyle="-.", linewidth=1.4, label=mine[0].label)
+            axes.axhline(
+                level, color=_colour(entry, method), linestyle="-.", linewidth=1.4, label=f"{mine[0].label}, at the end"
+            )
             continue
         points = [(one.samples, one.at(last)) for one in mine]
         means = [float(returns.mean()) for _, returns in points if returns is not None]

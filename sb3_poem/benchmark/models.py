@@ -257,6 +257,7 @@ class ModelLibrary:
         if model.num_timesteps < plan.timesteps:
             raise TrainingError(f"{finished[-1]} stopped after {model.num_timesteps:,} of {plan.timesteps:,} steps; remove it")
         sessions[-1]["seconds"] = time.time() - sessions[-1]["started"]
+        write_json_atomically(folder / SESSIONS, {"sessions": sessions})
         info = {
             "source": "trained",
             "run": str(finished[-1].parent.relative_to(folder)),

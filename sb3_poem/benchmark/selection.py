@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -118,14 +119,7 @@ class Reference:
         :param oracle: Who answers.
         :return: The most that so many answers allow with these policies, for each seed.
         """
-        noise = make_oracle_factory(oracle)().noise_model
-        limits = []
-        for record in self.records:
-            returns = np.array(record.result["candidate_returns"])
-            tasks, empty = np.array(record.result["tasks"]), np.empty((0, 0))
-            known = KnownTaskReturn(tasks, np.array(record.result["task_returns"])[:, None], empty, empty, returns)
-            limits.append(known.limit(queries, noise))
-        return np.array(limits)
+        return np.array(_limits(self, queries, oracle))
 
 
 class Selection:
@@ -147,6 +141,7 @@ class Selection:
         self.seeds = sorted({record.seed for record in self.records.values()})
         shares = [share for record in self.records.values() if (share := record.identity["snapshot"]) is not None]
         self.snapshots = round(1 / min(shares)) if shares else suite.snapshots
+        self._references: dict[Condition, list[Reference]] = {}
 
     def series(self, entry: Entry, condition: Condition) -> list[Series]:
         """
@@ -178,6 +173,11 @@ class Selection:
         :param condition: The condition.
         :return: In the order of the suite.
         """
+        if condition not in self._references:
+            self._references[condition] = self._find_references(condition)
+        return self._references[condition]
+
+    def _find_references(self, condition: Condition) -> list[Reference]:
         entry = Entry("references", "", self.suite.references)
         found: dict[str, list[Record]] = {}
         for seed in self.seeds:
@@ -185,6 +185,19 @@ class Selection:
                 if cell.key in self.records:
                     found.setdefault(cell.method, []).append(self.records[cell.key])
         return [Reference(method, tuple(found[method])) for method in self.suite.references if method in found]
+
+
+@cache
+def _limits(reference: Reference, queries: int, oracle: OracleSpec) -> tuple[float, ...]:
+    """Tables and figures ask for the same ones."""
+    noise = make_oracle_factory(oracle)().noise_model
+    limits = []
+    for record in reference.records:
+        returns = np.array(record.result["candidate_returns"])
+        tasks, empty = np.array(record.result["tasks"]), np.empty((0, 0))
+        known = KnownTaskReturn(tasks, np.array(record.result["task_returns"])[:, None], empty, empty, returns)
+        limits.append(known.limit(queries, noise))
+    return tuple(limits)
 
 
 def _condition(identity: dict[str, Any]) -> Condition:

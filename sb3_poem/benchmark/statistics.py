@@ -22,7 +22,7 @@ class Summary:
     :param mean: Of the seeds' mean returns.
     :param deviation: Their standard deviation (n - 1); None for one seed.
     :param iqm: The interquartile mean over seeds and tasks.
-    :param low: The lower end of its 95 % interval; None for one seed.
+    :param low: The lower end of its 95 % interval; None for one seed, and where none is wanted.
     :param high: The upper end.
     """
 
@@ -34,11 +34,12 @@ class Summary:
     high: float | None
 
 
-def summarise(returns: np.ndarray) -> list[Summary]:
+def summarise(returns: np.ndarray, intervals: bool = True) -> list[Summary]:
     """
     Summarise one method on one family after several numbers of answers.
 
     :param returns: (n_seeds, n_tasks, n_records) mean returns; column j is the same test task for all seeds.
+    :param intervals: Whether intervals are wanted, which take about a second.
     :return: A summary for each record. The intervals are rliable's: percentiles of stratified bootstrap samples, which draw
         the seeds anew for every task.
     :raises ValueError: If the shape is wrong, or a value not finite.
@@ -48,16 +49,15 @@ def summarise(returns: np.ndarray) -> list[Summary]:
         raise ValueError(f"`returns` must be finite, (n_seeds, n_tasks, n_records), none 0, but has shape {returns.shape}")
     seeds = returns.mean(axis=1)
     iqms = [float(metrics.aggregate_iqm(returns[:, :, i])) for i in range(returns.shape[2])]
-    if len(returns) == 1:
-        return [Summary(1, float(mean), None, iqm, None, None) for mean, iqm in zip(seeds[0], iqms, strict=True)]
-    with _seeded(0):
-        _, intervals = library.get_interval_estimates({"method": returns}, _iqms, reps=BOOTSTRAP_SAMPLES)
-    return [
-        Summary(len(returns), float(mean), float(deviation), iqm, float(low), float(high))
-        for mean, deviation, iqm, low, high in zip(
-            seeds.mean(axis=0), seeds.std(axis=0, ddof=1), iqms, *intervals["method"], strict=True
-        )
-    ]
+    deviations = seeds.std(axis=0, ddof=1).tolist() if len(seeds) > 1 else [None] * len(iqms)
+    low: list[float | None] = [None] * len(iqms)
+    high = low
+    if intervals and len(seeds) > 1:
+        with _seeded(0):
+            _, bounds = library.get_interval_estimates({"method": returns}, _iqms, reps=BOOTSTRAP_SAMPLES)
+        low, high = bounds["method"].tolist()
+    figures = zip(seeds.mean(axis=0).tolist(), deviations, iqms, low, high, strict=True)
+    return [Summary(len(returns), *figure) for figure in figures]
 
 
 def _iqms(scores: np.ndarray) -> np.ndarray:

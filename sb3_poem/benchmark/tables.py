@@ -168,7 +168,8 @@ def format_rows(rows: Iterable[Row], kind: str) -> str:
 def _method_rows(suite: str, condition: Condition, entry: Entry, series: Series) -> list[Row]:
     definition = METHODS[series.method]
     rows = []
-    for queries, summary in zip(series.queries, summarise(series.returns), strict=True):
+    summaries = summarise(series.returns, intervals=series.snapshot is None)
+    for queries, summary in zip(series.queries, summaries, strict=True):
         # The paper's figures are of the whole training and of its own answers.
         final = series.snapshot is None and series.oracle == EXACT and entry.name == "methods"
         paper = paper_figure(condition.family, definition.paper_row, queries) if final else None
