@@ -32,6 +32,7 @@ test: $(STAMP) rendering
 	$(THREADS) $(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
 
 test-all: $(STAMP) rendering
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[ray]'
 	$(THREADS) $(BIN)/python -m pytest -n 2 -m "not gpu" $(PYTEST_ARGS)
 
 lint: $(STAMP)

@@ -108,12 +108,12 @@ def _methods() -> dict[str, Method]:
     for inference, prefix in INFERENCE_LABELS.items():
         for rule in QUERY_RULES:
             if rule != DEFAULT_QUERY_RULE[inference]:
-                options = {"inference": inference, "query_rule": rule}
-                methods.append(Method(f"poem-{inference}-{rule}", f"{prefix}, {rule} queries", "poem", "preference", options))
+                asked = {"inference": inference, "query_rule": rule}
+                methods.append(Method(f"poem-{inference}-{rule}", f"{prefix}, {rule} queries", "poem", "preference", asked))
     for epsilon in EPSILONS:
         # 0.1 is the default, and so the same cell as poem-paper.
-        options = {"inference": "paper"} | ({} if epsilon == 0.1 else {"epsilon": epsilon})
-        methods.append(Method(f"poem-paper-epsilon-{epsilon:g}", f"epsilon = {epsilon:g}", "poem", "preference", options))
+        tolerant = {"inference": "paper", **({} if epsilon == 0.1 else {"epsilon": epsilon})}
+        methods.append(Method(f"poem-paper-epsilon-{epsilon:g}", f"epsilon = {epsilon:g}", "poem", "preference", tolerant))
     return {method.name: method for method in methods}
 
 

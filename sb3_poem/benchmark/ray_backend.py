@@ -9,8 +9,10 @@ what is finished: so a lost worker's trial is tried again where it stood, and th
 from __future__ import annotations
 
 import json
+import logging
 import os
-import tempfile
+import shutil
+import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -59,7 +61,7 @@ def run_with_ray(plan: Plan, library: ModelLibrary, store: Store, options: RayOp
     workplace = _absolute(library.workplace)
     own = not ray.is_initialized()
     if own:
-        ray.init(address=options.address, log_to_driver=False, include_dashboard=False, logging_level="ERROR")
+        ray.init(address=options.address, log_to_driver=False, include_dashboard=False, logging_level=logging.ERROR)
     try:
         failures: list[str] = []
         for depth in (False, True):  # what is derived from others comes after them
@@ -87,18 +89,10 @@ def _run_trials(
         return []
     from ray import tune
 
-    class KeepRecords(tune.Callback):
-        """Keeps each record when it arrives, so that losing this process loses no finished cell."""
-
-        def on_trial_result(self, iteration: int, trials: list, trial: Any, result: dict, **info: Any) -> None:
-            if result.get("record"):
-                record = Record(**json.loads(result["record"]))
-                store.add(record)
-            if "name" in result:
-                say(f"finished {result['name']}")
-
-    # Tune's own copy of the results is not needed: the store and the folder of runs hold everything.
-    with tempfile.TemporaryDirectory() as folder:
+    # Where all machines can see it. Of Tune's own files nothing is needed afterwards: store and runs hold everything.
+    storage = Path(workplace.runs) / ".ray" / uuid.uuid4().hex
+    storage.mkdir(parents=True)
+    try:
         tuner = tune.Tuner(
             tune.with_resources(_trial, {"cpu": options.cpus, "gpu": options.gpus}),
             param_space={
@@ -106,18 +100,38 @@ def _run_trials(
                 "job": tune.grid_search([{**job, "name": name} for job, name in zip(jobs, names, strict=True)]),
             },
             run_config=tune.RunConfig(
-                storage_path=folder,
+                storage_path=str(storage),
                 failure_config=tune.FailureConfig(max_failures=options.max_failures),
-                callbacks=[KeepRecords()],
+                callbacks=[_keep_records(store.path.absolute(), say)],
                 verbose=0,
             ),
         )
         results = tuner.fit()
+    finally:
+        shutil.rmtree(storage, ignore_errors=True)
     failures = []
-    for result in results:
+    for result in (results[i] for i in range(len(results))):
         if result.error is not None:
             failures.append(f"{(result.config or {}).get('job', {}).get('name', 'a trial')}: {result.error}")
     return failures
+
+
+def _keep_records(store: Path, say: Say) -> Any:
+    """
+    A callback that keeps each record when it arrives, so that losing this process loses no finished cell. Tune pickles it with
+    everything else, hence the path.
+    """
+    from ray import tune
+
+    class KeepRecords(tune.Callback):
+        def on_trial_result(self, iteration: int, trials: list, trial: Any, result: dict, **info: Any) -> None:
+            if result.get("record"):
+                with Store(store) as opened:
+                    opened.add(Record(**json.loads(result["record"])))
+            if "name" in result:
+                say(f"finished {result['name']}")
+
+    return KeepRecords()
 
 
 def _trial(config: dict[str, Any]) -> None:

@@ -72,7 +72,7 @@ def test_models_are_found_in_a_folder_or_by_name_and_checked(tmp_path: Path) -> 
     with pytest.raises(ValueError, match="was handed over, and so has no models along its training"):
         library.load(ModelKey(POINT, "poem-d2", 0), env, snapshot=0.5)
     gone = ModelLibrary(Workplace(str(tmp_path), named=(("PointGoal", "poem", 0, str(tmp_path / "gone")),)))
-    with pytest.raises(ValueError, match="--model PointGoal:poem:0=.*gone: there is no such file or folder"):
+    with pytest.raises(ValueError, match=r"--model PointGoal:poem:0=.*gone: there is no such file or folder"):
         gone.given(ModelKey(POINT, "poem", 0))
     env.close()
 

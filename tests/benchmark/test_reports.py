@@ -159,6 +159,6 @@ def test_lines_show_the_values_of_the_store(tmp_path: Path) -> None:
 
 def test_a_store_without_the_suite_is_refused(tmp_path: Path) -> None:
     store = fill(tmp_path / "store.sqlite", "epsilon", seeds=1, methods=["poem-paper-epsilon-0.4"])
-    with pytest.raises(ValueError, match="--suite smoke: .* holds no finished cell of it"):
+    with pytest.raises(ValueError, match=r"--suite smoke: .* holds no finished cell of it"):
         make_report(store, ["smoke"])
     assert make_report(store)[0].count("# Tolerance of the paper's rule") == 1
