@@ -101,7 +101,8 @@ def _figures_of(
                 some = [one for one in series if one.label.startswith(prefix)]
                 draw(axes, some, entry, oracle, references[condition])
                 _title(axes, condition, prefix)
-        _finish(figure, panels, f"{entry.title}, {oracle.label}")
+        after = f"; return after {max(entry.record_at)} queries" if kind == "samples" else ""
+        _finish(figure, panels, f"{entry.title}, {oracle.label}{after}")
         figures[f"{name}-{kind}"] = figure
     return figures
 
@@ -143,8 +144,8 @@ def _draw_samples(
         means = [float(returns.mean()) for _, returns in points if returns is not None]
         deviations = [_deviation(returns) for _, returns in points if returns is not None]
         _band(axes, [samples for samples, _ in points], np.array(means), np.array(deviations), entry, method, mine[0].label)
-    axes.set_xlabel(f"environment steps of the training (return after {last} queries)")
-    axes.ticklabel_format(axis="x", style="sci", scilimits=(4, 4), useMathText=True)
+    axes.set_xlabel("environment steps of the training, thousands")
+    axes.xaxis.set_major_formatter(lambda steps, position: f"{steps / 1000:g}")
 
 
 def _tolerance_figure(entry: Entry, by_condition: dict[Condition, list[Series]]) -> Figure | None:
@@ -183,7 +184,8 @@ def _line(axes: Axes, x: Sequence[float], by_seed: np.ndarray, entry: Entry, met
 def _band(
     axes: Axes, x: Sequence[float], means: np.ndarray, deviations: np.ndarray, entry: Entry, method: str, label: str
 ) -> None:
-    marker = MARKERS[entry.methods.index(method) % len(MARKERS)]
+    names = list(dict.fromkeys(map(_change, entry.methods))) if entry.by_inference else list(entry.methods)
+    marker = MARKERS[names.index(_change(method) if entry.by_inference else method) % len(MARKERS)]
     _draw_band(axes, x, means, deviations, _colour(entry, method), marker, label)
 
 
@@ -191,7 +193,7 @@ def _draw_band(
     axes: Axes, x: Sequence[float], means: np.ndarray, deviations: np.ndarray, colour: str, marker: str, label: str
 ) -> None:
     axes.plot(x, means, color=colour, marker=marker, markersize=4, linewidth=1.6, label=label, zorder=3)
-    axes.fill_between(x, means - deviations, means + deviations, color=colour, alpha=0.13, linewidth=0)
+    axes.fill_between(x, means - deviations, means + deviations, color=colour, alpha=0.1, linewidth=0)
 
 
 def _colour(entry: Entry, method: str) -> str:
