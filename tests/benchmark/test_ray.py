@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from pathlib import Path
@@ -42,12 +43,14 @@ def test_a_lost_worker_costs_no_cell_and_counts_none_twice(tmp_path: Path) -> No
     lost, over = threading.Event(), threading.Event()
 
     def lose_a_worker() -> None:
-        """As soon as both trainings have a checkpoint: in the middle of both trials."""
+        """As soon as a training has a checkpoint, the node goes that it runs on."""
         while not (lost.is_set() or over.is_set()):
-            if len(list((tmp_path / "runs").rglob("checkpoint.zip"))) == 2:
-                assert not list((tmp_path / "runs").rglob("trained.json"))
-                cluster.remove_node(workers[0], allow_graceful=False)
+            for checkpoint in (tmp_path / "runs").rglob("checkpoint.zip"):
+                raylet = parent(parent(training_process(checkpoint.parents[2])))
+                node = next(node for node in workers if node.all_processes["raylet"][0].process.pid == raylet)
+                cluster.remove_node(node, allow_graceful=False)
                 lost.set()
+                return
             time.sleep(0.05)
 
     watcher = threading.Thread(target=lose_a_worker)
@@ -71,8 +74,24 @@ def test_a_lost_worker_costs_no_cell_and_counts_none_twice(tmp_path: Path) -> No
     # The one that was lost went on from its checkpoint.
     counts = [record.provenance["model"]["sessions"] for record in records if record.method == "known-task"]
     assert sorted(counts) == [1, 2]
+    assert sum("Resuming" in log.read_text() for log in (tmp_path / "runs").rglob("train.log")) == 1
     assert all(record.provenance["model"]["env_steps"] == 9000 for record in records)
 
     # The same command finds nothing to do.
     again = make_plan(TINY, library, store, None, None, range(2), Budget(tasks=2, episodes=1), TRAINING, 1)
     assert again.todo == []
+
+
+def training_process(folder: Path) -> int:
+    """The process that trains in a folder."""
+    for process in Path("/proc").iterdir():
+        if process.name.isdigit():
+            with contextlib.suppress(OSError):
+                command = (process / "cmdline").read_bytes()
+                if b"training_process" in command and str(folder).encode() in command:
+                    return int(process.name)
+    raise AssertionError(f"nobody trains in {folder}")
+
+
+def parent(pid: int) -> int:
+    return int(Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[1])
