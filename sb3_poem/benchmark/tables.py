@@ -245,7 +245,8 @@ def _comparison(condition: Condition, entry: Entry, oracle: OracleSpec, rows: Se
     notes += known
     if any(row.kind == "limit" for row in rows):
         notes.append(
-            "A limit is the most that so many of these answers allow with those policies, chosen with the test tasks in sight."
+            "A limit is the most that so many of these answers allow with those policies, chosen with the test tasks in "
+            "sight; it does not bind the reward oracle, which sees more than answers."
         )
     return Table(f"{condition}; {entry.title.lower()}, {oracle.label}", tuple(header), tuple(body), tuple(notes))
 
