@@ -36,6 +36,7 @@ test: $(STAMP) rendering browser
 	$(THREADS) $(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
 
 test-all: $(STAMP) rendering browser
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[ray]'
 	$(THREADS) $(BIN)/python -m pytest -n 2 -m "not gpu" $(PYTEST_ARGS)
 
 lint: $(STAMP)

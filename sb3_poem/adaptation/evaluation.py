@@ -18,9 +18,14 @@ from sb3_poem.common.rollouts import rollout_features, rollout_outcomes
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
+    from sb3_poem.common.family import FamilyEnv
+
 
 # Latents to try for each task, where every one must be rolled out in every task, and where one rollout serves all of them.
 LATENTS_WITH_OWN_DYNAMICS, LATENTS_WITH_SHARED_DYNAMICS = 30, 300
+
+# Test tasks come from a stream of their own, so that no seed gives the tasks that a model was trained on.
+TEST_TASK_STREAM = 0x7E57
 
 
 @dataclass(frozen=True, eq=False)
@@ -384,6 +389,21 @@ def preference_order(model: Any, known: KnownTaskReturn) -> tuple[float, float]:
     policies = np.unique(best)
     similarities = model.similarity(known.latents, known.candidate_latents[policies])
     return property_one(similarities, known.candidate_returns[:, policies])
+
+
+def held_out_tasks(family: FamilyEnv, n: int, seed: int) -> np.ndarray:
+    """
+    Test tasks. Those of a finite family are repeated in turn: each is one adaptation more.
+
+    :param family: The family.
+    :param n: How many.
+    :param seed: Draws them; no seed gives the tasks that a model was trained on.
+    :return: (n, task_dim).
+    """
+    rng = np.random.default_rng([TEST_TASK_STREAM, seed])
+    if family.all_tasks is None:
+        return family.sample_tasks(n, rng)
+    return np.resize(family.sample_tasks(len(family.all_tasks), rng), (n, family.task_dim))
 
 
 def evaluation_seed(seed: int, stream: int = 0) -> int:

@@ -1,7 +1,7 @@
 """What POEM is compared with, behind the same ask and tell."""
 
 from sb3_poem.baselines.anole import ANOLEAdapter
-from sb3_poem.baselines.fragments import replay_fragments, training_rollouts
+from sb3_poem.baselines.fragments import replay_fragments, rollout_fragments, training_rollouts
 from sb3_poem.baselines.maml_adapter import MAMLRewardAdapter, MAMLRewardModel
 from sb3_poem.baselines.maml_reward import MetaReward, meta_train_reward
 from sb3_poem.baselines.reward_oracle import RewardOracleAdapter
@@ -14,5 +14,6 @@ __all__ = [
     "RewardOracleAdapter",
     "meta_train_reward",
     "replay_fragments",
+    "rollout_fragments",
     "training_rollouts",
 ]

@@ -70,3 +70,32 @@ def training_rollouts(model: Any, vec_env: VecEnv, n: int, seed: int = 0, determ
     """
     chosen = np.random.default_rng([seed, 4]).integers(len(model.train_tasks), size=n)
     return rollout_latents(model, vec_env, model.task_latents[chosen], model.train_tasks[chosen], seed, deterministic)
+
+
+def rollout_fragments(model: Any, vec_env: VecEnv, n: int, length: int, seed: int = 0) -> list[Trajectory]:
+    """
+    Fragments of :func:`training_rollouts`, one from a random place of each: what a replay buffer would hold of the present
+    policies, for a model that was loaded without one.
+
+    :param model: A trained :class:`PEARLSAC`.
+    :param vec_env: A vector environment of its family.
+    :param n: How many.
+    :param length: Steps of a fragment; an episode that ended earlier is taken whole.
+    :param seed: Of the training tasks, the episodes and the places.
+    :return: n trajectories.
+    """
+    rng = np.random.default_rng([seed, 6])
+    fragments = []
+    for episode in training_rollouts(model, vec_env, n, seed):
+        steps = min(length, len(episode))
+        start = int(rng.integers(len(episode) - steps + 1))
+        features = episode.reward_features
+        fragments.append(
+            Trajectory(
+                episode.observations[start : start + steps + 1],
+                episode.actions[start : start + steps],
+                episode.latent,
+                None if features is None else features[start : start + steps],
+            )
+        )
+    return fragments

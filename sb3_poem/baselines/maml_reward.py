@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from safetensors import SafetensorError
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as tensors_to_bytes
 
 from sb3_poem.adaptation.preference import Preference
+from sb3_poem.adaptation.state import read_json, write_json_atomically
 from sb3_poem.baselines.fragments import replay_fragments
 from sb3_poem.baselines.maml import Parameters, PreferencePairs, RewardNetwork, adapt_parameters, maml_loss
+from sb3_poem.common.files import write_atomically
 from sb3_poem.common.trajectory import Trajectory
 
+FORMAT = "sb3_poem meta reward 1"
+WEIGHTS, CONFIG = "reward.safetensors", "reward.json"
+# The parameters mean something only together with this standardisation of observations.
+STANDARDISATION = ("obs_mean", "obs_std")
 LABELS = {Preference.LEFT: 1.0, Preference.RIGHT: 0.0, Preference.EQUAL: 0.5}
 
 
@@ -49,11 +59,66 @@ class MetaReward:
         if inner_steps < 1:
             raise ValueError(f"`inner_steps` must be at least 1, but is {inner_steps}")
         self.policy, self.inner_learning_rate, self.inner_steps = policy, inner_learning_rate, inner_steps
+        self.net_arch = tuple(int(width) for width in net_arch)
         in_dim = 2 * spaces.flatdim(policy.observation_space) + spaces.flatdim(policy.action_space)
         with th.random.fork_rng():
             th.manual_seed(seed)
             self.network = RewardNetwork(in_dim, net_arch).to(policy.device)
         self.parameters: Parameters = {name: value.detach().clone() for name, value in self.network.named_parameters()}
+
+    def save(self, folder: str | Path) -> None:
+        """
+        Write the parameters as safetensors and the settings as JSON.
+
+        :param folder: Where; made if missing.
+        :raises OSError: If it cannot be written.
+        """
+        folder = Path(folder)
+        tensors = {f"network.{name}": value.detach().cpu().contiguous() for name, value in self.parameters.items()}
+        tensors |= {name: getattr(self.policy, name).detach().cpu().contiguous() for name in STANDARDISATION}
+        config = {
+            "format": FORMAT,
+            "net_arch": list(self.net_arch),
+            "inner_learning_rate": self.inner_learning_rate,
+            "inner_steps": self.inner_steps,
+        }
+        write_atomically(folder / WEIGHTS, tensors_to_bytes(tensors))
+        write_json_atomically(folder / CONFIG, config)
+
+    @classmethod
+    def load(cls, folder: str | Path, policy: Any) -> MetaReward:
+        """
+        Read what :meth:`save` wrote.
+
+        :param folder: The folder.
+        :param policy: The :class:`LatentPolicy` with which it was meta-trained.
+        :return: The meta-trained reward.
+        :raises FileNotFoundError: If the folder does not hold one.
+        :raises ValueError: If a file is broken or of another version, or the policy is another one.
+        """
+        folder = Path(folder)
+        if not (folder / CONFIG).is_file():
+            raise FileNotFoundError(f"{folder} holds no meta-trained reward: it has no {CONFIG}")
+        config = read_json(folder / CONFIG)
+        if config.get("format") != FORMAT:
+            raise ValueError(f"{folder / CONFIG} is not of this version of sb3_poem (expected format {FORMAT!r})")
+        try:
+            tensors = load_tensors((folder / WEIGHTS).read_bytes())
+        except SafetensorError as error:
+            raise ValueError(f"{folder / WEIGHTS} is truncated, or no safetensors file: {error}") from error
+        for name in STANDARDISATION:
+            own = getattr(policy, name).cpu()
+            if name not in tensors or tensors[name].shape != own.shape or not th.equal(tensors[name], own):
+                raise ValueError(
+                    f"`policy` is not the one with which the reward in {folder} was meta-trained: its {name} differs; "
+                    "load the same model again"
+                )
+        meta = cls(policy, config["net_arch"], config["inner_learning_rate"], config["inner_steps"])
+        names = {f"network.{name}": value.shape for name, value in meta.parameters.items()}
+        if names != {name: tensors[name].shape for name in tensors if name.startswith("network.")}:
+            raise ValueError(f"{folder / WEIGHTS} does not hold the network that {CONFIG} describes")
+        meta.parameters = {name: tensors[f"network.{name}"].to(policy.device) for name in meta.parameters}
+        return meta
 
     def transitions(self, trajectory: Trajectory) -> th.Tensor:
         """(T, in_dim + 1) standardised (s, a, s') of a trajectory, and 1."""

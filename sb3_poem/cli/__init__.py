@@ -1,5 +1,5 @@
 """
-The command line, ``sb3-poem``: train, enjoy, adapt and label.
+The command line, ``sb3-poem``: train, enjoy, adapt, label and benchmark.
 
 This file only reads the command; what a command needs is imported when it runs, so that ``sb3-poem --help`` is immediate.
 """
@@ -13,6 +13,7 @@ from pathlib import Path
 import gymnasium
 
 from sb3_poem import __version__
+from sb3_poem.cli.benchmark_arguments import add_benchmark
 
 ZOO_COMMANDS = {
     "train": "meta-train an agent (rl_zoo3's train, with poem_sac and pearl_sac)",
@@ -153,7 +154,7 @@ def build_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="{train,enjoy,adapt,label}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="{train,enjoy,adapt,label,benchmark}")
     for name, summary in ZOO_COMMANDS.items():
         commands.add_parser(name, help=summary, add_help=False)
     adapt = commands.add_parser(
@@ -168,6 +169,7 @@ def build_parser() -> argparse.ArgumentParser:
         description="Open a web page on which people teach a trained agent their task by comparing videos.",
     )
     _add_label_arguments(label)
+    add_benchmark(commands, _count)
     return parser
 
 
@@ -211,6 +213,10 @@ def _run(arguments: argparse.Namespace, others: list[str]) -> int:
         with loading:
             from sb3_poem.cli.label import run_label
         run_label(arguments)
+    elif arguments.command == "benchmark":
+        with loading:
+            from sb3_poem.cli.benchmark import run_benchmark
+        return run_benchmark(arguments)
     else:
         with loading:
             from sb3_poem.cli.adapt import run_adapt

@@ -30,7 +30,7 @@ from sb3_poem.adaptation import (
     evaluate_episodes,
     known_task_return,
 )
-from sb3_poem.adaptation.evaluation import evaluation_seed
+from sb3_poem.adaptation.evaluation import evaluation_seed, held_out_tasks
 from sb3_poem.adaptation.human import HumanAnswer
 from sb3_poem.adaptation.oracles import compute_reward
 from sb3_poem.cli.models import load_model
@@ -46,8 +46,6 @@ DEFAULT_TASKS = 30
 VECTORISED_COPIES = 60
 # Episodes per latent when looking for a task's best: the fewer, the more luck counts in the limit.
 SELECTION_EPISODES = 3
-# Test tasks come from a stream of their own, so that no seed gives the tasks that a model was trained on.
-TEST_TASK_STREAM = 0x7E57
 
 
 def run_adapt(arguments: argparse.Namespace) -> None:
@@ -137,10 +135,7 @@ class Adaptation:
         if human and arguments.tasks not in (None, 1):
             raise ValueError(f"--oracle human answers for one task, but --tasks asks for {arguments.tasks}")
         count = arguments.tasks or (1 if human else DEFAULT_TASKS)
-        rng = np.random.default_rng([TEST_TASK_STREAM, self.seed])
-        if family.all_tasks is None:
-            return family.sample_tasks(count, rng)
-        return np.resize(family.sample_tasks(len(family.all_tasks), rng), (count, family.task_dim))
+        return held_out_tasks(family, count, self.seed)
 
     def ask_oracle(self) -> AdaptationEvaluation:
         """Let a program that knows the tasks answer."""

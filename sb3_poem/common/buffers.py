@@ -268,8 +268,10 @@ class ContextStore:
     :param transitions: (tasks, steps, context_dim) standardised (s, a, s', r[, Q])
     :param rewards: (tasks, steps) in the environment's units
     :param returns: (tasks, tasks), J[i, j] of task j's policy on task i; NaN where it was not measured
+    :param features: (tasks, steps, feat_dim) reward features, where contexts are relabelled
     """
 
     transitions: th.Tensor
     rewards: th.Tensor
     returns: th.Tensor
+    features: th.Tensor | None = None

@@ -30,11 +30,15 @@ def save_checkpoint(model: "PEARLSAC", path: str | Path) -> None:
         "algorithm": type(model).__name__,
         "model": th.frombuffer(bytearray(archive.getvalue()), dtype=th.uint8),
         "replay_buffer": {name: th.as_tensor(value).cpu() for name, value in model.replay_buffer.state().items()},
-        "context": None if context is None else {name: value.cpu() for name, value in vars(context).items()},
+        "context": None if context is None else _tensors(context),
     }
     content = io.BytesIO()
     th.save(state, content)
     write_atomically(path, content.getbuffer())
+
+
+def _tensors(context: ContextStore) -> dict[str, th.Tensor]:
+    return {name: value.cpu() for name, value in vars(context).items() if value is not None}
 
 
 def read_checkpoint(path: str | Path, algorithm: str) -> dict[str, Any]:

@@ -24,6 +24,7 @@ class CollectingSAC(TaskSAC):
     #: Mean and deviation by which the rewards in ``context`` are standardised; kept with the model, other than the context
     context_reward_statistics: tuple[float, float] | None
     context_has_value: bool = False
+    context_relabel_fraction: float
     epoch: int
     trajectories_per_task: int
     _statistics_known: bool
@@ -132,10 +133,14 @@ class CollectingSAC(TaskSAC):
                 parts.append(_standardised(self._context_values(obs, actions, epoch.latents))[..., None])
             transitions = th.cat(parts, dim=-1)
         steps = per_task * transitions.shape[1]
+        features = None
+        if self.context_relabel_fraction > 0:
+            features = th.as_tensor(epoch.features, device=self.device).reshape(n_tasks, steps, -1)
         self.context = ContextStore(
             transitions.reshape(n_tasks, steps, -1),
             rewards.reshape(n_tasks, steps),
             th.as_tensor(returns, dtype=th.float32, device=self.device),
+            features,
         )
 
     def _context_values(self, obs: th.Tensor, actions: th.Tensor, latents: np.ndarray) -> th.Tensor:

@@ -53,6 +53,9 @@ class PEARLSAC(SamplingSAC):
     :param policy_coef: Weight of the actor's loss
     :param relabel_fraction: Share of each task's batch that comes from other tasks' buffers, with rewards relabelled. Needs
         a family with shared dynamics
+    :param context_relabel_fraction: Share of the contexts in a gradient step that hold other tasks' transitions, with rewards
+        relabelled. Without any, the encoder may read a task from what its policy does rather than from the rewards, and is
+        then at a loss when it sees a new task's first rollouts. Needs a family with shared dynamics
     :param reward_scale: Factor on the rewards that the critics learn; "auto" divides by the deviation of the first epoch's
     :param horizon: Steps of an episode; None takes the environment's time limit
     :param precision: "auto" (bfloat16 where the processor has it), "bf16", or "fp32"
@@ -67,6 +70,10 @@ class PEARLSAC(SamplingSAC):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy}
+    saved_arguments: ClassVar[dict[str, str]] = {
+        **SamplingSAC.saved_arguments,
+        "context_relabel_fraction": "context_relabel_fraction",
+    }
 
     def __init__(
         self,
@@ -91,6 +98,7 @@ class PEARLSAC(SamplingSAC):
         reward_coef: float = 1.0,
         policy_coef: float = 1.0,
         relabel_fraction: float = 0.0,
+        context_relabel_fraction: float = 0.0,
         reward_scale: float | str = "auto",
         horizon: int | None = None,
         precision: str = "auto",
@@ -121,7 +129,8 @@ class PEARLSAC(SamplingSAC):
                 raise ValueError(f"{name} must be at least {low}, got {value}")
         if reward_scale != "auto" and not (isinstance(reward_scale, (int, float)) and reward_scale > 0):
             raise ValueError(f'reward_scale must be a positive number or "auto", got {reward_scale!r}')
-        for name, value in (("gamma", gamma), ("tau", tau), ("relabel_fraction", relabel_fraction)):
+        fractions = (("relabel_fraction", relabel_fraction), ("context_relabel_fraction", context_relabel_fraction))
+        for name, value in (("gamma", gamma), ("tau", tau), *fractions):
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must lie in [0, 1], got {value}")
         hidden_dtype(precision, "cpu")  # refuses an unknown name now rather than at the first step
@@ -134,6 +143,7 @@ class PEARLSAC(SamplingSAC):
         self.reward_coef = reward_coef
         self.policy_coef = policy_coef
         self.relabel_fraction = relabel_fraction
+        self.context_relabel_fraction = context_relabel_fraction
         self.reward_scale = reward_scale
         self.horizon = horizon
         self.precision = precision

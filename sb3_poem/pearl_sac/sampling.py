@@ -11,6 +11,8 @@ from sb3_poem.pearl_sac.losses import MetaBatch
 
 #: Bytes of transitions that are drawn at once: few enough to stay in the cache; on a GPU the number of draws is what costs
 BYTES_AT_ONCE = {"cpu": 2**20, "cuda": 2**28}
+#: Tasks whose policies a relabelled context comes from, as many as there are trajectories before adaptation's first estimate
+FOREIGN_SOURCES = 2
 
 
 class SamplingSAC(CollectingSAC):
@@ -90,9 +92,32 @@ class SamplingSAC(CollectingSAC):
         steps = transitions.shape[1]
         shape = (len(task_ids), self.context_size)
         picks = th.randint(steps, shape, generator=self.generators.torch, device=self.device)
-        rows = (task_ids[:, None] * steps + picks).view(-1)
+        relabels = self.context_relabel_fraction > 0
+        sources = self._context_sources(task_ids) if relabels else task_ids[:, None]
+        rows = (sources * steps + picks).view(-1)
         context = transitions.view(-1, transitions.shape[-1]).index_select(0, rows).view(*shape, -1)
-        return context, rewards.view(-1).index_select(0, rows).view(shape)
+        if not relabels:
+            return context, rewards.view(-1).index_select(0, rows).view(shape)
+        assert self.train_tasks is not None
+        assert self.context.features is not None
+        assert self.context_reward_statistics is not None
+        features = self.context.features.view(len(rewards) * steps, -1).index_select(0, rows).view(*shape, -1)
+        tasks = self.train_tasks[task_ids.cpu().numpy()][:, None, :]
+        own = th.as_tensor(self.family.compute_reward(tasks, features.cpu().numpy()), dtype=th.float32, device=self.device)
+        centre, deviation = self.context_reward_statistics
+        context[..., -1] = (own - centre) / deviation
+        return context, own
+
+    def _context_sources(self, task_ids: th.Tensor) -> th.Tensor:
+        """Whose transitions a context holds, (tasks, context_size): the task's own, or for ``context_relabel_fraction`` of the
+        contexts a mixture of those of two random tasks.
+        """
+        generator, device, n = self.generators.torch, self.device, len(task_ids)
+        assert self.context is not None
+        pool = th.randint(len(self.context.rewards), (n, FOREIGN_SOURCES), generator=generator, device=device)
+        picks = th.randint(FOREIGN_SOURCES, (n, self.context_size), generator=generator, device=device)
+        foreign = th.rand((n, 1), generator=generator, device=device) < self.context_relabel_fraction
+        return th.where(foreign, pool.gather(1, picks), task_ids[:, None])
 
     def _standard_normal(self, *shape: int) -> th.Tensor:
         return th.randn(shape, generator=self.generators.torch, device=self.device)

@@ -45,8 +45,9 @@ class TaskSAC(PersistentSAC):
                 f"n_train_tasks is {count}, but {family.env_id} is a finite family of {len(family.all_tasks)} tasks; "
                 f"use at most {len(family.all_tasks)}, or None for all"
             )
-        if self.relabel_fraction > 0 and not family.shared_dynamics:
-            raise ValueError(f"relabel_fraction must be 0: the tasks of {family.env_id} do not share dynamics")
+        for name in ("relabel_fraction", "context_relabel_fraction"):
+            if getattr(self, name) > 0 and not family.shared_dynamics:
+                raise ValueError(f"{name} must be 0: the tasks of {family.env_id} do not share dynamics")
         self.env_id = family.env_id
         self.env_kwargs = family.env_kwargs
         self.task_space = family.task_space

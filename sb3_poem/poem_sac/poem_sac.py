@@ -12,6 +12,7 @@ from sb3_poem.common.buffers import Segment
 from sb3_poem.common.collection import relabelled_returns
 from sb3_poem.pearl_sac.losses import MetaBatch, TaskEmbeddings
 from sb3_poem.pearl_sac.pearl_sac import PEARLSAC
+from sb3_poem.pearl_sac.sampling import SamplingSAC
 from sb3_poem.poem_sac.losses import preference_loss
 from sb3_poem.poem_sac.policies import MlpPolicy, POEMPolicy
 
@@ -33,7 +34,7 @@ class POEMSAC(PEARLSAC):
     value network; a replay buffer that outlives the epoch for the critics and the actor, while contexts and preference
     labels are the last epoch's only; the critics' loss trains the encoder too, as in PEARL.
 
-    All arguments of :class:`PEARLSAC`, and:
+    All arguments of :class:`PEARLSAC` but ``context_relabel_fraction`` (contexts are of the task's own policy, eq. 8), and:
 
     :param preference_coef: Weight of the preference loss
     :param similarity: "two-encoder": <f_r(z_i), f_pi(z_j)>; "inner": <z_i, z_j>, the ablation of Proposition 1
@@ -47,7 +48,7 @@ class POEMSAC(PEARLSAC):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy}
     policy: POEMPolicy
     saved_arguments: ClassVar[dict[str, str]] = {
-        **PEARLSAC.saved_arguments,
+        **SamplingSAC.saved_arguments,
         "preference_coef": "preference_coef",
         "similarity": "similarity_metric",
         "context": "context_kind",

@@ -12,7 +12,7 @@ import sb3_poem
 from sb3_poem import PEARLSAC, ANOLEAdapter
 from sb3_poem.adaptation import MistakeOracle, Preference, ReturnOracle, adapt_tasks, evaluate_adaptation
 from sb3_poem.adaptation.options import inference_rng
-from sb3_poem.baselines import replay_fragments, training_rollouts
+from sb3_poem.baselines import replay_fragments, rollout_fragments, training_rollouts
 from sb3_poem.baselines.anole import ANOLEOptions
 from sb3_poem.baselines.berlekamp import berlekamp_volumes, n_distinguishable, worst_case_volumes
 from sb3_poem.common.rollouts import rollout_latents
@@ -242,3 +242,19 @@ def test_models_and_families_that_will_not_do(trained):
     with pytest.raises(ValueError, match="does not belong to this environment"):
         ANOLEAdapter(MODEL, walks(1, Walk), library=LIBRARY)
     assert "ANOLEAdapter" in dir(sb3_poem)
+
+
+def test_fragments_of_rollouts_are_pieces_of_the_training_tasks_episodes():
+    model, env = small(PEARLSAC, walks(5), horizon=10, n_train_tasks=5).learn(100), walks(4)
+    fragments = rollout_fragments(model, env, 12, 6, seed=3)
+    episodes = training_rollouts(model, env, 12, seed=3)
+    starts = set()
+    for fragment, episode in zip(fragments, episodes, strict=True):
+        assert len(fragment) == 6
+        [start] = [t for t in range(5) if np.array_equal(episode.observations[t : t + 7], fragment.observations)]
+        np.testing.assert_array_equal(episode.actions[start : start + 6], fragment.actions)
+        np.testing.assert_array_equal(episode.reward_features[start : start + 6], fragment.reward_features)
+        np.testing.assert_array_equal(episode.latent, fragment.latent)
+        starts.add(start)
+    assert len(starts) > 2
+    assert [len(fragment) for fragment in rollout_fragments(model, env, 2, 50)] == [10, 10]

@@ -138,3 +138,31 @@ def test_what_will_not_do(trained):
         MetaReward(trained.policy, inner_learning_rate=0.0)
     with pytest.raises(ValueError, match="`inner_steps` must be at least 1"):
         MetaReward(trained.policy, inner_steps=0)
+
+
+def test_a_meta_reward_is_saved_and_read(tmp_path):
+    model = small(PEARLSAC).learn(300)
+    arguments = {"net_arch": (8, 4), "inner_learning_rate": 0.2, "inner_steps": 2}
+    meta = meta_train_reward(model, n_iterations=2, n_fragments=20, fragment_length=10, **arguments)
+    meta.save(tmp_path / "reward")
+    loaded = MetaReward.load(tmp_path / "reward", model.policy)
+    assert (loaded.net_arch, loaded.inner_learning_rate, loaded.inner_steps) == ((8, 4), 0.2, 2)
+    left, right = replay_fragments(model, 2, 10, np.random.default_rng(0))
+    answers = [JudgedPair(Preference.LEFT, left, right)]
+    for judged in ([], answers):
+        np.testing.assert_array_equal(loaded.rewards(loaded.adapted(judged), right), meta.rewards(meta.adapted(judged), right))
+    assert {file.suffix for file in (tmp_path / "reward").iterdir()} == {".safetensors", ".json"}
+
+    other = small(PEARLSAC, seed=5).learn(300)
+    with pytest.raises(ValueError, match=r"is not the one with which the reward in .* was meta-trained: its obs_mean differs"):
+        MetaReward.load(tmp_path / "reward", other.policy)
+    with pytest.raises(FileNotFoundError, match="holds no meta-trained reward"):
+        MetaReward.load(tmp_path, model.policy)
+    weights = tmp_path / "reward" / "reward.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-20])
+    with pytest.raises(ValueError, match="is truncated, or no safetensors file"):
+        MetaReward.load(tmp_path / "reward", model.policy)
+    config = tmp_path / "reward" / "reward.json"
+    config.write_text(config.read_text().replace("meta reward 1", "meta reward 2"))
+    with pytest.raises(ValueError, match="is not of this version of sb3_poem"):
+        MetaReward.load(tmp_path / "reward", model.policy)

@@ -125,6 +125,10 @@ def test_vec_normalize(algorithm: type[PEARLSAC]) -> None:
 def test_relabelling_needs_shared_dynamics(algorithm: type[PEARLSAC]) -> None:
     with pytest.raises(ValueError, match=r"relabel_fraction must be 0: the tasks of .* do not share dynamics"):
         small(algorithm, walks(2, WindyWalk), horizon=10, relabel_fraction=0.5)
+    with pytest.raises(ValueError, match=r"context_relabel_fraction must be 0: the tasks of .* do not share dynamics"):
+        small(PEARLSAC, walks(2, WindyWalk), horizon=10, context_relabel_fraction=0.5)
+    with pytest.raises(ValueError, match=r"context_relabel_fraction must lie in \[0, 1\], got 1.5"):
+        small(PEARLSAC, walks(2), horizon=10, context_relabel_fraction=1.5)
     with pytest.raises(ValueError, match=r'preference_source must be "rollout" or "auto": .* do not share dynamics'):
         small(POEMSAC, walks(2, WindyWalk), horizon=10, preference_source="relabel")
 

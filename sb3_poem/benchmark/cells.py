@@ -1,0 +1,151 @@
+"""One cell: load the model, adapt, measure, and note everything."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_poem.adaptation import BoltzmannOracle, MistakeOracle, PreferenceAdapter, ReturnOracle, TaskOracle
+from sb3_poem.adaptation.evaluation import evaluate_adaptation, held_out_tasks, known_task_return, preference_order
+from sb3_poem.baselines import ANOLEAdapter, MAMLRewardAdapter, RewardOracleAdapter, rollout_fragments
+from sb3_poem.benchmark.models import ModelLibrary, Say, fragment_length
+from sb3_poem.benchmark.provenance import provenance
+from sb3_poem.benchmark.store import Record
+from sb3_poem.benchmark.suites import Cell, OracleSpec
+from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.vec_env import make_task_vec_env
+
+ADAPTERS: dict[str, type[PreferenceAdapter]] = {
+    "preference": PreferenceAdapter,
+    "anole": ANOLEAdapter,
+    "maml": MAMLRewardAdapter,
+    "oracle": RewardOracleAdapter,
+}
+SELECTION_EPISODES = 3
+DIGITS = 4  # of returns in the store
+
+
+def run_cell(cell: Cell, library: ModelLibrary, say: Say = print) -> Record:
+    """
+    Run one cell. Its model is trained first if it is missing.
+
+    :param cell: The cell.
+    :param library: The models.
+    :param say: Takes a line of progress.
+    :return: What to keep.
+    :raises ValueError: If the method and the model do not fit.
+    :raises TrainingError: If the model's training fails.
+    """
+    training = library.ensure(cell.model_key, say)
+    th.set_num_threads(library.workplace.num_threads)
+    env = make_task_vec_env(cell.env_id, 2 * cell.budget.tasks)
+    try:
+        model = library.load(cell.model_key, env, cell.snapshot)
+        tasks = held_out_tasks(FamilyEnv(env), cell.budget.tasks, cell.budget.task_seed)
+        started = time.perf_counter()
+        measure = _measure_known if cell.definition.kind == "known" else _measure_adaptation
+        result = measure(cell, model, env, tasks)
+        result["seconds"] = round(time.perf_counter() - started, 2)
+    finally:
+        env.close()
+    trained = training if cell.snapshot is None else {**training, "snapshot": cell.snapshot}
+    result["training_samples"] = int(getattr(model, "num_timesteps", training.get("env_steps", 0)))
+    result["updates"] = int(getattr(model, "_n_updates", training.get("updates", 0)))
+    result["training_seconds"] = training.get("seconds")
+    about = {**provenance(), "device": library.workplace.device, "num_threads": library.workplace.num_threads}
+    return Record(cell.key, cell.family, cell.method, cell.seed, cell.identity(), result, {**about, "model": trained})
+
+
+def make_oracle_factory(spec: OracleSpec) -> Callable[..., TaskOracle]:
+    """
+    What makes a task's oracle.
+
+    :param spec: Who answers.
+    :return: A function of ``env``, ``task`` and ``seed``.
+    :raises ValueError: If the kind is unknown.
+    """
+    if spec.kind == "return":
+        return ReturnOracle
+    if spec.kind == "boltzmann":
+        return partial(BoltzmannOracle, spec.value)
+    if spec.kind == "mistake" and spec.value is not None:
+        return partial(MistakeOracle, spec.value)
+    raise ValueError(f"there is no oracle {spec}; there are return, boltzmann, and mistake with a rate")
+
+
+def _measure_adaptation(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) -> dict[str, Any]:
+    kind, options, budget = cell.definition.kind, dict(cell.options), cell.budget
+    fragments = None
+    if kind == "anole":
+        options.setdefault("fragment_length", fragment_length(model.horizon))
+        if not _has_experience(model):
+            settings = ANOLEAdapter.make_options(**options)
+            fragments = rollout_fragments(model, env, 2 * settings.n_pairs, settings.fragment_length, cell.seed)
+            options["library"] = fragments
+    evaluation = evaluate_adaptation(
+        model,
+        env,
+        tasks,
+        make_oracle_factory(cell.oracle),
+        record_at=budget.record_at,
+        n_episodes=budget.episodes,
+        seed=budget.task_seed + cell.seed,
+        adapter=ADAPTERS[kind],
+        **options,
+    )
+    answers = [[answer.value for answer in row] for row in evaluation.preferences]
+    data: dict[str, Any] = {
+        "queries": list(evaluation.record_at),
+        "tasks": _rounded(tasks),
+        "task_returns": _rounded(evaluation.task_returns),
+        "task_deviations": _rounded(evaluation.returns.std(axis=2)),
+        "answers": ["".join(answer[0] for answer in row) for row in answers],
+        # ANOLE shows what it has; the others roll two trajectories out for each question.
+        "adaptation_trajectories": 0 if kind == "anole" else 2 * sum(map(len, answers)),
+    }
+    if kind == "anole":
+        data["fragments"] = "replay buffer" if fragments is None else "rollouts of the training tasks"
+        data["fragment_length"] = options["fragment_length"]
+    if evaluation.successes is not None:
+        data["task_success_rates"] = _rounded(evaluation.successes.mean(axis=2))
+    return data
+
+
+def _measure_known(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) -> dict[str, Any]:
+    """What the model's policies could earn: returns of the best of them for each task, and the matrix J for the limits."""
+    budget = cell.budget
+    episodes = min(budget.episodes, SELECTION_EPISODES)
+    known = known_task_return(
+        model, env, tasks, n_episodes=budget.episodes, seed=budget.task_seed + cell.seed, selection_episodes=episodes
+    )
+    data: dict[str, Any] = {
+        "tasks": _rounded(tasks),
+        "task_returns": _rounded(known.returns.mean(axis=1)),
+        "candidate_returns": _rounded(known.candidate_returns, 2),
+    }
+    if known.successes is not None:
+        data["task_success_rates"] = _rounded(known.successes.mean(axis=1))
+    if hasattr(model, "similarity"):
+        accuracy, tau = preference_order(model, known)
+        data |= {"preference_accuracy": _number(accuracy), "kendall_tau": _number(tau)}
+    return data
+
+
+def _has_experience(model: Any) -> bool:
+    buffer = getattr(model, "replay_buffer", None)
+    return buffer is not None and bool(buffer.counts.any())
+
+
+def _rounded(values: np.ndarray, digits: int = DIGITS) -> Any:
+    return np.round(np.asarray(values, dtype=np.float64), digits).tolist()
+
+
+def _number(value: float) -> float | None:
+    """JSON has no NaN."""
+    return None if np.isnan(value) else round(value, 6)

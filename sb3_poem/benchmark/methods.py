@@ -1,0 +1,134 @@
+"""The methods that are compared: which model each adapts, and how. Nothing heavy is imported here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+EPSILONS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4)
+LATENT_DIMS = (2, 10)  # beside the default, 5
+QUERY_RULES = ("worst-case", "information-gain", "random")
+DEFAULT_QUERY_RULE = {"paper": "worst-case", "bayes": "information-gain"}
+INFERENCE_LABELS = {"paper": "POEM (paper)", "bayes": "POEM (Bayes)"}
+
+# Outer steps of MAML-reward's meta-training, with what differs for a family.
+META_ITERATIONS = 500
+META_ITERATIONS_OF = {"PointGoal": 100}
+
+SHARED_DYNAMICS_REASONS = {
+    "anole": "ANOLE asks which fragment of the training tasks is better on the new task, and here these show another world",
+    "maml": "MAML-reward learns from what tasks say of each other's fragments",
+}
+
+
+@dataclass(frozen=True)
+class Variant:
+    """
+    A model to be trained.
+
+    :param name: Of the variant, and of its folder.
+    :param algorithm: "poem_sac" or "pearl_sac".
+    :param hyperparameters: What differs from the entry of ``zoo_configs/<algorithm>.yml``.
+    :param base: The variant that this one is derived from without a training run of its own.
+    """
+
+    name: str
+    algorithm: str
+    hyperparameters: Mapping[str, Any] = field(default_factory=dict)
+    base: str | None = None
+
+
+@dataclass(frozen=True)
+class Method:
+    """
+    A row of the tables.
+
+    :param name: As on the command line.
+    :param label: As in tables and figures.
+    :param variant: The model that it adapts.
+    :param kind: "preference", "anole", "maml", "oracle", or "known" for what the model's policies could earn.
+    :param options: Of the adapter.
+    :param paper_row: Its row in Table 3 of Xu & Zhu 2025.
+    """
+
+    name: str
+    label: str
+    variant: str
+    kind: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+    paper_row: str | None = None
+
+    def objection(self, shared_dynamics: bool) -> str | None:
+        """
+        Why the method cannot run on a family; None if it can.
+
+        :param shared_dynamics: Whether the family's tasks share their dynamics.
+        :return: The reason.
+        """
+        if shared_dynamics or self.kind not in SHARED_DYNAMICS_REASONS:
+            return None
+        return f"its tasks do not share their dynamics, and {SHARED_DYNAMICS_REASONS[self.kind]}"
+
+
+def _variants() -> dict[str, Variant]:
+    variants = [
+        Variant("poem", "poem_sac"),
+        Variant("poem-inner", "poem_sac", {"similarity": "inner"}),
+        Variant("poem-pearl-context", "poem_sac", {"context": "pearl"}),
+        *(Variant(f"poem-d{d}", "poem_sac", {"latent_dim": d}) for d in LATENT_DIMS),
+        Variant("pearl", "pearl_sac"),
+        Variant("maml-reward", "pearl_sac", base="pearl"),
+    ]
+    return {variant.name: variant for variant in variants}
+
+
+def _methods() -> dict[str, Method]:
+    methods = [
+        Method("poem-bayes", "POEM (Bayes)", "poem", "preference", {"inference": "bayes"}, "POEM"),
+        Method("poem-paper", "POEM (paper)", "poem", "preference", {"inference": "paper"}, "POEM"),
+        Method("anole", "ANOLE", "pearl", "anole", {"strategy": "berlekamp"}, "ANOLE"),
+        Method("anole-greedy", "ANOLE-greedy", "pearl", "anole", {"strategy": "greedy"}, "ANOLE-greedy"),
+        Method("anole-random", "ANOLE-random", "pearl", "anole", {"strategy": "random"}, "ANOLE-random"),
+        Method("maml-reward", "MAML-reward", "maml-reward", "maml", {}, "MAML-reward"),
+        Method("reward-oracle", "reward oracle", "pearl", "oracle"),
+        Method("known-task", "task known (POEM's policies)", "poem", "known"),
+        Method("known-task-pearl", "task known (PEARL's policies)", "pearl", "known"),
+    ]
+    ablations = {
+        "poem-inner": "inner product",
+        "poem-pearl-context": "PEARL's context",
+        **{f"poem-d{d}": f"d = {d}" for d in LATENT_DIMS},
+    }
+    for variant, label in ablations.items():
+        methods.append(Method(f"known-task-{variant}", f"task known ({label})", variant, "known"))
+        for inference, prefix in INFERENCE_LABELS.items():
+            options = {"inference": inference}
+            methods.append(Method(f"{variant}-{inference}", f"{prefix}, {label}", variant, "preference", options))
+    for inference, prefix in INFERENCE_LABELS.items():
+        for rule in QUERY_RULES:
+            if rule != DEFAULT_QUERY_RULE[inference]:
+                asked = {"inference": inference, "query_rule": rule}
+                methods.append(Method(f"poem-{inference}-{rule}", f"{prefix}, {rule} queries", "poem", "preference", asked))
+    for epsilon in EPSILONS:
+        # 0.1 is the default, and so the same cell as poem-paper.
+        tolerant = {"inference": "paper", **({} if epsilon == 0.1 else {"epsilon": epsilon})}
+        methods.append(Method(f"poem-paper-epsilon-{epsilon:g}", f"epsilon = {epsilon:g}", "poem", "preference", tolerant))
+    return {method.name: method for method in methods}
+
+
+VARIANTS = _variants()
+METHODS = _methods()
+
+
+def find_method(name: str) -> Method:
+    """
+    A method by its name.
+
+    :param name: The name.
+    :return: The method.
+    :raises ValueError: If there is none; the message lists all.
+    """
+    if name not in METHODS:
+        raise ValueError(f"--methods {name}: there is no such method; there are: {', '.join(METHODS)}")
+    return METHODS[name]

@@ -1,0 +1,418 @@
+"""Trained models: found among those that were handed over or left by earlier runs, or trained."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+import zipfile
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+# A model that rl_zoo3 trained may hold its schedules. Importing it replaces Gymnasium's TimeLimit, so it comes first.
+import rl_zoo3  # noqa: F401
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_poem.adaptation.state import read_json, write_json_atomically
+from sb3_poem.baselines import MAMLRewardModel, MetaReward, meta_train_reward
+from sb3_poem.benchmark.hyperparameters import TrainingPlan, training_plan
+from sb3_poem.benchmark.locks import locked
+from sb3_poem.benchmark.methods import META_ITERATIONS, META_ITERATIONS_OF, VARIANTS
+from sb3_poem.benchmark.provenance import provenance
+from sb3_poem.benchmark.suites import ModelKey
+from sb3_poem.common.pretrained import CONFIG, WEIGHTS, read_config
+from sb3_poem.common.vec_env import make_task_vec_env
+from sb3_poem.pearl_sac import PEARLSAC
+from sb3_poem.poem_sac import POEMSAC
+
+ALGORITHMS: dict[str, type[PEARLSAC]] = {"poem_sac": POEMSAC, "pearl_sac": PEARLSAC}
+CHECKPOINT, MODEL, FINISHED, SESSIONS, LOG, REWARD = (
+    "checkpoint.zip",
+    "model.zip",
+    "trained.json",
+    "sessions.json",
+    "train.log",
+    "reward",
+)
+LOG_LINES = 15
+FRAGMENT_LENGTH = 50
+
+Say = Callable[[str], None]
+
+
+class TrainingError(RuntimeError):
+    """A training that did not end well; the message has the end of its log."""
+
+
+@dataclass(frozen=True)
+class Workplace:
+    """
+    Where models are kept, and how they are trained and run.
+
+    :param runs: Folder of the trainings, and of locks.
+    :param models: Folders with models that were handed over, see :meth:`ModelLibrary.given`.
+    :param named: Models that were handed over one by one: family, variant, seed, path.
+    :param device: As PyTorch names it.
+    :param num_threads: Of PyTorch.
+    """
+
+    runs: str
+    models: tuple[str, ...] = ()
+    named: tuple[tuple[str, str, int, str], ...] = ()
+    device: str = "cpu"
+    num_threads: int = 1
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Workplace:
+        """
+        Read what :meth:`to_dict` wrote.
+
+        :param data: The dictionary.
+        :return: The workplace.
+        """
+        named = tuple((str(f), str(v), int(s), str(p)) for f, v, s, p in data["named"])
+        return cls(**{**data, "models": tuple(data["models"]), "named": named})
+
+
+class ModelLibrary:
+    """
+    The models of a workplace.
+
+    :param workplace: It.
+    """
+
+    def __init__(self, workplace: Workplace) -> None:
+        self.workplace = workplace
+        self.runs = Path(workplace.runs)
+
+    def folder(self, key: ModelKey) -> Path:
+        """Where a model's training is kept."""
+        variant = key.variant
+        if not key.training.is_default:
+            text = json.dumps(key.training.to_dict(), sort_keys=True)
+            variant += "-" + hashlib.sha256(text.encode()).hexdigest()[:8]
+        return self.runs / key.family / variant / f"seed{key.seed}"
+
+    def given(self, key: ModelKey) -> Path | None:
+        """
+        The file or folder of a model that was handed over: one that was named; ``<Family>/<variant>/seed<seed>`` (a folder,
+        or with ``.zip`` a file) in a folder of models; or ``<Family>`` there, a pretrained model of that variant and seed.
+
+        :param key: The model.
+        :return: Its place; None if it was not handed over.
+        :raises ValueError: If a model that was named does not exist.
+        """
+        if not key.training.is_default:
+            return None
+        for family, variant, seed, path in self.workplace.named:
+            if (family, variant, seed) == (key.family, key.variant, key.seed):
+                if not Path(path).exists():
+                    raise ValueError(f"--model {family}:{variant}:{seed}={path}: there is no such file or folder")
+                return Path(path)
+        for folder in map(Path, self.workplace.models):
+            place = folder / key.family / key.variant / f"seed{key.seed}"
+            for candidate in (place, place.with_suffix(".zip")):
+                if candidate.is_file() or (candidate.is_dir() and _content(candidate) is not None):
+                    return candidate
+            pretrained = folder / key.family
+            if (pretrained / CONFIG).is_file() and _is_variant(read_config(pretrained), key):
+                return pretrained
+        return None
+
+    def state(self, key: ModelKey) -> str:
+        """
+        "handed over", "trained", "interrupted" or "missing".
+
+        :param key: The model.
+        """
+        if self.given(key) is not None:
+            return "handed over"
+        folder = self.folder(key)
+        if (folder / FINISHED).exists():
+            return "trained"
+        return "interrupted" if any(folder.glob(f"*/*/{CHECKPOINT}")) else "missing"
+
+    def has_snapshots(self, key: ModelKey) -> bool:
+        """Whether the model is, or will be, saved along its training."""
+        return self.given(key) is None
+
+    def ensure(self, key: ModelKey, say: Say = print) -> dict[str, Any]:
+        """
+        Train the model if it is missing, or finish its training; another process that is at it is waited for.
+
+        :param key: The model.
+        :param say: Takes a line of progress.
+        :return: How it was trained, JSON-ready.
+        :raises TrainingError: If the training fails.
+        """
+        path = self.given(key)
+        if path is not None:
+            return _describe_given(path)
+        folder = self.folder(key)
+        if not (folder / FINISHED).exists():
+            base = VARIANTS[key.variant].base
+            if base is not None:
+                self.ensure(_other(key, base), say)
+            with locked(folder / ".lock", lambda: say(f"waiting for another process that trains {key}")) as lock:
+                if not (folder / FINISHED).exists():
+                    self._derive(key, base) if base is not None else self._train(key, lock, say)
+        return read_json(folder / FINISHED)
+
+    def load(self, key: ModelKey, env: VecEnv, snapshot: float | None = None) -> Any:
+        """
+        A model that :meth:`ensure` has made sure of.
+
+        :param key: The model.
+        :param env: An environment of its family, which it gets.
+        :param snapshot: The share of the training after which to take it; None: all.
+        :return: The model, or a :class:`MAMLRewardModel`; with its replay buffer where that was kept.
+        :raises ValueError: If a model that was handed over is another, or was not saved along its training.
+        """
+        base = VARIANTS[key.variant].base
+        path = self.given(key)
+        if base is not None and path is None:
+            model = self.load(_other(key, base), env)
+            return MAMLRewardModel(MetaReward.load(self.folder(key) / REWARD, model.policy), model)
+        algorithm = ALGORITHMS[VARIANTS[key.variant].algorithm]
+        device = self.workplace.device
+        if path is not None:
+            if snapshot is not None:
+                raise ValueError(f"{key} was handed over, and so has no models along its training")
+            model = _load_given(algorithm, path, env, device)
+            _check_variant(model, key, path)
+            return model
+        if snapshot is not None:
+            return algorithm.load(self.snapshot_file(key, snapshot), env, device=device)
+        if algorithm is PEARLSAC:  # whose replay buffer is asked about
+            return algorithm.load_checkpoint(self._run(key) / CHECKPOINT, env, device=device)
+        return algorithm.load(self._run(key) / f"{_file_name(key.env_id)}.zip", env, device=device)
+
+    def snapshot_file(self, key: ModelKey, snapshot: float) -> Path:
+        """
+        The model that was saved nearest to a share of the training.
+
+        :param key: The model.
+        :param snapshot: The share.
+        :return: The file.
+        :raises ValueError: If none was saved within one interval of it.
+        """
+        plan = training_plan(key)
+        wanted = snapshot * plan.timesteps
+        files = {int(re.findall(r"\d+", file.stem)[-1]): file for file in self.folder(key).glob("*/*/rl_model_*_steps.zip")}
+        files = {
+            steps: file for steps, file in files.items() if steps > plan.epoch_steps
+        }  # the first epoch is not learnt from
+        nearest = min(files, key=lambda steps: abs(steps - wanted), default=None)
+        if nearest is None or abs(nearest - wanted) > plan.save_steps:
+            raise ValueError(f"{key} has no model that was saved near {wanted:,.0f} steps; there are: {sorted(files)}")
+        return files[nearest]
+
+    def _run(self, key: ModelKey) -> Path:
+        """The folder that rl_zoo3 made for the run that finished."""
+        return self.folder(key) / read_json(self.folder(key) / FINISHED)["run"]
+
+    def _train(self, key: ModelKey, lock: int, say: Say) -> None:
+        plan, folder = training_plan(key), self.folder(key)
+        sessions = _begin_session(folder)
+        arguments = _train_arguments(key, plan)
+        state = "resuming" if len(sessions) > 1 else "training"
+        say(f"{state} {key}: {plan.timesteps:,} steps, {plan.updates:,} updates; log in {folder / LOG}")
+        others = ["-f", str(folder), "--resume", "--save-freq", str(plan.save_steps), "--device", self.workplace.device]
+        others += ["--num-threads", str(self.workplace.num_threads)]
+        module = [sys.executable, "-m", "sb3_poem.benchmark.training_process", str(os.getpid())]
+        threads = {name: str(self.workplace.num_threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
+        with (folder / LOG).open("a") as log:
+            # In a session of its own an interrupt from the keyboard does not reach it: rl_zoo3 would save half a training as
+            # if it were whole. It inherits the lock, so that nobody else trains while it still ends.
+            child = subprocess.Popen(
+                [*module, *arguments, *others],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, **threads},
+                pass_fds=(lock,),
+                start_new_session=True,
+            )
+            try:
+                status = child.wait()
+            finally:
+                if child.poll() is None:
+                    child.kill()
+                    child.wait()
+        finished = sorted(folder.glob(f"*/*/{_file_name(key.env_id)}.zip"), key=lambda file: file.stat().st_mtime)
+        if status != 0 or not finished:
+            tail = "\n".join((folder / LOG).read_text(errors="replace").splitlines()[-LOG_LINES:])
+            raise TrainingError(f"the training of {key} ended with status {status}; the end of {folder / LOG}:\n{tail}")
+        model = ALGORITHMS[plan.algorithm].load(finished[-1], device="cpu")
+        if model.num_timesteps < plan.timesteps:
+            raise TrainingError(f"{finished[-1]} stopped after {model.num_timesteps:,} of {plan.timesteps:,} steps; remove it")
+        sessions[-1]["seconds"] = time.time() - sessions[-1]["started"]
+        write_json_atomically(folder / SESSIONS, {"sessions": sessions})
+        info = {
+            "source": "trained",
+            "run": str(finished[-1].parent.relative_to(folder)),
+            "command": "sb3-poem " + " ".join(arguments),
+            "hyperparameters": plan.hyperparameters,
+            "overrides": plan.overrides,
+            "env_steps": int(model.num_timesteps),
+            "updates": int(model._n_updates),
+            "seconds": round(sum(session["seconds"] for session in sessions), 1),
+            "sessions": len(sessions),
+            **provenance(),
+        }
+        write_json_atomically(folder / FINISHED, info)
+        say(f"trained {key} in {info['seconds']:.0f} s")
+
+    def _derive(self, key: ModelKey, base: str) -> None:
+        """MAML's reward, from PEARL's experience."""
+        base_key = _other(key, base)
+        env = make_task_vec_env(key.env_id, 1)
+        try:
+            model = self.load(base_key, env)
+            if not model.replay_buffer.counts.any():
+                raise ValueError(
+                    f"{key} learns from the replay buffer of {base_key}, which the model that was handed over does not have; "
+                    f"hand over its {CHECKPOINT} instead"
+                )
+            started = time.time()
+            iterations = META_ITERATIONS_OF.get(key.family, META_ITERATIONS)
+            length = fragment_length(model.horizon)
+            reward = meta_train_reward(model, iterations, fragment_length=length, seed=key.seed)
+        finally:
+            env.close()
+        folder = self.folder(key)
+        reward.save(folder / REWARD)
+        base_info = self.ensure(base_key)
+        info = {
+            "source": "derived",
+            "base": base_info,
+            "hyperparameters": {"n_iterations": iterations, "fragment_length": length},
+            "env_steps": base_info["env_steps"],
+            "updates": base_info["updates"],
+            "seconds": round(time.time() - started, 1),
+            **provenance(),
+        }
+        write_json_atomically(folder / FINISHED, info)
+
+
+def fragment_length(horizon: int) -> int:
+    """
+    Steps of the fragments that ANOLE shows and MAML-reward learns from.
+
+    :param horizon: Steps of an episode.
+    :return: 50, or an episode.
+    """
+    return min(FRAGMENT_LENGTH, horizon)
+
+
+def _other(key: ModelKey, variant: str) -> ModelKey:
+    return ModelKey(key.env_id, variant, key.seed, key.training)
+
+
+def _file_name(env_id: str) -> str:
+    return env_id.replace("/", "-")
+
+
+def _train_arguments(key: ModelKey, plan: TrainingPlan) -> list[str]:
+    """Those of ``sb3-poem`` that decide what comes out."""
+    arguments = ["train", "--algo", plan.algorithm, "--env", key.env_id, "--seed", str(key.seed), "--eval-freq", "-1"]
+    if key.training.timesteps is not None:
+        arguments += ["-n", str(plan.timesteps)]
+    if plan.overrides:
+        arguments += ["-params", *(f"{name}:{value!r}" for name, value in plan.overrides.items())]
+    return arguments
+
+
+def _begin_session(folder: Path) -> list[dict[str, float]]:
+    """Note that a training (again) begins. An earlier one that was interrupted counts up to its last checkpoint."""
+    file = folder / SESSIONS
+    sessions: list[dict[str, float]] = read_json(file)["sessions"] if file.exists() else []
+    if sessions and "seconds" not in sessions[-1]:
+        saved = max((path.stat().st_mtime for path in folder.glob(f"*/*/{CHECKPOINT}")), default=0.0)
+        sessions[-1]["seconds"] = max(0.0, saved - sessions[-1]["started"])
+    sessions.append({"started": time.time()})
+    write_json_atomically(file, {"sessions": sessions})
+    return sessions
+
+
+def _content(folder: Path) -> Path | None:
+    """What a folder holds that can be loaded: the checkpoint first, for its replay buffer."""
+    names = (folder / CHECKPOINT, folder / MODEL, folder / CONFIG)
+    return next((path for path in names if path.is_file()), None)
+
+
+def _load_given(algorithm: type[PEARLSAC], path: Path, env: VecEnv, device: str) -> PEARLSAC:
+    file = _content(path) if path.is_dir() else path
+    if file is None:
+        raise ValueError(f"{path} holds no model: neither {CHECKPOINT}, nor {MODEL}, nor {CONFIG}")
+    if file.name == CONFIG:
+        return algorithm.from_pretrained(path, env, device=device)
+    if _is_checkpoint(file):
+        return algorithm.load_checkpoint(file, env, device=device)
+    return algorithm.load(file, env, device=device)
+
+
+def _is_checkpoint(file: Path) -> bool:
+    if not zipfile.is_zipfile(file):
+        return False
+    with zipfile.ZipFile(file) as archive:
+        return any(Path(name).name == "data.pkl" for name in archive.namelist())
+
+
+def _is_variant(config: dict[str, Any], key: ModelKey) -> bool:
+    """Whether a pretrained folder's configuration is that of a model."""
+    variant, arguments = VARIANTS[key.variant], config["arguments"]
+    if variant.base is not None or config["algorithm"] != ALGORITHMS[variant.algorithm].__name__:
+        return False
+    facts = _distinguishing(arguments.get("similarity"), arguments.get("context"), arguments["latent_dim"])
+    return (config["env_id"], arguments.get("seed"), facts) == (key.env_id, key.seed, _expected(key))
+
+
+def _check_variant(model: Any, key: ModelKey, path: Path) -> None:
+    """Refuse a model that is not the one as which it was handed over."""
+    facts = _distinguishing(
+        getattr(model, "similarity_metric", None), getattr(model, "context_kind", None), int(model.latent_dim)
+    )
+    found, expected = (model.env_id, model.seed, facts), (key.env_id, key.seed, _expected(key))
+    if found != expected:
+        names = ("env_id", "seed", "(similarity, context, latent_dim)")
+        wrong = [f"{n} {f!r} instead of {e!r}" for n, f, e in zip(names, found, expected, strict=True) if f != e]
+        raise ValueError(f"{path} was handed over as {key}, but has {', '.join(wrong)}")
+
+
+def _distinguishing(similarity: str | None, context: str | None, latent_dim: int) -> tuple[str | None, str | None, int]:
+    return similarity, context, latent_dim
+
+
+def _expected(key: ModelKey) -> tuple[str | None, str | None, int]:
+    variant = VARIANTS[key.variant]
+    hyperparameters = training_plan(key).hyperparameters
+    dim = int(hyperparameters.get("latent_dim", 5))
+    if variant.algorithm == "pearl_sac":
+        return None, None, dim
+    return hyperparameters.get("similarity", "two-encoder"), hyperparameters.get("context", "optimal"), dim
+
+
+def _describe_given(path: Path) -> dict[str, Any]:
+    """What is known of a model that was handed over; how it was trained if it says so."""
+    file = _content(path) if path.is_dir() else path
+    assert file is not None, "given() finds what can be loaded"
+    info: dict[str, Any] = {"source": "handed over", "name": "/".join(path.parts[-3:])}
+    if file.name == CONFIG:
+        config = read_config(path)
+        card = {name: value for name, value in config["card"].items() if name != "results"}
+        info |= {"env_steps": config["num_timesteps"], "updates": config["n_updates"], "arguments": config["arguments"]}
+        info |= {"seconds": card.get("wall_seconds"), "card": card}
+        file = path / WEIGHTS
+    info["sha256"] = hashlib.sha256(file.read_bytes()).hexdigest()
+    return info

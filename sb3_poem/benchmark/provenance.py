@@ -1,0 +1,65 @@
+"""Where a record comes from: commit, versions, machine."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+VERSIONED = ("sb3_poem", "stable_baselines3", "rl_zoo3", "torch", "gymnasium", "mujoco", "numpy")
+INSTRUCTION_SETS = ("avx2", "avx512f", "avx512_bf16", "amx_bf16")
+
+
+def provenance() -> dict[str, Any]:
+    """Commit, versions and machine, JSON-ready."""
+    return {"commit": commit(), "versions": versions(), "machine": machine()}
+
+
+def commit() -> str | None:
+    """The checkout's commit, with a plus sign if the code was changed since; None where this is no checkout."""
+    folder = Path(__file__).resolve().parents[2]
+    head = _git(folder, "rev-parse", "--short", "HEAD")
+    if head is None or not (folder / "sb3_poem" / "benchmark").is_dir():
+        return None
+    changed = _git(folder, "status", "--porcelain", "--untracked-files=no", "--", "sb3_poem", "envs", "zoo_configs")
+    return head + ("+" if changed else "")
+
+
+def versions() -> dict[str, str]:
+    """Of Python and of the packages that matter for a result."""
+    found = {"python": platform.python_version()}
+    for name in VERSIONED:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:  # on the path, but not installed
+            from sb3_poem import __version__
+
+            found[name] = __version__ if name == "sb3_poem" else "unknown"
+    return found
+
+
+def machine() -> str:
+    """The processor by what it can do: cores that this process may use, architecture, vector instructions; and the GPU."""
+    cpuinfo = Path("/proc/cpuinfo")
+    flags: set[str] = set()
+    if cpuinfo.exists():
+        flags = set(next((line for line in cpuinfo.read_text().splitlines() if line.startswith("flags")), "").split())
+    known = [name for name in INSTRUCTION_SETS if name in flags]
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    words = [f"{cores} of {os.cpu_count()} cores", platform.machine(), *known]
+    import torch as th
+
+    if th.cuda.is_available():
+        words.append(th.cuda.get_device_name())
+    return ", ".join(words)
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    try:
+        done = subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return done.stdout.strip()

@@ -1,0 +1,216 @@
+"""What a store holds of a suite: finished cells, gathered over seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from sb3_poem.adaptation.evaluation import KnownTaskReturn
+from sb3_poem.benchmark.cells import make_oracle_factory
+from sb3_poem.benchmark.methods import METHODS
+from sb3_poem.benchmark.store import Record
+from sb3_poem.benchmark.suites import Budget, Entry, OracleSpec, Suite, Training, family_name
+
+
+@dataclass(frozen=True)
+class Condition:
+    """
+    What must be equal for cells to stand in one table.
+
+    :param env_id: The family.
+    :param tasks: Number of test tasks.
+    :param episodes: Per task and measurement.
+    :param task_seed: Of the test tasks.
+    :param training: What differs from the hyperparameter files.
+    """
+
+    env_id: str
+    tasks: int
+    episodes: int
+    task_seed: int
+    training: Training
+
+    @property
+    def family(self) -> str:
+        """The family's name."""
+        return family_name(self.env_id)
+
+    @property
+    def budget(self) -> Budget:
+        """As cells have it."""
+        return Budget(self.tasks, self.episodes, task_seed=self.task_seed)
+
+    def __str__(self) -> str:
+        words = [f"{self.family}: {self.tasks} test tasks, {self.episodes} episodes each"]
+        if self.training.timesteps is not None:
+            words.append(f"trained for {self.training.timesteps:,} steps")
+        words += [f"{name} = {value}" for name, value in self.training.hyperparameters]
+        return ", ".join(words)
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """
+    One method under one condition and one oracle, over seeds.
+
+    :param method: Its name.
+    :param oracle: Who answered.
+    :param snapshot: The share of the training after which; None: all.
+    :param queries: After how many answers.
+    :param seeds: Which seeds there are.
+    :param returns: (n_seeds, n_tasks, n_queries).
+    :param records: Of the seeds.
+    """
+
+    method: str
+    oracle: OracleSpec
+    snapshot: float | None
+    queries: tuple[int, ...]
+    seeds: tuple[int, ...]
+    returns: np.ndarray
+    records: tuple[Record, ...]
+
+    @property
+    def label(self) -> str:
+        """As in tables and figures."""
+        return METHODS[self.method].label
+
+    @property
+    def samples(self) -> float:
+        """Environment steps of the training, mean over seeds."""
+        return float(np.mean([record.result["training_samples"] for record in self.records]))
+
+    def at(self, queries: int) -> np.ndarray | None:
+        """(n_seeds, n_tasks) after so many answers; None if that was not measured."""
+        return self.returns[:, :, self.queries.index(queries)] if queries in self.queries else None
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """
+    What the policies of one kind of model could earn.
+
+    :param method: Its name.
+    :param records: Of the seeds.
+    """
+
+    method: str
+    records: tuple[Record, ...]
+
+    @property
+    def label(self) -> str:
+        """As in tables."""
+        return METHODS[self.method].label
+
+    @property
+    def known(self) -> np.ndarray:
+        """(n_seeds,) mean returns if the task were known."""
+        return np.array([np.mean(record.result["task_returns"]) for record in self.records])
+
+    def limits(self, queries: int, oracle: OracleSpec) -> np.ndarray:
+        """
+        The information limit, (n_seeds,).
+
+        :param queries: How many answers.
+        :param oracle: Who answers.
+        :return: The most that so many answers allow with these policies, for each seed.
+        """
+        return np.array(_limits(self, queries, oracle))
+
+
+class Selection:
+    """
+    What there is of a suite.
+
+    :param suite: The suite.
+    :param records: Of a store.
+    :param families: Only these; None: all.
+    """
+
+    def __init__(self, suite: Suite, records: Iterable[Record], families: Sequence[str] | None = None) -> None:
+        self.suite = suite
+        self.records = {record.key: record for record in records if families is None or record.family in families}
+        self.conditions = sorted(
+            {_condition(record.identity) for record in self.records.values()},
+            key=lambda c: (_family_order(suite, c.family), c.env_id, str(c)),
+        )
+        self.seeds = sorted({record.seed for record in self.records.values()})
+        shares = [share for record in self.records.values() if (share := record.identity["snapshot"]) is not None]
+        self.snapshots = round(1 / min(shares)) if shares else suite.snapshots
+        self._references: dict[Condition, list[Reference]] = {}
+
+    def series(self, entry: Entry, condition: Condition) -> list[Series]:
+        """
+        The finished cells of an entry under a condition, final models and those along the training.
+
+        :param entry: The entry.
+        :param condition: The condition.
+        :return: In the order of the entry.
+        """
+        found: dict[tuple[str, OracleSpec, float | None], list[Record]] = {}
+        for seed in self.seeds:
+            arguments = (condition.env_id, seed, condition.budget, condition.training, self.snapshots)
+            for cell in self.suite.entry_cells(entry, *arguments):
+                if cell.key in self.records:
+                    found.setdefault((cell.method, cell.oracle, cell.snapshot), []).append(self.records[cell.key])
+        order = {name: position for position, name in enumerate(entry.methods)}
+        result = []
+        for (method, oracle, snapshot), records in sorted(found.items(), key=lambda item: order[item[0][0]]):
+            returns = np.stack([np.array(record.result["task_returns"]) for record in records])
+            seeds = tuple(record.seed for record in records)
+            queries = tuple(records[0].result["queries"])
+            result.append(Series(method, oracle, snapshot, queries, seeds, returns, tuple(records)))
+        return result
+
+    def references(self, condition: Condition) -> list[Reference]:
+        """
+        What the models' policies could earn under a condition.
+
+        :param condition: The condition.
+        :return: In the order of the suite.
+        """
+        if condition not in self._references:
+            self._references[condition] = self._find_references(condition)
+        return self._references[condition]
+
+    def _find_references(self, condition: Condition) -> list[Reference]:
+        entry = Entry("references", "", self.suite.references)
+        found: dict[str, list[Record]] = {}
+        for seed in self.seeds:
+            for cell in self.suite.entry_cells(entry, condition.env_id, seed, condition.budget, condition.training, 1):
+                if cell.key in self.records:
+                    found.setdefault(cell.method, []).append(self.records[cell.key])
+        return [Reference(method, tuple(found[method])) for method in self.suite.references if method in found]
+
+
+@cache
+def _limits(reference: Reference, queries: int, oracle: OracleSpec) -> tuple[float, ...]:
+    """Tables and figures ask for the same ones."""
+    noise = make_oracle_factory(oracle)().noise_model
+    limits = []
+    for record in reference.records:
+        returns = np.array(record.result["candidate_returns"])
+        tasks, empty = np.array(record.result["tasks"]), np.empty((0, 0))
+        known = KnownTaskReturn(tasks, np.array(record.result["task_returns"])[:, None], empty, empty, returns)
+        limits.append(known.limit(queries, noise))
+    return tuple(limits)
+
+
+def _condition(identity: dict[str, Any]) -> Condition:
+    training = identity["training"]
+    hyperparameters = tuple(sorted(training["hyperparameters"].items()))
+    return Condition(
+        identity["env_id"],
+        identity["tasks"],
+        identity["episodes"],
+        identity["task_seed"],
+        Training(training["timesteps"], hyperparameters),
+    )
+
+
+def _family_order(suite: Suite, family: str) -> int:
+    return suite.families.index(family) if family in suite.families else len(suite.families)

@@ -1,0 +1,164 @@
+"""The results: one SQLite file, one row per finished cell."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.dialects.sqlite import insert
+from sqlalchemy.pool import NullPool
+from sqlalchemy.schema import CreateTable
+
+from sb3_poem import __version__
+
+SCHEMA = "1"
+BUSY_SECONDS = 120
+
+_METADATA = sa.MetaData()
+_ABOUT = sa.Table(
+    "about", _METADATA, sa.Column("name", sa.String, primary_key=True), sa.Column("value", sa.String, nullable=False)
+)
+_CELLS = sa.Table(
+    "cells",
+    _METADATA,
+    sa.Column("key", sa.String, primary_key=True),
+    sa.Column("family", sa.String, nullable=False),
+    sa.Column("method", sa.String, nullable=False),
+    sa.Column("seed", sa.Integer, nullable=False),
+    sa.Column("created", sa.String, nullable=False),
+    sa.Column("identity", sa.String, nullable=False),
+    sa.Column("result", sa.String, nullable=False),
+    sa.Column("provenance", sa.String, nullable=False),
+)
+
+
+@dataclass(frozen=True)
+class Record:
+    """
+    A finished cell.
+
+    :param key: :attr:`Cell.key`.
+    :param family: The family's name.
+    :param method: The method under whose name it was run first.
+    :param seed: Its seed.
+    :param identity: :meth:`Cell.identity`.
+    :param result: Every task's return after every recorded number of answers, samples and times.
+    :param provenance: Commit, versions, machine, and how the model was trained.
+    :param created: When, in UTC.
+    """
+
+    key: str
+    family: str
+    method: str
+    seed: int
+    identity: dict[str, Any]
+    result: dict[str, Any]
+    provenance: dict[str, Any]
+    created: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready."""
+        return dict(vars(self))
+
+
+class Store:
+    """
+    A store of finished cells. Several processes may use one file: every access is a transaction of its own, and a cell that
+    is there stays as it is.
+
+    :param path: The file.
+    :param create: Whether to make it where it is missing.
+    :raises FileNotFoundError: If it is missing and shall not be made.
+    :raises ValueError: If the file is something else, or of another version.
+    """
+
+    def __init__(self, path: str | Path, create: bool = True) -> None:
+        self.path = Path(path)
+        if not self.path.exists():
+            if not create:
+                raise FileNotFoundError(f"--store {path}: there is no such file; `sb3-poem benchmark run` makes it")
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+        arguments = {"timeout": BUSY_SECONDS}
+        self._engine = sa.create_engine(f"sqlite:///{self.path}", poolclass=NullPool, connect_args=arguments)
+        try:
+            self._open(create)
+        except sa.exc.DatabaseError as error:
+            raise ValueError(f"--store {path} cannot be used as a store of the benchmark: {error.orig}") from error
+
+    def _open(self, create: bool) -> None:
+        with self._engine.connect() as connection:
+            tables = set(sa.inspect(connection).get_table_names())
+        if "about" not in tables:
+            if tables or not create:
+                raise ValueError(f"--store {self.path} is a database of another program: it has no table `about`")
+            self._create()
+        with self._engine.connect() as connection:
+            about = {row.name: row.value for row in connection.execute(sa.select(_ABOUT))}
+        if about.get("schema") != SCHEMA:
+            raise ValueError(
+                f"--store {self.path} was written in schema {about.get('schema')!r} by sb3_poem {about.get('version')!r}, "
+                f"but this is sb3_poem {__version__}, which reads schema {SCHEMA!r}; use that version, or another file"
+            )
+
+    def _create(self) -> None:
+        """Another process may be doing the same: what is there already stays."""
+        with self._engine.begin() as connection:
+            for table in _METADATA.sorted_tables:
+                connection.execute(CreateTable(table, if_not_exists=True))
+            facts = [{"name": "schema", "value": SCHEMA}, {"name": "version", "value": __version__}]
+            connection.execute(insert(_ABOUT).on_conflict_do_nothing(), facts)
+
+    def __enter__(self) -> Store:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._engine.dispose()
+
+    def __contains__(self, key: str) -> bool:
+        with self._engine.connect() as connection:
+            return connection.execute(sa.select(_CELLS.c.key).where(_CELLS.c.key == key)).first() is not None
+
+    def keys(self) -> set[str]:
+        """Of all finished cells."""
+        with self._engine.connect() as connection:
+            return set(connection.execute(sa.select(_CELLS.c.key)).scalars())
+
+    def add(self, record: Record) -> bool:
+        """
+        Keep a finished cell.
+
+        :param record: It.
+        :return: Whether it is new; if not, what is there stays.
+        """
+        row = record.to_dict()
+        for name in ("identity", "result", "provenance"):
+            row[name] = json.dumps(row[name], sort_keys=True, allow_nan=False)
+        row["created"] = record.created or datetime.now(timezone.utc).isoformat(timespec="seconds")
+        with self._engine.begin() as connection:
+            return connection.execute(insert(_CELLS).on_conflict_do_nothing(), row).rowcount == 1
+
+    def records(self, keys: Iterable[str] | None = None) -> Iterator[Record]:
+        """
+        Finished cells, in the order of their names.
+
+        :param keys: Only these; None: all.
+        :return: The records.
+        """
+        wanted = None if keys is None else set(keys)
+        order = (_CELLS.c.family, _CELLS.c.method, _CELLS.c.seed, _CELLS.c.key)
+        with self._engine.connect() as connection:
+            rows = connection.execute(sa.select(_CELLS).order_by(*order)).mappings().all()
+        for row in rows:
+            if wanted is None or row["key"] in wanted:
+                parsed = {name: json.loads(row[name]) for name in ("identity", "result", "provenance")}
+                yield Record(**{**row, **parsed})

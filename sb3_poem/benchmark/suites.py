@@ -1,0 +1,383 @@
+"""The suites, and the cells that they are made of. Nothing heavy is imported here."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from sb3_poem.benchmark.methods import EPSILONS, METHODS, QUERY_RULES, Method, find_method
+
+PAPER_FAMILIES = (
+    "HalfCheetahVel",
+    "HalfCheetahFwdBack",
+    "AntFwdBack",
+    "AntDir2D",
+    "AntVel",
+    "AntGoal",
+    "MetaWorldML1",
+    "HumanoidDir2D",
+    "MetaWorldML10",
+)
+CHEETAHS = PAPER_FAMILIES[:2]
+RECORD_AT = (0, 1, 2, 3, 5, 7, 10)
+TABLE_METHODS = ("poem-bayes", "poem-paper", "anole", "anole-greedy", "anole-random", "maml-reward", "reward-oracle")
+TABLE_REFERENCES = ("known-task", "known-task-pearl")
+# MAML-reward trains a reward only, so its return does not depend on how long a policy was trained; greedy search takes as long
+# as all the others together, and lies beside ANOLE.
+WITHOUT_CURVE = ("maml-reward", "anole-greedy")
+
+
+@dataclass(frozen=True)
+class OracleSpec:
+    """
+    Who answers.
+
+    :param kind: "return", "boltzmann" or "mistake".
+    :param value: The Boltzmann oracle's beta (None is the paper's), or the rate of mistakes.
+    """
+
+    kind: str = "return"
+    value: float | None = None
+
+    @property
+    def label(self) -> str:
+        """As in tables."""
+        if self.kind == "return":
+            return "exact answers"
+        if self.kind == "mistake":
+            return f"{100 * (self.value or 0):g} % of the answers flipped"
+        return "Boltzmann answers" + ("" if self.value is None else f", beta = {self.value:g}")
+
+
+EXACT, BOLTZMANN = OracleSpec(), OracleSpec("boltzmann")
+NOISES = (BOLTZMANN, OracleSpec("mistake", 0.1), OracleSpec("mistake", 0.2))
+
+
+@dataclass(frozen=True)
+class Budget:
+    """
+    What a cell may spend on evaluation.
+
+    :param tasks: Test tasks, drawn alike for all methods and seeds.
+    :param episodes: Episodes per task and measurement.
+    :param record_at: Numbers of answers after which returns are measured; the largest is the number of questions.
+    :param task_seed: Of the test tasks.
+    """
+
+    tasks: int = 30
+    episodes: int = 10
+    record_at: tuple[int, ...] = RECORD_AT
+    task_seed: int = 100
+
+
+@dataclass(frozen=True)
+class Training:
+    """
+    What differs from the hyperparameter files, for all models of a run.
+
+    :param timesteps: Environment steps; None takes those of the files.
+    :param hyperparameters: Names and values, sorted by name.
+    """
+
+    timesteps: int | None = None
+    hyperparameters: tuple[tuple[str, Any], ...] = ()
+
+    @property
+    def is_default(self) -> bool:
+        """Whether nothing differs."""
+        return self == Training()
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready."""
+        return {"timesteps": self.timesteps, "hyperparameters": dict(self.hyperparameters)}
+
+
+@dataclass(frozen=True)
+class ModelKey:
+    """
+    Which trained model.
+
+    :param env_id: The family.
+    :param variant: A name of :data:`VARIANTS`.
+    :param seed: Of the training.
+    :param training: What differs from the hyperparameter files.
+    """
+
+    env_id: str
+    variant: str
+    seed: int
+    training: Training = Training()
+
+    @property
+    def family(self) -> str:
+        """See :func:`family_name`."""
+        return family_name(self.env_id)
+
+    def __str__(self) -> str:
+        return f"{self.family} {self.variant} seed {self.seed}"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """
+    One entry of the store: a method with its settings on a family, with one seed.
+
+    :param env_id: The family.
+    :param method: A name of :data:`METHODS`.
+    :param seed: Of the training, and of what is random in the adaptation.
+    :param oracle: Who answers.
+    :param budget: What may be spent.
+    :param training: See :class:`Training`.
+    :param snapshot: The share of the training after which the model is taken; None: all of it.
+    :param overrides: Options of the adapter that differ from the method's own, sorted by name.
+    """
+
+    env_id: str
+    method: str
+    seed: int
+    oracle: OracleSpec = EXACT
+    budget: Budget = Budget()
+    training: Training = Training()
+    snapshot: float | None = None
+    overrides: tuple[tuple[str, Any], ...] = ()
+
+    @property
+    def family(self) -> str:
+        """See :func:`family_name`."""
+        return family_name(self.env_id)
+
+    @property
+    def definition(self) -> Method:
+        """The method."""
+        return METHODS[self.method]
+
+    @property
+    def model_key(self) -> ModelKey:
+        """The model that is adapted."""
+        return ModelKey(self.env_id, self.definition.variant, self.seed, self.training)
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Of the adapter."""
+        return {**self.definition.options, **dict(self.overrides)}
+
+    def identity(self) -> dict[str, Any]:
+        """What makes two cells the same, JSON-ready. It names neither a suite nor where the model comes from."""
+        method = self.definition
+        known = method.kind == "known"
+        return {
+            "env_id": self.env_id,
+            "variant": method.variant,
+            "kind": method.kind,
+            "options": self.options,
+            "seed": self.seed,
+            # What a model's policies could earn does not depend on who answers.
+            "oracle": None if known else {"kind": self.oracle.kind, "value": self.oracle.value},
+            "record_at": None if known else list(self.budget.record_at),
+            "tasks": self.budget.tasks,
+            "episodes": self.budget.episodes,
+            "task_seed": self.budget.task_seed,
+            "training": self.training.to_dict(),
+            "snapshot": self.snapshot,
+        }
+
+    @property
+    def key(self) -> str:
+        """A digest of :meth:`identity`."""
+        return hashlib.sha256(json.dumps(self.identity(), sort_keys=True).encode()).hexdigest()[:24]
+
+    def __str__(self) -> str:
+        words = [self.family, self.method, f"seed {self.seed}"]
+        if self.oracle != EXACT:
+            words.append(self.oracle.label)
+        if self.budget.record_at[-1] != RECORD_AT[-1]:
+            words.append(f"{self.budget.record_at[-1]} queries")
+        if self.snapshot is not None:
+            words.append(f"after {100 * self.snapshot:g} % of the training")
+        return ", ".join(words)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """
+    Methods that a suite compares under the same conditions: a table, and a figure.
+
+    :param name: Of the comparison; part of its figures' names.
+    :param title: As in reports.
+    :param methods: Their names.
+    :param oracles: Who answers.
+    :param record_at: See :class:`Budget`.
+    :param curves: With whose answers the methods are measured along the training too.
+    :param by_inference: Whether figures have a row for each of POEM's inference rules.
+    """
+
+    name: str
+    title: str
+    methods: tuple[str, ...]
+    oracles: tuple[OracleSpec, ...] = (EXACT,)
+    record_at: tuple[int, ...] = RECORD_AT
+    curves: tuple[OracleSpec, ...] = ()
+    by_inference: bool = False
+
+
+@dataclass(frozen=True)
+class Suite:
+    """
+    A declared set of cells.
+
+    :param name: As on the command line.
+    :param title: As in reports.
+    :param families: What it runs on unless told otherwise.
+    :param entries: What it compares.
+    :param references: Methods that say what the models' policies could earn, for the limits in the tables.
+    :param snapshots: In how many equal parts the training is cut for measurements along it; 1 measures its end only.
+    :param budget: Unless told otherwise.
+    :param overrides: Options of adapters by kind of method, where the suite differs from their defaults.
+    """
+
+    name: str
+    title: str
+    families: tuple[str, ...]
+    entries: tuple[Entry, ...]
+    references: tuple[str, ...]
+    snapshots: int = 5
+    budget: Budget = Budget()
+    overrides: dict[str, tuple[tuple[str, Any], ...]] = field(default_factory=dict)
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """All that it compares, each once."""
+        return tuple(dict.fromkeys([name for entry in self.entries for name in entry.methods] + [*self.references]))
+
+    def cells(
+        self,
+        env_ids: Sequence[str],
+        seeds: Sequence[int],
+        methods: Sequence[str] | None = None,
+        budget: Budget | None = None,
+        training: Training | None = None,
+        snapshots: int | None = None,
+    ) -> list[Cell]:
+        """
+        The suite's cells, each once, in the order in which they should be run.
+
+        :param env_ids: Families.
+        :param seeds: Seeds.
+        :param methods: Only these; None: all.
+        :param budget: Numbers of tasks and episodes, if not the suite's own; ``record_at`` is the entries'.
+        :param training: See :class:`Training`.
+        :param snapshots: See the class; None takes the suite's own.
+        :return: The cells.
+        :raises ValueError: If the suite does not hold a method.
+        """
+        for name in methods or ():
+            if find_method(name).name not in self.methods:
+                raise ValueError(f"--methods {name} is not in the suite {self.name!r}, which has: {', '.join(self.methods)}")
+        budget, training = budget or self.budget, training or Training()
+        parts = self.snapshots if snapshots is None else snapshots
+        cells: dict[str, Cell] = {}
+        for env_id in env_ids:
+            for seed in seeds:
+                for entry in (*self.entries, Entry("references", "", self.references)):
+                    for cell in self.entry_cells(entry, env_id, seed, budget, training, parts):
+                        if not methods or cell.method in methods:
+                            cells.setdefault(cell.key, cell)
+        return list(cells.values())
+
+    def entry_cells(
+        self, entry: Entry, env_id: str, seed: int, budget: Budget, training: Training, snapshots: int
+    ) -> list[Cell]:
+        """
+        The cells of one entry, for one family and seed.
+
+        :param entry: The entry.
+        :param env_id: The family.
+        :param seed: The seed.
+        :param budget: See :meth:`cells`.
+        :param training: See :meth:`cells`.
+        :param snapshots: See the class.
+        :return: The cells.
+        """
+        cells = []
+        for name in entry.methods:
+            kind = METHODS[name].kind
+            overrides = self.overrides.get(kind, ())
+            for oracle in entry.oracles:
+                moments: list[tuple[float | None, tuple[int, ...]]] = [(None, entry.record_at)]
+                if oracle in entry.curves and name not in WITHOUT_CURVE:
+                    shares = [round(part / snapshots, 4) for part in range(1, snapshots)]
+                    moments += [(share, entry.record_at[-1:]) for share in shares]
+                for share, record_at in moments:
+                    spent = replace(budget, record_at=record_at)
+                    cells.append(Cell(env_id, name, seed, oracle, spent, training, share, overrides))
+        return cells
+
+
+def family_name(env_id: str) -> str:
+    """AntGoal of poem/AntGoal-v0."""
+    return env_id.split("/")[-1].split("-")[0]
+
+
+def family_id(name: str) -> str:
+    """poem/AntGoal-v0 of AntGoal; an id stays as it is."""
+    return name if "/" in name or "-v" in name else f"poem/{name}-v0"
+
+
+_ABLATED = ("poem-inner", "poem-pearl-context", "poem-d2", "poem-d10")
+_BOTH = ("poem-bayes", "poem-paper")
+_DESIGNS = (*_BOTH, *(f"{variant}-{inference}" for variant in _ABLATED for inference in ("bayes", "paper")))
+# A rule's own way of asking has no name of its own.
+_RULES = (*_BOTH, *(name for i in ("bayes", "paper") for rule in QUERY_RULES if (name := f"poem-{i}-{rule}") in METHODS))
+_EPSILON_METHODS = tuple(f"poem-paper-epsilon-{epsilon:g}" for epsilon in EPSILONS)
+
+SUITES = {
+    suite.name: suite
+    for suite in (
+        Suite(
+            "table3",
+            "Methods under exact answers (Table 3; figures 5, 9, 10)",
+            PAPER_FAMILIES,
+            (Entry("methods", "Methods", TABLE_METHODS, curves=(EXACT,)),),
+            TABLE_REFERENCES,
+        ),
+        Suite(
+            "noise",
+            "Methods under answers with errors (figures 6, 11)",
+            CHEETAHS,
+            (Entry("methods", "Methods", TABLE_METHODS, NOISES, curves=(BOLTZMANN,)),),
+            TABLE_REFERENCES,
+        ),
+        Suite(
+            "ablation",
+            "Ablations of POEM (figures 7, 12, 13)",
+            CHEETAHS,
+            (
+                Entry("design", "Similarity, context and latent dimension", _DESIGNS, curves=(EXACT,), by_inference=True),
+                Entry("rules", "Query rules", _RULES, by_inference=True),
+                Entry("queries", "Number of queries", ("poem-bayes", "poem-paper"), record_at=tuple(range(21))),
+            ),
+            ("known-task", *(f"known-task-{variant}" for variant in _ABLATED)),
+        ),
+        Suite(
+            "epsilon",
+            "Tolerance of the paper's rule (figures 14, 15)",
+            CHEETAHS,
+            (Entry("tolerance", "Tolerance epsilon", _EPSILON_METHODS, (EXACT, BOLTZMANN)),),
+            ("known-task",),
+        ),
+        Suite(
+            "smoke",
+            "All methods on a small family",
+            ("PointGoal",),
+            (Entry("methods", "Methods", TABLE_METHODS, (EXACT, BOLTZMANN), curves=(EXACT,)),),
+            TABLE_REFERENCES,
+            snapshots=3,
+            budget=Budget(tasks=10, episodes=5),
+            # The networks of SAC are as large here as elsewhere, and a point needs fewer steps.
+            overrides={"maml": (("gradient_steps", 20),)},
+        ),
+    )
+}

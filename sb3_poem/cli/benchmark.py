@@ -1,0 +1,119 @@
+"""``sb3-poem benchmark``: run suites into a store, and report what it holds."""
+
+import argparse
+import importlib
+from pathlib import Path
+from typing import Any
+
+from sb3_poem.benchmark.methods import VARIANTS
+from sb3_poem.benchmark.suites import SUITES, Budget, Training, family_id, family_name
+from sb3_poem.cli.outputs import check_writable
+
+
+def run_benchmark(arguments: argparse.Namespace) -> int:
+    """
+    Run the command.
+
+    :param arguments: as ``sb3_poem.cli`` parsed them
+    :return: the exit status: 1 if a cell failed
+    :raises ValueError: if they name what does not exist or cannot be run
+    :raises ImportError: if an optional package is missing; the message says how to install it
+    """
+    return _run(arguments) if arguments.part == "run" else _report(arguments)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    try:
+        from sb3_poem.benchmark.store import Store
+    except ImportError as error:
+        raise ValueError(f"the benchmark's packages are missing: pip install 'sb3_poem[benchmark]' ({error})") from error
+    from sb3_poem.benchmark.models import ModelLibrary, Workplace
+    from sb3_poem.benchmark.plan import describe, make_plan
+    from sb3_poem.benchmark.runner import run_cells
+
+    for package in arguments.gym_packages:
+        importlib.import_module(package)
+    training = Training(arguments.timesteps, tuple(sorted(_parse_params(arguments.params).items())))
+    if not training.is_default and (arguments.models or arguments.model):
+        raise ValueError("--models and --model hand over models that were trained already: leave out --timesteps and --params")
+    library = ModelLibrary(
+        Workplace(
+            arguments.runs,
+            tuple(arguments.models),
+            tuple(_parse_named(text) for text in arguments.model),
+            arguments.device,
+            arguments.num_threads,
+        )
+    )
+    store = Store(arguments.store) if not arguments.list or arguments.store.exists() else None
+    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+    suite = SUITES[arguments.suite]
+    budget = Budget(arguments.tasks or suite.budget.tasks, arguments.episodes or suite.budget.episodes)
+    plan = make_plan(
+        suite, library, store, arguments.families, arguments.methods, seeds, budget, training, arguments.snapshots
+    )
+    lines = describe(plan, library)
+    if arguments.list:
+        print("\n".join(lines))
+        return 0
+    assert store is not None
+    check_writable(arguments.runs)
+    print(lines[0] + f"; results in {arguments.store}", flush=True)
+    if arguments.backend == "ray":
+        from sb3_poem.benchmark.ray_backend import RayOptions, run_with_ray
+
+        options = RayOptions(arguments.address, arguments.cpus_per_trial, arguments.gpus_per_trial, arguments.max_failures)
+        failures = run_with_ray(plan, library, store, options, _say)
+    else:
+        failures = run_cells(plan.todo, library, store, _say)
+    for failure in failures:
+        print(f"FAILED {failure}")
+    left = len(failures)
+    print(f"{len(plan.todo) - left} cells run" + (f", {left} failed: the same command tries them again" if left else ""))
+    return 1 if failures else 0
+
+
+def _report(arguments: argparse.Namespace) -> int:
+    try:
+        from sb3_poem.benchmark.report import make_report
+        from sb3_poem.benchmark.store import Store
+    except ImportError as error:
+        raise ValueError(f"the benchmark's packages are missing: pip install 'sb3_poem[benchmark]' ({error})") from error
+
+    families = None if arguments.families is None else [family_name(family_id(name)) for name in arguments.families]
+    if arguments.out is not None:
+        check_writable(arguments.out)
+    store = Store(arguments.store, create=False)
+    text, files = make_report(store, arguments.suite, families, arguments.format, arguments.out)
+    if arguments.out is None:
+        print(text)
+    for file in files:
+        print(f"Wrote {file}")
+    return 0
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)
+
+
+def _parse_params(pairs: list[str]) -> dict[str, Any]:
+    from sb3_poem.cli.adapt import parse_env_kwargs
+
+    try:
+        return parse_env_kwargs(pairs)
+    except ValueError as error:
+        raise ValueError(str(error).replace("--env-kwargs", "--params")) from error
+
+
+def _parse_named(text: str) -> tuple[str, str, int, str]:
+    """FAMILY:VARIANT:SEED=PATH."""
+    name, equals, path = text.partition("=")
+    parts = name.rsplit(":", 2)
+    if not equals or len(parts) != 3 or not parts[2].isdigit():
+        raise ValueError(f"--model {text}: must have the form FAMILY:VARIANT:SEED=PATH")
+    family, variant, seed = parts
+    if variant not in VARIANTS:
+        raise ValueError(f"--model {text}: there is no variant {variant!r}; there are: {', '.join(VARIANTS)}")
+    if not Path(path).exists():
+        raise ValueError(f"--model {text}: there is no such file or folder")
+    return family_name(family_id(family)), variant, int(seed), path

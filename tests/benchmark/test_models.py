@@ -1,0 +1,111 @@
+"""Which models are taken, and what is refused before any training."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from meta_toys import small
+
+from sb3_poem import PEARLSAC, POEMSAC
+from sb3_poem.benchmark.families import FamilyFacts, family_facts
+from sb3_poem.benchmark.hyperparameters import training_plan
+from sb3_poem.benchmark.models import ModelLibrary, Workplace
+from sb3_poem.benchmark.plan import describe, make_plan
+from sb3_poem.benchmark.suites import SUITES, Budget, ModelKey, Training
+from sb3_poem.common.vec_env import make_task_vec_env
+from sb3_poem.resources import shipped_folder
+
+POINT = "poem/PointGoal-v0"
+
+
+def plan_for(library: ModelLibrary, suite: str, families: list[str], methods: list[str] | None = None, seeds: int = 1):
+    return make_plan(SUITES[suite], library, None, families, methods, range(seeds), Budget(), Training())
+
+
+def test_the_training_plan_follows_the_hyperparameter_file(tmp_path: Path) -> None:
+    plan = training_plan(ModelKey("poem/HalfCheetahVel-v0", "poem-d2", 0))
+    assert (plan.timesteps, plan.epoch_steps, plan.updates) == (480_000, 24_000, 20_000)
+    assert plan.save_steps == 48_000
+    assert plan.hyperparameters["latent_dim"] == 2
+    assert plan.overrides == {"latent_dim": 2}
+    two_tasks = training_plan(ModelKey("poem/HalfCheetahFwdBack-v0", "poem", 0))
+    assert (two_tasks.epoch_steps, two_tasks.updates) == (24_000, 48_000)
+    shorter = training_plan(ModelKey(POINT, "pearl", 0, Training(3000, (("gradient_steps", 7),))))
+    assert (shorter.timesteps, shorter.updates) == (3000, 14)
+    assert shorter.overrides == {"gradient_steps": 7}
+
+
+def test_shipped_models_are_taken_for_their_own_seed_alone() -> None:
+    folder = shipped_folder("pretrained")
+    library = ModelLibrary(Workplace("nowhere", models=(str(folder),)))
+    for family in ("PointGoal", "HalfCheetahVel", "HalfCheetahFwdBack"):
+        own = json.loads((folder / family / "config.json").read_text())["arguments"]["seed"]
+        keys = [ModelKey(f"poem/{family}-v0", "poem", seed) for seed in range(3)]
+        assert [library.given(key) is not None for key in keys] == [seed == own for seed in range(3)]
+        for variant in ("poem-inner", "poem-pearl-context", "poem-d2", "poem-d10", "pearl", "maml-reward"):
+            assert library.given(ModelKey(f"poem/{family}-v0", variant, own)) is None
+    altered = ModelKey("poem/HalfCheetahVel-v0", "poem", 0, Training(timesteps=1000))
+    assert library.given(altered) is None
+
+
+def test_models_are_found_in_a_folder_or_by_name_and_checked(tmp_path: Path) -> None:
+    poem = small(POEMSAC, latent_dim=2).learn(300)
+    pearl = small(PEARLSAC).learn(300)
+    poem.save(tmp_path / "models/PointGoal/poem-d2/seed0.zip")
+    (tmp_path / "models/PointGoal/pearl/seed0").mkdir(parents=True)
+    pearl.save_checkpoint(tmp_path / "models/PointGoal/pearl/seed0/checkpoint.zip")
+    poem.save_pretrained(tmp_path / "elsewhere")
+    named = (("PointGoal", "poem-inner", 0, str(tmp_path / "elsewhere")),)
+    library = ModelLibrary(Workplace(str(tmp_path / "runs"), models=(str(tmp_path / "models"),), named=named))
+    env = make_task_vec_env(POINT, 4)
+    loaded = library.load(ModelKey(POINT, "poem-d2", 0), env)
+    assert loaded.num_timesteps == poem.num_timesteps
+    with_buffer = library.load(ModelKey(POINT, "pearl", 0), env)
+    np.testing.assert_array_equal(with_buffer.replay_buffer.counts, pearl.replay_buffer.counts)
+    info = library.ensure(ModelKey(POINT, "poem-d2", 0))
+    assert info["source"] == "handed over"
+    assert len(info["sha256"]) == 64
+    assert str(tmp_path) not in json.dumps(info)
+    with pytest.raises(ValueError, match=r"handed over as PointGoal poem-inner seed 0, but has \(similarity, context, latent"):
+        library.load(ModelKey(POINT, "poem-inner", 0), env)
+    with pytest.raises(ValueError, match="was handed over, and so has no models along its training"):
+        library.load(ModelKey(POINT, "poem-d2", 0), env, snapshot=0.5)
+    gone = ModelLibrary(Workplace(str(tmp_path), named=(("PointGoal", "poem", 0, str(tmp_path / "gone")),)))
+    with pytest.raises(ValueError, match=r"--model PointGoal:poem:0=.*gone: there is no such file or folder"):
+        gone.given(ModelKey(POINT, "poem", 0))
+    env.close()
+
+
+def test_a_method_that_cannot_run_on_a_family_says_so_before_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    known = family_facts("PointGoal")
+    ml10 = FamilyFacts("poem/MetaWorldML10-v0", 200, None, False)  # Meta-World takes seconds to make it
+    for module in ("plan", "hyperparameters"):
+        monkeypatch.setattr(
+            f"sb3_poem.benchmark.{module}.family_facts", lambda name: ml10 if "ML10" in name else family_facts(name)
+        )
+    assert known.shared_dynamics
+    library = ModelLibrary(Workplace(str(tmp_path)))
+    with pytest.raises(ValueError, match="--methods anole cannot run on MetaWorldML10: its tasks do not share their dynamics"):
+        plan_for(library, "table3", ["MetaWorldML10"], ["anole"])
+    plan = plan_for(library, "table3", ["MetaWorldML10"])
+    assert {cell.method for cell, _ in plan.skipped} == {"anole", "anole-greedy", "anole-random", "maml-reward"}
+    assert {cell.method for cell in plan.todo} >= {"poem-bayes", "poem-paper", "reward-oracle"}
+    lines = "\n".join(describe(plan, library))
+    assert "anole cannot run on MetaWorldML10" in lines
+    assert "MetaWorldML10 poem seed 0: missing, 2,000,000 steps" in lines
+    for families, message in (
+        (["HalfCheetahFly"], "--families HalfCheetahFly: .* The package's own families are: AntDir2D"),
+        (["CartPole-v1"], "--families CartPole-v1 is no task family"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            plan_for(library, "table3", families)
+    assert not any(tmp_path.iterdir())
+
+
+def test_the_plan_names_each_model_once_and_a_base_first(tmp_path: Path) -> None:
+    plan = plan_for(ModelLibrary(Workplace(str(tmp_path))), "table3", ["PointGoal"], seeds=2)
+    names = [(key.variant, key.seed) for key in plan.models]
+    assert names == [(v, s) for s in range(2) for v in ("poem", "pearl", "maml-reward")]
+    only = plan_for(ModelLibrary(Workplace(str(tmp_path))), "table3", ["PointGoal"], ["maml-reward"])
+    assert [key.variant for key in only.models] == ["pearl", "maml-reward"]

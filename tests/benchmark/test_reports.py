@@ -1,0 +1,164 @@
+"""Tables against values computed by hand, and figures that can be read back."""
+
+import csv
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from benchmark_records import finished
+
+from sb3_poem.benchmark.report import make_report
+from sb3_poem.benchmark.selection import Selection
+from sb3_poem.benchmark.statistics import summarise
+from sb3_poem.benchmark.store import Store
+from sb3_poem.benchmark.suites import BOLTZMANN, SUITES, Budget, Cell, OracleSpec
+from sb3_poem.benchmark.tables import suite_rows, suite_tables
+
+VEL = "poem/HalfCheetahVel-v0"
+FOUR = Budget(tasks=4, episodes=2)
+
+
+@pytest.fixture(autouse=True)
+def few_bootstrap_samples(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_poem.benchmark.statistics.BOOTSTRAP_SAMPLES", 20)
+
+
+def ladder(cell: Cell, k: int) -> np.ndarray:
+    """Four tasks at 10 apart, 1 higher with each answer, 5 higher with each seed."""
+    return np.array([-40.0, -30.0, -20.0, -10.0]) + k + 5.0 * cell.seed
+
+
+def matrix(cell: Cell) -> dict:
+    """Four tasks and four policies, each the best of one: 0 on the diagonal, -1 beside it, and so on."""
+    places = np.arange(4)
+    return {"candidate_returns": (-np.abs(places[:, None] - places[None, :]).astype(float)).tolist()}
+
+
+def fill(path: Path, suite: str = "table3", seeds: int = 3, **arguments: object) -> Store:
+    store = Store(path)
+    for cell in SUITES[suite].cells([VEL], range(seeds), budget=FOUR, **arguments):
+        extra = matrix(cell) if cell.definition.kind == "known" else {}
+        store.add(finished(cell, ladder, **extra))
+    return store
+
+
+def test_means_deviations_and_interquartile_means() -> None:
+    returns = np.array([[0.0, 10.0, 20.0, 30.0], [4.0, 14.0, 24.0, 34.0]])  # two seeds, four tasks
+    one, shifted = summarise(np.stack([returns, returns + 100.0], axis=2))
+    assert (one.n_seeds, one.mean) == (2, 17.0)
+    assert one.deviation == pytest.approx(np.sqrt(8.0))  # seeds 15 and 19
+    assert one.iqm == 17.0  # of 0 4 10 14 20 24 30 34 the middle four
+    # Of a seed drawn for each task anew the sorted eight values lie between all of seed 0 and all of seed 1.
+    assert 15.0 <= one.low < one.iqm < one.high <= 19.0
+    assert shifted.mean == one.mean + 100.0
+    assert summarise(returns[:, :, None]) == summarise(returns[:, :, None])  # a report is the same twice
+    [single] = summarise(returns[:1, :, None])
+    assert (single.deviation, single.low, single.high) == (None, None, None)
+    for bad in (returns, np.full((2, 2, 1), np.nan), np.empty((0, 3, 1))):
+        with pytest.raises(ValueError, match="`returns` must be finite"):
+            summarise(bad)
+
+
+def test_rows_of_table_3(tmp_path: Path) -> None:
+    selection = Selection(SUITES["table3"], fill(tmp_path / "store.sqlite").records())
+    rows = suite_rows(selection)
+    [row] = [r for r in rows if (r.method, r.queries, r.snapshot) == ("poem-paper", 5, None)]
+    # Seeds' means are -20, -15, -10.
+    assert (row.n_seeds, row.mean, row.deviation) == (3, -15.0, 5.0)
+    # The middle six of twelve values -35 -30 -25 -25 -20 -15 -15 -10 -5 -5 0 5.
+    assert row.iqm == pytest.approx(-15.0)
+    assert (row.paper_mean, row.paper_deviation) == (-50.0, 8.0)
+    [early] = [r for r in rows if (r.method, r.queries, r.snapshot) == ("poem-paper", 10, 0.4)]
+    assert (early.samples, early.paper_mean) == (400.0, None)
+    # One policy for all four tasks loses 1 on average, two (tasks 0, 1 and 2, 3) 1/2, four nothing.
+    limits = {r.queries: r.mean for r in rows if r.kind == "limit" and r.method == "known-task"}
+    assert (limits[0], limits[1], limits[2], limits[10]) == (-1.0, -0.5, 0.0, 0.0)
+    known = [r for r in rows if r.kind == "known" and r.method == "known-task"]
+    assert [(r.mean, r.deviation, r.queries) for r in known] == [(-20.0, 5.0, None)]
+
+
+def test_an_unfinished_method_shows_the_seeds_that_there_are(tmp_path: Path) -> None:
+    with fill(tmp_path / "store.sqlite", seeds=1) as store:
+        selection = Selection(SUITES["table3"], store.records())
+    [row] = [r for r in suite_rows(selection) if (r.method, r.queries, r.snapshot) == ("anole", 10, None)]
+    assert (row.n_seeds, row.mean, row.deviation, row.iqm_low) == (1, -15.0, None, None)
+
+
+def test_noisy_answers_have_a_lower_limit(tmp_path: Path) -> None:
+    store = fill(tmp_path / "store.sqlite", "noise", seeds=1)
+    rows = [r for r in suite_rows(Selection(SUITES["noise"], store.records())) if r.kind == "limit" and r.queries == 10]
+    by_oracle = {r.oracle: r.mean for r in rows if r.method == "known-task"}
+    assert set(by_oracle) == {o.label for o in (BOLTZMANN, OracleSpec("mistake", 0.1), OracleSpec("mistake", 0.2))}
+    assert all(-1.0 <= value <= 0.0 for value in by_oracle.values())
+    assert by_oracle[BOLTZMANN.label] < by_oracle["10 % of the answers flipped"]
+
+
+def test_other_budgets_stand_in_other_tables(tmp_path: Path) -> None:
+    with fill(tmp_path / "store.sqlite", seeds=1, snapshots=1) as store:
+        for cell in SUITES["table3"].cells([VEL], [0], ["anole"], replace(FOUR, episodes=3), snapshots=1):
+            store.add(finished(cell, ladder))
+        tables = suite_tables(Selection(SUITES["table3"], store.records()))
+    assert [table.title for table in tables] == [
+        "HalfCheetahVel: 4 test tasks, 2 episodes each; methods, exact answers",
+        "HalfCheetahVel: the models",
+        "HalfCheetahVel: 4 test tasks, 3 episodes each; methods, exact answers",
+    ]
+
+
+def test_every_format(tmp_path: Path) -> None:
+    store = fill(tmp_path / "store.sqlite", snapshots=1)
+    markdown, _ = make_report(store, ["table3"])
+    [line] = [line for line in markdown.splitlines() if line.startswith("| POEM (paper) ")]
+    cells = [cell.strip() for cell in line.strip("|").split("|")]
+    assert cells[:3] == ["POEM (paper)", "3", "-19.0 ± 5.0"]
+    assert cells[3].startswith("-19.0 [-")
+    assert cells[4] == "-65.0 ± 10.0"
+    latex, _ = make_report(store, ["table3"], kind="latex")
+    assert r"POEM (paper) & 3 & -19.0 $\pm$ 5.0 & " in latex
+    assert latex.count(r"\begin{tabular}") == latex.count(r"\end{tabular}") == 2
+    assert "95 %" not in latex.replace(r"95 \%", "")
+    table = list(csv.DictReader(io.StringIO(make_report(store, ["table3"], kind="csv")[0])))
+    data = json.loads(make_report(store, ["table3"], kind="json")[0])
+    assert len(table) == len(data)
+    assert [float(row["mean"]) for row in table] == [row["mean"] for row in data]
+
+
+@pytest.mark.parametrize("suite", ["table3", pytest.param("noise", marks=pytest.mark.slow), "ablation", "epsilon"])
+def test_figures(suite: str, tmp_path: Path) -> None:
+    store = fill(tmp_path / "store.sqlite", suite, seeds=1)
+    _, files = make_report(store, [suite], out=tmp_path)
+    expected = {
+        "table3": {"methods-queries", "methods-samples"},
+        "noise": {f"methods-{o}-queries" for o in ("boltzmann", "mistake-0.1", "mistake-0.2")} | {"methods-boltzmann-samples"},
+        "ablation": {"design-queries", "design-samples", "rules-queries", "queries-queries"},
+        "epsilon": {"tolerance"},
+    }[suite]
+    names = {f"{suite}-{name}{suffix}" for name in expected for suffix in (".png", ".pdf")} | {f"{suite}.md"}
+    assert {file.name for file in files} == names
+    assert all(file.stat().st_size > 500 for file in files)
+    assert all(file.read_bytes()[:4] == b"\x89PNG" for file in files if file.suffix == ".png")
+
+
+def test_lines_show_the_values_of_the_store(tmp_path: Path) -> None:
+    from sb3_poem.benchmark.figures import suite_figures
+
+    store = fill(tmp_path / "store.sqlite")
+    figures = suite_figures(Selection(SUITES["table3"], store.records()))
+    [axes] = figures["table3-methods-queries"].axes
+    line = next(line for line in axes.get_lines() if line.get_label() == "ANOLE")
+    np.testing.assert_allclose(line.get_xydata(), [[k, -20.0 + k] for k in (0, 1, 2, 3, 5, 7, 10)])
+    limit = next(line for line in axes.get_lines() if line.get_label().startswith("limit"))
+    np.testing.assert_allclose(limit.get_ydata()[:3], [-1.0, -0.5, 0.0])
+    [axes] = figures["table3-methods-samples"].axes
+    line = next(line for line in axes.get_lines() if line.get_label() == "ANOLE")
+    np.testing.assert_allclose(line.get_xydata(), [[s, -10.0] for s in (200, 400, 600, 800, 1000)])
+
+
+def test_a_store_without_the_suite_is_refused(tmp_path: Path) -> None:
+    store = fill(tmp_path / "store.sqlite", "epsilon", seeds=1, methods=["poem-paper-epsilon-0.4"])
+    with pytest.raises(ValueError, match=r"--suite smoke: .* holds no finished cell of it"):
+        make_report(store, ["smoke"])
+    assert make_report(store)[0].count("# Tolerance of the paper's rule") == 1
