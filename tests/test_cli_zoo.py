@@ -291,13 +291,32 @@ def test_resume_finishes_the_interrupted_run_of_the_same_seed_as_if_nothing_had_
     assert not (logs / "poem_sac" / "poem-PointGoal-v0_4").exists()
 
 
-def interrupted_at(method, call: int):  # type: ignore[no-untyped-def]
+def test_resume_goes_on_after_an_interrupt_from_the_keyboard(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = ("-c", config, "--eval-freq", "-1", "--save-freq", "150", "-params", "n_timesteps:600", "-f", tmp_path)
+    for call in (1, 3):  # before the first checkpoint, and after
+        monkeypatch.setattr(POEMSAC, "train", interrupted_at(POEMSAC.train, call, KeyboardInterrupt))
+        assert train(*flags, "--resume") == 0
+        monkeypatch.undo()
+    folder = tmp_path / "poem_sac"
+    assert (folder / "poem-PointGoal-v0_2" / "poem-PointGoal-v0.zip").exists()  # what was learned so far
+    capsys.readouterr()
+    assert train(*flags, "--resume") == 0
+    assert "Resuming" in capsys.readouterr().out
+    assert POEMSAC.load(folder / "poem-PointGoal-v0_3" / "poem-PointGoal-v0.zip").num_timesteps == 600
+    (folder / "poem-PointGoal-v0_3" / "poem-PointGoal-v0.zip").write_bytes(b"half")
+    assert train(*flags, "--resume") == 1
+    assert "is truncated" in capsys.readouterr().err
+
+
+def interrupted_at(method, call: int, error: type[BaseException] = InterruptionError):  # type: ignore[no-untyped-def]
     calls = []
 
     def wrapped(*arguments, **options):  # type: ignore[no-untyped-def]
         calls.append(None)
         if len(calls) == call:
-            raise InterruptionError
+            raise error
         return method(*arguments, **options)
 
     return wrapped

@@ -1,6 +1,8 @@
 """``sb3-poem train --resume``: go on with what was interrupted."""
 
 import argparse
+import json
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -35,10 +37,27 @@ def resumed(arguments: Sequence[str]) -> list[str] | None:
     run = last_run(Path(given.log_folder) / given.algo, given.env.replace("/", "-"), given.seed)
     if run is None:
         return rest
-    if (run / f"{given.env.replace('/', '-')}.zip").exists():
+    if is_complete(run / f"{given.env.replace('/', '-')}.zip"):
         print(f"{run} has finished already; start another run without --resume, or train it further with -i")
         return None
-    return [*rest, "-i", str(run / CHECKPOINT)]
+    return [*rest, "-i", str(run / CHECKPOINT)] if (run / CHECKPOINT).exists() else rest
+
+
+def is_complete(model: Path) -> bool:
+    """
+    Whether a training made all its steps. rl_zoo3 saves a model too when an interrupt from the keyboard stops it.
+
+    :param model: the file that it saved last, or would have
+    :raises ValueError: if the file is no model
+    """
+    if not model.exists():
+        return False
+    try:
+        with zipfile.ZipFile(model) as archive:
+            data = json.loads(archive.read("data"))
+        return int(data["num_timesteps"]) >= int(data["_total_timesteps"])
+    except (zipfile.BadZipFile, KeyError, ValueError) as error:
+        raise ValueError(f"{model} is truncated, or no model: {error}; remove it to train anew") from error
 
 
 def last_run(folder: Path, env_name: str, seed: int) -> Path | None:

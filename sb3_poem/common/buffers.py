@@ -187,8 +187,11 @@ class TaskReplayBuffer(ReplayBuffer):
             self._reserve(used)
             self.rows[:, :used] = state["rows"].to(self.device)
             self.rows[:, -1] = self.rows[:, 0]
-        self.counts, self.positions = np.array(state["counts"]), np.array(state["positions"])
-        self.ends, self._free_ends = state["ends"].to(self.device, copy=True), np.array(state["free_ends"])
+        # a file gives tensors back where there were arrays
+        self.counts, self.positions, self._free_ends = (
+            th.as_tensor(state[name]).numpy().copy() for name in ("counts", "positions", "free_ends")
+        )
+        self.ends = state["ends"].to(self.device, copy=True)
         self._counts_on_device = th.as_tensor(self.counts, dtype=th.float32, device=self.device)
         self.full = bool((self.counts == self.buffer_size).all())
 
