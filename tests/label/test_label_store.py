@@ -156,7 +156,7 @@ def test_videos_without_a_turn_are_removed(store: Store) -> None:
 WRITER = """
 import sys
 sys.path.insert(0, {tests!r})
-from test_store import answer, begin
+from test_label_store import answer, begin
 from sb3_poem.label.store import Store
 store = Store(sys.argv[1])
 session, _ = begin(store, step=10**6)
