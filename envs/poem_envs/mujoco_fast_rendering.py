@@ -1,4 +1,4 @@
-"""Rendering of MuJoCo states for a processor without a graphics card: no shadows, no reflections, coarse shapes."""
+"""Rendering of MuJoCo states for a processor without a graphics card: no shadows, reflections or haze, coarse shapes."""
 
 from __future__ import annotations
 

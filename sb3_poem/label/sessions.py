@@ -14,7 +14,7 @@ from typing import Any
 
 from sb3_poem.label.catalogue import Choice
 from sb3_poem.label.store import RefusedError, Session, Store
-from sb3_poem.label.turns import Request, load_choice
+from sb3_poem.label.turns import Request, Turn, load_choice
 from sb3_poem.label.workshop import LIKELY, POSSIBLE, WAITED_FOR, Job, Workshop
 
 _logger = logging.getLogger(__name__)
@@ -265,13 +265,13 @@ class Conversations:
                 request = await asyncio.to_thread(self.request, session, answered - 1, preference, wanted)
                 job = presence.jobs[key] = self.workshop.submit(request, WAITED_FOR)
             self.workshop.hurry(job)
-            turn = await asyncio.shield(job.done)
+            made = await asyncio.shield(job.done)
             last_answer = None if last is None else last["id"]
             video = job.request.video
-            kept = await asyncio.to_thread(self.store.add_turn, session.id, wanted, answered, last_answer, turn, video.name)
+            kept = await asyncio.to_thread(self.store.add_turn, session.id, wanted, answered, last_answer, made, video.name)
             presence.jobs.pop(key, None)
             if not kept:
-                await asyncio.to_thread(self._put_back, session, answered, wanted, video)
+                await asyncio.to_thread(self._put_back, session, answered, wanted, video, made)
             presence.failed = None
         except asyncio.CancelledError:
             raise
@@ -280,11 +280,12 @@ class Conversations:
             presence.failed = str(error) if isinstance(error, RefusedError) else f"{type(error).__name__}; it is tried again"
             presence.failed_at = time.monotonic()
 
-    def _put_back(self, session: Session, answered: int, wanted: str, video: Path) -> None:
+    def _put_back(self, session: Session, answered: int, wanted: str, video: Path, made: Turn) -> None:
         """Of a turn that is kept already, the video takes the place of one that somebody deleted; else it is not needed."""
         turn = self.store.turn(session.id, wanted, answered)
         if turn is not None and not (self.store.videos / turn["video"]).is_file():
             video.replace(self.store.videos / turn["video"])
+            self.store.note_film(turn["id"], made.fps, made.frames)
         else:
             video.unlink(missing_ok=True)
 

@@ -271,6 +271,17 @@ class Store:
         with self._transaction() as connection:
             connection.execute("UPDATE turns SET shown = ? WHERE id = ? AND shown IS NULL", (time.time(), turn))
 
+    def note_film(self, turn: int, fps: float, frames: int) -> None:
+        """
+        Note how a turn's video moves that was filmed again.
+
+        :param turn: Its number.
+        :param fps: Frames per second.
+        :param frames: How many.
+        """
+        with self._transaction() as connection:
+            connection.execute("UPDATE turns SET fps = ?, frames = ? WHERE id = ?", (fps, frames, turn))
+
     def add_answer(self, session: int, question: int, preference: str) -> int:
         """
         Keep an answer. Once this returns, it is on the disk. The same answer again is no second one.

@@ -190,3 +190,21 @@ def test_films_show_every_second_step_while_more_people_are_at_work_than_workers
 
     alone, crowded = last_ones_film(1), last_ones_film(2)  # of one worker
     assert (crowded["fps"], crowded["frames"]) == (alone["fps"] / 2, -(-alone["frames"] // 2))
+
+
+def test_a_film_made_again_while_crowded_is_described_as_it_is(
+    with_conversations: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(turns, "SMOOTH_FPS", 2.0)
+
+    async def talk(conversations: Conversations) -> tuple[Any, Any]:
+        first, _ = await begin(conversations)
+        before = (await settled(conversations, first))["turn"]
+        path = conversations.video(first, before["id"])
+        assert path is not None
+        path.unlink()
+        await begin(conversations)
+        return before, (await settled(conversations, first))["turn"]
+
+    before, after = with_conversations(talk)
+    assert (after["id"], after["fps"], after["frames"]) == (before["id"], before["fps"] / 2, -(-before["frames"] // 2))
