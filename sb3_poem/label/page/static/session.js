@@ -96,6 +96,7 @@ async function show(next) {
   byId("undo").hidden = !next.can_undo;
   byId("undo-text").textContent = phase === "result" && answered < target ? "Back to the questions" : "Undo the last answer";
   byId("stop").hidden = phase !== "question" || answered === 0;
+  for (const button of document.querySelectorAll(".answer")) button.setAttribute("aria-disabled", String(waiting));
   if (waiting) return;
   if (next.turn.id !== shownTurn) {
     await player.load(`${base}/video/${next.turn.id}`, next.turn.fps, next.turn.frames, phase === "question" ? 2 : 1);
