@@ -144,6 +144,13 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--algo", default="poem_sac")
     parser.add_argument("--runs", type=Path, default=Path("logs/benchmark"), help="where models and checkpoints are kept")
+    parser.add_argument(
+        "--adaptations",
+        nargs="+",
+        default=["-".join(pair) for pair in RULES],
+        choices=["-".join(pair) for pair in RULES],
+        help="inference rules and their sources of candidates",
+    )
     parser.add_argument("--train-args", nargs=argparse.REMAINDER, default=[], help="further arguments of sb3-poem train")
     arguments = parser.parse_args()
     family = family_of(arguments.env_id)
@@ -156,7 +163,7 @@ def main() -> None:
         test_seed = 100 + seed
         adaptations = [
             adapt(arguments.env_id, model, rule, candidates, test_seed, folder / f"adapt-{rule}-{candidates}.json")
-            for rule, candidates in RULES
+            for rule, candidates in (pair.split("-") for pair in arguments.adaptations)
         ]
         by_seed[seed] = {
             "training": training,
