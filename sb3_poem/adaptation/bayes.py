@@ -42,10 +42,10 @@ ERROR_CORRELATION = 10.0
 MOVE_SWEEPS = 2
 MOVE_TRIES = 6
 # Moves by the decoder: tries of a particle, and the decoder's evaluations (latents times decoded steps) that one answer may
-# spend on them: a quarter of what the answer's own two trajectories take with 100 particles. On a family
+# spend on them: half of what the answer's own two trajectories take with 100 particles. On a family
 # of known truth budgets from nothing to many times this one differed by no more than seeds do.
 DECODER_TRIES = 2
-DECODER_MOVE_STEPS = 1_250
+DECODER_MOVE_STEPS = 2_500
 # Steps of a trajectory that the decoder sees. From every eighth of HalfCheetah's the returns' difference was within 4.0 of
 # that from all (every fourth: 2.5), where the decoder's own error is 3.5 and the differences spread over 155.
 DECODED_STEPS = 25
