@@ -67,6 +67,15 @@ class Request:
     preference: str | None = None
     film_every: int = 1
 
+    @property
+    def marker(self) -> Path:
+        """A file that whoever asks may keep while the turn is wanted: taking it away ends the work."""
+        return self.video.with_suffix(".wanted")
+
+
+class NotWantedError(Exception):
+    """A turn's marker was taken away while it was made."""
+
 
 @dataclass(frozen=True)
 class Turn:
@@ -202,8 +211,10 @@ def make_turn(request: Request) -> Turn:
 
     :param request: What it is made from.
     :return: The turn.
+    :raises NotWantedError: If there was a marker, and it is taken away.
     """
     bench = bench_of(request.choice)
+    bench.env.env_method("render_while", request.marker if request.marker.exists() else None)
     family = FamilyEnv(bench.env)
     bench.env.env_method("set_task", family.sample_tasks(1, np.random.default_rng([TASK_STREAM, request.seed]))[0])
     return bench.turn(request)
@@ -219,8 +230,28 @@ def bench_of(choice: Choice) -> Bench:
     """
     from stable_baselines3.common.vec_env import DummyVecEnv
 
-    env = DummyVecEnv([lambda: make_env(choice.env_id, dict(choice.env_kwargs))])
+    env = DummyVecEnv([lambda: _RendersWhileWanted(make_env(choice.env_id, dict(choice.env_kwargs)))])
     return Bench(load_choice(choice), env, choice.env_id)
+
+
+class _RendersWhileWanted(gym.Wrapper):
+    """Rendering is what takes long in a turn, so there it is looked whether the turn is still wanted."""
+
+    _marker: Path | None = None
+
+    def render_while(self, marker: Path | None) -> None:
+        """
+        From now on.
+
+        :param marker: A file without which rendering raises :class:`NotWantedError`; None renders always.
+        """
+        self._marker = marker
+
+    def render(self) -> Any:
+        """See :class:`gymnasium.Env`."""
+        if self._marker is not None and not self._marker.exists():
+            raise NotWantedError
+        return super().render()
 
 
 def load_choice(choice: Choice) -> Any:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from sb3_poem.label.catalogue import Choice
-from sb3_poem.label.turns import BENCHES, Request, Turn, bench_of, make_turn
+from sb3_poem.label.turns import BENCHES, NotWantedError, Request, Turn, bench_of, make_turn
 
 _logger = logging.getLogger(__name__)
 
@@ -97,7 +97,7 @@ class Workshop:
 
     def discard(self, job: Job) -> None:
         """
-        Nobody will want a job's turn: do not start it, and delete its video.
+        Nobody will want a job's turn: do not start it, or stop it soon, and delete its video.
 
         :param job: The job.
         """
@@ -107,6 +107,8 @@ class Workshop:
             job.done.cancel()
         elif job.done.done():
             job.request.video.unlink(missing_ok=True)
+        else:
+            job.request.marker.unlink(missing_ok=True)
 
     @property
     def n_waiting(self) -> int:
@@ -138,17 +140,23 @@ class Workshop:
         self._start_jobs()
 
     async def _run(self, job: Job) -> None:
+        job.request.marker.touch()
         try:
             turn = await self._attempt(job.request)
         except asyncio.CancelledError:
             job.done.cancel()
             raise
+        except NotWantedError:
+            job.done.cancel()
+            return
         except Exception as error:
             _logger.error("a %s of %s could not be made: %r", job.request.wanted, job.request.choice.name, error)
             if not job.done.done():
                 job.done.set_exception(error)
                 job.done.exception()  # somebody may wait for it or not
             return
+        finally:
+            job.request.marker.unlink(missing_ok=True)
         if job.discarded:
             job.request.video.unlink(missing_ok=True)
         if not job.done.done():
