@@ -143,6 +143,8 @@ def main() -> None:
     arguments = parser.parse_args()
     if not 0.0 < arguments.seconds <= 600.0:
         parser.error("--seconds must be at most 600")
+    if arguments.out is not None and arguments.out.is_dir():
+        parser.error(f"--out must be a file, but {arguments.out} is a folder")
 
     others = busy_share()
     with tempfile.TemporaryDirectory() as folder:
