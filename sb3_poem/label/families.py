@@ -30,6 +30,9 @@ PLACE_HINT = "Think of a place where it should go. It cannot see the place; your
 SPEED_HINT = "Think of a speed at which it should run, from standing still to as fast as it can."
 WAY_HINT = "Think of the way it should run: forward or backward."
 DIRECTION_HINT = "Think of a direction in which it should walk."
+REACH_HINT = "Think of a place that its hand should reach. It cannot see the place; your answers show the way."
+BOX_HINT = "Think of a place where the box should lie in the end. It cannot see the place; your answers show the way."
+ARM_HINT = "Think of what its hand should do, and where."
 
 DESCRIPTIONS = {
     "PointGoal": Description("A dot that goes to a place", PLACE_HINT, "place", extent=1.35),
@@ -40,6 +43,11 @@ DESCRIPTIONS = {
     "AntDir2D": Description("A four-legged robot: in which direction?", DIRECTION_HINT, "direction"),
     "HumanoidDir2D": Description("A humanoid: in which direction?", DIRECTION_HINT, "direction"),
     "AntGoal": Description("A four-legged robot that goes to a place", PLACE_HINT, "place", "m", 3.5),
+    "FetchReach": Description("A robot arm that reaches for a place", REACH_HINT, "projection"),
+    "FetchPush": Description("A robot arm that pushes a box", BOX_HINT, "projection"),
+    "MetaWorldML1": Description("A robot arm at a table: where?", REACH_HINT, "projection"),
+    "MetaWorldML10": Description("A robot arm at a table: what, and where?", ARM_HINT, "projection"),
+    "AntMaze": Description("A four-legged robot in a maze", PLACE_HINT, "projection"),
 }
 OTHER_HINT = "Think of what it should do. Your answers show it."
 
