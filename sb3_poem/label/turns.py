@@ -33,6 +33,8 @@ RESULT_ROLLOUT = 1_000_000
 TASK_STREAM = 0x1ABE1
 # Frames per second that a film should not fall below.
 SMOOTH_FPS = 8.0
+# Frames per second of a film otherwise; where a family is drawn more often, some steps are left out.
+FILM_FPS = 20.0
 #: Models that a process keeps.
 BENCHES = 4
 #: What an adapter's dictionary holds of its conversation; the rest is the ``state`` of a turn.
@@ -184,7 +186,8 @@ class Bench:
         return PreferenceAdapter.from_dict(data, self.model, self.env, oracle=_Watches(self._film_every(request)))
 
     def _film_every(self, request: Request) -> int:
-        return request.film_every if self.fps / request.film_every >= SMOOTH_FPS else 1
+        every = max(1, int(self.fps / FILM_FPS))  # of what moves faster than films do not all steps are filmed
+        return every * request.film_every if self.fps / (every * request.film_every) >= SMOOTH_FPS else every
 
     def _film(self, adapter: PreferenceAdapter, latent: np.ndarray, film_every: int) -> list[np.ndarray]:
         seed = rollout_seed(adapter.seed, RESULT_ROLLOUT)
