@@ -140,8 +140,8 @@ class Workshop:
         self._start_jobs()
 
     async def _run(self, job: Job) -> None:
-        job.request.marker.touch()
         try:
+            job.request.marker.touch()
             turn = await self._attempt(job.request)
         except asyncio.CancelledError:
             job.done.cancel()

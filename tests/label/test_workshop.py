@@ -6,13 +6,14 @@ import asyncio
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
 import pytest
 
 from sb3_poem.label.catalogue import Choice
-from sb3_poem.label.turns import NotWantedError, Request, Turn, _RendersWhileWanted, make_env, make_turn
+from sb3_poem.label.turns import Bench, NotWantedError, Request, Turn, _RendersWhileWanted, make_env, make_turn
 from sb3_poem.label.workshop import LIKELY, WAITED_FOR, Workshop
 
 TURN = Turn(None, None, None, None, None, 20.0, 1)
@@ -85,3 +86,13 @@ def test_a_worker_leaves_a_turn_whose_marker_goes(point_goal: Choice, tmp_path: 
     turn = make_turn(wanted)  # nobody keeps a marker: made to the end, in the same environment
     assert cast(int, turn.frames) > 3
     assert wanted.video.is_file()
+
+
+@pytest.mark.parametrize(("fps", "alone", "crowded"), [(10, 1, 1), (20, 1, 2), (25, 1, 2), (80, 4, 8)])
+def test_films_show_about_twenty_frames_a_second(
+    point_goal: Choice, tmp_path: Path, fps: int, alone: int, crowded: int
+) -> None:
+    bench = object.__new__(Bench)
+    bench.fps = float(fps)
+    wanted = request(point_goal, tmp_path, "turn")
+    assert [bench._film_every(replace(wanted, film_every=every)) for every in (1, 2)] == [alone, crowded]
