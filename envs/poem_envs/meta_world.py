@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from poem_envs.headless import choose_headless_backend
+from poem_envs.mujoco_fast_rendering import renders_fast
 from poem_envs.process_vector import ProcessFamilyVector
 from poem_envs.replay import ReplayFamily
 from poem_envs.sawyer import (
@@ -39,6 +39,7 @@ class MetaWorldEnv(ReplayFamily):
     :param width: of rendered images, pixels
     :param height: of rendered images, pixels
     :param camera_name: one of Meta-World's cameras
+    :param render_quality: "full", or "fast": without shadows and antialiasing, for RGB images alone
     """
 
     metadata = {"render_modes": ["human", "rgb_array", "depth_array"], "render_fps": 80}  # noqa: RUF012
@@ -50,13 +51,15 @@ class MetaWorldEnv(ReplayFamily):
         width: int = 480,
         height: int = 480,
         camera_name: str | None = "corner2",
+        render_quality: str = "full",
         **kwargs: Any,
     ) -> None:
         load_metaworld()
         super().__init__(**kwargs)
         self.observation_space = spaces.Box(-np.inf, np.inf, (OBSERVATION_DIM,), np.float64)
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
-        self._render_arguments: dict[str, Any] = {
+        self._sawyer_arguments: dict[str, Any] = {
+            "renders_fast": renders_fast(render_quality, self.render_mode),
             "render_mode": self.render_mode,
             "width": width,
             "height": height,
@@ -81,7 +84,7 @@ class MetaWorldEnv(ReplayFamily):
         manipulation, placement = self._place(self._task, rng)
         if self._sawyer is None or self._sawyer.manipulation != manipulation:
             self._release_sawyer()
-            self._sawyer = take_sawyer(manipulation, **self._render_arguments)
+            self._sawyer = take_sawyer(manipulation, **self._sawyer_arguments)
         self._success = False
         return self._sawyer.reset(placement, self.render_task)
 
@@ -122,16 +125,15 @@ class MetaWorldEnv(ReplayFamily):
         """Render the current state as ``render_mode`` says: an image ``(height, width, 3)`` for ``"rgb_array"``."""
         if self._sawyer is None:
             raise RuntimeError("render() was called before the first reset()")
-        choose_headless_backend()
-        image = self._sawyer.env.render()
+        image = self._sawyer.render()
         # Meta-World's models have these cameras upside down.
-        upside_down = isinstance(image, np.ndarray) and (self._render_arguments["camera_name"] or "").startswith("corner")
+        upside_down = isinstance(image, np.ndarray) and (self._sawyer_arguments["camera_name"] or "").startswith("corner")
         return image[::-1, ::-1].copy() if upside_down else image
 
     def close(self) -> None:
         """Free what rendering and simulation hold."""
         if self._sawyer is not None:
-            self._sawyer.env.close()  # closes its windows, which a later rendering would open again
+            self._sawyer.close()
         self._release_sawyer()
 
     def _release_sawyer(self) -> None:
@@ -201,6 +203,7 @@ class MetaWorldML1Env(MetaWorldEnv):
     | `render_task`     | **bool** | `False`     | Whether rendering shows the goal                                |
     | `width`, `height` | **int**  | `480`       | Size of the rendered image, pixels                              |
     | `camera_name`     | **str**  | `"corner2"` | One of Meta-World's cameras                                     |
+    | `render_quality`  | **str**  | `"full"`    | `"fast"` leaves out shadows and antialiasing of RGB images      |
 
     ## Version History
     * v0: Initial version

@@ -13,13 +13,12 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
 from poem_envs.cores import available_cores
-from poem_envs.mujoco_fast_rendering import FastRenderer
+from poem_envs.mujoco_fast_rendering import FastRenderer, renders_fast
 from poem_envs.mujoco_integrator import Integrator
 from poem_envs.mujoco_rendering import StateRenderer
 from poem_envs.vector import BatchFamily, BatchTaskFamily, TaskFamilyVector
 
 DEFAULT_SIZE = 480
-RENDER_QUALITIES = ("full", "fast")
 RENDER_MODES = ["human", "rgb_array", "depth_array", "rgbd_tuple"]
 
 
@@ -82,11 +81,6 @@ class MujocoFamily(BatchFamily):
         render_quality: str = "full",
         **kwargs: Any,
     ) -> None:
-        if render_quality not in RENDER_QUALITIES:
-            raise ValueError(f"render_quality must be one of {RENDER_QUALITIES}, got {render_quality!r}")
-        render_mode = kwargs.get("render_mode")
-        if render_quality == "fast" and render_mode not in (None, "rgb_array"):
-            raise ValueError(f'render_quality="fast" goes with render_mode="rgb_array" alone, got {render_mode!r}')
         self.model = mujoco.MjModel.from_xml_path(_model_path(xml_file))
         if self.model.na:
             raise ValueError(f"xml_file={xml_file!r} has actuators with activations, which these environments do not handle")
@@ -94,7 +88,7 @@ class MujocoFamily(BatchFamily):
         self.reset_noise_scale = reset_noise_scale
         initial = mujoco.MjData(self.model)
         self.init_qpos, self.init_qvel = initial.qpos.copy(), initial.qvel.copy()
-        self._renders_fast = render_quality == "fast"
+        self._renders_fast = renders_fast(render_quality, kwargs.get("render_mode"))
         self._render_arguments: dict[str, Any] = {
             "width": width,
             "height": height,

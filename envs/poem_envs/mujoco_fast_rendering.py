@@ -12,6 +12,7 @@ import numpy as np
 from poem_envs.headless import choose_headless_backend
 from poem_envs.mujoco_rendering import close_at_exit, stays_closed
 
+RENDER_QUALITIES = ("full", "fast")
 MAX_GEOM = 200
 # Slices and stacks of a sphere, and quads of a plane: at the size of a web page nobody sees the difference.
 COARSE = (12, 6, 1)
@@ -70,12 +71,21 @@ class FastRenderer:
         """
         mujoco.mj_setState(self._model, self._data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         mujoco.mj_forward(self._model, self._data)
+        return self.render_data(self._data, markers)
+
+    def render_data(self, data: mujoco.MjData, markers: list[dict[str, Any]]) -> np.ndarray:
+        """Render what a simulation has computed last.
+
+        :param data: of the model
+        :param markers: see :meth:`render`
+        :return: ``(height, width, 3)`` uint8
+        """
         if self._camera.type == mujoco.mjtCamera.mjCAMERA_FREE:
-            self._camera.lookat[:2] = self._data.xpos[1, :2]
+            self._camera.lookat[:2] = data.xpos[1, :2]
         self._context.make_current()  # another environment may have rendered since
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._resources)
         everything = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(self._model, self._data, self._options, None, self._camera, everything, self._scene)
+        mujoco.mjv_updateScene(self._model, data, self._options, None, self._camera, everything, self._scene)
         for marker in markers:
             self._add(marker)
         mujoco.mjr_render(self._viewport, self._scene, self._resources)
@@ -116,6 +126,21 @@ class FastRenderer:
         colour = np.asarray(marker.get("rgba", (1.0, 1.0, 1.0, 1.0)), dtype=np.float32)
         mujoco.mjv_initGeom(geom, marker["type"], size, np.asarray(marker["pos"], dtype=np.float64), rotation, colour)
         self._scene.ngeom += 1
+
+
+def renders_fast(render_quality: str, render_mode: str | None) -> bool:
+    """
+    Whether images come from a :class:`FastRenderer`.
+
+    :param render_quality: "full" or "fast", as users give it
+    :param render_mode: of the environment
+    :raises ValueError: if the quality is another, or "fast" is asked of a mode that has no images in colour
+    """
+    if render_quality not in RENDER_QUALITIES:
+        raise ValueError(f"render_quality must be one of {RENDER_QUALITIES}, got {render_quality!r}")
+    if render_quality == "fast" and render_mode not in (None, "rgb_array"):
+        raise ValueError(f'render_quality="fast" goes with render_mode="rgb_array" alone, got {render_mode!r}')
+    return render_quality == "fast"
 
 
 def _make_context(width: int, height: int) -> Any:

@@ -11,6 +11,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from poem_envs.headless import choose_headless_backend
+from poem_envs.mujoco_fast_rendering import FastRenderer
+
 SUPPORTED = "metaworld >= 3.1, < 4"
 
 
@@ -70,13 +73,15 @@ class Sawyer:
     been made, bit for bit, however often it was used before.
 
     :param manipulation: its name, without ``-v3``
+    :param renders_fast: whether images are made by :class:`~poem_envs.mujoco_fast_rendering.FastRenderer`
     :param render_arguments: ``render_mode``, ``camera_name``, ``width`` and ``height``, as Meta-World has them
     """
 
-    def __init__(self, manipulation: str, **render_arguments: Any) -> None:
+    def __init__(self, manipulation: str, *, renders_fast: bool = False, **render_arguments: Any) -> None:
         self.manipulation = manipulation
-        self.render_arguments = render_arguments
+        self.arguments = {"renders_fast": renders_fast, **render_arguments}
         self.env = _environment_class(manipulation)(**render_arguments)
+        self._fast_renderer: FastRenderer | None = None
         self.env._set_task_called = True  # placements are set here, without Meta-World's pickled tasks
         self.env.max_path_length = np.inf  # time limits are a wrapper's
         self.env._get_state_rand_vec = self._take_placement
@@ -120,6 +125,25 @@ class Sawyer:
             raise FloatingPointError("MuJoCo met a state that is not finite or too large")
         return observation, float(reward), bool(info["success"])
 
+    def render(self) -> Any:
+        """What Meta-World returns in its ``render_mode``; an image ``(height, width, 3)``, uint8, where it renders fast."""
+        choose_headless_backend()
+        if not self.arguments["renders_fast"]:
+            return self.env.render()
+        if self._fast_renderer is None:
+            env = self.env
+            self._fast_renderer = FastRenderer(
+                env.model, width=env.width, height=env.height, camera_id=None, camera_name=env.camera_name, camera_config={}
+            )
+        return self._fast_renderer.render_data(self.env.data, [])
+
+    def close(self) -> None:
+        """Close windows and graphics contexts, which a later rendering would open again."""
+        self.env.close()
+        if self._fast_renderer is not None:
+            self._fast_renderer.close()
+            self._fast_renderer = None
+
     def get_state(self) -> np.ndarray:
         """All that determines how the episode goes on, besides the placement, ``(state_dim,)``."""
         return np.concatenate([self._get_mujoco_state(), self.env._prev_obs])
@@ -151,19 +175,19 @@ class Sawyer:
 _at_rest: dict[tuple[Any, ...], list[Sawyer]] = {}
 
 
-def take_sawyer(manipulation: str, **render_arguments: Any) -> Sawyer:
+def take_sawyer(manipulation: str, **arguments: Any) -> Sawyer:
     """A simulator of a manipulation, made anew if none is at rest; arguments as :class:`Sawyer` has them."""
-    at_rest = _at_rest.get(_key(manipulation, render_arguments))
-    return at_rest.pop() if at_rest else Sawyer(manipulation, **render_arguments)
+    at_rest = _at_rest.get(_key(manipulation, arguments))
+    return at_rest.pop() if at_rest else Sawyer(manipulation, **arguments)
 
 
 def give_back_sawyer(sawyer: Sawyer) -> None:
     """Let others have a simulator that is no longer used."""
-    _at_rest.setdefault(_key(sawyer.manipulation, sawyer.render_arguments), []).append(sawyer)
+    _at_rest.setdefault(_key(sawyer.manipulation, sawyer.arguments), []).append(sawyer)
 
 
-def _key(manipulation: str, render_arguments: dict[str, Any]) -> tuple[Any, ...]:
-    return manipulation, *sorted(render_arguments.items())
+def _key(manipulation: str, arguments: dict[str, Any]) -> tuple[Any, ...]:
+    return manipulation, *sorted(arguments.items())
 
 
 class Placements:

@@ -11,7 +11,7 @@ from sb3_poem.cli import can_draw
 
 
 @pytest.mark.skipif(not can_draw(), reason="no off-screen OpenGL")
-@pytest.mark.parametrize("env_id", ["poem/HalfCheetahVel-v0", "poem/AntGoal-v0"])
+@pytest.mark.parametrize("env_id", ["poem/HalfCheetahVel-v0", "poem/AntGoal-v0", "poem/MetaWorldML1-v0"])
 def test_the_same_scene_from_the_same_camera(env_id: str) -> None:
     images = {}
     for quality in ("full", "fast"):
@@ -28,8 +28,9 @@ def test_the_same_scene_from_the_same_camera(env_id: str) -> None:
     assert np.corrcoef(full.ravel(), fast[:, ::-1].ravel())[0, 1] < np.corrcoef(full.ravel(), fast.ravel())[0, 1]
 
 
-def test_it_renders_images_alone() -> None:
+@pytest.mark.parametrize("env_id", ["poem/AntVel-v0", "poem/MetaWorldML1-v0"])
+def test_it_renders_images_alone(env_id: str) -> None:
     with pytest.raises(ValueError, match="render_quality"):
-        gym.make("poem/AntVel-v0", render_quality="best")
+        gym.make(env_id, render_quality="best")
     with pytest.raises(ValueError, match="rgb_array"):
-        gym.make("poem/AntVel-v0", render_quality="fast", render_mode="depth_array")
+        gym.make(env_id, render_quality="fast", render_mode="depth_array")
