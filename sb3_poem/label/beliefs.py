@@ -24,9 +24,9 @@ def belief(adapter: Any, env_id: str) -> dict[str, Any]:
         summing to one, ``estimate`` (the point of the policy that would be taken now), ``extent``, ``unit`` and ``sentence``.
     """
     latents, weights = posterior(adapter.inference)
-    description = describe(env_id)
     everything = np.concatenate([latents, adapter.inference.estimate()[None, :]])
     tasks = np.asarray(adapter.model.train_tasks, dtype=np.float64)
+    description = describe(env_id, tasks.shape[1])
     picture = description.picture
     if picture == "projection":
         points, extent = _projection(adapter.model, everything)
@@ -77,10 +77,8 @@ def sentence(picture: str, points: np.ndarray, weights: np.ndarray, estimate: np
     radius = weighted_quantiles(distances, weights, (SHARE,))[0]
     if picture == "place":
         x, y = estimate
-        return (
-            f"It believes that you mean a place near {x:.1f} across and {y:.1f} up, give or take {radius:.1f} {unit}".strip()
-            + "."
-        )
+        x, y, radius = (f"{round(value, 2):.2g}" for value in (x, y, radius))
+        return f"It believes that you mean a place near {x} across and {y} up, give or take {radius} {unit}".strip() + "."
     return "Each dot is a behaviour that still fits your answers; the closer together they lie, the surer it is."
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
 
@@ -50,6 +52,32 @@ def test_tasks_as_points() -> None:
     np.testing.assert_allclose(as_points("poem/HalfCheetahFwdBack-v0", np.array([[-1.0]])), [[-1.0, 0.0]])
     assert describe("Walk1D-v0").picture == "projection"
     assert describe("Walk1D-v0").title == "Walk1D"
+
+
+def test_places_in_space_are_drawn_as_the_camera_sees_them() -> None:
+    fetch = gym.make("poem/FetchReach-v0")
+    fetch.reset(seed=0)
+    robot = fetch.unwrapped.env.unwrapped
+    config, camera = robot.mujoco_renderer.default_cam_config, mujoco.MjvCamera()
+    camera.distance, camera.azimuth, camera.elevation = config["distance"], config["azimuth"], config["elevation"]
+    camera.lookat[:] = config["lookat"]
+    scene = mujoco.MjvScene(robot.model, 1000)
+    mujoco.mjv_updateScene(robot.model, robot.data, mujoco.MjvOption(), None, camera, mujoco.mjtCatBit.mjCAT_ALL, scene)
+    forward, up = scene.camera[0].forward, scene.camera[0].up
+    hand = robot.initial_gripper_xpos
+    places = hand + np.random.default_rng(0).uniform(-0.15, 0.15, size=(20, 3))
+    expected = (places - hand) @ np.stack([np.cross(forward, up), up], axis=1)
+    np.testing.assert_allclose(as_points("poem/FetchReach-v0", places), expected, atol=2e-3)
+
+    sawyer = gym.make("poem/MetaWorldML1-v0")
+    sawyer.reset(seed=0)
+    arm = sawyer.unwrapped._sawyer.env
+    axes = arm.model.cam("corner2").mat0.reshape(3, 3)
+    places = arm.hand_init_pos + np.random.default_rng(1).uniform(-0.3, 0.3, size=(20, 3))
+    expected = -(places - arm.hand_init_pos) @ axes[:, :2]  # videos show this camera's image turned by half a turn
+    np.testing.assert_allclose(as_points("poem/MetaWorldML1-v0", places), expected, atol=2e-3)
+    # Placements of an object and a goal are more than a place.
+    assert describe("poem/MetaWorldML1-v0", 6).picture == "projection"
 
 
 def test_weighted_quantiles_are_those_of_the_repeated_sample() -> None:
