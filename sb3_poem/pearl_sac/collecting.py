@@ -1,10 +1,12 @@
 """The collection of an epoch: every training task is rolled out under its own latest latent."""
 
 import time
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import torch as th
+from colorednoise import powerlaw_psd_gaussian
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import RolloutReturn
 from stable_baselines3.common.vec_env import VecEnv
@@ -25,6 +27,7 @@ class CollectingSAC(TaskSAC):
     context_reward_statistics: tuple[float, float] | None
     context_has_value: bool = False
     context_relabel_fraction: float
+    noise_color: float = 0.0  # models of before it have white noise
     epoch: int
     trajectories_per_task: int
     _statistics_known: bool
@@ -73,13 +76,13 @@ class CollectingSAC(TaskSAC):
     def _collect(self, callback: BaseCallback, task_ids: np.ndarray, tasks: np.ndarray, latents: np.ndarray) -> Segment | None:
         family, noise_shape = self.family, (len(latents), int(self.action_space.shape[0]))  # type: ignore[index]
         policy_action = self.policy.acting_on(latents)
+        noises = self._action_noises(noise_shape)
 
         def act(obs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             if self.num_timesteps < self.learning_starts:
                 scaled = self.generators.numpy.uniform(-1.0, 1.0, noise_shape).astype(np.float32)
             else:
-                noise = th.randn(noise_shape, generator=self.generators.torch, device=self.device)
-                scaled = policy_action(obs, noise)
+                scaled = policy_action(obs, next(noises))
             actions = np.clip(self.policy.unscale_action(scaled), self.action_space.low, self.action_space.high)  # type: ignore[attr-defined]
             return actions, scaled
 
@@ -96,6 +99,15 @@ class CollectingSAC(TaskSAC):
 
         episodes = np.full(family.num_envs, self._episode_num)
         return collect_segment(family, act, task_ids, tasks, latents, self.generators.integer_seed(), episodes, on_step)
+
+    def _action_noises(self, shape: tuple[int, int]) -> Iterator[th.Tensor]:
+        """The policy's standard normal noise of each step of a horizon, (copies, action_dim)."""
+        if self.noise_color == 0:
+            while True:
+                yield th.randn(shape, generator=self.generators.torch, device=self.device)
+        steps = max(2, self.family.horizon)
+        noise = powerlaw_psd_gaussian(self.noise_color, (*shape, steps), random_state=self.generators.numpy)
+        yield from th.as_tensor(noise, dtype=th.float32, device=self.device).movedim(-1, 0)
 
     def _set_statistics(self, segments: list[Segment]) -> None:
         """Standardise by the first epoch's mean and deviation."""

@@ -57,6 +57,8 @@ class PEARLSAC(SamplingSAC):
         relabelled. Without any, the encoder may read a task from what its policy does rather than from the rewards, and is
         then at a loss when it sees a new task's first rollouts. Needs a family with shared dynamics
     :param reward_scale: Factor on the rewards that the critics learn; "auto" divides by the deviation of the first epoch's
+    :param noise_color: Exponent b of the power spectrum 1 / f^b of the policy's noise in training rollouts: 0 white, as in
+        SAC; 1 pink, 2 red (Eberhard et al., ICLR 2023). Noise that keeps a direction for some steps moves a robot farther
     :param horizon: Steps of an episode; None takes the environment's time limit
     :param precision: "auto" (bfloat16 where the processor has it), "bf16", or "fp32"
     :param stats_window_size: Episodes that the rollout logging averages over
@@ -100,6 +102,7 @@ class PEARLSAC(SamplingSAC):
         relabel_fraction: float = 0.0,
         context_relabel_fraction: float = 0.0,
         reward_scale: float | str = "auto",
+        noise_color: float = 0.0,
         horizon: int | None = None,
         precision: str = "auto",
         stats_window_size: int = 100,
@@ -124,6 +127,7 @@ class PEARLSAC(SamplingSAC):
             ("kl_coef", kl_coef, 0),
             ("reward_coef", reward_coef, 0),
             ("policy_coef", policy_coef, 0),
+            ("noise_color", noise_color, 0),
         ):
             if not value >= low:
                 raise ValueError(f"{name} must be at least {low}, got {value}")
@@ -145,6 +149,7 @@ class PEARLSAC(SamplingSAC):
         self.relabel_fraction = relabel_fraction
         self.context_relabel_fraction = context_relabel_fraction
         self.reward_scale = reward_scale
+        self.noise_color = noise_color
         self.horizon = horizon
         self.precision = precision
         self.train_tasks: np.ndarray | None = None

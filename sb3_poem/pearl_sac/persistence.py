@@ -51,6 +51,7 @@ class PersistentSAC(SAC):
             "policy_coef",
             "relabel_fraction",
             "reward_scale",
+            "noise_color",
             "horizon",
             "precision",
             "seed",

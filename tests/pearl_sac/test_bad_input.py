@@ -44,7 +44,7 @@ def algorithm(request: pytest.FixtureRequest) -> type[PEARLSAC]:
         ("gradient_steps", -2, "gradient_steps must be at least -1, got -2"),
         *[
             (name, value, rf"{name} must be at least 0, got {value}")
-            for name in ("kl_coef", "reward_coef", "policy_coef", "learning_starts")
+            for name in ("kl_coef", "reward_coef", "policy_coef", "learning_starts", "noise_color")
             for value in (-0.5, NAN)
         ],
         ("target_update_interval", 0, "target_update_interval must be at least 1, got 0"),
