@@ -156,9 +156,7 @@ def measure(env_id: str, nthread: int, repeats: int) -> dict[str, Any]:
     processes.close()
     copies = {name: getattr(contender, "copies", N_TASKS) for name, contender in contenders.items()}
     rates = {name: STEPS * copies[name] / float(np.median(values)) for name, values in seconds.items()}
-    shares = {
-        name: common.ratio(seconds["TaskVecEnv"], values) * copies[name] / N_TASKS for name, values in seconds.items()
-    }
+    shares = {name: common.ratio(seconds["TaskVecEnv"], values) * copies[name] / N_TASKS for name, values in seconds.items()}
     return {"env_id": env_id, "seconds": seconds, "steps_per_second": rates, "seconds_of_TaskVecEnv_over_own": shares}
 
 

@@ -77,8 +77,11 @@ def sentence(picture: str, points: np.ndarray, weights: np.ndarray, estimate: np
     radius = weighted_quantiles(distances, weights, (SHARE,))[0]
     if picture == "place":
         x, y = estimate
-        x, y, radius = (f"{round(value, 2):.2g}" for value in (x, y, radius))
-        return f"It believes that you mean a place near {x} across and {y} up, give or take {radius} {unit}".strip() + "."
+        across, upwards, about = (f"{round(value, 2):.2g}" for value in (x, y, radius))
+        return (
+            f"It believes that you mean a place near {across} across and {upwards} up, give or take {about} {unit}".strip()
+            + "."
+        )
     return "Each dot is a behaviour that still fits your answers; the closer together they lie, the surer it is."
 
 
