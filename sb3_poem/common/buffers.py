@@ -44,7 +44,8 @@ class TaskBatch(NamedTuple):
     """Transitions of several tasks.
 
     observations (tasks, batch, obs_dim), actions (tasks, batch, action_dim), next_observations (tasks, batch, obs_dim),
-    rewards (tasks, batch), terminated (tasks, batch), features (tasks, batch, feat_dim).
+    rewards (tasks, batch), terminated (tasks, batch), features (tasks, batch, feat_dim), ended (tasks, batch): whether the
+    episode or its recording ends there.
     """
 
     observations: th.Tensor
@@ -53,6 +54,7 @@ class TaskBatch(NamedTuple):
     rewards: th.Tensor
     terminated: th.Tensor
     features: th.Tensor
+    ended: th.Tensor
 
 
 class TaskReplayBuffer(ReplayBuffer):
@@ -140,18 +142,22 @@ class TaskReplayBuffer(ReplayBuffer):
         self._counts_on_device = th.as_tensor(self.counts, dtype=th.float32, device=self.device)
         self.full = bool((self.counts == self.buffer_size).all())
 
-    def sample_rows(self, source_tasks: th.Tensor, generator: th.Generator) -> TaskBatch:
-        """Draw one stored transition for each entry, uniformly from its task's own.
+    def draw_slots(self, source_tasks: th.Tensor, generator: th.Generator) -> th.Tensor:
+        """Draw one stored transition for each entry, uniformly from its task's own: its slot, for :meth:`at`.
 
         :param source_tasks: (tasks, batch) indices of the tasks to draw from
         :param generator: torch generator on this buffer's device
         """
         uniform = th.rand(source_tasks.shape, generator=generator, device=self.device)
-        slots = (uniform * self._counts_on_device[source_tasks]).long()
-        return self._gather(source_tasks * self.rows.shape[1] + slots)
+        return (uniform * self._counts_on_device[source_tasks]).long()
+
+    def sample_rows(self, source_tasks: th.Tensor, generator: th.Generator) -> TaskBatch:
+        """The transitions in :meth:`draw_slots`, with its arguments."""
+        return self.at(source_tasks, self.draw_slots(source_tasks, generator))
 
     def at(self, tasks: th.Tensor, slots: th.Tensor) -> TaskBatch:
-        """The transitions in some slots; following slots hold following steps, but at the end of an episode and of the ring.
+        """The transitions in some slots. The next slot, round the ring, holds the next step, but where an episode or its
+        recording ended.
 
         :param tasks: (...) indices of tasks
         :param slots: (...), below the tasks' ``counts``
@@ -226,7 +232,7 @@ class TaskReplayBuffer(ReplayBuffer):
         marks = rows[:, mark].contiguous()  # what is dense is converted and searched several times as fast
         ends = marks.nonzero().view(-1)
         floats[:, words:].index_copy_(0, ends, self.ends.index_select(0, marks.index_select(0, ends).abs()))
-        terminated = (marks < 0).float()
+        ended, terminated = marks != 0, (marks < 0).float()
         actions = (rows[:, mark + 1 : words].contiguous().view(th.int16) * (1.0 / ACTION_UNITS))[:, : self.action_dim]
         floats, shape = floats.unflatten(0, flat.shape), flat.shape
         return TaskBatch(
@@ -236,6 +242,7 @@ class TaskReplayBuffer(ReplayBuffer):
             floats[..., mark - 1],
             terminated.view(shape),
             floats[..., obs_dim : mark - 1],
+            ended.view(shape),
         )
 
     def _reserve(self, rows_per_task: int) -> None:

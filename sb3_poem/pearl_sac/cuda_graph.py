@@ -1,10 +1,10 @@
 """A gradient step as one CUDA graph."""
 
 from collections.abc import Callable
+from typing import Any
 
 import torch as th
 
-from sb3_poem.common.buffers import TaskBatch
 from sb3_poem.pearl_sac.losses import MetaBatch
 
 EAGER_STEPS = 3
@@ -48,10 +48,7 @@ class GraphedStep:
             th.cuda.current_stream().wait_stream(self._stream)
             return metrics
         if self._batch is None:
-            self._batch = batch._replace(
-                **{name: field.clone() for name, field in batch._asdict().items() if isinstance(field, th.Tensor)},
-                transitions=TaskBatch(*(field.clone() for field in batch.transitions)),
-            )
+            self._batch = _cloned(batch)
             with th.cuda.graph(self._graph):
                 self._metrics = self._step(self._batch)
         else:
@@ -60,6 +57,13 @@ class GraphedStep:
         return {name: value.clone() for name, value in self._metrics.items()}
 
 
-def tensors(batch: MetaBatch) -> list[th.Tensor]:
+def tensors(batch: tuple[Any, ...]) -> list[th.Tensor]:
     """All tensors of a meta-batch."""
-    return [*batch.transitions, *(field for field in batch if isinstance(field, th.Tensor))]
+    parts = (tensors(field) if isinstance(field, tuple) else [field] for field in batch if field is not None)
+    return [tensor for part in parts for tensor in part]
+
+
+def _cloned(batch: Any) -> Any:
+    if isinstance(batch, tuple):
+        return type(batch)(*map(_cloned, batch))
+    return None if batch is None else batch.clone()

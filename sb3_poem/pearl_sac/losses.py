@@ -11,12 +11,25 @@ from sb3_poem.common.buffers import TaskBatch
 from sb3_poem.pearl_sac.policies import LatentPolicy
 
 
+class Bootstraps(NamedTuple):
+    """What the critics' targets are made of where they look some steps ahead.
+
+    rewards (tasks, batch), their discounted sum until then; observations (tasks, batch, obs_dim) after it; discounts
+    (tasks, batch) of the value there, 0 where the episode terminated.
+    """
+
+    rewards: th.Tensor
+    observations: th.Tensor
+    discounts: th.Tensor
+
+
 class MetaBatch(NamedTuple):
     """What one gradient step sees of a meta-batch of tasks.
 
     task_ids (tasks,), transitions: a :class:`TaskBatch` (tasks, batch, ...), context (tasks, context_size, context_dim),
     context_rewards (tasks, context_size), returns (tasks, tasks): J[i, j], NaN where unknown; standard normal draws for the
-    latents (tasks, latent_dim), the actions and the next actions (tasks, batch, action_dim).
+    latents (tasks, latent_dim), the actions and the next actions (tasks, batch, action_dim); bootstraps, None where targets
+    look one step ahead, which ``transitions`` tell.
     """
 
     task_ids: th.Tensor
@@ -27,6 +40,7 @@ class MetaBatch(NamedTuple):
     latent_noise: th.Tensor
     action_noise: th.Tensor
     next_action_noise: th.Tensor
+    bootstraps: Bootstraps | None = None
 
 
 class TaskEmbeddings(NamedTuple):
@@ -55,17 +69,21 @@ def critic_loss(
     gamma: float,
     reward_scale: th.Tensor | float,
     noise: th.Tensor,
+    bootstraps: Bootstraps | None = None,
 ) -> th.Tensor:
     """Half the squared soft Bellman error, summed over the critics; it trains the encoder too, as in PEARL.
 
     :param noise: (tasks, batch, action_dim) standard normal draws for the next actions
+    :param bootstraps: Where targets look further ahead than one step
     """
     n = batch.rewards.shape[1]
+    if bootstraps is None:
+        bootstraps = Bootstraps(batch.rewards, batch.next_observations, gamma * (1.0 - batch.terminated))
     with th.no_grad():
-        next_obs, z = batch.next_observations, embeddings.latents
+        next_obs, z = bootstraps.observations, embeddings.latents
         next_actions, next_log_prob = policy.actor(next_obs, rows(embeddings.policy, n), noise)  # type: ignore[operator]
         next_values = policy.critic_target(next_obs, next_actions, rows(z, n)).amin(dim=0) - alpha * next_log_prob  # type: ignore[operator]
-        targets = reward_scale * batch.rewards + gamma * (1.0 - batch.terminated) * next_values
+        targets = reward_scale * bootstraps.rewards + bootstraps.discounts * next_values
     values = policy.critic(batch.observations, batch.actions, rows(embeddings.latents, n))  # type: ignore[operator]
     return 0.5 * len(values) * (values - targets).pow(2).mean()
 

@@ -57,6 +57,8 @@ class PEARLSAC(SamplingSAC):
         relabelled. Without any, the encoder may read a task from what its policy does rather than from the rewards, and is
         then at a loss when it sees a new task's first rollouts. Needs a family with shared dynamics
     :param reward_scale: Factor on the rewards that the critics learn; "auto" divides by the deviation of the first epoch's
+    :param n_steps: Steps of rewards in the critics' targets before the value takes over; more carry rewards back faster, and
+        rely more on what older policies, and with ``relabel_fraction`` other tasks', did
     :param noise_color: Exponent b of the power spectrum 1 / f^b of the policy's noise in training rollouts: 0 white, as in
         SAC; 1 pink, 2 red (Eberhard et al., ICLR 2023). Noise that keeps a direction for some steps moves a robot farther
     :param horizon: Steps of an episode; None takes the environment's time limit
@@ -75,6 +77,7 @@ class PEARLSAC(SamplingSAC):
     saved_arguments: ClassVar[dict[str, str]] = {
         **SamplingSAC.saved_arguments,
         "context_relabel_fraction": "context_relabel_fraction",
+        "n_steps": "target_steps",
     }
 
     def __init__(
@@ -102,6 +105,7 @@ class PEARLSAC(SamplingSAC):
         relabel_fraction: float = 0.0,
         context_relabel_fraction: float = 0.0,
         reward_scale: float | str = "auto",
+        n_steps: int = 1,
         noise_color: float = 0.0,
         horizon: int | None = None,
         precision: str = "auto",
@@ -127,6 +131,7 @@ class PEARLSAC(SamplingSAC):
             ("kl_coef", kl_coef, 0),
             ("reward_coef", reward_coef, 0),
             ("policy_coef", policy_coef, 0),
+            ("n_steps", n_steps, 1),
             ("noise_color", noise_color, 0),
         ):
             if not value >= low:
@@ -149,6 +154,7 @@ class PEARLSAC(SamplingSAC):
         self.relabel_fraction = relabel_fraction
         self.context_relabel_fraction = context_relabel_fraction
         self.reward_scale = reward_scale
+        self.target_steps = n_steps  # SB3's attribute n_steps goes with its own replay buffer
         self.noise_color = noise_color
         self.horizon = horizon
         self.precision = precision
@@ -304,7 +310,10 @@ class PEARLSAC(SamplingSAC):
         embeddings = self._embed(latents)
         transitions = self._standardise(batch.transitions)
         alpha = self._entropy_coefficient()
-        critic_loss = self._critic_loss(transitions, embeddings, alpha, batch.next_action_noise)
+        bootstraps = batch.bootstraps
+        if bootstraps is not None:
+            bootstraps = bootstraps._replace(observations=self.policy.standardise(bootstraps.observations))
+        critic_loss = self._critic_loss(transitions, embeddings, alpha, batch.next_action_noise, bootstraps)
         actor_loss, log_prob = losses.actor_loss(self.policy, transitions, embeddings, alpha, batch.action_noise)
         decoder_loss = self._decoder_loss(batch, transitions, embeddings)
         kl_loss = kl.mean()
@@ -350,9 +359,16 @@ class PEARLSAC(SamplingSAC):
             observations=standardise(batch.observations), next_observations=standardise(batch.next_observations)
         )
 
-    def _critic_loss(self, batch: TaskBatch, embeddings: TaskEmbeddings, alpha: th.Tensor, noise: th.Tensor) -> th.Tensor:
+    def _critic_loss(
+        self,
+        batch: TaskBatch,
+        embeddings: TaskEmbeddings,
+        alpha: th.Tensor,
+        noise: th.Tensor,
+        bootstraps: losses.Bootstraps | None = None,
+    ) -> th.Tensor:
         scale = 1.0 / self.policy.reward_std if self.reward_scale == "auto" else self.reward_scale
-        return losses.critic_loss(self.policy, batch, embeddings, alpha, self.gamma, scale, noise)  # type: ignore[arg-type]
+        return losses.critic_loss(self.policy, batch, embeddings, alpha, self.gamma, scale, noise, bootstraps)  # type: ignore[arg-type]
 
     def _decoder_loss(self, batch: MetaBatch, transitions: TaskBatch, embeddings: TaskEmbeddings) -> th.Tensor:
         """On context transitions (eq. 4); with relabelling on the batch of transitions instead, which holds other tasks'

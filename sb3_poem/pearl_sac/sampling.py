@@ -6,6 +6,7 @@ import numpy as np
 import torch as th
 
 from sb3_poem.common.buffers import TaskBatch
+from sb3_poem.pearl_sac import losses
 from sb3_poem.pearl_sac.collecting import CollectingSAC
 from sb3_poem.pearl_sac.losses import MetaBatch
 
@@ -24,6 +25,7 @@ class SamplingSAC(CollectingSAC):
     meta_batch_size: int
     context_size: int
     relabel_fraction: float
+    target_steps: int = 1  # models of before it looked one step ahead
 
     def _choose_tasks(self) -> np.ndarray:
         """Indices of a meta-batch, without repetition: a repeated task would give preference pairs without a difference."""
@@ -45,7 +47,7 @@ class SamplingSAC(CollectingSAC):
         sizes = [len(choice) for choice in choices]
         chosen = np.concatenate(choices)
         task_ids = th.as_tensor(chosen, device=self.device)  # (n * tasks,)
-        transitions = self._sample_transitions(task_ids, chosen, batch_size)
+        transitions, bootstraps = self._sample_transitions(task_ids, chosen, batch_size)
         context, context_rewards = self._sample_contexts(task_ids)
         action_dim = transitions.actions.shape[-1]
         noise = self._standard_normal(len(chosen), 2 * batch_size * action_dim + self.latent_dim)
@@ -59,30 +61,55 @@ class SamplingSAC(CollectingSAC):
                 context_rewards,
                 latent_noise,
                 *(part.reshape(-1, batch_size, action_dim) for part in action_noises),
+                *(bootstraps or ()),
             )
         )
         n_fields = len(TaskBatch._fields)
         batches = []
         for ids, *rest in zip(*split, strict=True):
-            transitions, (context, context_rewards, *noises) = TaskBatch(*rest[:n_fields]), rest[n_fields:]
+            transitions, rest = TaskBatch(*rest[:n_fields]), rest[n_fields:]
+            context, context_rewards, latent_noise, action_noise, next_noise, *ahead = rest
             returns = self.context.returns[ids][:, ids]
-            batches.append(MetaBatch(ids, transitions, context, context_rewards, returns, *noises))
+            bootstraps = losses.Bootstraps(*ahead) if ahead else None
+            noises = latent_noise, action_noise, next_noise
+            batches.append(MetaBatch(ids, transitions, context, context_rewards, returns, *noises, bootstraps))
         return batches
 
-    def _sample_transitions(self, task_ids: th.Tensor, chosen: np.ndarray, batch_size: int) -> TaskBatch:
-        """``batch_size`` transitions for each task, ``relabel_fraction`` of them other tasks' with the task's own rewards."""
-        generator, device = self.generators.torch, self.device
+    def _sample_transitions(
+        self, task_ids: th.Tensor, chosen: np.ndarray, batch_size: int
+    ) -> tuple[TaskBatch, losses.Bootstraps | None]:
+        """``batch_size`` transitions for each task, ``relabel_fraction`` of them other tasks' with the task's own rewards; and
+        what follows within ``target_steps``, if these are more than one.
+        """
+        generator, buffer = self.generators.torch, self.replay_buffer
         sources = task_ids[:, None].expand(-1, batch_size)
         n_foreign = round(self.relabel_fraction * batch_size)
+        if n_foreign:
+            foreign = th.randint(buffer.n_tasks, (len(chosen), n_foreign), generator=generator, device=self.device)
+            sources = th.cat([sources[:, n_foreign:], foreign], dim=1)
+        slots = buffer.draw_slots(sources, generator)
+        transitions = self._relabelled(buffer.at(sources, slots), chosen, n_foreign)
+        if self.target_steps == 1:
+            return transitions, None
+        last, rewards, going_on = transitions, transitions.rewards.clone(), ~transitions.ended
+        discounts = th.full_like(rewards, self.gamma)
+        for _ in range(self.target_steps - 1):
+            slots = th.where(going_on, (slots + 1) % buffer.capacity, slots)
+            following = self._relabelled(buffer.at(sources, slots), chosen, n_foreign)
+            rewards += going_on * discounts * following.rewards
+            discounts = th.where(going_on, self.gamma * discounts, discounts)
+            last, going_on = following, going_on & ~following.ended
+        return transitions, losses.Bootstraps(rewards, last.next_observations, discounts * (1.0 - last.terminated))
+
+    def _relabelled(self, transitions: TaskBatch, chosen: np.ndarray, n_foreign: int) -> TaskBatch:
+        """With the tasks' own rewards in the last ``n_foreign`` transitions of each."""
         if not n_foreign:
-            return self.replay_buffer.sample_rows(sources, generator)
+            return transitions
         assert self.train_tasks is not None
-        foreign = th.randint(self.replay_buffer.n_tasks, (len(chosen), n_foreign), generator=generator, device=device)
-        transitions = self.replay_buffer.sample_rows(th.cat([sources[:, n_foreign:], foreign], dim=1), generator)
         features = transitions.features[:, -n_foreign:].cpu().numpy()
         own = self.family.compute_reward(self.train_tasks[chosen][:, None, :], features)
         rewards = transitions.rewards.clone()
-        rewards[:, -n_foreign:] = th.as_tensor(own, dtype=th.float32, device=device)
+        rewards[:, -n_foreign:] = th.as_tensor(own, dtype=th.float32, device=self.device)
         return transitions._replace(rewards=rewards)
 
     def _sample_contexts(self, task_ids: th.Tensor) -> tuple[th.Tensor, th.Tensor]:

@@ -49,6 +49,7 @@ class POEMSAC(PEARLSAC):
     policy: POEMPolicy
     saved_arguments: ClassVar[dict[str, str]] = {
         **SamplingSAC.saved_arguments,
+        "n_steps": "target_steps",
         "preference_coef": "preference_coef",
         "similarity": "similarity_metric",
         "context": "context_kind",
@@ -85,6 +86,7 @@ class POEMSAC(PEARLSAC):
         preference_group_size: int = 4,
         relabel_fraction: float = 0.0,
         reward_scale: float | str = "auto",
+        n_steps: int = 1,
         noise_color: float = 0.0,
         horizon: int | None = None,
         precision: str = "auto",
@@ -137,6 +139,7 @@ class POEMSAC(PEARLSAC):
             policy_coef=policy_coef,
             relabel_fraction=relabel_fraction,
             reward_scale=reward_scale,
+            n_steps=n_steps,
             noise_color=noise_color,
             horizon=horizon,
             precision=precision,

@@ -1,0 +1,96 @@
+"""Targets some steps ahead, against sums over the recorded episodes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from meta_toys import POINT_GOAL, small, walks
+
+from sb3_poem import PEARLSAC
+from sb3_poem.common.buffers import Segment
+
+GAMMA = 0.9
+
+
+def collected(monkeypatch: pytest.MonkeyPatch, n_steps: int, relabel_fraction: float) -> tuple[PEARLSAC, list[Segment]]:
+    """A model whose episodes end early, are cut off, and have partly been overwritten; and all that it has seen."""
+    model = small(
+        PEARLSAC,
+        walks(6, edge=0.6),
+        horizon=10,
+        n_train_tasks=6,
+        buffer_size=35,
+        n_steps=n_steps,
+        gamma=GAMMA,
+        relabel_fraction=relabel_fraction,
+    )
+    segments: list[Segment] = []
+    extend = model.replay_buffer.extend
+    monkeypatch.setattr(model.replay_buffer, "extend", lambda segment: (segments.append(segment), extend(segment)))
+    return model.learn(5 * 60), segments
+
+
+def ahead(
+    model: PEARLSAC, segments: list[Segment], task: int, obs: np.ndarray, n_steps: int
+) -> tuple[float, np.ndarray, float]:
+    """Step by step: the discounted rewards of ``task``, the observation after them, and the discount of its value."""
+    [(segment, copy, step)] = [
+        (segment, copy, step) for segment in segments for copy, step in np.argwhere((segment.observations == obs).all(axis=-1))
+    ]
+    total, horizon = 0.0, segment.observations.shape[1]
+    for k in range(n_steps):
+        features = segment.features[copy, step].astype(np.float64)
+        total += GAMMA**k * float(model.family.compute_reward(model.train_tasks[task], features))
+        over, after = segment.terminated[copy, step] > 0, segment.next_observations[copy, step]
+        cut = step + 1 == horizon or not (segment.observations[copy, step + 1] == after).all()
+        if over or cut or k + 1 == n_steps:
+            return total, after, 0.0 if over else GAMMA ** (k + 1)
+        step += 1
+    raise AssertionError
+
+
+@pytest.mark.parametrize("relabel_fraction", [0.0, 0.5])
+@pytest.mark.parametrize("n_steps", [2, 4])
+def test_rewards_values_and_discounts(monkeypatch: pytest.MonkeyPatch, n_steps: int, relabel_fraction: float) -> None:
+    model, segments = collected(monkeypatch, n_steps, relabel_fraction)
+    assert model.replay_buffer.full
+    [batch] = model._sample_meta_batches(1, 60)
+    assert batch.bootstraps is not None
+    rewards, observations, discounts = (part.numpy() for part in batch.bootstraps)
+    lengths = set()
+    for row, task in enumerate(batch.task_ids.tolist()):
+        for column in range(60):
+            obs = batch.transitions.observations[row, column].numpy()
+            total, after, discount = ahead(model, segments, task, obs, n_steps)
+            assert rewards[row, column] == pytest.approx(total, abs=1e-4)
+            np.testing.assert_array_equal(observations[row, column], after)
+            assert discounts[row, column] == pytest.approx(discount, abs=1e-6)
+            lengths.add(round(discount, 6))
+    assert {0.0, round(GAMMA, 6), round(GAMMA**n_steps, 6)} <= lengths  # all kinds of ends were seen
+
+
+def test_one_step_is_what_it_was() -> None:
+    model = small(PEARLSAC).learn(300)
+    [batch] = model._sample_meta_batches(1, 16)
+    assert batch.bootstraps is None
+
+
+def test_the_critics_learn_from_what_lies_ahead() -> None:
+    model = small(PEARLSAC, n_steps=3).learn(300)
+    [batch] = model._sample_meta_batches(1, 16)
+    assert batch.bootstraps is not None
+    _, metrics = model._losses(batch)
+    richer = batch._replace(bootstraps=batch.bootstraps._replace(rewards=batch.bootstraps.rewards + 100.0))
+    _, other = model._losses(richer)
+    scale = 1.0 / model.policy.reward_std.item()
+    # Half the squared error of two critics: raising targets by c adds about c^2 once c is large.
+    assert other["critic_loss"].item() == pytest.approx((100.0 * scale) ** 2, rel=0.2)
+    assert metrics["critic_loss"].item() < 0.1 * other["critic_loss"].item()
+
+
+def test_it_is_kept_with_the_model(tmp_path: Path) -> None:
+    model = small(PEARLSAC, n_steps=3).learn(300)
+    model.save_pretrained(tmp_path)
+    assert PEARLSAC.from_pretrained(tmp_path, POINT_GOAL).target_steps == 3
+    model.save(tmp_path / "model.zip")
+    assert PEARLSAC.load(tmp_path / "model.zip", env=POINT_GOAL).target_steps == 3
