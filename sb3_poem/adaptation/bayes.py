@@ -326,6 +326,6 @@ def _check_likelihood(model: Any, likelihood: str | None) -> str:
     if likelihood == "decoder" and not decoder_is_known:
         raise ValueError(
             f'likelihood="decoder" needs a model with `predicted_returns` and a finite `predicted_rewards_error`, which is '
-            f"{error} for this {name}: it is known once the model has been trained"
+            f"{error} for this {name}: it is known once a model has been trained on tasks that share their dynamics"
         )
     return likelihood

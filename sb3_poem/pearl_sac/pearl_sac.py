@@ -401,14 +401,15 @@ class PEARLSAC(SamplingSAC):
         self.latent_means, self.latent_variances = mean.double().cpu().numpy(), variance.double().cpu().numpy()
 
     def _measure_decoder(self) -> None:
-        """Residual deviation of the decoder, per step, on transitions of all training policies, in units of reward."""
+        """Residual deviation of the decoder, per step, on transitions of all training policies, in units of reward. Where
+        tasks do not share their dynamics it stays unknown: the decoder has seen no rewards for what others' policies do.
+        """
         assert self.train_tasks is not None
+        if not self.family.shared_dynamics:
+            return
         n_tasks, per_task = len(self.train_tasks), 64
         generator, device, policy = self.generators.torch, self.device, self.policy
-        if self.family.shared_dynamics:
-            sources = th.randint(n_tasks, (n_tasks, per_task), generator=generator, device=device)
-        else:
-            sources = th.arange(n_tasks, device=device)[:, None].expand(-1, per_task)
+        sources = th.randint(n_tasks, (n_tasks, per_task), generator=generator, device=device)
         data = self.replay_buffer.sample_rows(sources, generator)
         rewards = self.family.compute_reward(self.train_tasks[:, None, :], data.features.cpu().numpy())
         with th.no_grad():

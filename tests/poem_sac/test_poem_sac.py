@@ -12,6 +12,7 @@ from meta_toys import EPOCH, N_TASKS, POINT_GOAL, TwoWalks, Walk, WindyWalk, par
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_poem import PEARLSAC, POEMSAC
+from sb3_poem.adaptation.bayes import BayesInference
 from sb3_poem.common.buffers import TaskBatch
 from sb3_poem.common.vec_env import TaskVecEnv
 from sb3_poem.pearl_sac.losses import TaskEmbeddings, actor_loss
@@ -144,6 +145,9 @@ def test_auto_relabels_where_it_can() -> None:
     assert not windy._relabels
     windy.learn(1)
     assert not windy.context.returns.isfinite().all()
+    # The decoder knows no rewards for what others' policies do, so adaptation goes by S.
+    assert np.isnan(windy.predicted_rewards_error)
+    assert BayesInference(windy).likelihood == "similarity"
     assert small(POEMSAC, walks(4), horizon=10, preference_source="rollout")._relabels is False
 
 
