@@ -45,16 +45,15 @@ class LowPrecisionMLP:
                 copy.requires_grad_(original.requires_grad)
                 self.parameters.append(copy)
                 self.pairs.append((original, copy, place))
-        self._constant = th.zeros(padded[0] - widths[0], dtype=dtype, device=output.weight.device)
+        self._constant = th.zeros(padded[0] - widths[0], device=output.weight.device)
         self._constant[:1] = 1.0
         self.dtype = dtype
 
     def inputs(self, parts: Sequence[th.Tensor]) -> th.Tensor:
         """Concatenate (..., width) tensors into what :meth:`evaluate` takes, (..., padded width)."""
-        low = [part.to(self.dtype) for part in parts]
         if self.ones[0] is not None:
-            low.append(self._constant.expand(*low[0].shape[:-1], -1))
-        return th.cat(low, dim=-1)
+            parts = [*parts, self._constant.expand(*parts[0].shape[:-1], -1)]
+        return th.cat(list(parts), dim=-1).to(self.dtype)
 
     def evaluate(self, x: th.Tensor, frozen: bool) -> th.Tensor:
         """Outputs (..., out_dim), float32, of :meth:`inputs`."""

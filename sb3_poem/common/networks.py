@@ -5,17 +5,21 @@ in the hundreds lose their differences in eight bits of mantissa.
 """
 
 import itertools
+import math
 from collections.abc import Sequence
+from typing import Any
 
-import numpy as np
 import torch as th
 from torch import nn
+from torch.autograd.function import once_differentiable
 from torch.nn.functional import linear, softplus
 
 from sb3_poem.common.low_precision import LowPrecisionMLP
 
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
 MIN_FACTOR_VARIANCE = 1e-7
+#: Of a standard normal and of tanh's slope, for each dimension of an action
+LOG_DENSITY_CONSTANT = 0.5 * math.log(2.0 * math.pi) + 2.0 * math.log(2.0)
 
 
 class MLP(nn.Module):
@@ -65,6 +69,33 @@ def _linear(x: th.Tensor, layer: nn.Module, frozen: bool) -> th.Tensor:
     return linear(x, layer.weight.detach(), layer.bias.detach()) if frozen else layer(x)
 
 
+class _GaussianProduct(th.autograd.Function):
+    """Mean and variance, (..., d), of the normalised product of Gaussian factors, (..., factors, 2 d): their means, then what
+    softplus makes their variances.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, raw: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        means, raw_variances = raw.chunk(2, dim=-1)
+        variances = softplus(raw_variances)
+        precisions = variances.clamp(min=MIN_FACTOR_VARIANCE).reciprocal_()
+        variance = precisions.sum(dim=-2).reciprocal_()
+        mean = (precisions * means).sum(dim=-2).mul_(variance)
+        ctx.save_for_backward(means, variances, precisions, mean, variance)
+        return mean, variance
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, of_mean: th.Tensor, of_variance: th.Tensor) -> th.Tensor:  # type: ignore[override]
+        means, variances, precisions, mean, variance = ctx.saved_tensors
+        by_sum = (of_mean * variance).unsqueeze(-2)
+        of_precisions = (means - mean.unsqueeze(-2)).mul_(by_sum).sub_((of_variance * variance.square()).unsqueeze(-2))
+        # the slope of softplus(x) = y is 1 - exp(-y); a factor at the least variance has none
+        slope = th.expm1(-variances).mul_(variances >= MIN_FACTOR_VARIANCE)
+        of_variances = of_precisions.mul_(precisions.square()).mul_(slope)
+        return th.cat([precisions * by_sum, of_variances], dim=-1)
+
+
 class ContextEncoder(nn.Module):
     """Probabilistic, permutation-invariant task encoder q_phi(z | c).
 
@@ -87,10 +118,34 @@ class ContextEncoder(nn.Module):
         :param context: (tasks, transitions, in_dim)
         :return: mean and variance, each (tasks, latent_dim)
         """
-        mean, raw_variance = self.mlp(context).chunk(2, dim=-1)
-        precision = 1.0 / softplus(raw_variance).clamp(min=MIN_FACTOR_VARIANCE)
-        variance = 1.0 / precision.sum(dim=-2)
-        return variance * (precision * mean).sum(dim=-2), variance
+        return _GaussianProduct.apply(self.mlp(context))
+
+
+class _SquashedGaussian(th.autograd.Function):
+    """Actions and their log-probability from means and log standard deviations, (..., 2 * action_dim), and noise."""
+
+    @staticmethod
+    def forward(ctx: Any, raw: th.Tensor, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        mean, raw_log_std = raw.chunk(2, dim=-1)
+        log_std = raw_log_std.clamp(LOG_STD_MIN, LOG_STD_MAX)
+        shift = log_std.exp().mul_(noise)
+        pre_tanh = mean + shift
+        # log(1 - tanh(x)^2) = 2 (log 2 - x - softplus(-2 x)) does not saturate
+        terms = softplus(pre_tanh * -2.0).add_(pre_tanh).mul_(2.0).sub_(log_std).addcmul_(noise, noise, value=-0.5)
+        actions = pre_tanh.tanh_()
+        ctx.save_for_backward(actions, shift, raw_log_std)
+        return actions, terms.sum(dim=-1).sub_(noise.shape[-1] * LOG_DENSITY_CONSTANT)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, of_actions: th.Tensor, of_log_prob: th.Tensor) -> tuple[th.Tensor, None]:  # type: ignore[override]
+        actions, shift, raw_log_std = ctx.saved_tensors
+        of_log_prob = of_log_prob.unsqueeze(-1)
+        # tanh' = 1 - tanh^2, and the log-probability's derivative by the value before squashing is 2 tanh
+        of_mean = of_actions.addcmul(of_actions * actions, actions, value=-1.0).addcmul_(actions, of_log_prob, value=2.0)
+        of_log_std = (of_mean * shift).sub_(of_log_prob)
+        inside = raw_log_std.clamp(LOG_STD_MIN, LOG_STD_MAX) == raw_log_std
+        return th.cat([of_mean, of_log_std.mul_(inside)], dim=-1), None
 
 
 class LatentActor(nn.Module):
@@ -128,14 +183,10 @@ class LatentActor(nn.Module):
         :param noise: (..., action_dim) standard normal draws; None takes the mean action
         :return: actions (..., action_dim), and their log-probability (...), None without noise
         """
-        mean, log_std = self.distribution(obs, embedding)
+        raw = self.mlp(obs, embedding)
         if noise is None:
-            return th.tanh(mean), None
-        pre_tanh = mean + log_std.exp() * noise
-        # log(1 - tanh(x)^2) = 2 (log 2 - x - softplus(-2 x)) does not saturate
-        log_jacobian = 2.0 * (np.log(2.0) - pre_tanh - softplus(-2.0 * pre_tanh))
-        log_prob = -0.5 * noise.pow(2) - log_std - 0.5 * np.log(2.0 * np.pi) - log_jacobian
-        return th.tanh(pre_tanh), log_prob.sum(dim=-1)
+            return th.tanh(raw.chunk(2, dim=-1)[0]), None
+        return _SquashedGaussian.apply(raw, noise)
 
 
 class LatentCritic(nn.Module):

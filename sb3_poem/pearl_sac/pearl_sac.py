@@ -1,6 +1,7 @@
 """Soft actor-critic with a probabilistic task context: what POEM and its baselines share."""
 
 import time
+from functools import partial
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -15,7 +16,7 @@ from sb3_poem.common.precision import MixedPrecision, hidden_dtype
 from sb3_poem.common.random import Generators
 from sb3_poem.pearl_sac import losses
 from sb3_poem.pearl_sac.collecting import MIN_STD
-from sb3_poem.pearl_sac.cuda_graph import GraphedStep
+from sb3_poem.pearl_sac.cuda_graph import GraphedStep, Step
 from sb3_poem.pearl_sac.losses import MetaBatch, TaskEmbeddings
 from sb3_poem.pearl_sac.policies import LatentPolicy, MlpPolicy
 from sb3_poem.pearl_sac.sampling import SamplingSAC
@@ -61,6 +62,8 @@ class PEARLSAC(SamplingSAC):
         rely more on what older policies, and with ``relabel_fraction`` other tasks', did
     :param noise_color: Exponent b of the power spectrum 1 / f^b of the policy's noise in training rollouts: 0 white, as in
         SAC; 1 pink, 2 red (Eberhard et al., ICLR 2023). Noise that keeps a direction for some steps moves a robot farther
+    :param policy_delay: Gradient steps of critics and encoder for each of everything else, that is the actor, the decoder, the
+        embeddings and the entropy coefficient (as in TD3)
     :param horizon: Steps of an episode; None takes the environment's time limit
     :param precision: "auto" (bfloat16 where the processor has it), "bf16", or "fp32"
     :param stats_window_size: Episodes that the rollout logging averages over
@@ -79,6 +82,8 @@ class PEARLSAC(SamplingSAC):
         "context_relabel_fraction": "context_relabel_fraction",
         "n_steps": "target_steps",
     }
+
+    policy_delay: int = 1  # models of before it
 
     def __init__(
         self,
@@ -107,6 +112,7 @@ class PEARLSAC(SamplingSAC):
         reward_scale: float | str = "auto",
         n_steps: int = 1,
         noise_color: float = 0.0,
+        policy_delay: int = 1,
         horizon: int | None = None,
         precision: str = "auto",
         stats_window_size: int = 100,
@@ -133,6 +139,7 @@ class PEARLSAC(SamplingSAC):
             ("policy_coef", policy_coef, 0),
             ("n_steps", n_steps, 1),
             ("noise_color", noise_color, 0),
+            ("policy_delay", policy_delay, 1),
         ):
             if not value >= low:
                 raise ValueError(f"{name} must be at least {low}, got {value}")
@@ -156,6 +163,7 @@ class PEARLSAC(SamplingSAC):
         self.reward_scale = reward_scale
         self.target_steps = n_steps  # SB3's attribute n_steps goes with its own replay buffer
         self.noise_color = noise_color
+        self.policy_delay = policy_delay
         self.horizon = horizon
         self.precision = precision
         self.train_tasks: np.ndarray | None = None
@@ -224,14 +232,13 @@ class PEARLSAC(SamplingSAC):
         policy = self.policy
         networks = nn.ModuleList([policy.encoder, policy.decoder, policy.actor, policy.critic, policy.critic_target])
         with MixedPrecision(networks, self.hidden_dtype) as precision:
-
-            def step(batch: MetaBatch) -> dict[str, th.Tensor]:
-                return self._gradient_step(batch, precision)
-
+            # whether everything learns or, in between, critics and encoder only
+            steps: dict[bool, Step] = {whole: partial(self._gradient_step, precision, whole) for whole in (True, False)}
             if self.device.type == "cuda" and self.target_update_interval == 1:
-                step = GraphedStep(step, optimizers)
+                steps = {whole: GraphedStep(step, optimizers) for whole, step in steps.items()}
             for block in self._meta_batch_blocks(gradient_steps, batch_size):
                 for batch in block:
+                    step = steps[self._n_updates % self.policy_delay == 0]
                     for name, value in step(batch).items():
                         history.setdefault(name, []).append(value)
                     self._n_updates += 1
@@ -244,12 +251,13 @@ class PEARLSAC(SamplingSAC):
         self._record_latent_statistics()
         self._measure_decoder()
 
-    def _gradient_step(self, batch: MetaBatch, precision: MixedPrecision) -> dict[str, th.Tensor]:
-        """One step of all networks on a meta-batch; returns what to log."""
+    def _gradient_step(self, precision: MixedPrecision, whole: bool, batch: MetaBatch) -> dict[str, th.Tensor]:
+        """One step on a meta-batch, of all networks or, unless ``whole``, of critics and encoder; returns what to log."""
         precision.refresh()
-        loss, metrics = self._losses(batch)
+        loss, metrics = self._losses(batch, whole)
         metrics["gradient_norm"] = self._optimise(loss, precision)
-        self._update_entropy_coefficient(metrics["entropy"])
+        if whole:
+            self._update_entropy_coefficient(metrics["entropy"])
         if self._n_updates % self.target_update_interval == 0:
             self._update_targets()
         return {name: value.detach() for name, value in metrics.items()}
@@ -304,8 +312,8 @@ class PEARLSAC(SamplingSAC):
         """What actor and decoder see of the latents. PEARL's encoder learns nothing from the actor."""
         return TaskEmbeddings(latents, self.policy.policy_embedding(latents.detach()), self.policy.reward_embedding(latents))
 
-    def _losses(self, batch: MetaBatch) -> tuple[th.Tensor, dict[str, th.Tensor]]:
-        """Sum of all losses of a meta-batch, and what to log of them."""
+    def _losses(self, batch: MetaBatch, whole: bool = True) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+        """Sum of all losses of a meta-batch or, unless ``whole``, of critics' and encoder's; and what to log of them."""
         latents, kl = self._encode(batch.context, batch.latent_noise)
         embeddings = self._embed(latents)
         transitions = self._standardise(batch.transitions)
@@ -314,9 +322,12 @@ class PEARLSAC(SamplingSAC):
         if bootstraps is not None:
             bootstraps = bootstraps._replace(observations=self.policy.standardise(bootstraps.observations))
         critic_loss = self._critic_loss(transitions, embeddings, alpha, batch.next_action_noise, bootstraps)
+        kl_loss = kl.mean()
+        metrics = {"critic_loss": critic_loss, "kl": kl_loss}
+        if not whole:
+            return critic_loss + self.kl_coef * kl_loss, metrics
         actor_loss, log_prob = losses.actor_loss(self.policy, transitions, embeddings, alpha, batch.action_noise)
         decoder_loss = self._decoder_loss(batch, transitions, embeddings)
-        kl_loss = kl.mean()
         embedding_loss, embedding_metrics = self._embedding_loss(batch, embeddings)
         loss = (
             critic_loss
@@ -325,13 +336,11 @@ class PEARLSAC(SamplingSAC):
             + self.kl_coef * kl_loss
             + embedding_loss
         )
-        metrics = {
-            "critic_loss": critic_loss,
+        metrics |= {
             "actor_loss": actor_loss,
             "decoder_loss": decoder_loss,
-            "kl": kl_loss,
             "entropy": -log_prob,
-            "ent_coef": alpha.squeeze(),
+            "ent_coef": alpha,
             **embedding_metrics,
         }
         return loss, metrics
@@ -342,7 +351,7 @@ class PEARLSAC(SamplingSAC):
 
     def _entropy_coefficient(self) -> th.Tensor:
         if self.log_ent_coef is not None:
-            return self.log_ent_coef.detach().exp()
+            return self.log_ent_coef.detach().exp().squeeze()
         return self.ent_coef_tensor
 
     def _update_entropy_coefficient(self, entropy: th.Tensor) -> None:

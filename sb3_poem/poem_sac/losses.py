@@ -1,6 +1,9 @@
 """The preference loss, for all triples of a meta-batch at once."""
 
+from typing import Any
+
 import torch as th
+from torch.autograd.function import once_differentiable
 from torch.nn.functional import softplus
 
 
@@ -14,11 +17,26 @@ def preference_loss(similarity: th.Tensor, returns: th.Tensor) -> tuple[th.Tenso
     :param returns: (tasks, tasks), J[i, j], NaN where unknown
     :return: loss, and the share of pairs in the right order (NaN without pairs)
     """
-    margin = similarity[:, :, None] - similarity[:, None, :]  # (tasks i, policies j, policies k)
-    # every pair counts twice, as (j, k) and as (k, j), which changes neither of the means
-    sign = (returns[:, :, None] - returns[:, None, :]).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0).sign()
-    agreement = sign * margin
-    ordered = sign.abs()
-    n_pairs = ordered.sum()
-    loss = (ordered * softplus(-agreement)).sum() / n_pairs.clamp(min=1.0)
-    return loss, (agreement > 0).sum() / n_pairs
+    return _PreferenceLoss.apply(similarity, returns)
+
+
+class _PreferenceLoss(th.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, similarity: th.Tensor, returns: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        margin = similarity[:, :, None] - similarity[:, None, :]  # (tasks i, policies j, policies k)
+        # every pair counts twice, as (j, k) and as (k, j), which changes neither of the means
+        sign = (returns[:, :, None] - returns[:, None, :]).nan_to_num_(nan=0.0, posinf=0.0, neginf=0.0).sign_()
+        agreement = margin.mul_(sign)
+        ordered = sign.abs()
+        n_pairs = ordered.sum()
+        counted = n_pairs.clamp(min=1.0)
+        # of j's similarity, over all k: (j, k) and (k, j) give the same
+        ctx.gradient = (sign * th.sigmoid(-agreement)).sum(dim=2).mul_(-2.0 / counted)
+        accuracy = (agreement > 0).sum() / n_pairs
+        ctx.mark_non_differentiable(accuracy)
+        return ordered.mul_(softplus(-agreement)).sum() / counted, accuracy
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, of_loss: th.Tensor, _: th.Tensor) -> tuple[th.Tensor, None]:  # type: ignore[override]
+        return ctx.gradient * of_loss, None

@@ -8,12 +8,15 @@ from torch.distributions import Independent, Normal, TanhTransform, TransformedD
 
 from sb3_poem.common.networks import (
     LOG_STD_MAX,
+    LOG_STD_MIN,
     MIN_FACTOR_VARIANCE,
     MLP,
     ContextEncoder,
     LatentActor,
     LatentCritic,
     RewardDecoder,
+    _GaussianProduct,
+    _SquashedGaussian,
 )
 
 
@@ -187,3 +190,33 @@ def test_decoder_broadcasts_over_leading_dimensions() -> None:
     assert rewards.shape == (5, 6)
     one = decoder(obs[2, 3], actions[2, 3], next_obs[2, 3], embedding[2, 3])
     th.testing.assert_close(rewards[2, 3], one)
+
+
+# ---------------------------------------------------------------- gradients worked out by hand, against finite differences
+
+
+def test_gradient_of_actions_and_their_log_probability() -> None:
+    raw = th.randn(3, 4, 6, dtype=th.float64)
+    raw[0, 0, 3], raw[0, 1, 4] = LOG_STD_MAX + 1.0, LOG_STD_MIN - 1.0  # beyond the bounds nothing changes
+    raw.requires_grad_()
+    noise = th.randn(3, 4, 3, dtype=th.float64)
+    assert th.autograd.gradcheck(lambda x: _SquashedGaussian.apply(x, noise), (raw,))
+    actions, log_prob = _SquashedGaussian.apply(raw, noise)
+    (of_raw,) = th.autograd.grad(actions.sum() + log_prob.sum(), raw)
+    assert of_raw[0, 0, 3] == 0.0
+    assert of_raw[0, 1, 4] == 0.0
+
+
+def test_gradient_of_the_posterior() -> None:
+    raw = th.randn(3, 5, 4, dtype=th.float64)
+    raw[0, 1, 2] = -20.0  # at the least variance, where its own raw value changes nothing
+    raw.requires_grad_()
+
+    def away_from_the_bound(x: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        return _GaussianProduct.apply(x[1:])
+
+    assert th.autograd.gradcheck(away_from_the_bound, (raw,))
+    mean, variance = _GaussianProduct.apply(raw)
+    (of_raw,) = th.autograd.grad(mean.sum() + variance.sum(), raw)
+    assert of_raw[0, 1, 2] == 0.0
+    assert of_raw.isfinite().all()

@@ -39,6 +39,7 @@ def algorithm(request: pytest.FixtureRequest) -> type[PEARLSAC]:
                 "buffer_size",
                 "n_train_tasks",
                 "n_steps",
+                "policy_delay",
             ]
             for value in (0, -3)
         ],

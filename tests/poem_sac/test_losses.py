@@ -44,6 +44,14 @@ def test_loss_and_accuracy_are_those_of_all_triples(n: int, seed: int) -> None:
     assert (loss.item(), accuracy.item()) == pytest.approx(expected, rel=1e-6)
 
 
+def test_gradient_is_that_of_finite_differences() -> None:
+    similarity, returns = make(5)
+    returns[0, 1] = returns[0, 4]
+    returns[1, 2] = math.nan
+    similarity.requires_grad_()
+    assert th.autograd.gradcheck(lambda x: 3.0 * preference_loss(x, returns)[0], (similarity,))
+
+
 def test_ties_and_unknown_returns_are_left_out() -> None:
     similarity, returns = make(6)
     returns[0, 1] = returns[0, 4] = returns[0, 5]
