@@ -27,7 +27,7 @@ def plan_for(library: ModelLibrary, suite: str, families: list[str], methods: li
 def test_the_training_plan_follows_the_hyperparameter_file(tmp_path: Path) -> None:
     plan = training_plan(ModelKey("poem/HalfCheetahVel-v0", "poem-d2", 0))
     assert (plan.timesteps, plan.epoch_steps, plan.updates) == (720_000, 24_000, 12_000)
-    assert plan.save_steps == 48_000
+    assert plan.save_steps == 72_000
     assert plan.hyperparameters["latent_dim"] == 2
     assert plan.overrides == {"latent_dim": 2}
     two_tasks = training_plan(ModelKey("poem/HalfCheetahFwdBack-v0", "poem", 0))
