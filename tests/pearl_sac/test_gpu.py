@@ -22,10 +22,14 @@ def weights(model: PEARLSAC) -> dict[str, th.Tensor]:
     return {name: value.detach().clone() for name, value in model.policy.state_dict().items()}
 
 
-def test_replayed_steps_are_the_eager_ones(algorithm: type[PEARLSAC], monkeypatch: pytest.MonkeyPatch) -> None:
-    graphed = on_gpu(algorithm, precision="fp32", gradient_steps=20).learn(EPOCH)
+@pytest.mark.parametrize("policy_delay", [1, 2])
+def test_replayed_steps_are_the_eager_ones(
+    algorithm: type[PEARLSAC], policy_delay: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments = {"precision": "fp32", "gradient_steps": 20, "policy_delay": policy_delay}
+    graphed = on_gpu(algorithm, **arguments).learn(EPOCH)
     monkeypatch.setattr(pearl_sac, "GraphedStep", lambda step, optimizers: step)
-    eager = on_gpu(algorithm, precision="fp32", gradient_steps=20).learn(EPOCH)
+    eager = on_gpu(algorithm, **arguments).learn(EPOCH)
     assert graphed._n_updates == eager._n_updates == 20
     for name, value in weights(eager).items():
         th.testing.assert_close(weights(graphed)[name], value, rtol=1e-3, atol=1e-4, msg=name)
