@@ -44,11 +44,17 @@ class NoiseModel(Protocol):
 def _logistic(x: np.ndarray, slope: np.ndarray | float) -> np.ndarray:
     x = np.asarray(x)  # stays float32 if it is
     with np.errstate(over="ignore"):  # to infinity, which is as good as 80: lapses hide what is left of the other answer
-        return 1.0 / (1.0 + np.exp(np.clip(x * np.asarray(-slope, dtype=x.dtype), -80.0, 80.0)))
+        y = np.asarray(x * np.asarray(-slope, dtype=x.dtype))
+    # in place: for all pairs of a question, new memory for every operation takes longer than the operation
+    np.exp(np.clip(y, -80.0, 80.0, out=y), out=y)
+    y += 1.0
+    return np.reciprocal(y, out=y)
 
 
-def _with_lapse(probability: np.ndarray) -> np.ndarray:
-    return LAPSE / 2 + (1.0 - LAPSE) * probability
+def _with_lapse(probability: np.ndarray) -> np.ndarray:  # in place
+    probability *= 1.0 - LAPSE
+    probability += LAPSE / 2
+    return probability
 
 
 class _Serialisable:

@@ -147,4 +147,7 @@ def _entropy(probability: np.ndarray) -> np.ndarray:
     smallest = np.finfo(probability.dtype).eps
     p = np.clip(probability, smallest, 1.0 - smallest)
     q = 1.0 - p
-    return -(p * np.log(p) + q * np.log(q))
+    p *= np.log(p)
+    q *= np.log(q)
+    p += q
+    return np.negative(p, out=p)
