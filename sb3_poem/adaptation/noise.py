@@ -42,7 +42,10 @@ class NoiseModel(Protocol):
 
 
 def _logistic(x: np.ndarray, slope: np.ndarray | float) -> np.ndarray:
-    x = np.asarray(x)  # stays float32 if it is
+    x = np.asarray(x)
+    x = x.astype(
+        np.result_type(x.dtype, np.float32), copy=False
+    )  # stays float32 if it is; whole numbers would cut the slope off
     with np.errstate(over="ignore"):  # to infinity, which is as good as 80: lapses hide what is left of the other answer
         y = np.asarray(x * np.asarray(-slope, dtype=x.dtype))
     # in place: for all pairs of a question, new memory for every operation takes longer than the operation

@@ -116,3 +116,10 @@ def test_noise_models_survive_json_and_never_say_never(noise):
 def test_bad_noise_models(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_whole_numbers_are_as_good_as_real_ones() -> None:
+    difference = np.array([-3, 0, 5])
+    expected = ExactNoise().probability_left(difference.astype(np.float64), 2.0, 1.0)
+    np.testing.assert_allclose(ExactNoise().probability_left(difference, 2.0, 1.0), expected)
+    assert expected[0] < 0.5 < expected[2]
