@@ -27,7 +27,8 @@ def check_task_family(
     Check that an environment keeps the contract of a task family, so that training, relabelling and adaptation are right.
 
     It checks the spaces, the drawing of tasks, seeds, when a task takes effect, that the task is hidden, that relabelling is
-    exact, the vectorised version (of a registered id that has one), rendering, pickling and closing, in this order.
+    exact, the potential (of a family that has one), the vectorised version (of a registered id that has one), rendering,
+    pickling and closing, in this order.
 
     :param env: The id of a registered environment, or a class or function that makes one
     :param n_steps: How many steps of an episode to compare; the episode may be shorter
@@ -43,6 +44,7 @@ def check_task_family(
     check_set_task(make, seed)
     check_hidden_task(make, n_steps, seed)
     check_relabelling(make, n_steps, seed)
+    check_potential(make, n_steps, seed)
     if isinstance(env, str):
         check_registration(env)
         if gym.spec(env).vector_entry_point is not None:
@@ -216,6 +218,30 @@ def check_relabelling(make: MakeFamily, n_steps: int, seed: int) -> None:
         "compute_reward must give many rewards at once exactly as one after another, but does not: use elementwise operations "
         "in _reward, on the last dimension by tasks[..., i] and features[..., i]"
     )
+
+
+def check_potential(make: MakeFamily, n_steps: int, seed: int) -> None:
+    """A potential is a finite, pure function of task and observation, for many at once as for one."""
+    env = make()
+    if not env.has_potential:
+        return
+    tasks = np.stack(_two_tasks(env, seed))
+    observations = _run(env, _actions(env, n_steps, seed), seed=seed, options={"task": tasks[0]}).observations
+    try:
+        together = np.asarray(env.compute_potential(tasks[:, None, :], observations[None, :, :]))
+    except Exception as error:
+        raise AssertionError(
+            "compute_potential must broadcast tasks (n, 1, task_dim) against observations (1, m, obs_dim), but raised "
+            f"{type(error).__name__}: {error}; in _potential index the last dimension, as in tasks[..., i]"
+        ) from error
+    env.reset(seed=seed + 1)
+    one_by_one = np.array([[float(env.compute_potential(task, row)) for row in observations] for task in tasks])
+    ok = together.shape == one_by_one.shape and np.allclose(together, one_by_one, rtol=1e-6)
+    assert ok, (
+        "compute_potential must give many potentials at once as one after another, but does not: compute them in _potential "
+        "from its arguments alone, by elementwise operations on the last dimension"
+    )
+    assert np.isfinite(together).all(), f"compute_potential must give finite numbers, but gave {together.tolist()}"
 
 
 def check_registration(env_id: str) -> None:

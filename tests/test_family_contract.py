@@ -289,6 +289,21 @@ class ClosedOnce(Walk):
         del self.x
 
 
+class PotentialThatDoesNotBroadcast(Walk):
+    def _potential(self, tasks, observations):
+        return -float(abs(observations[0] - tasks[0]))
+
+
+class PotentialOfItsOwnState(Walk):
+    def _potential(self, tasks, observations):
+        return -np.abs(observations[..., 0] - tasks[..., 0]) - np.abs(self.x[0])
+
+
+class InfinitePotential(Walk):
+    def _potential(self, tasks, observations):
+        return np.full(np.broadcast_shapes(tasks.shape[:-1], observations.shape[:-1]), -np.inf)
+
+
 BROKEN = [
     (NoFamily, "must be a task family.*subclass poem_envs.TaskFamily"),
     (ObservationsInADict, "observation_space must be a flat"),
@@ -320,6 +335,9 @@ BROKEN = [
     (FeaturesThatAreReused, "return new arrays of features"),
     (RewardThatDoesNotBroadcast, "compute_reward must broadcast"),
     (RewardThatRounds, "exactly as one after another"),
+    (PotentialThatDoesNotBroadcast, "compute_potential must broadcast"),
+    (PotentialOfItsOwnState, "potentials at once as one after another"),
+    (InfinitePotential, "compute_potential must give finite numbers"),
     (RewardWithoutItsCosts, "step must return exactly compute_reward"),
     (RenderingThatMoves, "rendering must not change the episode"),
     (RenderingOfTheTask, "images must not show the task unless render_task=True"),

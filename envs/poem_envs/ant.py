@@ -123,8 +123,12 @@ class _AntGoal(_Ant):
         return np.column_stack([self._qpos[:, :2], np.square(actions).sum(axis=1)])
 
     def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
-        distance = np.abs(features[..., 0] - tasks[..., 0]) + np.abs(features[..., 1] - tasks[..., 1])
-        return -self.distance_reward_weight * distance - self.ctrl_cost_weight * features[..., 2]
+        return self._potential(tasks, features) - self.ctrl_cost_weight * features[..., 2]
+
+    def _potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
+        # observations and features both begin with the position
+        distance = np.abs(observations[..., 0] - tasks[..., 0]) + np.abs(observations[..., 1] - tasks[..., 1])
+        return -self.distance_reward_weight * distance
 
     def _task_markers(self, task: np.ndarray, position: np.ndarray) -> list[dict[str, Any]]:
         return [pole(float(task[0]), float(task[1]), height=1.0)]

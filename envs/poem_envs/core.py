@@ -100,6 +100,26 @@ class TaskDefinition:
             )
         return self._reward(tasks, features)
 
+    @property
+    def has_potential(self) -> bool:
+        """Whether the family says how good it is to be somewhere: :meth:`compute_potential`."""
+        return type(self)._potential is not TaskDefinition._potential
+
+    def compute_potential(self, tasks: npt.ArrayLike, observations: npt.ArrayLike) -> np.ndarray:
+        """The reward per step of staying where observations show the robot, roughly; by it training can be shaped (Ng, Harada
+        & Russell, ICML 1999), which changes how fast policies are learned, not which ones are best.
+
+        :param tasks: ``(..., task_dim)``
+        :param observations: ``(..., obs_dim)``; leading dimensions broadcast
+        :return: ``(...)``
+        :raises NotImplementedError: if the family defines none (:attr:`has_potential`)
+        """
+        return self._potential(np.asarray(tasks), np.asarray(observations))
+
+    def _potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
+        """Optional, for families whose rewards say where to be rather than how to move."""
+        raise NotImplementedError(f"{type(self).__name__} defines no _potential(tasks, observations)")
+
     def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
         """The reward function. Only elementwise operations, so that one step and a batch give the same bits."""
         raise NotImplementedError

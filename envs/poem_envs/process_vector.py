@@ -236,6 +236,13 @@ class ProcessFamilyVector(TaskFamilyVector):
     def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
         return self._template._reward(tasks, features)
 
+    @property
+    def has_potential(self) -> bool:
+        return self._template.has_potential
+
+    def _potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
+        return self._template._potential(tasks, observations)
+
     def _checked_tasks(self, tasks: npt.ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:
         return self._template._checked_tasks(tasks, shape, name)
 

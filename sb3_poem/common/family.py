@@ -74,6 +74,15 @@ class FamilyEnv:
         """Rewards (...) of reward features (..., feat_dim) under tasks (..., task_dim)."""
         return np.asarray(self.env.env_method("compute_reward", tasks, features, indices=[0])[0])
 
+    @property
+    def has_potential(self) -> bool:
+        """Whether the family has :meth:`compute_potential`."""
+        return self.env.has_attr("has_potential") and bool(self._get("has_potential"))
+
+    def compute_potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
+        """Potentials (...) of observations (..., obs_dim) under tasks (..., task_dim)."""
+        return np.asarray(self.env.env_method("compute_potential", tasks, observations, indices=[0])[0])
+
     def set_tasks(self, tasks: np.ndarray) -> None:
         """Give copy i the task ``tasks[i]``, from its next reset on."""
         inner: Any = self.env

@@ -60,6 +60,10 @@ class PEARLSAC(SamplingSAC):
     :param reward_scale: Factor on the rewards that the critics learn; "auto" divides by the deviation of the first epoch's
     :param n_steps: Steps of rewards in the critics' targets before the value takes over; more carry rewards back faster, and
         rely more on what older policies, and with ``relabel_fraction`` other tasks', did
+    :param shaping_coef: From 0 to 1, how far the critics learn what is gained beyond staying where one is: their rewards are
+        shaped (Ng, Harada & Russell, ICML 1999) with this share of the family's potential over 1 - ``gamma``. Which policies
+        are best stays as it is; where an action changes values by a small part of their spread, as on the way to a place,
+        they are learned sooner. Needs a family with a potential
     :param noise_color: Exponent b of the power spectrum 1 / f^b of the policy's noise in training rollouts: 0 white, as in
         SAC; 1 pink, 2 red (Eberhard et al., ICLR 2023). Noise that keeps a direction for some steps moves a robot farther
     :param policy_delay: Gradient steps of critics and encoder for each of everything else, that is the actor, the decoder, the
@@ -111,6 +115,7 @@ class PEARLSAC(SamplingSAC):
         context_relabel_fraction: float = 0.0,
         reward_scale: float | str = "auto",
         n_steps: int = 1,
+        shaping_coef: float = 0.0,
         noise_color: float = 0.0,
         policy_delay: int = 1,
         horizon: int | None = None,
@@ -145,7 +150,11 @@ class PEARLSAC(SamplingSAC):
                 raise ValueError(f"{name} must be at least {low}, got {value}")
         if reward_scale != "auto" and not (isinstance(reward_scale, (int, float)) and reward_scale > 0):
             raise ValueError(f'reward_scale must be a positive number or "auto", got {reward_scale!r}')
-        fractions = (("relabel_fraction", relabel_fraction), ("context_relabel_fraction", context_relabel_fraction))
+        fractions = (
+            ("relabel_fraction", relabel_fraction),
+            ("context_relabel_fraction", context_relabel_fraction),
+            ("shaping_coef", shaping_coef),
+        )
         for name, value in (("gamma", gamma), ("tau", tau), *fractions):
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must lie in [0, 1], got {value}")
@@ -162,6 +171,9 @@ class PEARLSAC(SamplingSAC):
         self.context_relabel_fraction = context_relabel_fraction
         self.reward_scale = reward_scale
         self.target_steps = n_steps  # SB3's attribute n_steps goes with its own replay buffer
+        if shaping_coef > 0 and gamma == 1:
+            raise ValueError("shaping_coef must be 0 with gamma=1: staying somewhere has no finite value then")
+        self.shaping_coef = shaping_coef
         self.noise_color = noise_color
         self.policy_delay = policy_delay
         self.horizon = horizon

@@ -52,6 +52,7 @@ class PersistentSAC(SAC):
             "relabel_fraction",
             "reward_scale",
             "noise_color",
+            "shaping_coef",
             "policy_delay",
             "horizon",
             "precision",

@@ -79,7 +79,7 @@ class SamplingSAC(CollectingSAC):
         self, task_ids: th.Tensor, chosen: np.ndarray, batch_size: int
     ) -> tuple[TaskBatch, losses.Bootstraps | None]:
         """``batch_size`` transitions for each task, ``relabel_fraction`` of them other tasks' with the task's own rewards; and
-        what follows within ``target_steps``, if these are more than one.
+        what the critics' targets are made of, if that is more than these.
         """
         generator, buffer = self.generators.torch, self.replay_buffer
         sources = task_ids[:, None].expand(-1, batch_size)
@@ -89,7 +89,7 @@ class SamplingSAC(CollectingSAC):
             sources = th.cat([sources[:, n_foreign:], foreign], dim=1)
         slots = buffer.draw_slots(sources, generator)
         transitions = self._relabelled(buffer.at(sources, slots), chosen, n_foreign)
-        if self.target_steps == 1:
+        if self.target_steps == 1 and self.shaping_coef == 0:
             return transitions, None
         last, rewards, going_on = transitions, transitions.rewards.clone(), ~transitions.ended
         discounts = th.full_like(rewards, self.gamma)
@@ -99,7 +99,17 @@ class SamplingSAC(CollectingSAC):
             rewards += going_on * discounts * following.rewards
             discounts = th.where(going_on, self.gamma * discounts, discounts)
             last, going_on = following, going_on & ~following.ended
-        return transitions, losses.Bootstraps(rewards, last.next_observations, discounts * (1.0 - last.terminated))
+        discounts *= 1.0 - last.terminated
+        if self.shaping_coef > 0:  # the potentials between first and last cancel each other
+            potential = self._potential(transitions.observations, chosen)
+            rewards += discounts * self._potential(last.next_observations, chosen) - potential
+        return transitions, losses.Bootstraps(rewards, last.next_observations, discounts)
+
+    def _potential(self, observations: th.Tensor, chosen: np.ndarray) -> th.Tensor:
+        """What staying at observations (tasks, batch, obs_dim) would be worth, (tasks, batch)."""
+        assert self.train_tasks is not None
+        potential = self.family.compute_potential(self.train_tasks[chosen][:, None, :], observations.cpu().numpy())
+        return th.as_tensor(potential, dtype=th.float32, device=self.device) * (self.shaping_coef / (1.0 - self.gamma))
 
     def _relabelled(self, transitions: TaskBatch, chosen: np.ndarray, n_foreign: int) -> TaskBatch:
         """With the tasks' own rewards in the last ``n_foreign`` transitions of each."""

@@ -30,6 +30,7 @@ class TaskSAC(PersistentSAC):
     precision: str
     n_train_tasks: int | None
     relabel_fraction: float
+    shaping_coef: float = 0.0  # models of before it
     train_tasks: np.ndarray | None
     latent_means: np.ndarray | None
     latent_variances: np.ndarray | None
@@ -48,6 +49,11 @@ class TaskSAC(PersistentSAC):
         for name in ("relabel_fraction", "context_relabel_fraction"):
             if getattr(self, name) > 0 and not family.shared_dynamics:
                 raise ValueError(f"{name} must be 0: the tasks of {family.env_id} do not share dynamics")
+        if self.shaping_coef > 0 and not family.has_potential:
+            raise ValueError(
+                f"shaping_coef must be 0: {family.env_id} has no potential; a family defines one by "
+                "_potential(tasks, observations)"
+            )
         self.env_id = family.env_id
         self.env_kwargs = family.env_kwargs
         self.task_space = family.task_space

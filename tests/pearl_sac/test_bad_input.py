@@ -53,7 +53,11 @@ def algorithm(request: pytest.FixtureRequest) -> type[PEARLSAC]:
         *[("gamma", value, r"gamma must lie in \[0, 1\]") for value in (-0.1, 1.01, NAN)],
         *[("tau", value, r"tau must lie in \[0, 1\]") for value in (-0.1, 1.01, NAN)],
         *[("reward_scale", value, "reward_scale must be a positive number or") for value in (0, -1.0, NAN, "big", None)],
-        *[("relabel_fraction", value, r"relabel_fraction must lie in \[0, 1\], got") for value in (-0.1, 1.1, NAN)],
+        *[
+            (name, value, rf"{name} must lie in \[0, 1\], got")
+            for name in ("relabel_fraction", "shaping_coef")
+            for value in (-0.1, 1.1, NAN)
+        ],
         ("precision", "fp16", "precision must be one of 'auto', 'bf16', 'fp32', got 'fp16'"),
         ("horizon", 30, "horizon is 30, but the environment ends episodes after 25 steps"),
         ("policy_kwargs", {"net_arch": {"critic": [3]}}, "net_arch has unknown keys"),
