@@ -58,6 +58,7 @@ def model_contents(model: "PEARLSAC", card: dict[str, Any] | None = None) -> tup
     activation = model.policy.activation_fn
     if getattr(nn, activation.__name__, None) is not activation:
         raise ValueError(f"activation_fn must be one of torch.nn to be saved by its name, got {activation}")
+    error = model.predicted_rewards_error
     tensors = {f"policy.{name}": value for name, value in model.policy.state_dict().items() if not name.startswith(DERIVED)}
     tensors |= {name: th.as_tensor(getattr(model, name)) for name in ARRAYS}
     config: dict[str, Any] = {
@@ -70,7 +71,7 @@ def model_contents(model: "PEARLSAC", card: dict[str, Any] | None = None) -> tup
         "activation_fn": activation.__name__,
         "n_critics": model.policy.n_critics,
         "reward_feature_dim": model.reward_feature_dim,
-        "predicted_rewards_error": model.predicted_rewards_error,
+        "predicted_rewards_error": None if np.isnan(error) else error,  # NaN is no JSON
         "context_reward_statistics": model.context_reward_statistics,
         "num_timesteps": model.num_timesteps,
         "n_updates": model._n_updates,
@@ -196,8 +197,10 @@ def build_model(
             setattr(model, name, spaces.Box(low, high, dtype=np.dtype(config[name]["dtype"]).type))
         for name in ARRAYS:
             setattr(model, name, tensors[name].numpy())
-        for name in ("env_id", "reward_feature_dim", "predicted_rewards_error", "num_timesteps"):
+        for name in ("env_id", "reward_feature_dim", "num_timesteps"):
             setattr(model, name, config[name])
+        error = config["predicted_rewards_error"]
+        model.predicted_rewards_error = float("nan") if error is None else error
         model.env_kwargs = config.get("env_kwargs", {})
         if config.get("context_reward_statistics") is not None:
             model.context_reward_statistics = tuple(config["context_reward_statistics"])

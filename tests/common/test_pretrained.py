@@ -153,6 +153,7 @@ def test_every_kind_of_model(variant: str, tmp_path: Path) -> None:
     arguments, env = VARIANTS[variant]
     model = small(POEMSAC, env() if callable(env) else env, **arguments)
     model.save_pretrained(tmp_path / "m")
+    json.loads((tmp_path / "m" / "config.json").read_text(), parse_constant=pytest.fail)  # NaN, which only Python reads
     loaded = POEMSAC.from_pretrained(tmp_path / "m", env=env() if callable(env) else env)
     assert_same_predictions(model, loaded)
     for name in ("similarity_metric", "context_kind", "preference_group_size", "target_update_interval", "gamma", "tau"):
