@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch as th
-from meta_toys import EPOCH, POINT_GOAL, small
+from meta_toys import EPOCH, small
 
 from sb3_poem import PEARLSAC, POEMSAC
 
@@ -38,11 +36,3 @@ def test_what_a_step_in_between_does_to_the_critics_is_what_a_whole_step_does() 
     first, second = (model.policy.critic.state_dict() for model in models)
     for name, value in first.items():
         th.testing.assert_close(second[name], value, msg=name)
-
-
-def test_it_is_kept_with_the_model(tmp_path: Path) -> None:
-    model = small(POEMSAC, policy_delay=2).learn(300)
-    model.save_pretrained(tmp_path)
-    assert POEMSAC.from_pretrained(tmp_path, POINT_GOAL).policy_delay == 2
-    model.save(tmp_path / "model.zip")
-    assert POEMSAC.load(tmp_path / "model.zip", env=POINT_GOAL).policy_delay == 2

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from meta_toys import POINT_GOAL, Walk, small, walks
+from meta_toys import Walk, small, walks
 
 from poem_envs import ProcessFamilyVector
-from sb3_poem import PEARLSAC, POEMSAC
+from sb3_poem import PEARLSAC
 from sb3_poem.common.vec_env import TaskVecEnv
 
 GAMMA = 0.9
@@ -88,11 +87,3 @@ def test_it_needs_a_potential_and_a_discount() -> None:
         small(PEARLSAC, walks(6), horizon=10, n_train_tasks=6, shaping_coef=1.0)
     with pytest.raises(ValueError, match="shaping_coef must be 0 with gamma=1"):
         small(PEARLSAC, walks(6, Shaped), horizon=10, n_train_tasks=6, shaping_coef=1.0, gamma=1.0)
-
-
-def test_it_is_kept_with_the_model(tmp_path: Path) -> None:
-    model = small(POEMSAC, shaping_coef=0.5).learn(300)
-    model.save_pretrained(tmp_path)
-    assert POEMSAC.from_pretrained(tmp_path, POINT_GOAL).shaping_coef == 0.5
-    model.save(tmp_path / "model.zip")
-    assert POEMSAC.load(tmp_path / "model.zip", env=POINT_GOAL).shaping_coef == 0.5
