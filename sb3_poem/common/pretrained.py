@@ -32,7 +32,7 @@ def save_pretrained(model: "PEARLSAC", folder: str | Path, card: dict[str, Any] 
 
     :param model: A trained model
     :param folder: Where; made if missing
-    :param card: What the model card should say: ``command``, ``seed``, ``commit``, ``machine``, ``results`` (any JSON)
+    :param card: What the card should say: ``command``, ``seed``, ``commit``, ``machine``, ``note``, ``results``: any JSON
     :raises OSError: if the folder cannot be written
     :raises ValueError: if the policy's activation is none of torch.nn's, which JSON could not name
     """
@@ -125,6 +125,8 @@ def _card_text(config: dict[str, Any]) -> str:
     for key in ("command", "seed", "commit", "machine"):
         if key in card:
             lines.append(f"- {key}: `{card[key]}`")
+    if "note" in card:
+        lines.append(f"- {card['note']}")
     if "results" in card:
         lines += ["", "Results:", "", "```json", json.dumps(card["results"], indent=2, default=_to_json), "```"]
     return "\n".join(lines) + "\n"

@@ -23,6 +23,7 @@ CARD = {
     "seed": 3,
     "commit": "abc123",
     "machine": "2 cores",
+    "note": "Stopped by hand.",
     "results": {"mean_return": np.float64(-12.5), "per_task": np.arange(3.0)},
 }
 
@@ -110,6 +111,7 @@ def test_the_card_says_where_the_model_comes_from(trained: PEARLSAC, folder: Pat
         CARD["command"],
         "abc123",
         "2 cores",
+        CARD["note"],
         "-12.5",
     ):
         assert str(part) in text, part
