@@ -63,7 +63,8 @@ class PEARLSAC(SamplingSAC):
     :param shaping_coef: From 0 to 1, how far the critics learn what is gained beyond staying where one is: their rewards are
         shaped (Ng, Harada & Russell, ICML 1999) with this share of the family's potential over 1 - ``gamma``. Which policies
         are best stays as it is; where an action changes values by a small part of their spread, as on the way to a place,
-        they are learned sooner. Needs a family with a potential
+        they are learned sooner. Action values, those in POEM's contexts too, are then without that share. Needs a family with
+        a potential
     :param noise_color: Exponent b of the power spectrum 1 / f^b of the policy's noise in training rollouts: 0 white, as in
         SAC; 1 pink, 2 red (Eberhard et al., ICLR 2023). Noise that keeps a direction for some steps moves a robot farther
     :param policy_delay: Gradient steps of critics and encoder for each of everything else, that is the actor, the decoder, the
