@@ -114,7 +114,8 @@ def table(env_id: str, runs: list[dict[str, Any]]) -> str:
             f"| {training['seed']} | {order['env_steps']:,} | {order['updates']:,} | {training['wall_seconds']} "
             f"| {order['preference_accuracy']:.3f} | {order['kendall_tau']:.3f} |"
         )
-    lines += ["", f"Trained with `{runs[0]['training']['command']}` (and the other seeds),"]
+    others = " (and the other seeds)" if len(runs) > 1 else ""
+    lines += ["", f"Trained with `{runs[0]['training']['command']}`{others},"]
     lines += [f"adapted with `{runs[0]['adaptations'][0]['command']}` (and the other rules)."]
     lines += [
         "Commits: " + ", ".join(run["training"]["commit"] for run in runs) + f". Machine: {runs[0]['training']['machine']}."

@@ -24,7 +24,7 @@ class Shaped(Walk):
         return 3.0 * np.sin(observations[..., 0]) * tasks[..., 0] + 1.0
 
 
-def targets(shaping_coef: float, n_steps: int, **kwargs: Any) -> tuple[PEARLSAC, Any]:
+def targets(shaping_coef: float, n_steps: int) -> tuple[PEARLSAC, Any]:
     """A model whose episodes may end early, and a meta-batch of what its critics learn."""
     model = small(
         PEARLSAC,
@@ -36,7 +36,6 @@ def targets(shaping_coef: float, n_steps: int, **kwargs: Any) -> tuple[PEARLSAC,
         gradient_steps=0,
         relabel_fraction=0.5,
         shaping_coef=shaping_coef,
-        **kwargs,
     ).learn(5 * 60)
     return model, model._sample_meta_batches(1, 60)[0]
 
