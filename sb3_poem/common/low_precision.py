@@ -2,7 +2,8 @@
 
 Three things make it faster than a cast around every operation. Bias and ReLU ride on the matrix product, where oneDNN offers
 it. Layers are padded to widths that matrix units like; a spare unit is held at 1, so that the product which gives the
-gradient of the weights gives the bias's too. And no value is cast twice.
+gradient of the weights gives the bias's too. And no value is cast twice. Layers that are normalised before the ReLU have only
+the last of these.
 """
 
 from collections.abc import Sequence
@@ -22,13 +23,16 @@ class LowPrecisionMLP:
     :param hidden: Hidden layers, each followed by a ReLU
     :param output: Output layer
     :param dtype: Arithmetic of the copies
+    :param layer_norm: Whether hidden layers are normalised before the ReLU
     """
 
-    def __init__(self, hidden: Sequence[nn.Linear], output: nn.Linear, dtype: th.dtype) -> None:
+    def __init__(self, hidden: Sequence[nn.Linear], output: nn.Linear, dtype: th.dtype, layer_norm: bool = False) -> None:
         self.output = output
+        self.layer_norm = layer_norm
+        alignment = 1 if layer_norm else ALIGNMENT
         self.width = output.in_features
         widths = [layer.in_features for layer in hidden] + [self.width]
-        padded = [-(-width // ALIGNMENT) * ALIGNMENT for width in widths]
+        padded = [-(-width // alignment) * alignment for width in widths]
         #: Column of each layer's input that is constantly 1, None without padding
         self.ones = [width if width < room else None for width, room in zip(widths, padded, strict=True)]
         self.parameters: list[th.Tensor] = []
@@ -60,8 +64,15 @@ class LowPrecisionMLP:
         parameters = [self.output.weight, self.output.bias, *self.parameters]
         if frozen:
             parameters = [parameter.detach() for parameter in parameters]
-        out = _Perceptron.apply(x.reshape(-1, x.shape[-1]), self.ones, *parameters)
+        rows = x.reshape(-1, x.shape[-1])
+        out = _normalised_perceptron(rows, *parameters) if self.layer_norm else _Perceptron.apply(rows, self.ones, *parameters)
         return out.view(*x.shape[:-1], -1)
+
+
+def _normalised_perceptron(x: th.Tensor, out_weight: th.Tensor, out_bias: th.Tensor, *hidden: th.Tensor) -> th.Tensor:
+    for weight, bias in zip(hidden[::2], hidden[1::2], strict=True):
+        x = th.relu_(nn.functional.layer_norm(linear(x, weight, bias), bias.shape))
+    return linear(x.float(), out_weight, out_bias)
 
 
 class _Perceptron(th.autograd.Function):

@@ -22,6 +22,21 @@ MIN_FACTOR_VARIANCE = 1e-7
 LOG_DENSITY_CONSTANT = 0.5 * math.log(2.0 * math.pi) + 2.0 * math.log(2.0)
 
 
+class Normalised(nn.Module):
+    """An activation of values that are normalised over their layer (Ba, Kiros & Hinton, 2016), without gain and bias.
+
+    :param activation: The activation
+    """
+
+    def __init__(self, activation: nn.Module) -> None:
+        super().__init__()
+        self.activation = activation
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """Map (..., width) to (..., width)."""
+        return self.activation(nn.functional.layer_norm(x, x.shape[-1:]))
+
+
 class MLP(nn.Module):
     """Multi-layer perceptron.
 
@@ -29,12 +44,21 @@ class MLP(nn.Module):
     :param out_dim: Width of the output
     :param net_arch: Widths of the hidden layers
     :param activation_fn: Activation between layers
+    :param layer_norm: Whether hidden layers are normalised before the activation
     """
 
-    def __init__(self, in_dim: int, out_dim: int, net_arch: Sequence[int], activation_fn: type[nn.Module] = nn.ReLU) -> None:
+    def __init__(
+        self,
+        in_dim: int,
+        out_dim: int,
+        net_arch: Sequence[int],
+        activation_fn: type[nn.Module] = nn.ReLU,
+        layer_norm: bool = False,
+    ) -> None:
         super().__init__()
         widths = [in_dim, *net_arch]
-        self.activation = nn.ReLU(inplace=True) if activation_fn is nn.ReLU else activation_fn()
+        activation = nn.ReLU(inplace=True) if activation_fn is nn.ReLU else activation_fn()
+        self.activation = Normalised(activation) if layer_norm else activation
         self.hidden = nn.ModuleList(nn.Linear(width, next_width) for width, next_width in itertools.pairwise(widths))
         self.output = nn.Linear(widths[-1], out_dim)
         #: The hidden layers in another arithmetic, while :class:`MixedPrecision` holds
@@ -155,6 +179,8 @@ class LatentActor(nn.Module):
     :param latent_dim: Width of the policy embedding
     :param action_dim: Width of an action
     :param net_arch: Widths of the hidden layers
+    :param activation_fn: Activation between layers
+    :param layer_norm: Whether hidden layers are normalised before the activation
     """
 
     def __init__(
@@ -164,9 +190,10 @@ class LatentActor(nn.Module):
         action_dim: int,
         net_arch: Sequence[int],
         activation_fn: type[nn.Module] = nn.ReLU,
+        layer_norm: bool = False,
     ) -> None:
         super().__init__()
-        self.mlp = MLP(obs_dim + latent_dim, 2 * action_dim, net_arch, activation_fn)
+        self.mlp = MLP(obs_dim + latent_dim, 2 * action_dim, net_arch, activation_fn, layer_norm)
 
     def distribution(self, obs: th.Tensor, embedding: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Mean and log standard deviation before squashing, each (..., action_dim)."""
@@ -196,6 +223,8 @@ class LatentCritic(nn.Module):
     :param action_dim: Width of an action
     :param latent_dim: Width of the latent
     :param net_arch: Widths of the hidden layers
+    :param activation_fn: Activation between layers
+    :param layer_norm: Whether hidden layers are normalised before the activation
     :param n_critics: Number of critics
     """
 
@@ -206,11 +235,12 @@ class LatentCritic(nn.Module):
         latent_dim: int,
         net_arch: Sequence[int],
         activation_fn: type[nn.Module] = nn.ReLU,
+        layer_norm: bool = False,
         n_critics: int = 2,
     ) -> None:
         super().__init__()
         in_dim = obs_dim + action_dim + latent_dim
-        self.members = nn.ModuleList(MLP(in_dim, 1, net_arch, activation_fn) for _ in range(n_critics))
+        self.members = nn.ModuleList(MLP(in_dim, 1, net_arch, activation_fn, layer_norm) for _ in range(n_critics))
 
     def forward(self, obs: th.Tensor, actions: th.Tensor, latents: th.Tensor, frozen: bool = False) -> th.Tensor:
         """Values of (..., obs_dim), (..., action_dim), (..., latent_dim) -> (n_critics, ...).
@@ -229,6 +259,8 @@ class RewardDecoder(nn.Module):
     :param action_dim: Width of an action
     :param latent_dim: Width of the reward embedding
     :param net_arch: Widths of the hidden layers
+    :param activation_fn: Activation between layers
+    :param layer_norm: Whether hidden layers are normalised before the activation
     """
 
     def __init__(
@@ -238,9 +270,10 @@ class RewardDecoder(nn.Module):
         latent_dim: int,
         net_arch: Sequence[int],
         activation_fn: type[nn.Module] = nn.ReLU,
+        layer_norm: bool = False,
     ) -> None:
         super().__init__()
-        self.mlp = MLP(2 * obs_dim + action_dim + latent_dim, 1, net_arch, activation_fn)
+        self.mlp = MLP(2 * obs_dim + action_dim + latent_dim, 1, net_arch, activation_fn, layer_norm)
 
     def forward(self, obs: th.Tensor, actions: th.Tensor, next_obs: th.Tensor, embedding: th.Tensor) -> th.Tensor:
         """Predicted standardised rewards (...) of transitions (..., dim)."""

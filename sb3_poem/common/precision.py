@@ -6,7 +6,7 @@ import torch as th
 from torch import nn
 
 from sb3_poem.common.low_precision import LowPrecisionMLP
-from sb3_poem.common.networks import MLP
+from sb3_poem.common.networks import MLP, Normalised
 
 PRECISIONS = ("auto", "bf16", "fp32")
 
@@ -31,6 +31,10 @@ def hidden_dtype(precision: str, device_type: str) -> th.dtype:
     return th.bfloat16 if precision == "bf16" else th.float32
 
 
+def _is_rectified(activation: nn.Module) -> bool:
+    return isinstance(activation.activation if isinstance(activation, Normalised) else activation, nn.ReLU)
+
+
 class MixedPrecision:
     """Runs the hidden layers of all rectified perceptrons of a module in another arithmetic, on weights that stay float32.
 
@@ -45,9 +49,9 @@ class MixedPrecision:
         self._networks: list[tuple[MLP, LowPrecisionMLP]] = []
         if dtype != th.float32:
             self._networks = [
-                (part, LowPrecisionMLP(list(part.hidden), part.output, dtype))  # type: ignore[arg-type]
+                (part, LowPrecisionMLP(list(part.hidden), part.output, dtype, isinstance(part.activation, Normalised)))  # type: ignore[arg-type]
                 for part in module.modules()
-                if isinstance(part, MLP) and isinstance(part.activation, nn.ReLU) and len(part.hidden)
+                if isinstance(part, MLP) and _is_rectified(part.activation) and len(part.hidden)
             ]
         self._pairs = [pair for _, network in self._networks for pair in network.pairs]
         self._originals: list[th.Tensor] = [original for original, _, _ in self._pairs]

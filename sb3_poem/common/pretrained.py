@@ -69,6 +69,7 @@ def model_contents(model: "PEARLSAC", card: dict[str, Any] | None = None) -> tup
         "arguments": _arguments(model),
         "net_arch": model.policy.net_arch,
         "activation_fn": activation.__name__,
+        "layer_norm": model.policy.layer_norm,
         "n_critics": model.policy.n_critics,
         "reward_feature_dim": model.reward_feature_dim,
         "predicted_rewards_error": None if np.isnan(error) else error,  # NaN is no JSON
@@ -212,6 +213,7 @@ def build_model(
             model.target_entropy = -float(np.prod(model.action_space.shape))  # type: ignore[arg-type]
         model.policy_kwargs["net_arch"] = config["net_arch"]
         model.policy_kwargs["activation_fn"] = getattr(nn, config.get("activation_fn", "ReLU"))
+        model.policy_kwargs["layer_norm"] = config.get("layer_norm", False)
         model.policy_kwargs["n_critics"] = config.get("n_critics", 2)
         model._setup_model()
         state = {name.removeprefix("policy."): value for name, value in tensors.items() if name.startswith("policy.")}

@@ -28,6 +28,8 @@ class LatentPolicy(SACPolicy):
     :param net_arch: Hidden widths of actor and critics, or a dict with keys ``pi``, ``qf``, ``encoder``, ``decoder``,
         ``embedding`` for each
     :param activation_fn: Activation of actor, critics and decoder
+    :param layer_norm: Whether actor, critics and decoder normalise their hidden layers before the activation (Ba, Kiros &
+        Hinton, 2016; without gain and bias). It steadies critics of robots with many observations
     :param latent_dim: Dimension d of the latent
     :param context_has_value: Whether a context transition carries Q(s, a)
     :param n_critics: Number of critics
@@ -49,6 +51,7 @@ class LatentPolicy(SACPolicy):
         lr_schedule: Schedule,
         net_arch: Sequence[int] | dict[str, Sequence[int]] | None = None,
         activation_fn: type[nn.Module] = nn.ReLU,
+        layer_norm: bool = False,
         latent_dim: int = 5,
         context_has_value: bool = False,
         n_critics: int = 2,
@@ -67,6 +70,7 @@ class LatentPolicy(SACPolicy):
         )
         self.net_arch = self._complete_net_arch(net_arch)  # type: ignore[assignment]
         self.activation_fn = activation_fn
+        self.layer_norm = layer_norm
         self.latent_dim = latent_dim
         self.context_has_value = context_has_value
         self.n_critics = n_critics
@@ -105,9 +109,10 @@ class LatentPolicy(SACPolicy):
         context_dim = 2 * obs_dim + action_dim + 1 + int(self.context_has_value)
         self.encoder = ContextEncoder(context_dim, self.latent_dim, arch["encoder"])
         self._build_embeddings(arch["embedding"])
-        self.decoder = RewardDecoder(obs_dim, action_dim, self.latent_dim, arch["decoder"], self.activation_fn)
-        self.actor = LatentActor(obs_dim, self.latent_dim, action_dim, arch["pi"], self.activation_fn)  # type: ignore[assignment]
-        critic_args = (obs_dim, action_dim, self.latent_dim, arch["qf"], self.activation_fn, self.n_critics)
+        activation_fn, layer_norm = self.activation_fn, self.layer_norm
+        self.decoder = RewardDecoder(obs_dim, action_dim, self.latent_dim, arch["decoder"], activation_fn, layer_norm)
+        self.actor = LatentActor(obs_dim, self.latent_dim, action_dim, arch["pi"], activation_fn, layer_norm)  # type: ignore[assignment]
+        critic_args = (obs_dim, action_dim, self.latent_dim, arch["qf"], activation_fn, layer_norm, self.n_critics)
         self.critic = LatentCritic(*critic_args)  # type: ignore[assignment]
         self.critic_target = LatentCritic(*critic_args)  # type: ignore[assignment]
         self.critic_target.load_state_dict(self.critic.state_dict())
@@ -234,6 +239,7 @@ class LatentPolicy(SACPolicy):
             "lr_schedule": self._dummy_schedule,
             "net_arch": self.net_arch,
             "activation_fn": self.activation_fn,
+            "layer_norm": self.layer_norm,
             "latent_dim": self.latent_dim,
             "context_has_value": self.context_has_value,
             "n_critics": self.n_critics,
