@@ -65,8 +65,40 @@ def test_rectified_mlp_is_torchs_own_with_its_gradients() -> None:
         th.testing.assert_close(ours.bias.grad, theirs.bias.grad)
 
 
-def test_frozen_gives_gradients_to_the_input_only() -> None:
-    critic = LatentCritic(3, 2, 4, [8, 8])
+def test_normalised_layers_are_linear_layers_less_their_mean_over_their_deviation() -> None:
+    mlp = MLP(4, 3, [8, 7], layer_norm=True)
+    h = th.randn(2, 5, 4)
+    x = h.numpy().astype(np.float64)
+    for layer in mlp.hidden:
+        x = x @ layer.weight.detach().numpy().T + layer.bias.detach().numpy()
+        x = (x - x.mean(axis=-1, keepdims=True)) / np.sqrt(x.var(axis=-1, keepdims=True) + 1e-5)
+        x = np.maximum(x, 0.0)
+    expected = x @ mlp.output.weight.detach().numpy().T + mlp.output.bias.detach().numpy()
+    np.testing.assert_allclose(mlp(h).detach().numpy(), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("layer_norm", [False, True])
+def test_actor_critics_and_decoder_normalise_when_asked(layer_norm: bool) -> None:
+    actor = LatentActor(3, 2, 2, [8], layer_norm=layer_norm)
+    critic = LatentCritic(3, 2, 2, [8], layer_norm=layer_norm)
+    decoder = RewardDecoder(3, 2, 2, [8], layer_norm=layer_norm)
+    obs, two = th.randn(5, 3), th.randn(5, 2)
+    networks = {
+        "actor": (actor.mlp, lambda: actor(obs, two)[0]),
+        "critic": (critic.members[1], lambda: critic(obs, two, two)[1]),
+        "decoder": (decoder.mlp, lambda: decoder(obs, two, obs, two)),
+    }
+    for name, (mlp, output) in networks.items():
+        before = output()
+        with th.no_grad():  # a factor on the layer is what normalisation takes away
+            mlp.hidden[0].weight.mul_(100.0)
+            mlp.hidden[0].bias.mul_(100.0)
+        assert th.allclose(output(), before, atol=1e-3) == layer_norm, name
+
+
+@pytest.mark.parametrize("layer_norm", [False, True])
+def test_frozen_gives_gradients_to_the_input_only(layer_norm: bool) -> None:
+    critic = LatentCritic(3, 2, 4, [8, 8], layer_norm=layer_norm)
     obs, actions, latents = (th.randn(6, width, requires_grad=True) for width in (3, 2, 4))
     critic(obs, actions, latents, frozen=True).sum().backward()
     assert all(parameter.grad is None for parameter in critic.parameters())

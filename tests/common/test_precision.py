@@ -5,7 +5,7 @@ import torch as th
 from torch import nn
 
 from sb3_poem.common import precision
-from sb3_poem.common.networks import MLP, LatentCritic
+from sb3_poem.common.networks import MLP, LatentCritic, Normalised
 from sb3_poem.common.precision import MixedPrecision, hidden_dtype
 
 
@@ -33,11 +33,13 @@ def test_another_name_is_refused(name: str) -> None:
         hidden_dtype(name, "cpu")
 
 
-@pytest.fixture(params=[(6, [64, 64]), (16, [20, 50])], ids=str)  # widths that are padded, and that are not
+@pytest.fixture(
+    params=[(6, [64, 64], False), (16, [20, 50], False), (6, [20, 64], True)], ids=str
+)  # widths that are padded, and that are not; normalised layers, which never are
 def mlp(request: pytest.FixtureRequest) -> MLP:
     th.manual_seed(0)
-    in_dim, widths = request.param
-    return MLP(in_dim, 3, widths)
+    in_dim, widths, layer_norm = request.param
+    return MLP(in_dim, 3, widths, layer_norm=layer_norm)
 
 
 def gradients(network: nn.Module) -> dict[str, th.Tensor]:
@@ -64,7 +66,10 @@ def test_bfloat16_is_close_to_float32_and_is_not_it(mlp: MLP) -> None:
 
 def test_hidden_layers_are_those_of_autocast(mlp: MLP) -> None:
     x = th.randn(100, mlp.hidden[0].in_features)
-    hidden = nn.Sequential(mlp.hidden[0], nn.ReLU(), mlp.hidden[1], nn.ReLU())
+    norms = [
+        nn.LayerNorm(layer.out_features) if isinstance(mlp.activation, Normalised) else nn.Identity() for layer in mlp.hidden
+    ]
+    hidden = nn.Sequential(mlp.hidden[0], norms[0], nn.ReLU(), mlp.hidden[1], norms[1], nn.ReLU())
     with th.autocast("cpu", dtype=th.bfloat16):
         expected = hidden(x)
     expected = nn.functional.linear(expected.float(), mlp.output.weight, mlp.output.bias)
@@ -110,8 +115,9 @@ def test_float32_changes_nothing(mlp: MLP) -> None:
     assert th.equal(mlp.hidden[0].weight.grad, gradient)
 
 
-def test_frozen_and_unused_networks_get_no_gradient() -> None:
-    networks = nn.ModuleList([MLP(6, 3, [8]), LatentCritic(2, 2, 2, [8])])
+@pytest.mark.parametrize("layer_norm", [False, True])
+def test_frozen_and_unused_networks_get_no_gradient(layer_norm: bool) -> None:
+    networks = nn.ModuleList([MLP(6, 3, [8], layer_norm=layer_norm), LatentCritic(2, 2, 2, [8], layer_norm=layer_norm)])
     obs = th.randn(4, 2, requires_grad=True)
     for _ in range(2):
         with MixedPrecision(networks, th.bfloat16) as precision:

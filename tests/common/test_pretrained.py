@@ -142,6 +142,7 @@ def test_continues_training(trained: PEARLSAC, folder: Path) -> None:
 
 VARIANTS = {
     "activation": ({"policy_kwargs": {"net_arch": ARCH, "activation_fn": th.nn.Tanh}}, POINT_GOAL),
+    "layer-norm": ({"policy_kwargs": {"net_arch": ARCH, "layer_norm": True}}, POINT_GOAL),
     "critics": ({"policy_kwargs": {"net_arch": ARCH, "n_critics": 3}}, POINT_GOAL),
     "fixed-entropy": ({"ent_coef": 0.3, "target_update_interval": 2}, POINT_GOAL),
     "schedule": ({"learning_rate": lambda remaining: 1e-3 * remaining}, POINT_GOAL),
@@ -160,6 +161,7 @@ def test_every_kind_of_model(variant: str, tmp_path: Path) -> None:
     assert_same_predictions(model, loaded)
     for name in ("similarity_metric", "context_kind", "preference_group_size", "target_update_interval", "gamma", "tau"):
         assert getattr(loaded, name) == getattr(model, name)
+    assert loaded.policy.layer_norm == model.policy.layer_norm == (variant == "layer-norm")
     assert len(loaded.policy.critic.members) == len(model.policy.critic.members)
     if variant == "fixed-entropy":
         assert loaded.ent_coef_optimizer is None

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from meta_toys import EPOCH, N_TASKS, POINT_GOAL, TwoWalks, Walk, WindyWalk, parameters, small, walks
+from meta_toys import EPOCH, N_TASKS, POINT_GOAL, SMALL, TwoWalks, Walk, WindyWalk, parameters, small, walks
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_poem import PEARLSAC, POEMSAC
@@ -431,10 +431,12 @@ def test_targets_are_bootstrapped_except_at_an_early_end() -> None:
     assert loss.item() == pytest.approx(total, rel=1e-4)
 
 
-def test_predicted_returns_are_sums_of_decoded_rewards() -> None:
+@pytest.mark.parametrize("layer_norm", [False, True])
+def test_predicted_returns_are_sums_of_decoded_rewards(layer_norm: bool) -> None:
     from sb3_poem.common.trajectory import Trajectory
 
-    model = small(POEMSAC, walks(4), horizon=10, precision="fp32").learn(120)
+    policy_kwargs = {**SMALL["policy_kwargs"], "layer_norm": layer_norm}
+    model = small(POEMSAC, walks(4), horizon=10, precision="fp32", policy_kwargs=policy_kwargs).learn(120)
     rng = np.random.default_rng(0)
     lengths, latents = (4, 9), rng.normal(size=(3, 5))
     trajectories = [Trajectory(rng.normal(size=(n + 1, 2)), rng.uniform(-2.0, 4.0, size=(n, 1)), np.zeros(5)) for n in lengths]
