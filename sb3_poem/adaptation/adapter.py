@@ -50,7 +50,7 @@ class PreferenceAdapter:
     :param inference: "bayes", or "paper" (Algorithm 2 of Xu & Zhu 2025).
     :param query_rule: "worst-case" (eq. 10), "information-gain" or "random"; None takes "information-gain" for
         "bayes" and "worst-case" for "paper".
-    :param n_candidates: Candidate latents (N_z).
+    :param n_candidates: Candidate latents (N_z); None takes 400 for "bayes" and the paper's 100 for "paper".
     :param epsilon: Tolerated error of eq. 9, in [0, 0.5); used by the paper's rules.
     :param candidates: Where candidates come from: "prior" (N(0, I)) or "aggregate" (the training tasks'
         posteriors and what lies between neighbours); None takes the prior, and for
@@ -78,7 +78,7 @@ class PreferenceAdapter:
         n_queries: int = 10,
         inference: str = "bayes",
         query_rule: str | None = None,
-        n_candidates: int = 100,
+        n_candidates: int | None = None,
         epsilon: float = 0.1,
         candidates: str | None = None,
         likelihood: str | None = None,

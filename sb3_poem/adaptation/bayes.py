@@ -92,7 +92,7 @@ class BayesInference(LatentInference):
     def __init__(
         self,
         model: Any,
-        n_candidates: int = 100,
+        n_candidates: int = 400,
         epsilon: float = 0.1,
         candidates: str = "prior",
         query_rule: str = "information-gain",

@@ -280,6 +280,14 @@ def test_bad_arguments(inference, arguments, message):
         adapter(**{"inference": inference, **arguments})
 
 
+def test_each_rule_has_its_own_number_of_candidates():
+    for inference, number in (("bayes", 400), ("paper", 100)):
+        one = adapter(inference=inference)
+        assert one.inference.n_candidates == number
+        assert one.to_dict()["options"]["n_candidates"] == number
+    assert adapter(n_candidates=7).inference.n_candidates == 7
+
+
 def test_a_model_for_another_environment_is_refused():
     class Other(SpeedEnv):
         observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float64)

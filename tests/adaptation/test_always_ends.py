@@ -100,7 +100,7 @@ def test_any_answers_end_in_a_finite_latent_with_bounded_work(answers, rule, noi
         assert np.all(np.isfinite(latent))
         # Bounded whatever the answers are, and in the number of answers at most linear.
         assert model.similarity_rows <= 40_000 + 200 * number
-        assert model.decoder_steps <= 2 * 100 * 5 + DECODER_MOVE_STEPS
+        assert model.decoder_steps <= 2 * options.n_candidates * 5 + DECODER_MOVE_STEPS
 
 
 @pytest.mark.parametrize(
