@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
 INFERENCES = ("bayes", "paper")
-# Algorithm 2 has the paper's 100. Bayesian inference gains by more where a task has several coordinates: on 60 tasks, after ten
+# Algorithm 2 has the paper's 100. Bayesian inference gains by more where a task has several coordinates: on 60 tasks after ten
 # answers, 100, 400 and 1,000 particles earned -208, -189 and -192 on AntGoal, and -26.0, -26.9 and -27.7 on HalfCheetahVel.
 N_CANDIDATES = {"bayes": 400, "paper": 100}
 # Nats between the aggregate posterior and N(0, I) up to which draws of the latter are as good as trained latents: measured
