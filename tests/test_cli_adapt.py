@@ -31,10 +31,13 @@ def adapt(model_file: str, *arguments: object) -> int:
     return cli.main(["adapt", "--model", model_file, *map(str, arguments)])
 
 
-@pytest.mark.parametrize("inference", ["bayes", "paper"])
-def test_json_holds_what_the_library_measures(model: tuple[POEMSAC, str], tmp_path: Path, inference: str) -> None:
+@pytest.mark.parametrize(("inference", "options"), [("bayes", {"n_candidates": 20}), ("paper", {})])
+def test_json_holds_what_the_library_measures(
+    model: tuple[POEMSAC, str], tmp_path: Path, inference: str, options: dict[str, int]
+) -> None:
     file = tmp_path / "new" / "result.json"
     flags = ["--oracle", "mistake", "--mistake-rate", 0.0, "--queries", 3, "--tasks", 4, "--episodes", 2, "--seed", 5]
+    flags += [flag for name, value in options.items() for flag in (f"--{name.replace('_', '-')}", value)]
     assert adapt(model[1], *flags, "--inference", inference, "--json", file) == 0
     result = json.loads(file.read_text())
 
@@ -50,7 +53,9 @@ def test_json_holds_what_the_library_measures(model: tuple[POEMSAC, str], tmp_pa
         n_episodes=2,
         seed=5,
         inference=inference,
+        **options,
     )
+    assert options.items() <= result.items()
     assert result["queries"] == [0, 1, 2, 3]
     np.testing.assert_allclose(result["task_returns"], expected.task_returns, rtol=1e-4)
     np.testing.assert_allclose(result["mean_return"], np.mean(result["task_returns"], axis=0))

@@ -68,6 +68,9 @@ def _add_adapt_arguments(parser: argparse.ArgumentParser) -> None:
     questions.add_argument(
         "--candidates", choices=("prior", "aggregate"), help="default: aggregate for bayes, prior for paper"
     )
+    questions.add_argument(
+        "--n-candidates", type=_count(2), metavar="N", help="candidate latents (default: 400 for bayes, 100 for paper)"
+    )
 
     tasks = parser.add_argument_group("test tasks")
     tasks.add_argument("--tasks", type=_count(1), help="how many, drawn anew (default: 30; 1 with --oracle human)")

@@ -115,7 +115,7 @@ class Adaptation:
             family.check_same_family(self.model.task_space, self.model.reward_feature_dim)
         except ValueError as error:
             raise ValueError(f"--env {env_id}, but {arguments.model} was trained on {self.model.env_id}: {error}") from error
-        chosen = {name: getattr(arguments, name) for name in ("inference", "query_rule", "candidates")}
+        chosen = {name: getattr(arguments, name) for name in ("inference", "query_rule", "candidates", "n_candidates")}
         self.options = {name: value for name, value in chosen.items() if value is not None}
         self.tasks = self._choose_tasks(family)
 
