@@ -9,8 +9,6 @@ For every seed: ``sb3-poem train`` (continued from its checkpoint if it was inte
 
 import argparse
 import json
-import os
-import platform
 import subprocess
 import sys
 import time
@@ -18,6 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from sb3_poem.benchmark.provenance import commit, machine
 
 RESULTS = Path(__file__).parent / "results"
 PROGRAM = [sys.executable, "-m", "sb3_poem.cli"]
@@ -49,8 +49,8 @@ def train(env_id: str, seed: int, folder: Path, algorithm: str, extra: list[str]
     record = {
         "command": shown(command),
         "seed": seed,
-        "commit": subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip(),
-        "machine": f"{platform.processor() or platform.machine()}, {len(os.sched_getaffinity(0))} cores",
+        "commit": commit(),
+        "machine": machine(),
         "wall_seconds": None if checkpoints else round(time.time() - started),
     }
     record_file.write_text(json.dumps(record, indent=2))

@@ -5,17 +5,16 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from sb3_poem.benchmark.provenance import commit, machine
+
 RESULTS = Path(__file__).parent / "results"
-INSTRUCTION_SETS = ("avx2", "avx512f", "avx512_bf16", "amx_bf16")
 
 
 def arguments(description: str | None, add: Callable[[argparse.ArgumentParser], None] | None = None) -> argparse.Namespace:
@@ -34,25 +33,6 @@ def arguments(description: str | None, add: Callable[[argparse.ArgumentParser], 
 def cores() -> int:
     """Cores that this process may use now."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def machine() -> str:
-    """The processor, without its owner's name: cores that this process may use, architecture, vector instructions."""
-    flags: set[str] = set()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        line = next((line for line in cpuinfo.read_text().splitlines() if line.startswith("flags")), "")
-        flags = set(line.split())
-    known = [name for name in INSTRUCTION_SETS if name in flags]
-    return f"{cores()} of {os.cpu_count()} cores, {platform.machine()}, {', '.join(known) or 'vector instructions unknown'}"
-
-
-def commit() -> str:
-    """The commit of the working tree, with a plus sign if it was changed since."""
-    folder = Path(__file__).parent
-    run = lambda *args: subprocess.run(["git", *args], cwd=folder, capture_output=True, text=True).stdout.strip()  # noqa: E731
-    changed = run("status", "--porcelain", "--untracked-files=no", "--", "../sb3_poem", "../envs", "*.py")
-    return run("rev-parse", "--short", "HEAD") + ("+" if changed else "")
 
 
 def seconds_in_turns(contenders: dict[str, Callable[[], Any]], repeats: int, warm_up: int = 1) -> dict[str, list[float]]:

@@ -9,7 +9,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+CODE = ("sb3_poem", "envs", "zoo_configs", "benchmarks/*.py")
 VERSIONED = ("sb3_poem", "stable_baselines3", "rl_zoo3", "torch", "gymnasium", "mujoco", "numpy")
+COMMIT_VARIABLE = "SB3_POEM_COMMIT"
 INSTRUCTION_SETS = ("avx2", "avx512f", "avx512_bf16", "amx_bf16")
 
 
@@ -19,12 +21,18 @@ def provenance() -> dict[str, Any]:
 
 
 def commit() -> str | None:
-    """The checkout's commit, with a plus sign if the code was changed since; None where this is no checkout."""
+    """The checkout's commit, with a plus sign if the code was changed since; None where this is no checkout. A copy of
+    the tree without its repository, as in a container, may name it by the environment variable ``SB3_POEM_COMMIT``.
+    """
+    if COMMIT_VARIABLE in os.environ:
+        return os.environ[COMMIT_VARIABLE]
     folder = Path(__file__).resolve().parents[2]
     head = _git(folder, "rev-parse", "--short", "HEAD")
     if head is None or not (folder / "sb3_poem" / "benchmark").is_dir():
         return None
-    changed = _git(folder, "status", "--porcelain", "--untracked-files=no", "--", "sb3_poem", "envs", "zoo_configs")
+    changed = _git(
+        folder, "status", "--porcelain", "--untracked-files=no", "--", "sb3_poem", "envs", "zoo_configs", "benchmarks/*.py"
+    )
     return head + ("+" if changed else "")
 
 

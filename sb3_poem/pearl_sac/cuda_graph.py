@@ -16,24 +16,19 @@ class GraphedStep:
     """Runs a step, and from the fourth on replays it: thousands of small kernels then cost one launch.
 
     Everything that the step reads and does not change must stay where it is between calls, but for the meta-batch, which is
-    copied to where the graph reads it.
+    copied to where the graph reads it. Its optimisers must be :func:`prepared <prepare_optimizers>`.
 
-    :param step: Maps a meta-batch to metrics, without waiting for the device
-    :param optimizers: Optimisers that it calls; they are told to keep their state on the device
+    :param step: Maps a meta-batch to metrics, all scalars, without waiting for the device
     """
 
-    def __init__(self, step: Step, optimizers: list[th.optim.Optimizer]) -> None:
+    def __init__(self, step: Step) -> None:
         self._step = step
         self._calls = 0
         self._stream = th.cuda.Stream()
         self._graph = th.cuda.CUDAGraph()
         self._batch: MetaBatch | None = None
-        self._metrics: dict[str, th.Tensor] = {}
-        for optimizer in optimizers:
-            for group in optimizer.param_groups:
-                group["capturable"] = True
-            for parameter, state in optimizer.state.items():
-                state["step"] = th.as_tensor(state["step"], dtype=th.float32, device=parameter.device)
+        self._names: tuple[str, ...] = ()
+        self._values: th.Tensor | None = None
 
     def __call__(self, batch: MetaBatch) -> dict[str, th.Tensor]:
         self._calls += 1
@@ -50,11 +45,26 @@ class GraphedStep:
         if self._batch is None:
             self._batch = _cloned(batch)
             with th.cuda.graph(self._graph):
-                self._metrics = self._step(self._batch)
+                metrics = self._step(self._batch)
+                self._names, self._values = tuple(metrics), th.stack(list(metrics.values()))
         else:
             th._foreach_copy_(tensors(self._batch), tensors(batch))
         self._graph.replay()
-        return {name: value.clone() for name, value in self._metrics.items()}
+        assert self._values is not None
+        return dict(zip(self._names, self._values.clone().unbind(), strict=True))
+
+
+def prepare_optimizers(optimizers: list[th.optim.Optimizer], device: th.device) -> None:
+    """Keep the state of optimisers where their parameters are, and tell them whether a graph may capture them: on a processor,
+    where a model that was trained on a GPU may go on, they refuse that.
+    """
+    for optimizer in optimizers:
+        for group in optimizer.param_groups:
+            if "capturable" in group:
+                group["capturable"] = device.type == "cuda"
+        for parameter, state in optimizer.state.items():
+            if "step" in state:
+                state["step"] = th.as_tensor(state["step"], dtype=th.float32, device=parameter.device)
 
 
 def tensors(batch: tuple[Any, ...]) -> list[th.Tensor]:

@@ -16,7 +16,7 @@ from sb3_poem.common.precision import MixedPrecision, hidden_dtype
 from sb3_poem.common.random import Generators
 from sb3_poem.pearl_sac import losses
 from sb3_poem.pearl_sac.collecting import MIN_STD
-from sb3_poem.pearl_sac.cuda_graph import GraphedStep, Step
+from sb3_poem.pearl_sac.cuda_graph import GraphedStep, Step, prepare_optimizers
 from sb3_poem.pearl_sac.losses import MetaBatch, TaskEmbeddings
 from sb3_poem.pearl_sac.policies import LatentPolicy, MlpPolicy
 from sb3_poem.pearl_sac.sampling import SamplingSAC
@@ -240,6 +240,7 @@ class PEARLSAC(SamplingSAC):
         if self.ent_coef_optimizer is not None:
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
+        prepare_optimizers(optimizers, self.device)
         started = time.perf_counter()
         history: dict[str, list[th.Tensor]] = {}
         policy = self.policy
@@ -248,7 +249,7 @@ class PEARLSAC(SamplingSAC):
             # whether everything learns or, in between, critics and encoder only
             steps: dict[bool, Step] = {whole: partial(self._gradient_step, precision, whole) for whole in (True, False)}
             if self.device.type == "cuda" and self.target_update_interval == 1:
-                steps = {whole: GraphedStep(step, optimizers) for whole, step in steps.items()}
+                steps = {whole: GraphedStep(step) for whole, step in steps.items()}
             for block in self._meta_batch_blocks(gradient_steps, batch_size):
                 for batch in block:
                     step = steps[self._n_updates % self.policy_delay == 0]

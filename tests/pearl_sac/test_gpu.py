@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import io
 from typing import Any
 
+import numpy as np
 import pytest
 import torch as th
-from meta_toys import EPOCH, small
+from meta_toys import EPOCH, POINT_GOAL, small
 
-from sb3_poem import PEARLSAC, POEMSAC
+from sb3_poem import PEARLSAC, POEMSAC, PreferenceAdapter, ReturnOracle
 from sb3_poem.pearl_sac import pearl_sac
 
 pytestmark = [pytest.mark.gpu, pytest.mark.parametrize("algorithm", [PEARLSAC, POEMSAC])]
@@ -28,7 +30,7 @@ def test_replayed_steps_are_the_eager_ones(
 ) -> None:
     arguments = {"precision": "fp32", "gradient_steps": 20, "policy_delay": policy_delay}
     graphed = on_gpu(algorithm, **arguments).learn(EPOCH)
-    monkeypatch.setattr(pearl_sac, "GraphedStep", lambda step, optimizers: step)
+    monkeypatch.setattr(pearl_sac, "GraphedStep", lambda step: step)
     eager = on_gpu(algorithm, **arguments).learn(EPOCH)
     assert graphed._n_updates == eager._n_updates == 20
     for name, value in weights(eager).items():
@@ -78,3 +80,31 @@ def test_a_checkpoint_continues(algorithm: type[PEARLSAC], tmp_path: Any) -> Non
     loaded = algorithm.load(tmp_path / "model.zip", env=model.get_env(), device="cuda")
     loaded.learn(EPOCH, reset_num_timesteps=False)
     assert loaded._n_updates == 10
+
+
+def test_a_model_goes_on_training_on_a_processor(algorithm: type[PEARLSAC], tmp_path: Any) -> None:
+    on_gpu(algorithm).learn(EPOCH).save(tmp_path / "model.zip")
+    loaded = algorithm.load(tmp_path / "model.zip", env=POINT_GOAL, device="cpu")
+    loaded.learn(EPOCH, reset_num_timesteps=False)
+    assert loaded._n_updates == 10
+
+
+@pytest.mark.parametrize("inference", ["bayes", "paper"])
+def test_adaptation_is_that_of_a_processor(algorithm: type[PEARLSAC], inference: str) -> None:
+    """The same model adapts on both devices to the same latent, but for rounding."""
+    if algorithm is PEARLSAC:
+        pytest.skip("PEARL has no similarity to adapt by")
+    model = on_gpu(algorithm, precision="fp32").learn(3 * EPOCH)
+    latents = []
+    for device in ("cuda", "cpu"):
+        copy = algorithm.load(saved(model), device=device)
+        adapter = PreferenceAdapter(copy, POINT_GOAL, oracle=ReturnOracle(), n_queries=3, inference=inference, seed=0)
+        latents.append(adapter.adapt().latent)
+    np.testing.assert_allclose(*latents, atol=0.05)
+
+
+def saved(model: PEARLSAC) -> io.BytesIO:
+    file = io.BytesIO()
+    model.save(file)
+    file.seek(0)
+    return file

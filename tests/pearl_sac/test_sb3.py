@@ -762,3 +762,14 @@ def test_monitors_episode_info(algorithm: type[PEARLSAC], tmp_path: Path) -> Non
     own = [model.replay_buffer.transitions(task).rewards.sum() for task in range(N_TASKS)]
     np.testing.assert_allclose([episode["r"] for episode in episodes], own, rtol=1e-4)
     assert len(list((tmp_path / "monitor").glob("*.monitor.csv"))) == 3
+
+
+def test_a_model_from_a_gpu_goes_on_training_here(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
+    """There optimisers are captured in a graph, which Adam refuses on a processor."""
+    model = small(algorithm).learn(EPOCH)
+    for optimizer in (model.policy.optimizer, model.ent_coef_optimizer):
+        optimizer.param_groups[0]["capturable"] = True
+    model.save(tmp_path / "model.zip")
+    loaded = algorithm.load(tmp_path / "model.zip", env=POINT_GOAL, device="cpu")
+    loaded.learn(EPOCH, reset_num_timesteps=False)
+    assert loaded._n_updates == 10
