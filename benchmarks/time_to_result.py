@@ -116,6 +116,11 @@ def main() -> None:
         returns = [f"{last[rule]:.1f}" for rule in given.rules]
         reached = "yes" if clock.reached else "no"
         rows.append([seed, reached, round(last["seconds"]), last["env_steps"], last["updates"], *returns])
+        report(given, results, rows)  # after every seed, since the next may be interrupted
+
+
+def report(given: argparse.Namespace, results: list[dict[str, Any]], rows: list[list[Any]]) -> None:
+    """Write what there is so far."""
     text = table(["seed", f"reached {given.target:g}", "seconds", "environment steps", "updates", *given.rules], rows)
     name = f"time-to-result-{given.env.split('/')[-1].split('-')[0]}{'' if given.device == 'cpu' else f'-{given.device}'}"
     settings = {key: str(value) for key, value in vars(given).items() if key not in ("out", "conf", "save")}
