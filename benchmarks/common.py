@@ -12,6 +12,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from sb3_poem.benchmark.provenance import commit, machine
 
 RESULTS = Path(__file__).parent / "results"
@@ -28,6 +30,14 @@ def arguments(description: str | None, add: Callable[[argparse.ArgumentParser], 
     if add is not None:
         add(parser)
     return parser.parse_args()
+
+
+def hyperparameters(conf: Path, env_id: str, **changes: Any) -> dict[str, Any]:
+    """An environment's entry of a file of hyperparameters, some changed, ``policy_kwargs`` evaluated as rl_zoo3 does."""
+    entry = {**yaml.safe_load(conf.read_text())[env_id], **changes}
+    if isinstance(entry.get("policy_kwargs"), str):
+        entry["policy_kwargs"] = eval(entry["policy_kwargs"])
+    return entry
 
 
 def cores() -> int:

@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
-import yaml
-from common import arguments, table, write
+from common import arguments, hyperparameters, table, write
 from rl_zoo3.utils import linear_schedule
 
 from sb3_poem import POEMSAC
@@ -76,8 +75,6 @@ def train(env_id: str, entry: dict[str, Any], seed: int, clock: Clock, device: s
     """Train with an entry of hyperparameters until the clock ends it; returns the model."""
     entry = dict(entry)
     n_timesteps, policy, n_envs = int(entry.pop("n_timesteps")), entry.pop("policy"), entry.pop("n_envs")
-    if isinstance(entry.get("policy_kwargs"), str):
-        entry["policy_kwargs"] = eval(entry["policy_kwargs"])  # as rl_zoo3 does
     rate = entry.get("learning_rate")
     if isinstance(rate, str):
         entry["learning_rate"] = linear_schedule(rate.removeprefix("lin_"))
@@ -104,7 +101,7 @@ def main() -> None:
     """Measure, print, write."""
     given = arguments(__doc__, add_arguments)
     th.set_num_threads(given.threads)
-    entry = yaml.safe_load(given.conf.read_text())[given.env]
+    entry = hyperparameters(given.conf, given.env)
     results, rows = [], []
     for seed in given.seeds:
         clock = Clock(given.env, given.target, given.rules, 300 + seed, given.from_step, given.every)
