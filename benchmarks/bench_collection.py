@@ -46,14 +46,14 @@ class Loop:
     def __init__(self, reset: Callable[[], np.ndarray], step: Callable[[np.ndarray], np.ndarray], model: POEMSAC) -> None:
         self.observations, self.step, self.model = reset(), step, model
         self.copies = len(self.observations)
-        self.latents = np.zeros((len(self.observations), model.latent_dim))
+        self.act = model.policy.acting_on(np.zeros((self.copies, model.latent_dim)))  # as collection does
         self.noise_shape = (len(self.observations), int(model.action_space.shape[0]))
 
     def __call__(self) -> None:
         space, policy = self.model.action_space, self.model.policy
         for _ in range(STEPS):
             noise = th.randn(self.noise_shape, generator=self.model.generators.torch)
-            actions = policy.unscale_action(policy.act(self.observations, self.latents, noise))
+            actions = policy.unscale_action(self.act(self.observations, noise))
             self.observations = self.step(np.clip(actions, space.low, space.high))
 
 
