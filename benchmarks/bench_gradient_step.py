@@ -19,7 +19,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
-from common import arguments, seconds_in_turns, table, write
+from common import arguments, available_device, seconds_in_turns, table, write
 from plain_poem import PlainPOEM
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import configure
@@ -230,7 +230,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--sizes", nargs="+", choices=SIZES, default=list(SIZES))
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--turns", type=int, default=5)
-    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--device", type=available_device, default="cpu")
 
 
 def main() -> None:

@@ -32,6 +32,18 @@ def arguments(description: str | None, add: Callable[[argparse.ArgumentParser], 
     return parser.parse_args()
 
 
+def available_device(name: str) -> str:
+    """The type of an argument that names a device: one that is there, since results are filed under its name.
+
+    :raises argparse.ArgumentTypeError: if it is not
+    """
+    import torch
+
+    if name.startswith("cuda") and not torch.cuda.is_available():
+        raise argparse.ArgumentTypeError(f"{name}: torch {torch.__version__} sees no CUDA device here")
+    return name
+
+
 def hyperparameters(conf: Path, env_id: str, **changes: Any) -> dict[str, Any]:
     """An environment's entry of a file of hyperparameters, some changed, ``policy_kwargs`` evaluated as rl_zoo3 does."""
     entry = {**yaml.safe_load(conf.read_text())[env_id], **changes}

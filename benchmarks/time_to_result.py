@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from common import arguments, hyperparameters, table, write
+from common import arguments, available_device, hyperparameters, table, write
 from rl_zoo3.utils import linear_schedule
 
 from sb3_poem import POEMSAC
@@ -92,7 +92,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--from-step", type=int, default=0)
     parser.add_argument("--every", type=int, default=1)
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--device", type=available_device, default="cpu")
     parser.add_argument("--save", type=Path, help="folder for the models")
     parser.add_argument("--conf", type=Path, default=Path(__file__).parents[1] / "zoo_configs" / "poem_sac.yml")
 

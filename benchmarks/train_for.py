@@ -14,7 +14,7 @@ from typing import Any
 
 import torch as th
 import yaml
-from common import hyperparameters
+from common import available_device, hyperparameters
 from stable_baselines3.common.utils import ConstantSchedule
 
 from sb3_poem import POEMSAC
@@ -91,7 +91,7 @@ def main() -> None:
     parser.add_argument("--start", type=Path, help="a pretrained folder to go on from")
     parser.add_argument("--every", type=int, default=8, help="epochs between two writes of the model")
     parser.add_argument("--threads", type=int, help="of the simulation")
-    parser.add_argument("--device", default="auto")
+    parser.add_argument("--device", type=available_device, default="auto")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     th.set_num_threads(1)

@@ -1,6 +1,7 @@
 """Soft actor-critic with a probabilistic task context: what POEM and its baselines share."""
 
 import time
+import warnings
 from functools import partial
 from typing import Any, ClassVar, TypeVar
 
@@ -160,6 +161,8 @@ class PEARLSAC(SamplingSAC):
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must lie in [0, 1], got {value}")
         hidden_dtype(precision, "cpu")  # refuses an unknown name now rather than at the first step
+        if str(device).startswith("cuda") and not th.cuda.is_available():  # which SB3 says nothing of
+            warnings.warn(f"device is {device!r}, but torch sees no CUDA device: the CPU is used", stacklevel=2)
         self.n_train_tasks = n_train_tasks
         self.meta_batch_size = meta_batch_size
         self.context_size = context_size

@@ -230,3 +230,10 @@ def test_no_task_family_after_all(algorithm: type[PEARLSAC]) -> None:
 
     with pytest.raises(ValueError, match="has no attribute 'shared_dynamics'"):
         small(algorithm, Half(), horizon=5, policy_kwargs={"net_arch": ARCH})
+
+
+@pytest.mark.skipif(th.cuda.is_available(), reason="shows what happens without the device")
+def test_a_missing_gpu_is_told() -> None:
+    with pytest.warns(UserWarning, match="device is 'cuda', but torch sees no CUDA device: the CPU is used"):
+        model = small(POEMSAC, device="cuda")
+    assert model.device.type == "cpu"
