@@ -20,6 +20,7 @@ def make_report(
     families: Sequence[str] | None = None,
     kind: str = "md",
     out: Path | None = None,
+    seeds: Sequence[int] | None = None,
 ) -> tuple[str, list[Path]]:
     """
     Tables as text and, in a folder, the figures beside them.
@@ -29,10 +30,11 @@ def make_report(
     :param families: Names of families; None: all.
     :param kind: "md", "latex", "csv" or "json".
     :param out: Where to write ``<suite>.<suffix>`` and the figures; None writes nothing.
+    :param seeds: Only these, say where some methods have more of them than others; None: all.
     :return: The text of all suites, and the files.
     :raises ValueError: If the store holds nothing of what is asked for.
     """
-    records = list(store.records())
+    records = [record for record in store.records() if seeds is None or record.seed in seeds]
     texts, files = [], []
     for name in suites or SUITES:
         # A small family's cells belong to the suite that declares it, unless a suite is asked for by its name.
@@ -53,5 +55,6 @@ def make_report(
             file.write_text(text)
             files += [file, *write_figures(selection, out)]
     if not texts:
-        raise ValueError(f"{store.path} holds no finished cell" + (f" of {', '.join(families)}" if families else ""))
+        of = [*(families or []), *(f"seed {seed}" for seed in seeds or [])]
+        raise ValueError(f"{store.path} holds no finished cell" + (f" of {', '.join(of)}" if of else ""))
     return "\n".join(texts), files

@@ -100,8 +100,9 @@ def suite_rows(selection: Selection) -> list[Row]:
                 some = [one for one in series if one.oracle == oracle]
                 for one in some:
                     rows += _method_rows(selection.suite.name, condition, entry, one)
-                if some:
-                    rows += _reference_rows(selection.suite.name, condition, entry, oracle, references)
+                variants = {METHODS[one.method].variant for one in some}
+                own = [reference for reference in references if METHODS[reference.method].variant in variants]
+                rows += _reference_rows(selection.suite.name, condition, entry, oracle, own)
     return rows
 
 

@@ -84,7 +84,7 @@ def _report(arguments: argparse.Namespace) -> int:
     if arguments.out is not None:
         check_writable(arguments.out)
     store = Store(arguments.store, create=False)
-    text, files = make_report(store, arguments.suite, families, arguments.format, arguments.out)
+    text, files = make_report(store, arguments.suite, families, arguments.format, arguments.out, arguments.seeds)
     if arguments.out is None:
         print(text)
     for file in files:

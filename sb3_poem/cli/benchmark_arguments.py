@@ -35,7 +35,7 @@ def add_benchmark(commands: Any, count: Count) -> None:
     run = parts.add_parser("run", help="train what is missing, adapt, evaluate; goes on where it was interrupted")
     report = parts.add_parser("report", help="write the tables and figures of what the store holds")
     _add_run_arguments(run, count)
-    _add_report_arguments(report)
+    _add_report_arguments(report, count)
 
 
 def _add_store(parser: argparse.ArgumentParser) -> None:
@@ -101,9 +101,10 @@ def _add_run_arguments(parser: argparse.ArgumentParser, count: Count) -> None:
     )
 
 
-def _add_report_arguments(parser: argparse.ArgumentParser) -> None:
+def _add_report_arguments(parser: argparse.ArgumentParser, count: Count) -> None:
     parser.add_argument("--suite", nargs="+", choices=SUITES, help="default: all of which the store holds cells")
     parser.add_argument("--families", nargs="+", metavar="FAMILY", help="default: all that the store holds")
+    parser.add_argument("--seeds", nargs="+", type=count(0), metavar="SEED", help="default: all that the store holds")
     parser.add_argument("--format", choices=("md", "latex", "csv", "json"), default="md", help="default: %(default)s")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="write tables, and figures as PNG and PDF (default: print)")
     _add_store(parser)

@@ -162,3 +162,24 @@ def test_a_store_without_the_suite_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"--suite smoke: .* holds no finished cell of it"):
         make_report(store, ["smoke"])
     assert make_report(store)[0].count("# Tolerance of the paper's rule") == 1
+
+
+def test_a_table_has_the_yardsticks_of_its_own_models_only(tmp_path: Path) -> None:
+    store = fill(tmp_path / "store.sqlite", "ablation", seeds=1, snapshots=1)
+    yardsticks: dict[str, set[str]] = {}
+    for row in suite_rows(Selection(SUITES["ablation"], store.records())):
+        if row.kind != "method":
+            yardsticks.setdefault(row.entry, set()).add(row.method)
+    assert yardsticks["rules"] == yardsticks["queries"] == {"known-task"}
+    assert {"known-task", "known-task-poem-inner", "known-task-poem-d2"} <= yardsticks["design"]
+
+
+def test_a_report_of_some_seeds(tmp_path: Path) -> None:
+    store = fill(tmp_path / "store.sqlite", "epsilon")
+    rows = json.loads(make_report(store, ["epsilon"], kind="json", seeds=[0, 2])[0])
+    final = [row for row in rows if row["kind"] == "method" and row["queries"] == 0]
+    assert {(row["n_seeds"], row["mean"]) for row in final} == {(2, -20.0)}  # of -25 and -15
+    with pytest.raises(ValueError, match="holds no finished cell of it"):
+        make_report(store, ["epsilon"], seeds=[7])
+    with pytest.raises(ValueError, match=r"holds no finished cell of HalfCheetahVel, seed 7"):
+        make_report(store, families=["HalfCheetahVel"], seeds=[7])
