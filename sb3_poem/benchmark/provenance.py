@@ -30,9 +30,7 @@ def commit() -> str | None:
     head = _git(folder, "rev-parse", "--short", "HEAD")
     if head is None or not (folder / "sb3_poem" / "benchmark").is_dir():
         return None
-    changed = _git(
-        folder, "status", "--porcelain", "--untracked-files=no", "--", "sb3_poem", "envs", "zoo_configs", "benchmarks/*.py"
-    )
+    changed = _git(folder, "status", "--porcelain", "--untracked-files=no", "--", *CODE)
     return head + ("+" if changed else "")
 
 
