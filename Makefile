@@ -48,7 +48,7 @@ bench: $(STAMP)
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[bench]'
 	for script in benchmarks/bench_*.py; do $(THREADS) $(BIN)/python "$$script"; done
 
-# The paper's hyperparameters, in the paper's own sizes.
+# In the paper's own sizes.
 bench-gpu: $(STAMP)
 	$(BIN)/python -m pytest -m gpu $(PYTEST_ARGS)
 	$(BIN)/python benchmarks/bench_gradient_step.py --device cuda --threads 2

@@ -49,7 +49,7 @@ def train(env_id: str, seed: int, folder: Path, algorithm: str, extra: list[str]
     record = {
         "command": shown(command),
         "seed": seed,
-        "commit": commit(),
+        "commit": commit() or "unknown",
         "machine": machine(),
         "wall_seconds": None if checkpoints else round(time.time() - started),
     }

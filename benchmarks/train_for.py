@@ -1,4 +1,4 @@
-"""Train for so many seconds, on a machine that is lent for no longer, and keep the model.
+"""Train for so many seconds, where there is no more time than that, and keep the model.
 
     python benchmarks/train_for.py poem/AntFwdBack-v0 ant.zip 470 --device cuda --conf zoo_configs/poem_sac_gpu.yml
 
