@@ -13,6 +13,7 @@ import numpy as np
 from gymnasium import spaces
 
 from poem_envs import TaskFamily, TaskFamilyVector
+from sb3_poem.common.family import plain_id
 
 MakeFamily = Callable[..., Any]
 
@@ -37,6 +38,8 @@ def check_task_family(
     :param env_kwargs: Arguments of the environment
     :raises AssertionError: At the first violation; the message says what to change
     """
+    if isinstance(env, str):
+        env = plain_id(env)
     make = partial(_make, env, **env_kwargs)
     check_spaces(make, seed)
     check_sampling(make, seed)

@@ -79,6 +79,9 @@ class SpeedVecEnv(VecEnv):
     def set_tasks(self, tasks: np.ndarray) -> None:
         self._next_tasks = np.array(tasks, dtype=np.float64)
 
+    def keep_tasks(self) -> None:
+        pass  # a seed draws no task here
+
     def reset(self) -> np.ndarray:
         self.tasks, self._time = self._next_tasks, 0
         self._places = np.array([np.random.default_rng(seed).normal() for seed in self._seeds])

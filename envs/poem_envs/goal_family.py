@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 
 from poem_envs.core import BOUNDS_TOLERANCE
 from poem_envs.headless import choose_headless_backend
@@ -17,6 +18,8 @@ from poem_envs.replay import ReplayFamily
 
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 GOAL_SITE = "target"
+#: Wrappers whose work the family, or what is around it, does itself
+TAKEN_OFF = (TimeLimit, OrderEnforcing, PassiveEnvChecker)
 SetGoal = Callable[[gym.Env, np.ndarray], None]
 
 
@@ -40,7 +43,8 @@ class GoalFamily(ReplayFamily):
             max_episode_steps=50,
         )
 
-    The environment's resets must depend on their seed alone. Time limits of its registration are left to the family's own.
+    The environment's resets must depend on their seed alone. Time limits of its registration are left to the family's own, and
+    other wrappers than those of ``gym.make`` are refused.
 
     :param env: an id, or a function that makes the environment
     :param observe_achieved_goal: whether the observation holds the achieved goal, which is needed unless
@@ -53,7 +57,7 @@ class GoalFamily(ReplayFamily):
     :param render_task: whether rendering shows the goal. If not, MuJoCo sites that mark it are made invisible, and whatever
         else the environment draws for its goal is drawn at the achieved goal
     :param env_kwargs: further arguments of the environment
-    :raises ValueError: if the environment is not goal-conditioned; the message says what is missing
+    :raises ValueError: if the environment is not goal-conditioned, or wrapped; the message says what is missing
     """
 
     metadata = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012 (Gymnasium declares it so)
@@ -110,7 +114,15 @@ class GoalFamily(ReplayFamily):
         else:
             env = self._source(**self._env_kwargs)
         check_goal_env(env)
-        return env.unwrapped  # the family checks actions itself, and a time limit of its own ends episodes
+        wrapper = env
+        while isinstance(wrapper, gym.Wrapper):
+            if not isinstance(wrapper, TAKEN_OFF):
+                raise ValueError(
+                    f"env makes {env}: its {type(wrapper).__name__} would have no effect, since the family steps the "
+                    "environment inside all wrappers. Make it without, or put what it does into the environment itself"
+                )
+            wrapper = wrapper.env
+        return wrapper  # the family checks actions itself, and a time limit of its own ends episodes
 
     def _build(self) -> None:
         self.env = self._make()
@@ -229,9 +241,10 @@ class GoalFamily(ReplayFamily):
                 return self.env.render()
             hide_goal_sites(self.env)
             self._place_goal(self._achieved_goal)
-            image = self.env.render()
-            self._place_goal(self._task)
-            return image
+            try:
+                return self.env.render()
+            finally:
+                self._place_goal(self._task)
 
     def close(self) -> None:
         """Close the environment."""
@@ -253,8 +266,10 @@ def unchanged_physics(env: gym.Env) -> Iterator[None]:
     spec = mujoco.mjtState.mjSTATE_INTEGRATION
     state = np.empty(mujoco.mj_stateSize(model, spec))
     mujoco.mj_getState(model, data, state, spec)
-    yield
-    mujoco.mj_setState(model, data, state, spec)
+    try:
+        yield
+    finally:
+        mujoco.mj_setState(model, data, state, spec)
 
 
 def hide_goal_sites(env: gym.Env) -> None:

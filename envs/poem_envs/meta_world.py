@@ -149,8 +149,9 @@ class MetaWorldML1Env(MetaWorldEnv):
     benchmark ML1. The goal is hidden as Meta-World hides it, by zeros in the observation.
 
     ## Task
-    For `reach` and `reach-wall` the position of the goal, `(x, y, z)` in metres, uniform on Meta-World's box for it. The puck,
-    which the reward of these two does not depend on, is placed anew in every episode.
+    For `reach` and `reach-wall` the position of the goal, `(x, y, z)` in metres, drawn as Meta-World draws it: uniform on its
+    box, but for goals close to the puck that it draws with them. The puck, which the reward of these two does not depend on,
+    is placed anew in every episode.
 
     For every other manipulation the placement that Meta-World calls `rand_vec`: the position of the object and, for some,
     that of the goal. It is drawn as Meta-World draws it. Observations show the object, as Meta-World's do.

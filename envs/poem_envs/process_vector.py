@@ -20,6 +20,7 @@ import cloudpickle
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
+from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 
 from poem_envs.core import TaskFamily
@@ -88,6 +89,11 @@ class CopyGroup:
             return getattr(self.envs[copy], method)(*arguments)
         except Exception as error:
             raise RuntimeError(f"environment copy {self.first + copy}: {type(error).__name__}: {error}") from error
+
+    def set_attribute(self, name: str, value: Any) -> None:
+        """Set an attribute of every copy."""
+        for env in self.envs:
+            setattr(env, name, value)
 
     def dump(self) -> list[bytes]:
         """Every copy, pickled."""
@@ -204,6 +210,7 @@ class ProcessFamilyVector(TaskFamilyVector):
         self._make = functools.partial(family, **family_kwargs)
         self._nthread = available_cores() if nthread is None else nthread
         self._groups: list[CopyGroup | RemoteGroup] = []
+        self._interrupted = False
         self._template = self._make()
         if not isinstance(self._template, TaskFamily):
             raise TypeError(
@@ -230,6 +237,17 @@ class ProcessFamilyVector(TaskFamilyVector):
         self.reward_feature_dim, self.shared_dynamics = family.reward_feature_dim, family.shared_dynamics
         self.splits = family.splits
 
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        return getattr(self._template, name)  # what a family has of its own, as a single environment does
+
+    def set_attribute(self, name: str, value: Any) -> None:
+        setattr(self._template, name, value)
+        self._call("set_attribute", {index: (name, value) for index in range(len(self._sizes))})
+        if hasattr(type(self), name) or name in self.__dict__:
+            setattr(self, name, value)
+
     def sample_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
         return self._template.sample_tasks(n, rng)
 
@@ -252,8 +270,9 @@ class ProcessFamilyVector(TaskFamilyVector):
         self._places = [(group, place) for group, chunk in enumerate(chunks) for place in range(len(chunk))]
         self._firsts = [int(chunk[0]) for chunk in chunks]
         self._sizes = [len(chunk) for chunk in chunks]
-        assert self._template.observation_space.shape is not None
-        self._last_observations = np.zeros((n, *self._template.observation_space.shape))
+        space = self._template.observation_space
+        assert space.shape is not None
+        self._last_observations = np.zeros((n, *space.shape), dtype=space.dtype)
         self._last_infos: dict[str, np.ndarray] = {}
 
     def _start(self, dumps: Sequence[list[bytes]] | None = None) -> None:
@@ -289,19 +308,30 @@ class ProcessFamilyVector(TaskFamilyVector):
         :param arguments: by the number of the group
         :return: results by the number of the group
         """
-        if not self._groups:
-            self._start()
-        local: dict[int, Any] = dict.fromkeys(arguments)
-        for index in sorted(arguments):  # this process's own group is the last, so that the others work meanwhile
-            group = self._groups[index]
-            if isinstance(group, RemoteGroup):
-                group.send(method, *arguments[index])
-            else:
-                try:
-                    local[index] = getattr(group, method)(*arguments[index])
-                except Exception as error:
-                    local[index] = error
-        return self._receive(local)
+        if self._interrupted and method != "begin":
+            raise ResetNeeded("a call of this environment was interrupted, and left its copies in the middle of it; reset it")
+        try:
+            if not self._groups:
+                self._start()
+            local: dict[int, Any] = dict.fromkeys(arguments)
+            for index in sorted(arguments):  # this process's own group is the last, so that the others work meanwhile
+                group = self._groups[index]
+                if isinstance(group, RemoteGroup):
+                    group.send(method, *arguments[index])
+                else:
+                    try:
+                        local[index] = getattr(group, method)(*arguments[index])
+                    except Exception as error:
+                        local[index] = error
+            results = self._receive(local)
+        except Exception:
+            raise
+        except BaseException:  # Ctrl-C: answers may be under way, or half read, and would be taken for those of later calls
+            self._end_groups()
+            self._interrupted = True
+            raise
+        self._interrupted = False
+        return results
 
     def _call_copy(self, copy: int, method: str, *arguments: Any) -> Any:
         group, place = self._places[copy]
@@ -346,10 +376,13 @@ class ProcessFamilyVector(TaskFamilyVector):
         return self._call_copy(copy, "render")
 
     def _release(self) -> None:
+        self._end_groups()
+        self._template.close()
+
+    def _end_groups(self) -> None:
         for group in self._groups:
             group.close()
         self._groups = []
-        self._template.close()
 
     def _dumps(self) -> Iterator[list[bytes]]:
         results = self._call("dump", {index: () for index in range(len(self._sizes))})

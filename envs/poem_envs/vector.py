@@ -236,6 +236,23 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         self._next_tasks[index] = self._checked_tasks(tasks, (len(index), *self.task_space.shape), "tasks")
         self._task_chosen[index] = True
 
+    def keep_tasks(self) -> None:
+        """Keep every copy's task through its next resets, also through one with a seed, which would draw another: the task
+        that was chosen for it, or else the one in effect. Before the first reset there is none in effect.
+        """
+        if self._tasks is not None:
+            undecided = ~self._task_chosen
+            self._next_tasks[undecided] = self._tasks[undecided]
+            self._task_chosen[:] = True
+
+    def set_attribute(self, name: str, value: Any) -> None:
+        """Set an attribute of the family, as if on each copy.
+
+        :param name: its name
+        :param value: its value
+        """
+        setattr(self, name, value)
+
     def reset(
         self,
         *,

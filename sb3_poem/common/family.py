@@ -1,10 +1,24 @@
 """What an algorithm needs to know of a task family, asked of any SB3 ``VecEnv`` of it."""
 
+import importlib
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_wrapper
+
+
+def plain_id(env_id: str) -> str:
+    """An environment's id as the registry has it.
+
+    :param env_id: As for ``gym.make``: an id, or ``"module:id"``, whose module is imported first
+    :raises ModuleNotFoundError: if there is no such module
+    """
+    module, _, name = env_id.rpartition(":")
+    if module:
+        importlib.import_module(module)
+    return name
+
 
 # Arguments that change how an environment is drawn, not what it is.
 DRAWING_ARGUMENTS = {"render_mode", "render_task"}

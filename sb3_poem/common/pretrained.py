@@ -34,7 +34,8 @@ def save_pretrained(model: "PEARLSAC", folder: str | Path, card: dict[str, Any] 
     :param folder: Where; made if missing
     :param card: What the card should say: ``command``, ``seed``, ``commit``, ``machine``, ``note``, ``results``: any JSON
     :raises OSError: if the folder cannot be written
-    :raises ValueError: if the policy's activation is none of torch.nn's, which JSON could not name
+    :raises ValueError: if the policy's activation is none of torch.nn's or its optimiser none of torch.optim's, which JSON
+        could not name
     """
     folder = Path(folder)
     config, tensors = model_contents(model, card)
@@ -55,9 +56,10 @@ def model_contents(model: "PEARLSAC", card: dict[str, Any] | None = None) -> tup
     :return: Its configuration, which :func:`config_text` writes, and its tensors by name
     :raises ValueError: see :func:`save_pretrained`
     """
-    activation = model.policy.activation_fn
-    if getattr(nn, activation.__name__, None) is not activation:
-        raise ValueError(f"activation_fn must be one of torch.nn to be saved by its name, got {activation}")
+    activation, optimizer = model.policy.activation_fn, model.policy.optimizer_class
+    for argument, value, module in (("activation_fn", activation, nn), ("optimizer_class", optimizer, th.optim)):
+        if getattr(module, value.__name__, None) is not value:
+            raise ValueError(f"{argument} must be one of {module.__name__} to be saved by its name, got {value}")
     error = model.predicted_rewards_error
     tensors = {f"policy.{name}": value for name, value in model.policy.state_dict().items() if not name.startswith(DERIVED)}
     tensors |= {name: th.as_tensor(getattr(model, name)) for name in ARRAYS}
@@ -69,6 +71,8 @@ def model_contents(model: "PEARLSAC", card: dict[str, Any] | None = None) -> tup
         "arguments": _arguments(model),
         "net_arch": model.policy.net_arch,
         "activation_fn": activation.__name__,
+        "optimizer_class": optimizer.__name__,
+        "optimizer_kwargs": model.policy.optimizer_kwargs,
         "layer_norm": model.policy.layer_norm,
         "n_critics": model.policy.n_critics,
         "reward_feature_dim": model.reward_feature_dim,
@@ -213,6 +217,9 @@ def build_model(
             model.target_entropy = -float(np.prod(model.action_space.shape))  # type: ignore[arg-type]
         model.policy_kwargs["net_arch"] = config["net_arch"]
         model.policy_kwargs["activation_fn"] = getattr(nn, config.get("activation_fn", "ReLU"))
+        if "optimizer_class" in config:  # not in the first models
+            model.policy_kwargs["optimizer_class"] = getattr(th.optim, config["optimizer_class"])
+            model.policy_kwargs["optimizer_kwargs"] = config["optimizer_kwargs"]
         model.policy_kwargs["layer_norm"] = config.get("layer_norm", False)
         model.policy_kwargs["n_critics"] = config.get("n_critics", 2)
         model._setup_model()

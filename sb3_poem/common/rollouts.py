@@ -29,10 +29,11 @@ def rollout_latents(
     """
     Roll out one episode of pi(. | f_pi(z)) for every latent z, as many at a time as the environment has copies.
 
-    Every rollout resets its copy with a seed of its own, so a rollout depends on its latent, its task and its seed, and
-    not on which copy ran it or on how many copies there are. Two rollouts with equal seeds start alike (common random
-    numbers). A copy's first episode alone is kept. Nothing is restored afterwards: the environment keeps the tasks and
-    the state that it ended in.
+    Every rollout resets its copy with a seed of its own, so a rollout of policies that act by their mode depends on its
+    latent, its task and its seed, and not on which copy ran it or on how many copies there are. Two rollouts with equal
+    seeds start alike (common random numbers). Action noise (``deterministic=False``) is drawn for all copies of a wave
+    together: it depends on the wave's first seed, on the copy and on their number, too. A copy's first episode alone is
+    kept. Nothing is restored afterwards: the environment keeps the tasks and the state that it ended in.
 
     :param model: Anything with SB3's ``predict(obs, state=latents, deterministic=...)``.
     :param vec_env: Any SB3 vector environment. ``last_reward_features`` is read where it has it, else
@@ -40,7 +41,7 @@ def rollout_latents(
     :param latents: (n, latent_dim), any n.
     :param tasks: (n, task_dim) to set before each rollout; None keeps the environment's own tasks as they are.
     :param seed: One seed a rollout, or one integer s: then rollout i takes s + i.
-    :param deterministic: Whether the policies act by their mode. If not, the actions' noise follows the seeds too.
+    :param deterministic: Whether the policies act by their mode.
     :param frames: Whether to render every step, or n to render every n-th; the environment needs ``render_mode="rgb_array"``.
     :param max_steps: Where an episode is cut if the environment does not end it; None takes ``model.horizon``.
     :return: n trajectories, in the order of the latents.
@@ -318,19 +319,22 @@ def seed_episodes(vec_env: VecEnv, seeds: Sequence[int]) -> None:
     A task family that was never given a task draws one whenever it is reset with a seed; a reset without a seed keeps the
     task. So a family's generators are replaced, and its next reset needs no seed: the episode is the same as after a seeded
     reset, and the task stays. Nobody looks at the task for that, except where copies have no generators to replace
-    (``TaskVecEnv``): there their tasks are handed back to them unread. Any other environment is seeded as usual.
+    (``TaskVecEnv``): it is told to keep them. A task that was chosen for the next reset is the one that stays, and seeds that
+    are pending are used up first. Any other environment is seeded as usual.
 
     :param vec_env: Any SB3 vector environment.
     :param seeds: One a copy.
     """
-    if hasattr(vec_env, "set_tasks"):
+    if hasattr(vec_env, "keep_tasks"):
         family: Any = vec_env
         if family.tasks is None:  # nobody has chosen yet, so that the first seeds do
             seed_copies(vec_env, seeds)
             vec_env.reset()
-        family.set_tasks(family.tasks)
+        family.keep_tasks()
         seed_copies(vec_env, seeds)
     elif vec_env.has_attr("set_task"):
+        if any(seed is not None for seed in vec_env.unwrapped._seeds):
+            vec_env.reset()  # whoever seeded the environment, as make_vec_env always does, chose its tasks, not these episodes
         for copy, seed in enumerate(seeds):
             vec_env.set_attr("np_random", np.random.default_rng(seed), indices=[copy])
     else:

@@ -50,7 +50,8 @@ class Trajectory:
     :param latent: (d,) the latent whose policy acted.
     :param reward_features: (T, feat_dim), from which an oracle that knows the task computes rewards; None where the
         environment gives none.
-    :param frames: RGB images (height, width, 3) uint8, one a step, when rendering was asked for; else None.
+    :param frames: RGB images (height, width, 3) uint8, one a step, and one more where the episode was cut, when rendering was
+        asked for; else None.
     :raises ValueError: If the shapes do not fit together, or T = 0.
     """
 

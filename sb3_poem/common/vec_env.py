@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices,
 
 from poem_envs.core import TaskFamily
 from poem_envs.vector import TaskFamilyVector
+from sb3_poem.common.family import plain_id
 
 # What these do, the vectorised environment or TaskVecEnv does itself.
 ABSORBED_WRAPPERS: tuple[type[gym.Wrapper], ...] = (TimeLimit, OrderEnforcing, PassiveEnvChecker, Monitor)
@@ -93,6 +94,10 @@ class TaskVecEnv(VecEnv):
         """
         self.vector_env.set_tasks(tasks)
 
+    def keep_tasks(self) -> None:
+        """See :meth:`poem_envs.TaskFamilyVector.keep_tasks`."""
+        self.vector_env.keep_tasks()
+
     def reset(self) -> VecEnvObs:
         for index, options in enumerate(self._options):
             if options:
@@ -161,7 +166,7 @@ class TaskVecEnv(VecEnv):
             )
         if attr_name in ("task", "tasks"):
             raise AttributeError(f"{attr_name!r} cannot be set; use set_tasks(tasks), which takes effect at the next reset")
-        setattr(self.vector_env, attr_name, value)
+        self.vector_env.set_attribute(attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
@@ -204,6 +209,7 @@ def make_task_vec_env(env_id: str, n_envs: int, max_sequential: int = 8, **env_k
     :param max_sequential: The most copies that a ``DummyVecEnv`` steps one after another
     :param env_kwargs: Arguments of the environment
     """
+    env_id = plain_id(env_id)
     if gym.spec(env_id).vector_entry_point is not None:
         return TaskVecEnv.from_id(env_id, n_envs, **env_kwargs)
     return DummyVecEnv([functools.partial(gym.make, env_id, **env_kwargs)] * min(n_envs, max_sequential))
@@ -213,7 +219,21 @@ class _CopyView:
     """One copy of a vectorised task family, with the attributes and methods of a single one."""
 
     # What a vectorised environment has for all copies together must not pass for an attribute of one copy.
-    _HIDDEN = frozenset({"tasks", "set_tasks", "num_envs", "reset", "step", "close", "closed", "render_copy", "close_extras"})
+    _HIDDEN = frozenset(
+        {
+            "tasks",
+            "set_tasks",
+            "keep_tasks",
+            "set_attribute",
+            "num_envs",
+            "reset",
+            "step",
+            "close",
+            "closed",
+            "render_copy",
+            "close_extras",
+        }
+    )
 
     def __init__(self, vector_env: TaskFamilyVector, index: int) -> None:
         self._vector_env = vector_env

@@ -15,6 +15,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_poem.common.checkpoint import read_checkpoint, restore_stores, save_checkpoint
+from sb3_poem.common.family import plain_id
 from sb3_poem.common.files import write_atomically
 from sb3_poem.common.pretrained import from_pretrained, save_pretrained
 
@@ -69,6 +70,7 @@ class PersistentSAC(SAC):
             return env
         import poem_envs  # noqa: F401
 
+        env = plain_id(env)
         if gym.spec(env).vector_entry_point is None:
             return env
         from sb3_poem.common.vec_env import TaskVecEnv

@@ -3,12 +3,25 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 from worlds import HORIZON, Blinded, SpeedEnv, SpeedModel, SpeedVecEnv
 
+from sb3_poem import TaskVecEnv
 from sb3_poem.common.rollouts import rollout_features, rollout_latents
 
 MODEL = SpeedModel()
+
+
+class Still:
+    """A policy of PointGoal that does nothing."""
+
+    horizon = 25
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.zeros((len(observation), 2), dtype=np.float32), state
+
+
 LATENTS = np.random.default_rng(0).standard_normal((7, 5))
 
 
@@ -46,6 +59,29 @@ def test_tasks_are_set_for_the_rollouts():
     env = vec_env(2)
     rollout_latents(MODEL, env, LATENTS[:4], np.array([[0.1], [0.2], [0.3], [0.4]]))
     np.testing.assert_allclose(np.ravel(env.get_attr("task")), [0.3, 0.4])
+
+
+@pytest.mark.parametrize("kind", [DummyVecEnv, TaskVecEnv])
+def test_a_task_that_was_chosen_for_the_next_reset_is_the_one_that_stays(kind):
+    env = make_vec_env("poem/PointGoal-v0", 2, vec_env_cls=kind)
+    for task in (0.3, 1.5, 2.8):
+        for copy in range(2):
+            env.env_method("set_task", np.array([task]), indices=[copy])
+        for _ in range(2):
+            rollout_latents(Still(), env, LATENTS[:3])
+            np.testing.assert_array_equal(env.get_attr("task"), [[task], [task]])
+
+
+@pytest.mark.parametrize("kind", [DummyVecEnv, TaskVecEnv])
+def test_seeds_that_an_environment_was_made_with_do_not_reach_the_rollouts(kind):
+    starts, tasks = [], []
+    for seed in (None, None, 3, 3):  # make_vec_env seeds in any case, by chance if not told how
+        env = make_vec_env("poem/PointGoal-v0", 1, vec_env_cls=kind, seed=seed)
+        starts += [rollout_latents(Still(), env, LATENTS[:1], seed=[0])[0].observations[0] for _ in range(2)]
+        tasks.append(env.get_attr("task")[0])
+    assert np.unique(starts, axis=0).shape == (1, 2)
+    assert tasks[2] == tasks[3]
+    assert tasks[0] != tasks[1]
 
 
 def test_only_the_first_episode_counts():

@@ -12,7 +12,7 @@ from meta_toys import EPOCH, POINT_GOAL, differing, parameters, small, walks
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 
-from sb3_poem import PEARLSAC, POEMSAC, AdaptationEvalCallback, TrainingCheckpointCallback
+from sb3_poem import PEARLSAC, POEMSAC, AdaptationEvalCallback, RewardOracleAdapter, TrainingCheckpointCallback
 from sb3_poem.common.callbacks import EpochCallback
 
 
@@ -161,3 +161,10 @@ def test_evaluation_refuses_nothing_to_do(arguments: dict[str, int]) -> None:
 def test_evaluation_prints_when_asked(capsys: pytest.CaptureFixture[str]) -> None:
     small(POEMSAC).learn(EPOCH, AdaptationEvalCallback(**QUICK, verbose=1))
     assert "Evaluation after 300 steps: return_after_0_queries -" in capsys.readouterr().out
+
+
+def test_a_baseline_evaluates_a_model_without_a_similarity() -> None:
+    evaluation = {"n_tasks": 2, "n_episodes": 1, "record_at": (0, 1), "adaptation_kwargs": {"adapter": RewardOracleAdapter}}
+    callback = AdaptationEvalCallback(every=1, **evaluation)
+    small(PEARLSAC).learn(EPOCH, callback)
+    assert np.isfinite(callback.last_evaluation["return_after_1_queries"])

@@ -180,6 +180,23 @@ def test_an_activation_that_cannot_be_named_is_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "m").exists()
 
 
+def test_the_optimiser_is_kept(tmp_path: Path) -> None:
+    policy_kwargs = {"net_arch": ARCH, "optimizer_class": th.optim.AdamW, "optimizer_kwargs": {"weight_decay": 0.3}}
+    small(POEMSAC, policy_kwargs=policy_kwargs).save_pretrained(tmp_path / "m")
+    optimizer = POEMSAC.from_pretrained(tmp_path / "m").policy.optimizer
+    assert type(optimizer) is th.optim.AdamW
+    assert optimizer.param_groups[0]["weight_decay"] == 0.3
+
+
+def test_an_optimiser_that_cannot_be_named_is_refused(tmp_path: Path) -> None:
+    class Mine(th.optim.Adam):
+        pass
+
+    model = small(POEMSAC, policy_kwargs={"net_arch": ARCH, "optimizer_class": Mine})
+    with pytest.raises(ValueError, match=r"optimizer_class must be one of torch\.optim.*Mine"):
+        model.save_pretrained(tmp_path / "m")
+
+
 # ---------------------------------------------------------------- what goes wrong
 
 

@@ -18,7 +18,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 from poem_envs import TaskFamily
-from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.common.family import plain_id
+from sb3_poem.common.vec_env import TaskVecEnv, make_task_vec_env
 
 SMALL = {"buffer_size": 500, "batch_size": 16, "policy_kwargs": {"net_arch": [8]}, "device": "cpu"}
 FAMILIES = ["poem/PointGoal-v0", "poem/HalfCheetahVel-v0", "poem/AntFwdBack-v0", "poem/HumanoidDir2D-v0"]
@@ -132,6 +133,18 @@ def test_only_the_first_function_is_called():
     env.reset()
     dones = [env.step(actions)[2].all() for actions in random_actions(env, 7)]
     assert dones == [False] * 6 + [True]
+
+
+def test_ids_that_name_their_module():
+    assert isinstance(make_task_vec_env("poem_envs:poem/PointGoal-v0", 2), TaskVecEnv)
+    assert plain_id("poem_envs:poem/PointGoal-v0") == plain_id("poem/PointGoal-v0") == "poem/PointGoal-v0"
+    with pytest.raises(ModuleNotFoundError, match="no_such_module"):
+        make_task_vec_env("no_such_module:poem/PointGoal-v0", 2)
+
+
+def test_attributes_of_a_family_in_processes():
+    env = TaskVecEnv.from_id("poem/MetaWorldML1-v0", 2, nthread=1)
+    assert env.get_attr("env_name") == ["reach", "reach"]
 
 
 def test_set_attr():

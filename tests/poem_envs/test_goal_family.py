@@ -154,6 +154,13 @@ def test_environments_that_are_not_goal_conditioned(env, message):
         GoalFamily(env)
 
 
+def test_wrappers_that_would_have_no_effect():
+    bare = GoalFamily(lambda: gym.wrappers.TimeLimit(Reach(), 5))
+    assert isinstance(bare.env, Reach)
+    with pytest.raises(ValueError, match="its ClipAction would have no effect"):
+        GoalFamily(lambda: gym.wrappers.ClipAction(Reach()))
+
+
 def test_an_environment_in_place_of_what_makes_it():
     with pytest.raises(ValueError, match="pass its id, or a function that makes it"):
         GoalFamily(Reach())

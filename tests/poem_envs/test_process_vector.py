@@ -8,6 +8,7 @@ import signal
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.error import ResetNeeded
 
 from poem_envs import ProcessFamilyVector, TaskFamily
 
@@ -66,6 +67,62 @@ def test_the_number_of_processes_changes_nothing(rng):
     for other in results[1:]:
         assert all(np.array_equal(one, two) for one, two in zip(results[0], other, strict=True))
     assert any(done.any() for done in results[0][3::7])  # some episodes ended early
+
+
+class Interrupted(Walk):
+    """Its user presses Ctrl-C while this process steps its own copies."""
+
+    armed = 0
+
+    def _simulate(self, action):
+        if Interrupted.armed and action[0] == 0.625:
+            Interrupted.armed -= 1
+            raise KeyboardInterrupt
+        return super()._simulate(action)
+
+
+def test_after_an_interrupt_the_environment_can_be_reset_and_is_right(rng):
+    actions = rng.uniform(-1, 1, (9, 4, 1)).astype(np.float32)
+    reference = ProcessFamilyVector(Walk, num_envs=4, nthread=2, max_episode_steps=6)
+    envs = ProcessFamilyVector(Interrupted, num_envs=4, nthread=2, max_episode_steps=6)
+    envs.reset(seed=123)
+    Interrupted.armed = 1
+    with pytest.raises(KeyboardInterrupt):
+        envs.step(np.full((4, 1), 0.625, dtype=np.float32))
+    for call in (lambda: envs.step(actions[0]), lambda: envs.get_physics_state(0)):
+        with pytest.raises(ResetNeeded, match="was interrupted"):
+            call()
+    mine, truth = (run(each, actions) for each in (envs, reference))
+    assert all(np.array_equal(one, two) for one, two in zip(mine, truth, strict=True))
+
+
+def test_attributes_of_the_family_are_read_and_set_on_every_copy():
+    envs = ProcessFamilyVector(Walk, num_envs=4, nthread=2, step_length=0.2)
+    assert envs.step_length == 0.2
+    with pytest.raises(AttributeError, match="no_such_thing"):
+        envs.no_such_thing  # noqa: B018
+    envs.set_attribute("step_length", 0.05)
+    assert envs.step_length == 0.05
+    before = envs.reset(seed=0)[0][:, 0]
+    after = envs.step(np.ones((4, 1), dtype=np.float32))[0][:, 0]
+    np.testing.assert_allclose(after - before, 0.05)
+
+
+class Single(Walk):
+    observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+
+    def _begin_episode(self, rng):
+        return super()._begin_episode(rng).astype(np.float32)
+
+    def _simulate(self, action):
+        observation, features, terminated = super()._simulate(action)
+        return observation.astype(np.float32), features, terminated
+
+
+def test_observations_have_the_type_of_their_space():
+    envs = ProcessFamilyVector(Single, num_envs=3, nthread=2)
+    assert envs.reset(seed=0)[0] in envs.observation_space
+    assert envs.step(np.zeros((3, 1), dtype=np.float32))[0] in envs.observation_space
 
 
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda envs: pickle.loads(pickle.dumps(envs))])
