@@ -175,9 +175,9 @@ class PreferenceAdapter:
             if self.done:
                 raise RuntimeError(f"all {self.options.n_queries} questions have been answered; take policy()")
             self._pending = self._make_query()
-        elif self._needs_frames and self._pending.left.frames is None:
+        elif self._needs_frames and self._pending.left.frames is None and self.inference.library is None:
             # It comes from a file, which holds no frames; the same seed gives the same rollouts.
-            self._pending = self._roll_out(self._pending.left.latent, self._pending.right.latent)
+            self._pending = self._roll_out(*self.inference.same_latents(self._pending.left.latent, self._pending.right.latent))
         return self._pending
 
     def tell(self, preference: Preference | str) -> None:

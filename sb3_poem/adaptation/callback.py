@@ -88,7 +88,7 @@ class AdaptationEvalCallback(EpochCallback):
     def _on_epoch(self) -> None:
         env, tasks = self._make_env()
         options: dict[str, Any] = {"seed": self.seed, "n_episodes": self.n_episodes}
-        if not hasattr(self.model, "similarity"):
+        if not hasattr(self.model, "similarity") and "adapter" not in self.adaptation_kwargs:
             self.adaptation_kwargs.setdefault("query_rule", "random")
         result = evaluate_adaptation(self.model, env, tasks, record_at=self.record_at, **options, **self.adaptation_kwargs)
         known = known_task_return(self.model, env, tasks, **options)

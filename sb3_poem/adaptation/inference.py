@@ -117,6 +117,16 @@ class LatentInference(ABC):
         """
         raise RuntimeError("there is no library to ask about; pass `library`")
 
+    def same_latents(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """
+        The policies of a pending question that was read from a file.
+
+        :param left: The latent in the file.
+        :param right: The other.
+        :return: The same ones; others where a latent means something to one model object alone.
+        """
+        return left, right
+
     @abstractmethod
     def tell(self, preference: Preference, left: Shown, right: Shown) -> None:
         """

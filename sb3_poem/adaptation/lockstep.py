@@ -55,7 +55,8 @@ def adapt_tasks(
     Adapt a model to each of many tasks, with all rollouts of a question in lockstep.
 
     Task i is adapted as ``adapter(model, env, seed=seed + i, ...)`` would alone: with the same candidates, questions
-    and reset seeds. (Matrix products may round otherwise in a batch than alone, in the last bits.) The tasks are set in
+    and reset seeds. (Matrix products may round otherwise in a batch than alone, in the last bits; and with
+    ``deterministic=False`` the actions' noise is drawn for all rollouts of a question together.) The tasks are set in
     ``vec_env`` for the rollouts, and known to the oracles; inference never sees them.
 
     :param model: A trained model.

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
 
+ORACLE_STREAM = 8
+
+
 class TaskOracle(ABC):
     """
     An oracle that computes true returns from the trajectories' reward features.
@@ -31,7 +34,8 @@ class TaskOracle(ABC):
     def __init__(self, env: gym.Env | VecEnv | None = None, task: np.ndarray | None = None, seed: int | None = None) -> None:
         self.env = env
         self.task = None if task is None else np.asarray(task, dtype=np.float64)
-        self.rng = np.random.default_rng(seed)
+        # A stream of its own: an adaptation with the same seed draws its candidates from another (``inference_rng``).
+        self.rng = np.random.default_rng(None if seed is None else [seed, ORACLE_STREAM])
 
     @property
     @abstractmethod

@@ -180,6 +180,10 @@ class MAMLRewardInference(LatentInference):
         """See :class:`LatentInference`: the current policy twice, with opposite exploration noise."""
         return self.latent.copy(), self.latent * np.array([1.0, -1.0])
 
+    def same_latents(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See :class:`LatentInference`: the current policy, which has another number here than in the file."""
+        return self.ask_latents()
+
     def tell(self, preference: Preference, left: Shown, right: Shown) -> None:
         """
         See :class:`LatentInference`.

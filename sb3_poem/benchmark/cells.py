@@ -28,6 +28,7 @@ ADAPTERS: dict[str, type[PreferenceAdapter]] = {
     "oracle": RewardOracleAdapter,
 }
 SELECTION_EPISODES = 3
+SEED_STRIDE = 10_000
 DIGITS = 4  # of returns in the store
 
 
@@ -79,6 +80,11 @@ def make_oracle_factory(spec: OracleSpec) -> Callable[..., TaskOracle]:
     raise ValueError(f"there is no oracle {spec}; there are return, boltzmann, and mistake with a rate")
 
 
+def _episode_seed(cell: Cell) -> int:
+    """Task i takes what follows it by i, so that seeds lie further apart than there are tasks; 0 shares nothing with 1."""
+    return cell.budget.task_seed + SEED_STRIDE * cell.seed
+
+
 def _measure_adaptation(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) -> dict[str, Any]:
     kind, options, budget = cell.definition.kind, dict(cell.options), cell.budget
     fragments = None
@@ -95,7 +101,7 @@ def _measure_adaptation(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) 
         make_oracle_factory(cell.oracle),
         record_at=budget.record_at,
         n_episodes=budget.episodes,
-        seed=budget.task_seed + cell.seed,
+        seed=_episode_seed(cell),
         adapter=ADAPTERS[kind],
         **options,
     )
@@ -122,7 +128,7 @@ def _measure_known(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) -> di
     budget = cell.budget
     episodes = min(budget.episodes, SELECTION_EPISODES)
     known = known_task_return(
-        model, env, tasks, n_episodes=budget.episodes, seed=budget.task_seed + cell.seed, selection_episodes=episodes
+        model, env, tasks, n_episodes=budget.episodes, seed=_episode_seed(cell), selection_episodes=episodes
     )
     data: dict[str, Any] = {
         "tasks": _rounded(tasks),

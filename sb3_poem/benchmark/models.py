@@ -25,7 +25,7 @@ from sb3_poem.benchmark.hyperparameters import TrainingPlan, training_plan
 from sb3_poem.benchmark.locks import locked
 from sb3_poem.benchmark.methods import META_ITERATIONS, META_ITERATIONS_OF, VARIANTS
 from sb3_poem.benchmark.provenance import provenance
-from sb3_poem.benchmark.suites import ModelKey
+from sb3_poem.benchmark.suites import ModelKey, family_label
 from sb3_poem.common.pretrained import CONFIG, WEIGHTS, read_config
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.pearl_sac import PEARLSAC
@@ -101,7 +101,7 @@ class ModelLibrary:
         if not key.training.is_default:
             text = json.dumps(key.training.to_dict(), sort_keys=True)
             variant += "-" + hashlib.sha256(text.encode()).hexdigest()[:8]
-        return self.runs / key.family / variant / f"seed{key.seed}"
+        return self.runs / _place(key) / variant / f"seed{key.seed}"
 
     def given(self, key: ModelKey) -> Path | None:
         """
@@ -110,17 +110,20 @@ class ModelLibrary:
 
         :param key: The model.
         :return: Its place; None if it was not handed over.
-        :raises ValueError: If a model that was named does not exist.
+        :raises ValueError: If a model that was named does not exist, or is a folder without one.
         """
         if not key.training.is_default:
             return None
         for family, variant, seed, path in self.workplace.named:
             if (family, variant, seed) == (key.family, key.variant, key.seed):
-                if not Path(path).exists():
+                named = Path(path)
+                if not named.exists():
                     raise ValueError(f"--model {family}:{variant}:{seed}={path}: there is no such file or folder")
-                return Path(path)
+                if named.is_dir():
+                    _find_content(named)
+                return named
         for folder in map(Path, self.workplace.models):
-            place = folder / key.family / key.variant / f"seed{key.seed}"
+            place = folder / _place(key) / key.variant / f"seed{key.seed}"
             for candidate in (place, place.with_suffix(".zip")):
                 if candidate.is_file() or (candidate.is_dir() and _content(candidate) is not None):
                     return candidate
@@ -319,6 +322,11 @@ def _other(key: ModelKey, variant: str) -> ModelKey:
     return ModelKey(key.env_id, variant, key.seed, key.training)
 
 
+def _place(key: ModelKey) -> str:
+    """The folder of an environment's models: two families of one name, from other packages or of other versions, have two."""
+    return _file_name(family_label(key.env_id))
+
+
 def _file_name(env_id: str) -> str:
     return env_id.replace("/", "-")
 
@@ -351,10 +359,15 @@ def _content(folder: Path) -> Path | None:
     return next((path for path in names if path.is_file()), None)
 
 
-def _load_given(algorithm: type[PEARLSAC], path: Path, env: VecEnv, device: str) -> PEARLSAC:
-    file = _content(path) if path.is_dir() else path
+def _find_content(folder: Path) -> Path:
+    file = _content(folder)
     if file is None:
-        raise ValueError(f"{path} holds no model: neither {CHECKPOINT}, nor {MODEL}, nor {CONFIG}")
+        raise ValueError(f"{folder} holds no model: neither {CHECKPOINT}, nor {MODEL}, nor {CONFIG}")
+    return file
+
+
+def _load_given(algorithm: type[PEARLSAC], path: Path, env: VecEnv, device: str) -> PEARLSAC:
+    file = _find_content(path) if path.is_dir() else path
     if file.name == CONFIG:
         return algorithm.from_pretrained(path, env, device=device)
     if _is_checkpoint(file):

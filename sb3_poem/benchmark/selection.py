@@ -13,7 +13,7 @@ from sb3_poem.adaptation.evaluation import KnownTaskReturn
 from sb3_poem.benchmark.cells import make_oracle_factory
 from sb3_poem.benchmark.methods import METHODS
 from sb3_poem.benchmark.store import Record
-from sb3_poem.benchmark.suites import Budget, Entry, OracleSpec, Suite, Training, family_name
+from sb3_poem.benchmark.suites import Budget, Entry, OracleSpec, Suite, Training, family_label, family_name, hashable
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Condition:
         return Budget(self.tasks, self.episodes, task_seed=self.task_seed)
 
     def __str__(self) -> str:
-        words = [f"{self.family}: {self.tasks} test tasks, {self.episodes} episodes each"]
+        words = [f"{family_label(self.env_id)}: {self.tasks} test tasks, {self.episodes} episodes each"]
         if self.training.timesteps is not None:
             words.append(f"trained for {self.training.timesteps:,} steps")
         words += [f"{name} = {value}" for name, value in self.training.hyperparameters]
@@ -139,8 +139,10 @@ class Selection:
             key=lambda c: (_family_order(suite, c.family), c.env_id, str(c)),
         )
         self.seeds = sorted({record.seed for record in self.records.values()})
-        shares = [share for record in self.records.values() if (share := record.identity["snapshot"]) is not None]
-        self.snapshots = round(1 / min(shares)) if shares else suite.snapshots
+        self._shares: dict[Condition, set[float]] = {condition: set() for condition in self.conditions}
+        for record in self.records.values():
+            if record.identity["snapshot"] is not None:
+                self._shares[_condition(record.identity)].add(record.identity["snapshot"])
         self._references: dict[Condition, list[Reference]] = {}
 
     def series(self, entry: Entry, condition: Condition) -> list[Series]:
@@ -153,8 +155,8 @@ class Selection:
         """
         found: dict[tuple[str, OracleSpec, float | None], list[Record]] = {}
         for seed in self.seeds:
-            arguments = (condition.env_id, seed, condition.budget, condition.training, self.snapshots)
-            for cell in self.suite.entry_cells(entry, *arguments):
+            arguments = (condition.env_id, seed, condition.budget, condition.training)
+            for cell in self.suite.entry_cells(entry, *arguments, sorted(self._shares[condition])):
                 if cell.key in self.records:
                     found.setdefault((cell.method, cell.oracle, cell.snapshot), []).append(self.records[cell.key])
         order = {name: position for position, name in enumerate(entry.methods)}
@@ -181,7 +183,7 @@ class Selection:
         entry = Entry("references", "", self.suite.references)
         found: dict[str, list[Record]] = {}
         for seed in self.seeds:
-            for cell in self.suite.entry_cells(entry, condition.env_id, seed, condition.budget, condition.training, 1):
+            for cell in self.suite.entry_cells(entry, condition.env_id, seed, condition.budget, condition.training):
                 if cell.key in self.records:
                     found.setdefault(cell.method, []).append(self.records[cell.key])
         return [Reference(method, tuple(found[method])) for method in self.suite.references if method in found]
@@ -202,7 +204,7 @@ def _limits(reference: Reference, queries: int, oracle: OracleSpec) -> tuple[flo
 
 def _condition(identity: dict[str, Any]) -> Condition:
     training = identity["training"]
-    hyperparameters = tuple(sorted(training["hyperparameters"].items()))
+    hyperparameters = tuple(sorted((name, hashable(value)) for name, value in training["hyperparameters"].items()))
     return Condition(
         identity["env_id"],
         identity["tasks"],

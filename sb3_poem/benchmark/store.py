@@ -98,13 +98,19 @@ class Store:
             if tables or not create:
                 raise ValueError(f"--store {self.path} is a database of another program: it has no table `about`")
             self._create()
-        with self._engine.connect() as connection:
-            about = {row.name: row.value for row in connection.execute(sa.select(_ABOUT))}
+        about = self._about()
+        if not about and create:  # another process is creating it, or was ended while it did
+            self._create()
+            about = self._about()
         if about.get("schema") != SCHEMA:
             raise ValueError(
                 f"--store {self.path} was written in schema {about.get('schema')!r} by sb3_poem {about.get('version')!r}, "
                 f"but this is sb3_poem {__version__}, which reads schema {SCHEMA!r}; use that version, or another file"
             )
+
+    def _about(self) -> dict[str, str]:
+        with self._engine.connect() as connection:
+            return {row.name: row.value for row in connection.execute(sa.select(_ABOUT))}
 
     def _create(self) -> None:
         """Another process may be doing the same: what is there already stays."""

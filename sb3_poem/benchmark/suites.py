@@ -117,7 +117,7 @@ class ModelKey:
         return family_name(self.env_id)
 
     def __str__(self) -> str:
-        return f"{self.family} {self.variant} seed {self.seed}"
+        return f"{family_label(self.env_id)} {self.variant} seed {self.seed}"
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ class Cell:
         return hashlib.sha256(json.dumps(self.identity(), sort_keys=True).encode()).hexdigest()[:24]
 
     def __str__(self) -> str:
-        words = [self.family, self.method, f"seed {self.seed}"]
+        words = [family_label(self.env_id), self.method, f"seed {self.seed}"]
         if self.oracle != EXACT:
             words.append(self.oracle.label)
         if self.budget.record_at[-1] != RECORD_AT[-1]:
@@ -278,17 +278,18 @@ class Suite:
                 raise ValueError(f"--methods {name} is not in the suite {self.name!r}, which has: {', '.join(self.methods)}")
         budget, training = budget or self.budget, training or Training()
         parts = self.snapshots if snapshots is None else snapshots
+        shares = [round(part / parts, 4) for part in range(1, parts)]
         cells: dict[str, Cell] = {}
         for env_id in env_ids:
             for seed in seeds:
                 for entry in (*self.entries, Entry("references", "", self.references)):
-                    for cell in self.entry_cells(entry, env_id, seed, budget, training, parts):
+                    for cell in self.entry_cells(entry, env_id, seed, budget, training, shares):
                         if not methods or cell.method in methods:
                             cells.setdefault(cell.key, cell)
         return list(cells.values())
 
     def entry_cells(
-        self, entry: Entry, env_id: str, seed: int, budget: Budget, training: Training, snapshots: int
+        self, entry: Entry, env_id: str, seed: int, budget: Budget, training: Training, shares: Sequence[float] = ()
     ) -> list[Cell]:
         """
         The cells of one entry, for one family and seed.
@@ -298,7 +299,7 @@ class Suite:
         :param seed: The seed.
         :param budget: See :meth:`cells`.
         :param training: See :meth:`cells`.
-        :param snapshots: See the class.
+        :param shares: After which shares of the training the methods are measured too, where the entry has curves.
         :return: The cells.
         """
         cells = []
@@ -308,7 +309,6 @@ class Suite:
             for oracle in entry.oracles:
                 moments: list[tuple[float | None, tuple[int, ...]]] = [(None, entry.record_at)]
                 if oracle in entry.curves and name not in WITHOUT_CURVE:
-                    shares = [round(part / snapshots, 4) for part in range(1, snapshots)]
                     moments += [(share, entry.record_at[-1:]) for share in shares]
                 for share, record_at in moments:
                     spent = replace(budget, record_at=record_at)
@@ -316,9 +316,26 @@ class Suite:
         return cells
 
 
+def hashable(value: Any) -> Any:
+    """A hyperparameter's value, with tuples for lists: a model is looked up by its hyperparameters, and JSON has no tuples.
+
+    :param value: Of YAML or JSON
+    :raises ValueError: if it is, or holds, a dictionary
+    """
+    if isinstance(value, dict):
+        raise ValueError(f'{value!r} is a dictionary; write it as text, as rl_zoo3\'s files do: "dict(...)"')
+    return tuple(map(hashable, value)) if isinstance(value, (list, tuple)) else value
+
+
 def family_name(env_id: str) -> str:
     """AntGoal of poem/AntGoal-v0."""
     return env_id.split("/")[-1].split("-")[0]
+
+
+def family_label(env_id: str) -> str:
+    """What no other environment is called: AntGoal for poem/AntGoal-v0; ids of other namespaces or versions stay as they are."""
+    name = family_name(env_id)
+    return name if env_id == family_id(name) else env_id
 
 
 def family_id(name: str) -> str:

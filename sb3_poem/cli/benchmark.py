@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_poem.benchmark.methods import VARIANTS
-from sb3_poem.benchmark.suites import SUITES, Budget, Training, family_id, family_name
+from sb3_poem.benchmark.suites import SUITES, Budget, Training, family_id, family_name, hashable
 from sb3_poem.cli.outputs import check_writable
 
 
@@ -36,6 +36,7 @@ def _run(arguments: argparse.Namespace) -> int:
     training = Training(arguments.timesteps, tuple(sorted(_parse_params(arguments.params).items())))
     if not training.is_default and (arguments.models or arguments.model):
         raise ValueError("--models and --model hand over models that were trained already: leave out --timesteps and --params")
+    _check_models(arguments)
     library = ModelLibrary(
         Workplace(
             arguments.runs,
@@ -73,6 +74,22 @@ def _run(arguments: argparse.Namespace) -> int:
     return 1 if failures else 0
 
 
+def _check_models(arguments: argparse.Namespace) -> None:
+    """Refuse what would quietly be trained instead of being taken."""
+    for folder in arguments.models:
+        if not Path(folder).is_dir():
+            raise ValueError(f"--models {folder}: there is no such folder")
+    names = arguments.families or SUITES[arguments.suite].families
+    families = {family_name(family_id(name)) for name in names}
+    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+    for text in arguments.model:
+        family, _, seed, _ = _parse_named(text)
+        if family not in families:
+            raise ValueError(f"--model {text}: {family} is none of the families of this run: {', '.join(sorted(families))}")
+        if seed not in seeds:
+            raise ValueError(f"--model {text}: {seed} is none of the seeds of this run: {', '.join(map(str, seeds))}")
+
+
 def _report(arguments: argparse.Namespace) -> int:
     try:
         from sb3_poem.benchmark.report import make_report
@@ -100,9 +117,16 @@ def _parse_params(pairs: list[str]) -> dict[str, Any]:
     from sb3_poem.cli.adapt import parse_env_kwargs
 
     try:
-        return parse_env_kwargs(pairs)
+        given = parse_env_kwargs(pairs)
     except ValueError as error:
         raise ValueError(str(error).replace("--env-kwargs", "--params")) from error
+    values = {}
+    for name, value in given.items():
+        try:
+            values[name] = hashable(value)
+        except ValueError as error:
+            raise ValueError(f"--params {name}: {error}") from error
+    return values
 
 
 def _parse_named(text: str) -> tuple[str, str, int, str]:

@@ -320,6 +320,13 @@ def test_the_oracles_noise_model_is_taken():
     assert adapter(oracle=outside_oracle).inference.noise_model == ExactNoise()
 
 
+class Looks:
+    needs_frames = True
+
+    def __call__(self, left, right):
+        return "left"
+
+
 def test_a_library_needs_no_rollouts():
     model = SpeedModel()
     source = PreferenceAdapter(model, make_env(np.array([0.3])), seed=3, query_rule="random")
@@ -333,6 +340,8 @@ def test_a_library_needs_no_rollouts():
     a = PreferenceAdapter(model, NoSteps(), library=library, seed=0, n_queries=4)
     answer(a, 4)
     assert all(item.left in library for item in a.answers)
+    looking = PreferenceAdapter(model, NoSteps(), library=library, seed=0, oracle=Looks())
+    assert looking.ask() is looking.ask()  # which has no frames, and is not rolled out for them
     with pytest.raises(ValueError, match="pass the same `library`"):
         PreferenceAdapter.from_json(a.to_json(), model, make_env())
     resumed = PreferenceAdapter.from_json(a.to_json(), model, make_env(), library=library)

@@ -20,6 +20,7 @@ from sb3_poem.adaptation import (
     ReturnOracle,
 )
 from sb3_poem.adaptation.human import PROMPT
+from sb3_poem.adaptation.options import inference_rng
 from sb3_poem.common.trajectory import Trajectory
 
 LEFT, RIGHT, EQUAL = Preference
@@ -168,3 +169,10 @@ def test_a_persons_terminal_and_frames_are_needed(tmp_path):
         HumanOracle(tmp_path, "avi")
     with pytest.raises(ValueError, match="render_mode"):
         PreferenceAdapter(SpeedModel(), SpeedEnv(), oracle=HumanOracle(tmp_path)).ask()
+
+
+def test_an_oracle_and_an_adaptation_of_one_seed_draw_from_different_streams():
+    for seed in (0, 7):
+        of_oracle, of_inference = MistakeOracle(seed=seed).rng.random(4), inference_rng(seed).random(4)
+        assert not np.isclose(of_oracle, of_inference).any()
+        assert np.array_equal(of_oracle, BoltzmannOracle(seed=seed).rng.random(4))

@@ -61,6 +61,19 @@ def test_the_state_resumes_and_the_generators_stay(model):
     assert np.abs(first - start).max() > 1e-3
 
 
+def test_a_pending_question_is_shown_again_by_a_model_that_was_made_anew(model, monkeypatch):
+    shown = MAMLRewardAdapter(model, walks(1), n_queries=3, seed=0, **FAST)
+    shown.ask()
+    shown.tell("left")
+    query = shown.ask()
+    monkeypatch.setattr("sb3_poem.adaptation.adapter.PreferenceAdapter._needs_frames", property(lambda self: True))
+    monkeypatch.setattr("sb3_poem.adaptation.adapter.rollout_latents", lambda *a, frames, **k: rollout_latents(*a, **k))
+    resumed = MAMLRewardAdapter.from_json(shown.to_json(), MAMLRewardModel(model.reward, model), walks(1))
+    again = resumed.ask()
+    np.testing.assert_array_equal(again.left.actions, query.left.actions)
+    np.testing.assert_array_equal(again.right.actions, query.right.actions)
+
+
 def test_what_will_not_do(trained, model):
     with pytest.raises(ValueError, match="`model` must be a MAMLRewardModel, but is of type SpeedModel"):
         MAMLRewardAdapter(SpeedModel(), SpeedEnv())

@@ -14,6 +14,7 @@ from sb3_poem.benchmark.hyperparameters import training_plan
 from sb3_poem.benchmark.models import ModelLibrary, Workplace
 from sb3_poem.benchmark.plan import describe, make_plan
 from sb3_poem.benchmark.suites import SUITES, Budget, ModelKey, Training
+from sb3_poem.cli import main
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.resources import shipped_folder
 
@@ -48,6 +49,13 @@ def test_shipped_models_are_taken_for_their_own_seed_alone() -> None:
             assert library.given(ModelKey(f"poem/{family}-v0", variant, own)) is None
     altered = ModelKey("poem/HalfCheetahVel-v0", "poem", 0, Training(timesteps=1000))
     assert library.given(altered) is None
+
+
+def test_families_of_one_name_have_folders_of_their_own(tmp_path: Path) -> None:
+    library = ModelLibrary(Workplace(str(tmp_path)))
+    ids = ("poem/PointGoal-v0", "mine/PointGoal-v0", "poem/PointGoal-v1")
+    folders = [library.folder(ModelKey(env_id, "poem", 0)).relative_to(tmp_path).as_posix() for env_id in ids]
+    assert folders == ["PointGoal/poem/seed0", "mine-PointGoal-v0/poem/seed0", "poem-PointGoal-v1/poem/seed0"]
 
 
 def test_models_are_found_in_a_folder_or_by_name_and_checked(tmp_path: Path) -> None:
@@ -110,3 +118,31 @@ def test_the_plan_names_each_model_once_and_a_base_first(tmp_path: Path) -> None
     assert names == [(v, s) for s in range(2) for v in ("poem", "pearl", "maml-reward")]
     only = plan_for(ModelLibrary(Workplace(str(tmp_path))), "table3", ["PointGoal"], ["maml-reward"])
     assert [key.variant for key in only.models] == ["pearl", "maml-reward"]
+
+
+def test_a_named_folder_without_a_model(tmp_path: Path) -> None:
+    library = ModelLibrary(Workplace(str(tmp_path), named=(("PointGoal", "poem", 0, str(tmp_path)),)))
+    with pytest.raises(ValueError, match=r"holds no model: neither checkpoint\.zip"):
+        library.given(ModelKey(POINT, "poem", 0))
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--models", "no_such_folder"], "--models no_such_folder: there is no such folder"),
+        (["--model", "PointGaol:poem:0=."], "PointGaol is none of the families of this run: PointGoal"),
+        (["--model", "PointGoal:poem:5=."], "5 is none of the seeds of this run: 0, 1, 2"),
+        (["--params", "net_arch:{'pi': [64]}"], "--params net_arch: .* is a dictionary; write it as text"),
+    ],
+)
+def test_what_would_quietly_train_something_else_is_refused(
+    words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["benchmark", "run", "--suite", "smoke", "--list", *words]) != 0
+    assert re.search(message, capsys.readouterr().err)
+
+
+def test_lists_are_taken_as_hyperparameters(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    runs = ["--runs", str(tmp_path), "--store", str(tmp_path / "s.sqlite")]
+    assert main(["benchmark", "run", "--suite", "smoke", "--list", "--params", "train_freq:[1, 'step']", *runs]) == 0
+    assert "PointGoal poem seed 0: missing" in capsys.readouterr().out

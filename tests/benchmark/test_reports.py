@@ -14,7 +14,7 @@ from sb3_poem.benchmark.report import make_report
 from sb3_poem.benchmark.selection import Selection
 from sb3_poem.benchmark.statistics import summarise
 from sb3_poem.benchmark.store import Store
-from sb3_poem.benchmark.suites import BOLTZMANN, SUITES, Budget, Cell, OracleSpec
+from sb3_poem.benchmark.suites import BOLTZMANN, SUITES, Budget, Cell, OracleSpec, Training
 from sb3_poem.benchmark.tables import suite_rows, suite_tables
 
 VEL = "poem/HalfCheetahVel-v0"
@@ -106,6 +106,33 @@ def test_other_budgets_stand_in_other_tables(tmp_path: Path) -> None:
         "HalfCheetahVel: the models",
         "HalfCheetahVel: 4 test tasks, 3 episodes each; methods, exact answers",
     ]
+
+
+def test_families_of_one_name_and_curves_of_different_parts_stay_apart(tmp_path: Path) -> None:
+    with Store(tmp_path / "store.sqlite") as store:
+        for env_id, parts in ((VEL, 5), ("mine/HalfCheetahVel-v0", 2)):
+            for cell in SUITES["table3"].cells([env_id], [0], ["anole"], FOUR, snapshots=parts):
+                store.add(finished(cell, lambda cell, k: ladder(cell, k) - 100.0 * cell.env_id.startswith("mine")))
+        selection = Selection(SUITES["table3"], store.records())
+    measured: dict[str, set[float | None]] = {}
+    for row in suite_rows(selection):
+        measured.setdefault(row.condition.split(":")[0], set()).add(row.snapshot)
+    assert measured == {"HalfCheetahVel": {None, 0.2, 0.4, 0.6, 0.8}, "mine/HalfCheetahVel-v0": {None, 0.5}}
+    tables = [table for table in suite_tables(selection) if table.title.endswith("methods, exact answers")]
+    assert sorted((table.title.split(":")[0], table.rows[0][2]) for table in tables) == [
+        ("HalfCheetahVel", "-24.0"),
+        ("mine/HalfCheetahVel-v0", "-124.0"),
+    ]
+
+
+def test_hyperparameters_that_are_lists(tmp_path: Path) -> None:
+    training = Training(None, (("net_arch", (64, 64)),))
+    with Store(tmp_path / "store.sqlite") as store:
+        [cell] = SUITES["table3"].cells([VEL], [0], ["anole"], FOUR, training, 1)
+        store.add(finished(cell, ladder))
+        [condition] = Selection(SUITES["table3"], store.records()).conditions
+    assert condition.training == training
+    assert str(condition).endswith("net_arch = (64, 64)")
 
 
 def test_every_format(tmp_path: Path) -> None:

@@ -39,6 +39,18 @@ def test_what_is_there_stays(tmp_path: Path) -> None:
         assert [record.key for record in store.records(["key2"])] == []
 
 
+def test_a_store_whose_creation_was_interrupted_is_completed(tmp_path: Path) -> None:
+    path = tmp_path / "store.sqlite"
+    Store(path).close()
+    with sqlite3.connect(path) as connection:  # as after a kill between the first table and its rows
+        connection.execute("delete from about")
+        connection.execute("drop table cells")
+    with Store(path) as store:
+        assert store.add(some_record(1))
+    with Store(path, create=False) as store:
+        assert store.keys() == {"key1"}
+
+
 def test_another_version_is_refused_by_name(tmp_path: Path) -> None:
     path = tmp_path / "store.sqlite"
     Store(path).close()

@@ -8,6 +8,7 @@ import pytest
 import yaml
 from benchmark_records import cells_of
 
+from sb3_poem.benchmark.cells import _episode_seed
 from sb3_poem.benchmark.methods import METHODS, VARIANTS, find_method
 from sb3_poem.benchmark.paper import TABLE_3, paper_figure
 from sb3_poem.benchmark.suites import (
@@ -20,6 +21,7 @@ from sb3_poem.benchmark.suites import (
     Training,
     family_id,
     family_name,
+    hashable,
 )
 from sb3_poem.resources import config_file
 
@@ -122,3 +124,15 @@ def test_the_declarations_are_light() -> None:
     """The command line reads them for its help."""
     code = "import sys, sb3_poem.benchmark.suites; print({'torch', 'mujoco', 'sqlalchemy'} & set(sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "set()"
+
+
+def test_seeds_share_no_episodes_or_answers() -> None:
+    cells = SUITES["noise"].cells(["poem/PointGoal-v0"], range(3), ["anole"], snapshots=1)
+    seeds = {cell.seed: {_episode_seed(cell) + i for i in range(cell.budget.tasks)} for cell in cells}
+    assert len(set.union(*seeds.values())) == 3 * 30
+
+
+def test_hyperparameters_can_be_looked_up() -> None:
+    assert hashable([64, [1, 2]]) == (64, (1, 2))
+    with pytest.raises(ValueError, match="is a dictionary; write it as text"):
+        hashable({"pi": [64]})
