@@ -333,7 +333,7 @@ def family_name(env_id: str) -> str:
 
 
 def family_label(env_id: str) -> str:
-    """What no other environment is called: AntGoal for poem/AntGoal-v0; ids of other namespaces or versions stay as they are."""
+    """What no other environment is called: AntGoal for poem/AntGoal-v0; ids of other namespaces or versions stay."""
     name = family_name(env_id)
     return name if env_id == family_id(name) else env_id
 
