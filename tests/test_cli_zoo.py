@@ -4,19 +4,23 @@ import sys
 from functools import partial
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import optuna
 import pytest
 import yaml
+from meta_toys import WindyWalk
 from rl_zoo3 import ALGOS
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem import PEARLSAC, POEMSAC, cli, resources
 from sb3_poem.cli import experiment
 from sb3_poem.cli.hyperparams import check_keys
 from sb3_poem.cli.hyperparams_opt import SAMPLERS
 from sb3_poem.cli.zoo import register_algorithms
+from sb3_poem.common.vec_env import make_task_vec_env
 
 SMALL = {
     "policy": "MlpPolicy",
@@ -104,6 +108,39 @@ def test_evaluation_is_by_adaptation_and_keeps_the_best(
     for name in ("return_after_0_queries", "return_after_10_queries", "known_task_return", "preference_accuracy"):
         assert name in shown
     assert POEMSAC.load(tmp_path / "logs/poem_sac/poem-PointGoal-v0_1/best_model.zip").num_timesteps in (150, 300)
+
+
+def test_evaluation_takes_its_own_arguments_of_the_environment(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = []
+
+    def make(env_id: str, n_envs: int, **arguments: object) -> VecEnv:
+        made.append(arguments)
+        return make_task_vec_env(env_id, n_envs, **arguments)
+
+    monkeypatch.setattr("sb3_poem.adaptation.callback.make_task_vec_env", make)
+    monkeypatch.setattr(experiment, "AdaptationEvalCallback", partial(experiment.AdaptationEvalCallback, n_tasks=2))
+    flags = ["-c", config, "-f", tmp_path / "logs", "--eval-freq", 300, "--eval-episodes", 1]
+    assert train(*flags, "--eval-env-kwargs", "step_length:0.2") == 0
+    assert [arguments.get("step_length") for arguments in made] == [0.2]
+
+
+def test_a_search_on_a_family_without_shared_dynamics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    gym.register("Windy-v0", lambda **kwargs: WindyWalk(), max_episode_steps=10)
+    config = tmp_path / "windy.yml"
+    entry = {"policy": "MlpPolicy", "n_timesteps": 60, "n_envs": 2, **{k: SMALL[k] for k in ("batch_size", "context_size")}}
+    config.write_text(yaml.safe_dump({"Windy-v0": {**entry, "n_train_tasks": 6, "gradient_steps": 2, "meta_batch_size": 2}}))
+    monkeypatch.setitem(SAMPLERS, "poem_sac", lambda trial, *_: {"relabel_fraction": trial.suggest_float("r", 0.2, 0.8)})
+    monkeypatch.setattr(experiment, "TrialAdaptationCallback", partial(experiment.TrialAdaptationCallback, n_tasks=2))
+    flags = ["-optimize", "--n-trials", "1", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots"]
+    command = ["train", "--env", "Windy-v0", "-c", str(config), "-f", str(tmp_path / "logs"), *flags]
+    try:
+        assert cli.main(command) == 0
+    finally:
+        del gym.registry["Windy-v0"]
+    (report,) = (tmp_path / "logs" / "poem_sac").glob("report_*.csv")
+    assert "COMPLETE" in report.read_text()
 
 
 def test_a_checkpoint_continues_bit_for_bit(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.adaptation.evaluation import evaluate_adaptation, evaluate_latents, known_task_return, preference_order
 from sb3_poem.common.callbacks import EpochCallback
+from sb3_poem.common.family import FamilyEnv
 from sb3_poem.common.vec_env import make_task_vec_env
 
 
@@ -33,6 +34,7 @@ class AdaptationEvalCallback(EpochCallback):
     :param seed: Seed of the held-out tasks and of everything else here
     :param adaptation_kwargs: Options of :func:`sb3_poem.adaptation.adapt_tasks`, for instance ``inference``. A model without a
         similarity is asked random queries unless they say otherwise
+    :param env_kwargs: Arguments of the environment that differ from training's, for instance a ``split`` of its tasks
     :param verbose: 1 prints each result
     :raises ValueError: for a number of tasks or episodes below 1
     """
@@ -46,6 +48,7 @@ class AdaptationEvalCallback(EpochCallback):
         best_model_save_path: str | Path | None = None,
         seed: int = 1_000_003,
         adaptation_kwargs: dict[str, Any] | None = None,
+        env_kwargs: dict[str, Any] | None = None,
         verbose: int = 0,
     ) -> None:
         super().__init__(every, verbose)
@@ -57,6 +60,7 @@ class AdaptationEvalCallback(EpochCallback):
         self.best_model_save_path = None if best_model_save_path is None else Path(best_model_save_path)
         self.seed = seed
         self.adaptation_kwargs = dict(adaptation_kwargs or {})
+        self.env_kwargs = dict(env_kwargs or {})
         self.best_return = -np.inf
         self.last_evaluation: dict[str, float] = {}
         self._env: VecEnv | None = None
@@ -80,7 +84,10 @@ class AdaptationEvalCallback(EpochCallback):
                     "register it, or call evaluate_adaptation with a vector environment of your own"
                 )
             limit = spec.max_episode_steps
-            self._env = make_task_vec_env(spec.id, 2 * self.n_tasks, max_episode_steps=limit, **spec.kwargs)
+            arguments = {**spec.kwargs, **self.env_kwargs}
+            self._env = make_task_vec_env(spec.id, 2 * self.n_tasks, max_episode_steps=limit, **arguments)
+        if self.env_kwargs:
+            family = FamilyEnv(self._env)
         if family.all_tasks is not None and len(family.all_tasks) <= self.n_tasks:
             return self._env, family.all_tasks
         return self._env, family.sample_tasks(self.n_tasks, np.random.default_rng(self.seed))

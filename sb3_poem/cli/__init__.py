@@ -9,6 +9,7 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 
@@ -66,7 +67,9 @@ def _add_adapt_arguments(parser: argparse.ArgumentParser) -> None:
     rules = ("worst-case", "information-gain", "random")
     questions.add_argument("--query-rule", choices=rules, help="how questions are chosen (default: the inference rule's own)")
     questions.add_argument(
-        "--candidates", choices=("prior", "aggregate"), help="default: aggregate for bayes, prior for paper"
+        "--candidates",
+        choices=("prior", "aggregate"),
+        help="default: prior; for bayes aggregate where the training tasks are far from it",
     )
     questions.add_argument(
         "--n-candidates", type=_count(2), metavar="N", help="candidate latents (default: 400 for bayes, 100 for paper)"
@@ -119,7 +122,7 @@ def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
 
     commands = parser.add_subparsers(dest="label_command", metavar="{export,replay}")
     export = commands.add_parser("export", help="write all answers as a data set", description="Write all answers.")
-    _add_store_argument(export)
+    _add_store_argument(export, argparse.SUPPRESS)
     export.add_argument("--out", type=Path, nargs="+", required=True, metavar="FILE", help="ends in .jsonl or .parquet")
     export.add_argument("--trajectories", action="store_true", help="with observations, actions and reward features")
     export.add_argument("--undone", action="store_true", help="with answers that were taken back")
@@ -128,23 +131,25 @@ def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
         help="feed recorded answers to another model or rule",
         description="Feed the recorded answers to a model and a rule, and say how well these would have foretold them.",
     )
-    _add_store_argument(replay)
+    # Without defaults of their own: what was given before the subcommand would be overwritten by these.
+    own: dict[str, Any] = {"default": argparse.SUPPRESS}
+    _add_store_argument(replay, **own)
     replay.add_argument(
-        "--model", help="a model's .zip, a pretrained folder, or a shipped model (default: each session's own)"
+        "--model", **own, help="a model's .zip, a pretrained folder, or a shipped model (default: each session's own)"
     )
-    replay.add_argument("--inference", choices=("paper", "bayes"), default="bayes", help="default: %(default)s")
-    replay.add_argument("--mistake-rate", type=float, default=0.05, help="default: %(default)s")
-    replay.add_argument("--seed", type=_count(0), default=0, help="of the inference (default: %(default)s)")
+    replay.add_argument("--inference", choices=("paper", "bayes"), **own, help="default: bayes")
+    replay.add_argument("--mistake-rate", type=float, **own, help="default: 0.05")
+    replay.add_argument("--seed", type=_count(0), **own, help="of the inference (default: 0)")
     replay.add_argument("--json", type=Path, metavar="FILE", help="write what was foretold, and the latents after each answer")
 
 
-def _add_store_argument(parser: argparse._ActionsContainer) -> None:
+def _add_store_argument(parser: argparse._ActionsContainer, default: Any = DEFAULT_STORE) -> None:
     parser.add_argument(
         "--store",
         type=Path,
-        default=DEFAULT_STORE,
+        default=default,
         metavar="FOLDER",
-        help="where answers and videos are (default: %(default)s)",
+        help=f"where answers and videos are (default: {DEFAULT_STORE})",
     )
 
 

@@ -110,6 +110,7 @@ class PoemExperiment(FamilyExperiment):
                     every=self._epochs(model, self.steps_per_evaluation),
                     n_episodes=self.n_eval_episodes,
                     best_model_save_path=self.save_path,
+                    env_kwargs=self._eval_env_kwargs_args,
                     verbose=self.verbose,
                 )
             )
@@ -151,15 +152,21 @@ class PoemExperiment(FamilyExperiment):
         :raises optuna.TrialPruned: if the trial is not worth finishing, or its hyperparameters made it fail
         """
         sampled = HYPERPARAMS_SAMPLER[self.algo](trial, self.n_actions, self.n_envs, {})
-        model = ALGORITHMS[self.algo](
-            env=self.create_envs(self.n_envs, no_log=True), device=self.device, **{**self._hyperparams, **sampled}
-        )
+        env = self.create_envs(self.n_envs, no_log=True)
+        if not env.get_attr("shared_dynamics", indices=[0])[0]:
+            sampled["relabel_fraction"] = 0.0  # a reward of another task needs a transition that could be of it
+        try:
+            model = ALGORITHMS[self.algo](env=env, device=self.device, **{**self._hyperparams, **sampled})
+        except Exception:
+            env.close()
+            raise
         folder = self.optimization_log_path and Path(self.optimization_log_path) / f"trial_{trial.number}"
         evaluation = TrialAdaptationCallback(
             trial,
             every=self._epochs(model, self.n_timesteps // self.n_evaluations),
             n_episodes=self.n_eval_episodes,
             best_model_save_path=folder,
+            env_kwargs=self._eval_env_kwargs_args,
         )
         try:
             model.learn(self.n_timesteps, [*get_callback_list({"callback": self.specified_callbacks}), evaluation])

@@ -3,6 +3,8 @@
 import argparse
 import importlib
 import secrets
+from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -61,7 +63,7 @@ def run_page(arguments: argparse.Namespace) -> None:
     store.remove_orphans()
     conversations = Conversations(
         store,
-        Workshop(arguments.workers, lambda: process_pool(arguments.workers, catalogue)),
+        Workshop(arguments.workers, lambda: process_pool(arguments.workers, catalogue, arguments.gym_packages)),
         catalogue,
         options,
         arguments.queries,
@@ -129,21 +131,36 @@ def run_replay(arguments: argparse.Namespace) -> None:
     console = Console()
     store = open_store(arguments)
     options = {"inference": arguments.inference, "mistake_rate": arguments.mistake_rate}
-    results = []
+    results: list[dict[str, Any]] = []
+    left_out: list[str] = []
     for session in store.sessions():
         if not store.answers(session.id):
             continue
         with console.status(f"Session {session.id}"):
-            model = load_model(arguments.model or session.model)
-            result = replay(store, session, model, options, arguments.seed, is_own=arguments.model in (None, session.model))
+            try:
+                model = load_model(arguments.model or session.model)
+            except FileNotFoundError:
+                if arguments.model is not None:
+                    raise
+                left_out.append(session.id)
+                console.print(
+                    f"Session {session.id} was recorded with a model {session.model!r} that does not ship: name it by --model",
+                    highlight=False,
+                )
+                continue
+            # the store knows a model by its folder's name
+            is_own = arguments.model is None or Path(arguments.model).resolve().name == session.model
+            result = replay(store, session, model, options, arguments.seed or 0, is_own)
         results.append(result)
         console.print(
             f"Session {session.id} ({session.model}): foretold {result['foretold']} of {result['decided']} answers. "
             f"{result['sentence']}",
             highlight=False,
         )
-    if not results:
+    if not results and not left_out:
         raise ValueError(f"--store {arguments.store} holds no answers")
+    if not results:
+        raise ValueError("no session could be replayed: name the model that they were recorded with by --model")
     if arguments.json is not None:
         write_json_atomically(arguments.json, {"model": arguments.model, "options": options, "sessions": results})
         console.print(f"Wrote {arguments.json}", highlight=False)

@@ -177,7 +177,7 @@ def from_pretrained(algorithm: type[Model], folder: str | Path, env: Any = None,
         raise ValueError(f"{weights} is truncated, or no safetensors file: {error}") from error
     model = build_model(algorithm, config, tensors, str(folder), device)
     if env is not None:
-        model.set_env(algorithm._vectorise(env, len(model.train_tasks)))  # type: ignore[arg-type]
+        model.set_env(algorithm._vectorise(env, len(model.train_tasks), model.trajectories_per_task))  # type: ignore[arg-type]
     return model
 
 

@@ -143,7 +143,9 @@ class Gate:
             given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
             if _same(given, access.token):
                 response = RedirectResponse(scope["path"] or "/", 303)
-                response.set_cookie(COOKIE, access.token, httponly=True, samesite="strict", max_age=30 * 86400)
+                # Not "strict": a link that is clicked in somebody's mail would not be let in. Requests of other sites that
+                # write are refused in any case.
+                response.set_cookie(COOKIE, access.token, httponly=True, samesite="lax", max_age=30 * 86400)
                 return response
         if headers.get("authorization") or b"token=" in scope["query_string"]:
             await asyncio.sleep(PAUSE_AFTER_WRONG_PASSWORD)

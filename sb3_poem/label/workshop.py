@@ -178,23 +178,26 @@ class Workshop:
         raise AssertionError("unreachable")
 
 
-def process_pool(n_workers: int, choices: Sequence[Choice] = ()) -> ProcessPoolExecutor:
+def process_pool(n_workers: int, choices: Sequence[Choice] = (), packages: Sequence[str] = ()) -> ProcessPoolExecutor:
     """
     Worker processes that end with this one, even if it is killed.
 
     :param n_workers: How many.
     :param choices: Models that they load at once.
+    :param packages: Modules that register environments; they import these first.
     :return: The pool.
     """
     context: Any = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(n_workers, mp_context=context, initializer=_begin_worker, initargs=(tuple(choices),))
+    arguments = (tuple(choices), tuple(packages))
+    return ProcessPoolExecutor(n_workers, mp_context=context, initializer=_begin_worker, initargs=arguments)
 
 
 def _nothing() -> None:
     pass
 
 
-def _begin_worker(choices: tuple[Choice, ...]) -> None:
+def _begin_worker(choices: tuple[Choice, ...], packages: tuple[str, ...]) -> None:
+    import importlib
     import signal
 
     import torch
@@ -209,6 +212,8 @@ def _begin_worker(choices: tuple[Choice, ...]) -> None:
         os._exit(1)
 
     threading.Thread(target=end_with_parent, daemon=True).start()
+    for package in packages:
+        importlib.import_module(package)
     for choice in choices[:BENCHES]:
         try:
             bench_of(choice).warm_up()

@@ -229,7 +229,23 @@ class PEARLSAC(SamplingSAC):
         self.policy_kwargs.update(latent_dim=self.latent_dim, context_has_value=self.context_has_value)
         self._complete_policy_kwargs()
         self.replay_buffer_kwargs = {"n_tasks": len(self.train_tasks), "feature_dim": self.reward_feature_dim}
+        generators = self.generators
         super()._setup_model()
+        self.generators = generators  # a model that is loaded goes on with its own
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """As SB3's: what follows depends on the seed. The training tasks stay."""
+        super().set_random_seed(seed)
+        if seed is not None:
+            self.generators = Generators(seed, self.device)
+
+    def set_parameters(
+        self, load_path_or_dict: str | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"
+    ) -> None:
+        """As SB3's. By what observations and rewards are standardised comes with the policy."""
+        super().set_parameters(load_path_or_dict, exact_match, device)
+        untouched = (self.policy.obs_mean == 0).all() & (self.policy.obs_std == 1).all()
+        self._statistics_known = not bool(untouched)
 
     def _complete_policy_kwargs(self) -> None:
         """Give the policy what only a subclass knows."""

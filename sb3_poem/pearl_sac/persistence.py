@@ -61,10 +61,15 @@ class PersistentSAC(SAC):
         )
     }
 
+    #: Arguments that decide what the networks are; a trained model has them for good
+    fixed_arguments: ClassVar[tuple[str, ...]] = ("latent_dim", "similarity", "context")
+
     @staticmethod
-    def _vectorise(env: GymEnv | str, n_train_tasks: int | None, trajectories_per_task: int = 1) -> GymEnv | str:
-        """A registered id of a family that has a vectorised version becomes one copy for each trajectory of an epoch, up to
-        one per task or :data:`DEFAULT_TRAIN_TASKS`, whichever is more.
+    def _vectorise(
+        env: GymEnv | str, n_train_tasks: int | None, trajectories_per_task: int, n_copies: int | None = None
+    ) -> GymEnv | str:
+        """A registered id of a family that has a vectorised version becomes ``n_copies``: unless given, one for each
+        trajectory of an epoch, up to one per task or :data:`DEFAULT_TRAIN_TASKS`, whichever is more.
         """
         if not isinstance(env, str):
             return env
@@ -75,6 +80,8 @@ class PersistentSAC(SAC):
             return env
         from sb3_poem.common.vec_env import TaskVecEnv
 
+        if n_copies is not None:
+            return TaskVecEnv.from_id(env, n_copies)
         if n_train_tasks is None:
             with contextlib.closing(gym.make(env)) as probe:
                 n_train_tasks = default_train_tasks(getattr(probe.unwrapped, "all_tasks", None))
@@ -100,9 +107,11 @@ class PersistentSAC(SAC):
     def load(  # type: ignore[override]
         cls: type[SelfPersistent], path: str | pathlib.Path | io.BufferedIOBase, env: GymEnv | str | None = None, **kwargs: Any
     ) -> SelfPersistent:
-        """As SB3's; ``env`` may be a registered id too.
+        """As SB3's. ``env`` may be a registered id too: it becomes as many copies as the model was trained with. Further
+        arguments are the constructor's; a ``seed`` begins new random streams.
 
-        :raises ValueError: if the file is truncated or holds another algorithm's model, or env is of another family
+        :raises ValueError: if the file is truncated or holds another algorithm's model, env is of another family, or an
+            argument would change what the networks are
         """
         try:
             data, _, _ = load_from_zip_file(path, device="cpu", load_data=True)
@@ -114,8 +123,18 @@ class PersistentSAC(SAC):
             raise ValueError(f"{path} holds a model of another algorithm, not of {cls.__name__}")
         if isinstance(path, io.BufferedIOBase):
             path.seek(0)
-        env = env if env is None else cls._vectorise(env, len(data["train_tasks"]))
-        return super().load(path, env=env, **kwargs)  # type: ignore[arg-type]
+        changed = {cls.saved_arguments.get(name, name): value for name, value in kwargs.items()}
+        for name in cls.fixed_arguments:
+            attribute = cls.saved_arguments.get(name, name)
+            if name in kwargs and data.get(attribute) != changed[attribute]:
+                raise ValueError(f"{name} is {data.get(attribute)!r} in {path}, and cannot become {kwargs[name]!r}")
+        if env is not None:
+            copies = data["n_envs"] if data["n_envs"] > 1 else None
+            env = cls._vectorise(env, len(data["train_tasks"]), data["trajectories_per_task"], copies)
+        model = super().load(path, env=env, **changed)  # type: ignore[arg-type]
+        if changed.get("seed") is not None:
+            model.set_random_seed(changed["seed"])
+        return model
 
     def save_checkpoint(self, path: str | pathlib.Path) -> None:
         """Write everything to one file, from which :meth:`load_checkpoint` continues bit for bit. Between two epochs only.

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import json
+import shutil
+import sqlite3
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
@@ -25,6 +27,7 @@ from sb3_poem.label.replay import replay
 from sb3_poem.label.sessions import Conversations
 from sb3_poem.label.store import Session, Store
 from sb3_poem.label.turns import load_choice
+from sb3_poem.resources import pretrained_folder
 
 TASK = np.array([0.7])
 
@@ -113,6 +116,28 @@ def test_the_commands(answered: Session, store: Store, tmp_path: Path, capsys: p
     assert len(json.loads(result.read_text())["sessions"]) == 1
     assert cli.main(["label", "replay", "--store", folder, "--model", "HalfCheetahVel"]) == 1
     assert "same robot" in capsys.readouterr().err
+    before = tmp_path / "before.jsonl"  # options before the subcommand are the same options
+    assert cli.main(["label", "--store", folder, "export", "--out", str(before), "--undone"]) == 0
+    assert before.read_text() == out.read_text()
+    options = ["--store", folder, "--inference", "paper"]
+    assert cli.main(["label", *options, "replay", "--json", str(tmp_path / "again.json")]) == 0
+    assert (tmp_path / "again.json").read_text() == result.read_text()
+
+
+def test_replay_knows_a_model_by_its_folder_and_says_which_it_lacks(
+    answered: Session, store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(pretrained_folder("PointGoal"), tmp_path / "models" / "PointGoal")
+    result, own = tmp_path / "replay.json", str(tmp_path / "models" / "PointGoal")
+    assert cli.main(["label", "replay", "--store", str(store.folder), "--model", own, "--json", str(result)]) == 0
+    assert json.loads(result.read_text())["sessions"][0]["action_error"] is None
+    with sqlite3.connect(store.folder / "answers.sqlite") as connection:
+        connection.execute("update sessions set model = 'gone'")
+    capsys.readouterr()
+    assert cli.main(["label", "replay", "--store", str(store.folder)]) == 1
+    shown = capsys.readouterr()
+    assert "recorded with a model 'gone'" in " ".join(shown.out.split())
+    assert "no session could be replayed" in shown.err
 
 
 @pytest.mark.parametrize(

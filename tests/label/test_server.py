@@ -252,6 +252,7 @@ def test_a_password_or_a_token_is_asked_for(guarded: TestClient) -> None:
     assert entry.status_code == 303
     assert entry.headers["location"] == "/"
     assert "httponly" in entry.headers["set-cookie"].lower()
+    assert "samesite=lax" in entry.headers["set-cookie"].lower()  # a browser keeps a strict one back after a click elsewhere
     assert guarded.get("/").status_code == 200  # the client keeps the cookie
 
 

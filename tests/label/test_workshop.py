@@ -10,11 +10,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
+import gymnasium
 import pytest
 
 from sb3_poem.label.catalogue import Choice
 from sb3_poem.label.turns import Bench, NotWantedError, Request, Turn, _RendersWhileWanted, make_env, make_turn
-from sb3_poem.label.workshop import LIKELY, WAITED_FOR, Workshop
+from sb3_poem.label.workshop import LIKELY, WAITED_FOR, Workshop, process_pool
 
 TURN = Turn(None, None, None, None, None, 20.0, 1)
 
@@ -96,3 +97,10 @@ def test_films_show_about_twenty_frames_a_second(
     bench.fps = float(fps)
     wanted = request(point_goal, tmp_path, "turn")
     assert [bench._film_every(replace(wanted, film_every=every)) for every in (1, 2)] == [alone, crowded]
+
+
+def test_workers_know_the_packages_that_register_environments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "walk_package.py").write_text("import gymnasium\ngymnasium.register('Strolling-v0', entry_point=dict)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with process_pool(1, packages=["walk_package"]) as pool:
+        assert pool.submit(gymnasium.spec, "Strolling-v0").result(60).id == "Strolling-v0"

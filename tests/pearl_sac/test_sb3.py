@@ -773,3 +773,73 @@ def test_a_model_from_a_gpu_goes_on_training_here(algorithm: type[PEARLSAC], tmp
     loaded = algorithm.load(tmp_path / "model.zip", env=POINT_GOAL, device="cpu")
     loaded.learn(EPOCH, reset_num_timesteps=False)
     assert loaded._n_updates == 10
+
+
+# ---------------------------------------------------------------- what a loaded model keeps, and what it is told anew
+
+
+def test_parameters_come_with_their_standardisation(trained: PEARLSAC) -> None:
+    copy = small(type(trained), gradient_steps=0)
+    copy.set_parameters(trained.get_parameters())
+    before = copy.predict(OBS, deterministic=True)[0]
+    copy.learn(EPOCH)  # which collects, and learns nothing
+    assert np.array_equal(copy.predict(OBS, deterministic=True)[0], before)
+    assert np.array_equal(trained.predict(OBS, deterministic=True)[0], before)
+    fresh = small(type(trained), seed=5)
+    fresh.set_parameters(small(type(trained)).get_parameters())  # of a model that has seen nothing
+    assert th.equal(fresh.policy.obs_std, th.ones(2))
+    fresh.learn(EPOCH)
+    assert not th.equal(fresh.policy.obs_std, th.ones(2))
+
+
+@one_is_enough
+def test_arguments_of_a_model_that_is_loaded(algorithm: type[POEMSAC], trained: PEARLSAC, tmp_path: Path) -> None:
+    model = small(algorithm, similarity="inner", context="pearl", latent_dim=3)
+    model.save(tmp_path / "m.zip")
+    same = {"similarity": "inner", "context": "pearl", "latent_dim": 3}
+    loaded = algorithm.load(tmp_path / "m.zip", n_steps=5, kl_coef=0.7, device="cpu", **same)
+    assert (loaded.target_steps, loaded.kl_coef) == (5, 0.7)
+    assert loaded.similarity(np.zeros((2, 3)), np.zeros((1, 3))).shape == (2, 1)
+    for name, value in {"similarity": "two", "context": "poem", "latent_dim": 5}.items():
+        with pytest.raises(ValueError, match=f"{name} is .* in .*m.zip, and cannot become {value!r}"):
+            algorithm.load(tmp_path / "m.zip", **{name: value})
+
+
+def test_a_seed_changes_what_follows(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
+    small(algorithm).learn(EPOCH).save(tmp_path / "m.zip")
+
+    def further(seed: int | None, later: int | None = None) -> dict[str, th.Tensor]:
+        arguments = {} if seed is None else {"seed": seed}
+        model = algorithm.load(tmp_path / "m.zip", env=POINT_GOAL, device="cpu", **arguments)
+        if later is not None:
+            model.set_random_seed(later)
+        return parameters(model.learn(EPOCH, reset_num_timesteps=False))
+
+    one, two = further(1), further(2)
+    assert differing(one, two)
+    assert not differing(one, further(1))
+    assert not differing(two, further(None, 2))
+    assert not differing(further(None), further(None))
+    assert differing(further(None), one)
+
+
+@one_is_enough
+def test_an_id_becomes_as_many_copies_as_in_training(algorithm: type[POEMSAC], tmp_path: Path) -> None:
+    arguments = {"n_train_tasks": 4, "trajectories_per_task": 3, "meta_batch_size": 4}
+    whole = small(algorithm, **arguments).learn(3 * 12 * 25)
+    half = small(algorithm, **arguments).learn(12 * 25)
+    half.save_checkpoint(tmp_path / "c.pt")
+    half.save(tmp_path / "m.zip")
+    half.save_pretrained(tmp_path / "p")
+    resumed = algorithm.load_checkpoint(tmp_path / "c.pt", POINT_GOAL, device="cpu")
+    for loaded in (
+        resumed,
+        algorithm.load(tmp_path / "m.zip", POINT_GOAL),
+        algorithm.from_pretrained(tmp_path / "p", POINT_GOAL),
+    ):
+        assert loaded.n_envs == whole.n_envs == 12
+    resumed.learn(2 * 12 * 25, reset_num_timesteps=False)
+    assert not differing(parameters(resumed), parameters(whole))
+    other = small(algorithm, TaskVecEnv.from_id(POINT_GOAL, 5), **arguments)
+    other.save(tmp_path / "o.zip")
+    assert algorithm.load(tmp_path / "o.zip", POINT_GOAL).n_envs == 5
