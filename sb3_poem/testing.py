@@ -328,6 +328,8 @@ def check_pickling(make: MakeFamily, n_steps: int, seed: int) -> None:
     try:
         twin = pickle.loads(pickle.dumps(env))
     except Exception as error:
+        if "lambda" in str(error) or "<locals>" in str(error):
+            advice = "register a class or function of a module, with its arguments in gym.register(..., kwargs={...})"
         raise AssertionError(
             f"the environment must be picklable, but raised {type(error).__name__}: {error}; {advice}"
         ) from error

@@ -10,7 +10,6 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 
 from poem_envs.core import BOUNDS_TOLERANCE
 from poem_envs.headless import choose_headless_backend
@@ -18,8 +17,8 @@ from poem_envs.replay import ReplayFamily
 
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 GOAL_SITE = "target"
-#: Wrappers whose work the family, or what is around it, does itself
-TAKEN_OFF = (TimeLimit, OrderEnforcing, PassiveEnvChecker)
+#: Wrappers whose work the family, or what is around it, does itself; by name, since rl_zoo3 replaces Gymnasium's TimeLimit
+TAKEN_OFF = frozenset({"TimeLimit", "OrderEnforcing", "PassiveEnvChecker"})
 SetGoal = Callable[[gym.Env, np.ndarray], None]
 
 
@@ -39,7 +38,8 @@ class GoalFamily(ReplayFamily):
 
         gym.register(
             "my/FetchSlide-v0",
-            entry_point=lambda **kwargs: GoalFamily("FetchSlide-v4", **kwargs),
+            entry_point=GoalFamily,
+            kwargs={"env": "gymnasium_robotics:FetchSlide-v4"},
             max_episode_steps=50,
         )
 
@@ -116,7 +116,7 @@ class GoalFamily(ReplayFamily):
         check_goal_env(env)
         wrapper = env
         while isinstance(wrapper, gym.Wrapper):
-            if not isinstance(wrapper, TAKEN_OFF):
+            if TAKEN_OFF.isdisjoint(kind.__name__ for kind in type(wrapper).__mro__):
                 raise ValueError(
                     f"env makes {env}: its {type(wrapper).__name__} would have no effect, since the family steps the "
                     "environment inside all wrappers. Make it without, or put what it does into the environment itself"

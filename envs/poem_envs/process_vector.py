@@ -211,6 +211,7 @@ class ProcessFamilyVector(TaskFamilyVector):
         self._nthread = available_cores() if nthread is None else nthread
         self._groups: list[CopyGroup | RemoteGroup] = []
         self._interrupted = False
+        self._attributes: dict[str, Any] = {}
         self._template = self._make()
         if not isinstance(self._template, TaskFamily):
             raise TypeError(
@@ -244,6 +245,7 @@ class ProcessFamilyVector(TaskFamilyVector):
 
     def set_attribute(self, name: str, value: Any) -> None:
         setattr(self._template, name, value)
+        self._attributes[name] = value  # for copies that are made anew
         self._call("set_attribute", {index: (name, value) for index in range(len(self._sizes))})
         if hasattr(type(self), name) or name in self.__dict__:
             setattr(self, name, value)
@@ -277,13 +279,19 @@ class ProcessFamilyVector(TaskFamilyVector):
 
     def _start(self, dumps: Sequence[list[bytes]] | None = None) -> None:
         """Start the workers; this process has the last, smallest group."""
-        for index, (first, size) in enumerate(zip(self._firsts, self._sizes, strict=True)):
-            make = (
-                functools.partial(_load_copies, dumps[index]) if dumps else functools.partial(_make_copies, self._make, size)
-            )
-            last = index == len(self._sizes) - 1
-            self._groups.append(CopyGroup(make(), first) if last else RemoteGroup(cloudpickle.dumps(make), first))
-        self._receive({index: None for index in range(len(self._groups) - 1)})
+        try:
+            for index, (first, size) in enumerate(zip(self._firsts, self._sizes, strict=True)):
+                make = (
+                    functools.partial(_load_copies, dumps[index])
+                    if dumps
+                    else functools.partial(_make_copies, self._make, size, self._attributes)
+                )
+                last = index == len(self._sizes) - 1
+                self._groups.append(CopyGroup(make(), first) if last else RemoteGroup(cloudpickle.dumps(make), first))
+            self._receive({index: None for index in range(len(self._groups) - 1)})
+        except BaseException:  # the next call tries again, rather than to use what is half made
+            self._end_groups()
+            raise
 
     def _receive(self, local: dict[int, Any]) -> dict[int, Any]:
         """Collect the results of a call to the groups in ``local``, all of them even if one failed: none may be left over."""
@@ -399,8 +407,12 @@ class ProcessFamilyVector(TaskFamilyVector):
             self._start(dumps)
 
 
-def _make_copies(make: Callable[[], TaskFamily], n: int) -> list[TaskFamily]:
-    return [make() for _ in range(n)]
+def _make_copies(make: Callable[[], TaskFamily], n: int, attributes: dict[str, Any]) -> list[TaskFamily]:
+    envs = [make() for _ in range(n)]
+    for env in envs:
+        for name, value in attributes.items():
+            setattr(env, name, value)
+    return envs
 
 
 def _load_copies(dumps: list[bytes]) -> list[TaskFamily]:

@@ -213,6 +213,7 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         self._tasks: np.ndarray | None = None  # (num_envs, task_dim)
         self._next_tasks = np.full((num_envs, *self.task_space.shape), np.nan)
         self._task_chosen = np.zeros(num_envs, dtype=bool)
+        self._tasks_kept = np.zeros(num_envs, dtype=bool)
         self._rngs: list[np.random.Generator] = []
         self._seeds: list[int] = []
         self._elapsed_steps = np.zeros(num_envs, dtype=np.int64)
@@ -237,13 +238,10 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         self._task_chosen[index] = True
 
     def keep_tasks(self) -> None:
-        """Keep every copy's task through its next resets, also through one with a seed, which would draw another: the task
-        that was chosen for it, or else the one in effect. Before the first reset there is none in effect.
+        """Keep every copy's task through its next reset, also if that has a seed, which would draw another: the task that was
+        chosen for it, or else the one in effect. Before the first reset there is none in effect.
         """
-        if self._tasks is not None:
-            undecided = ~self._task_chosen
-            self._next_tasks[undecided] = self._tasks[undecided]
-            self._task_chosen[:] = True
+        self._tasks_kept[:] = self._tasks is not None
 
     def set_attribute(self, name: str, value: Any) -> None:
         """Set an attribute of the family, as if on each copy.
@@ -280,7 +278,7 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
             self._tasks = self._next_tasks.copy()
             undecided = ~self._task_chosen
         else:
-            undecided = ~self._task_chosen & np.array([s is not None for s in seeds])
+            undecided = ~self._task_chosen & ~self._tasks_kept & np.array([s is not None for s in seeds])
         for copy in np.flatnonzero(undecided).tolist():
             self._tasks[copy] = self.sample_tasks(1, task_stream(self._rngs[copy]))[0]
         self._begin(np.arange(self.num_envs))
@@ -382,6 +380,7 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         assert self._tasks is not None
         chosen = copies[self._task_chosen[copies]]
         self._tasks[chosen] = self._next_tasks[chosen]
+        self._tasks_kept[copies] = False
         self._elapsed_steps[copies] = 0
         self._succeeded[copies] = False
         self._episodes[copies] += 1

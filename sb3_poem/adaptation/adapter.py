@@ -56,7 +56,7 @@ class PreferenceAdapter:
         posteriors and what lies between neighbours); None takes the prior, and for
         "bayes" the aggregate where that is far from the prior.
     :param likelihood: For "bayes": "decoder" (predicted returns of the trajectories shown) or "similarity" (S); None
-        takes the decoder where the model has one.
+        takes the decoder where the model has one and knows its error, which takes tasks that share their dynamics.
     :param decision: For "bayes": "expected-fitness", "posterior-mean" or "most-likely".
     :param noise_model: For "bayes": how the oracle errs; None takes ``oracle.noise_model`` where there is one, else no error.
     :param oracle: Who answers in :meth:`adapt`; a callable (left, right) -> Preference. If it has ``needs_frames``,
@@ -138,6 +138,9 @@ class PreferenceAdapter:
         if oracle is not None and hasattr(oracle, "bind") and getattr(oracle, "env", None) is None:
             oracle.bind(self.env)
         self.library = None if library is None else list(library)
+        if self.library is not None and self._owns_env:  # in which nothing is rolled out, and no task is drawn but now
+            self.env.seed(self.seed)
+            self.env.reset()
         self.inference = options.make_inference(model, inference_rng(self.seed), self.library)
         if hasattr(self.inference, "bind"):  # a method that is allowed to read rewards
             self.inference.bind(self.env)

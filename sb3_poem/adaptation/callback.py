@@ -26,7 +26,7 @@ class AdaptationEvalCallback(EpochCallback):
     whether a step was a success, ``eval/success_rate_after_<k>_queries`` and ``eval/known_task_success_rate`` too.
 
     :param every: Epochs between two evaluations
-    :param n_tasks: Held-out tasks; a finite family is evaluated on all its tasks
+    :param n_tasks: Held-out tasks; a finite family of no more than that is evaluated on all its tasks
     :param record_at: Numbers of answers after which the adapted policy is measured
     :param n_episodes: Episodes of each task and measurement
     :param best_model_save_path: Folder for ``best_model.zip``, the model of the highest return after the most answers. A run

@@ -13,6 +13,7 @@ from sb3_poem.adaptation.decisions import DECISIONS
 from sb3_poem.adaptation.environments import check_model_fits
 from sb3_poem.adaptation.inference import LatentInference, PaperInference
 from sb3_poem.adaptation.noise import NoiseModel, noise_model_from_dict
+from sb3_poem.adaptation.state import plain
 from sb3_poem.common.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -105,7 +106,7 @@ class AdaptationOptions:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready."""
-        data = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        data = plain({name: getattr(self, name) for name in self.__dataclass_fields__})
         data["noise_model"] = None if self.noise_model is None else self.noise_model.to_dict()
         return data
 

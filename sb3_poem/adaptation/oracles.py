@@ -207,6 +207,8 @@ def step_rewards(env: gym.Env | VecEnv, task: np.ndarray | None, trajectory: Tra
 
 def _current_task(env: gym.Env | VecEnv) -> np.ndarray:
     task = env.get_wrapper_attr("task") if isinstance(env, gym.Env) else env.get_attr("task", indices=[0])[0]
+    if task is None:
+        raise RuntimeError("the environment has no task before its first reset(): reset it, or give the oracle its `task`")
     return np.asarray(task, dtype=np.float64)
 
 

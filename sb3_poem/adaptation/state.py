@@ -12,6 +12,16 @@ import numpy as np
 from sb3_poem.common.files import write_atomically
 
 
+def plain(data: dict[str, Any]) -> dict[str, Any]:
+    """
+    Options with Python's numbers for NumPy's, which JSON does not know.
+
+    :param data: By name.
+    :return: The same.
+    """
+    return {name: value.item() if isinstance(value, np.generic) else value for name, value in data.items()}
+
+
 def generator_state(rng: np.random.Generator) -> dict[str, Any]:
     """
     A generator's state as JSON-ready data.

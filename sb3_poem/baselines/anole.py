@@ -16,8 +16,9 @@ from sb3_poem.adaptation.inference import SIGNS, Answer, LatentInference, Shown
 from sb3_poem.adaptation.preference import Preference
 from sb3_poem.adaptation.priors import SOURCES, make_prior
 from sb3_poem.adaptation.queries import random_pair
+from sb3_poem.adaptation.state import plain
 from sb3_poem.baselines.berlekamp import n_distinguishable, worst_case_volumes
-from sb3_poem.baselines.fragments import replay_fragments
+from sb3_poem.baselines.fragments import default_fragment_length, replay_fragments
 from sb3_poem.common.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -36,13 +37,13 @@ class ANOLEOptions:
     n_candidates: int = 100
     mistake_rate: float = 0.2
     n_pairs: int = 100
-    fragment_length: int = 50
+    fragment_length: int | None = None
     candidates: str = "prior"
     deterministic: bool = True
 
     def __post_init__(self) -> None:
         for name in ("n_queries", "n_candidates", "n_pairs", "fragment_length"):
-            if getattr(self, name) < 1:
+            if getattr(self, name) is not None and getattr(self, name) < 1:
                 raise ValueError(f"`{name}` must be at least 1, but is {getattr(self, name)}")
         if self.strategy not in STRATEGIES:
             raise ValueError(f"`strategy` must be one of {STRATEGIES}, but is {self.strategy!r}")
@@ -112,12 +113,13 @@ class ANOLEOptions:
         :return: The inference.
         """
         if library is None:
-            library = replay_fragments(model, 2 * self.n_pairs, self.fragment_length, rng)
+            length = self.fragment_length or default_fragment_length(model.horizon)
+            library = replay_fragments(model, 2 * self.n_pairs, length, rng)
         return ANOLEInference(model, self, rng, library)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready."""
-        return asdict(self)
+        return plain(asdict(self))
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> ANOLEOptions:
@@ -244,7 +246,8 @@ class ANOLEAdapter(PreferenceAdapter):
     :param n_candidates: Candidates at least; "greedy" takes 2^K.
     :param mistake_rate: The share of answers that may be mistakes: E = floor(rate K).
     :param n_pairs: Random pairs to choose from for each question; they are drawn from twice as many fragments.
-    :param fragment_length: Steps of a fragment from the replay buffer (the paper gives none).
+    :param fragment_length: Steps of a fragment from the replay buffer; None takes 50, or an episode that is shorter (the paper
+        gives none).
     :param candidates: Where candidates come from: "prior" or "aggregate".
     :param oracle: See :class:`PreferenceAdapter`.
     :param seed: See :class:`PreferenceAdapter`.
@@ -266,7 +269,7 @@ class ANOLEAdapter(PreferenceAdapter):
         n_candidates: int = 100,
         mistake_rate: float = 0.2,
         n_pairs: int = 100,
-        fragment_length: int = 50,
+        fragment_length: int | None = None,
         candidates: str = "prior",
         oracle: Oracle | None = None,
         seed: int | None = None,

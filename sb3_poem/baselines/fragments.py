@@ -14,6 +14,17 @@ if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
 MAX_ROUNDS = 50
+FRAGMENT_LENGTH = 50
+
+
+def default_fragment_length(horizon: int) -> int:
+    """
+    Steps of a fragment unless told.
+
+    :param horizon: Steps of an episode.
+    :return: 50, or an episode.
+    """
+    return min(FRAGMENT_LENGTH, horizon)
 
 
 def replay_fragments(model: Any, n: int, length: int, rng: np.random.Generator) -> list[Trajectory]:
@@ -53,7 +64,8 @@ def replay_fragments(model: Any, n: int, length: int, rng: np.random.Generator) 
         if len(found) >= n:
             return found[:n]
     raise ValueError(
-        f"`fragment_length` is {length}, but the replay buffer holds too few episodes that are as long; choose a smaller one"
+        f"`fragment_length` is {length}, but the replay buffer holds too few episodes that are as long (the horizon is "
+        f"{model.horizon}); choose a smaller one"
     )
 
 

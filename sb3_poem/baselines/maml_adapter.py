@@ -19,6 +19,7 @@ from sb3_poem.adaptation.adapter import Oracle, PreferenceAdapter
 from sb3_poem.adaptation.environments import check_model_fits
 from sb3_poem.adaptation.inference import Answer, LatentInference, Shown, Snapshot
 from sb3_poem.adaptation.preference import Preference
+from sb3_poem.adaptation.state import plain
 from sb3_poem.baselines.maml_reward import JudgedPair, MetaReward
 from sb3_poem.common.trajectory import Trajectory
 
@@ -138,7 +139,7 @@ class MAMLRewardOptions:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready."""
-        return asdict(self)
+        return plain(asdict(self))
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> MAMLRewardOptions:

@@ -15,7 +15,7 @@ from safetensors.torch import save as tensors_to_bytes
 
 from sb3_poem.adaptation.preference import Preference
 from sb3_poem.adaptation.state import read_json, write_json_atomically
-from sb3_poem.baselines.fragments import replay_fragments
+from sb3_poem.baselines.fragments import default_fragment_length, replay_fragments
 from sb3_poem.baselines.maml import Parameters, PreferencePairs, RewardNetwork, adapt_parameters, maml_loss
 from sb3_poem.common.files import write_atomically
 from sb3_poem.common.trajectory import Trajectory
@@ -165,7 +165,7 @@ def meta_train_reward(
     model: Any,
     n_iterations: int = 500,
     n_fragments: int = 500,
-    fragment_length: int = 50,
+    fragment_length: int | None = None,
     tasks_per_batch: int = 16,
     n_support: int = 10,
     n_query: int = 10,
@@ -181,7 +181,7 @@ def meta_train_reward(
     :param model: A trained :class:`PEARLSAC` with its environment and its replay buffer.
     :param n_iterations: Steps of the outer loop.
     :param n_fragments: Fragments that pairs are drawn from.
-    :param fragment_length: Steps of a fragment; at most an episode.
+    :param fragment_length: Steps of a fragment; None takes 50, or an episode that is shorter.
     :param tasks_per_batch: Tasks in an outer step (all, if there are fewer).
     :param n_support: Pairs that a task adapts to.
     :param n_query: Pairs that it is judged by.
@@ -203,7 +203,8 @@ def meta_train_reward(
             raise ValueError(f"`{name}` must be at least 1, but is {value}")
     rng = np.random.default_rng([seed, 5])
     meta = MetaReward(model.policy, seed=seed, **arguments)
-    fragments = replay_fragments(model, n_fragments, fragment_length, rng)
+    length = default_fragment_length(model.horizon) if fragment_length is None else fragment_length
+    fragments = replay_fragments(model, n_fragments, length, rng)
     inputs = th.stack([meta.transitions(fragment) for fragment in fragments])
     features = np.stack([np.asarray(fragment.reward_features) for fragment in fragments])
     returns = model.family.compute_reward(model.train_tasks[:, None, None, :], features[None]).sum(axis=2)

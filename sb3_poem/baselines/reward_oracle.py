@@ -15,6 +15,7 @@ from sb3_poem.adaptation.environments import check_model_fits
 from sb3_poem.adaptation.inference import Answer, LatentInference, Shown
 from sb3_poem.adaptation.oracles import step_rewards
 from sb3_poem.adaptation.preference import Preference
+from sb3_poem.adaptation.state import plain
 from sb3_poem.common.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ class RewardOracleOptions:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready."""
-        return asdict(self)
+        return plain(asdict(self))
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> RewardOracleOptions:

@@ -14,7 +14,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_poem.adaptation import BoltzmannOracle, MistakeOracle, PreferenceAdapter, ReturnOracle, TaskOracle
 from sb3_poem.adaptation.evaluation import evaluate_adaptation, held_out_tasks, known_task_return, preference_order
 from sb3_poem.baselines import ANOLEAdapter, MAMLRewardAdapter, RewardOracleAdapter, rollout_fragments
-from sb3_poem.benchmark.models import ModelLibrary, Say, fragment_length
+from sb3_poem.baselines.fragments import default_fragment_length
+from sb3_poem.benchmark.models import ModelLibrary, Say
 from sb3_poem.benchmark.provenance import provenance
 from sb3_poem.benchmark.store import Record
 from sb3_poem.benchmark.suites import Cell, OracleSpec
@@ -89,10 +90,10 @@ def _measure_adaptation(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) 
     kind, options, budget = cell.definition.kind, dict(cell.options), cell.budget
     fragments = None
     if kind == "anole":
-        options.setdefault("fragment_length", fragment_length(model.horizon))
+        options.setdefault("fragment_length", default_fragment_length(model.horizon))
         if not _has_experience(model):
             settings = ANOLEAdapter.make_options(**options)
-            fragments = rollout_fragments(model, env, 2 * settings.n_pairs, settings.fragment_length, cell.seed)
+            fragments = rollout_fragments(model, env, 2 * settings.n_pairs, options["fragment_length"], cell.seed)
             options["library"] = fragments
     evaluation = evaluate_adaptation(
         model,

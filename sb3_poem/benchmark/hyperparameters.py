@@ -43,20 +43,27 @@ class TrainingPlan:
         return max(1, round(self.timesteps / SAVES / self.epoch_steps)) * self.epoch_steps
 
 
+class MissingEntryError(ValueError):
+    """There are no hyperparameters for a family."""
+
+
 def training_plan(key: ModelKey) -> TrainingPlan:
     """
     How a model is trained.
 
     :param key: The model.
     :return: The plan.
-    :raises ValueError: If there are no hyperparameters for the family.
+    :raises MissingEntryError: If there are no hyperparameters for the family.
     """
     variant = VARIANTS[key.variant]
     file = config_file(variant.algorithm)
     entries = yaml.safe_load(file.read_text())
     entry = entries.get(key.env_id, entries.get("default"))
     if entry is None:
-        raise ValueError(f"{file} has no entry for {key.env_id}, which says how to train {variant.name} on it; add one")
+        raise MissingEntryError(
+            f"{file} has no entry for {key.env_id}, which says how to train {variant.name} on it: add one, or hand over a "
+            "model by --models or --model"
+        )
     overrides = {**variant.hyperparameters, **dict(key.training.hyperparameters)}
     hyperparameters = {**entry, **overrides}
     timesteps = int(hyperparameters["n_timesteps"] if key.training.timesteps is None else key.training.timesteps)

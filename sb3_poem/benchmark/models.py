@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -21,11 +22,12 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.adaptation.state import read_json, write_json_atomically
 from sb3_poem.baselines import MAMLRewardModel, MetaReward, meta_train_reward
-from sb3_poem.benchmark.hyperparameters import TrainingPlan, training_plan
+from sb3_poem.baselines.fragments import default_fragment_length
+from sb3_poem.benchmark.hyperparameters import MissingEntryError, TrainingPlan, training_plan
 from sb3_poem.benchmark.locks import locked
 from sb3_poem.benchmark.methods import META_ITERATIONS, META_ITERATIONS_OF, VARIANTS
 from sb3_poem.benchmark.provenance import provenance
-from sb3_poem.benchmark.suites import ModelKey, family_label
+from sb3_poem.benchmark.suites import ModelKey, family_id, family_label
 from sb3_poem.common.pretrained import CONFIG, WEIGHTS, read_config
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.pearl_sac import PEARLSAC
@@ -41,7 +43,6 @@ CHECKPOINT, MODEL, FINISHED, SESSIONS, LOG, REWARD = (
     "reward",
 )
 LOG_LINES = 15
-FRAGMENT_LENGTH = 50
 
 Say = Callable[[str], None]
 
@@ -115,7 +116,7 @@ class ModelLibrary:
         if not key.training.is_default:
             return None
         for family, variant, seed, path in self.workplace.named:
-            if (family, variant, seed) == (key.family, key.variant, key.seed):
+            if (family_id(family), variant, seed) == (key.env_id, key.variant, key.seed):
                 named = Path(path)
                 if not named.exists():
                     raise ValueError(f"--model {family}:{variant}:{seed}={path}: there is no such file or folder")
@@ -127,7 +128,7 @@ class ModelLibrary:
             for candidate in (place, place.with_suffix(".zip")):
                 if candidate.is_file() or (candidate.is_dir() and _content(candidate) is not None):
                     return candidate
-            pretrained = folder / key.family
+            pretrained = folder / _place(key)
             if (pretrained / CONFIG).is_file() and _is_variant(read_config(pretrained), key):
                 return pretrained
         return None
@@ -289,7 +290,7 @@ class ModelLibrary:
                 )
             started = time.time()
             iterations = META_ITERATIONS_OF.get(key.family, META_ITERATIONS)
-            length = fragment_length(model.horizon)
+            length = default_fragment_length(model.horizon)
             reward = meta_train_reward(model, iterations, fragment_length=length, seed=key.seed)
         finally:
             env.close()
@@ -306,16 +307,6 @@ class ModelLibrary:
             **provenance(),
         }
         write_json_atomically(folder / FINISHED, info)
-
-
-def fragment_length(horizon: int) -> int:
-    """
-    Steps of the fragments that ANOLE shows and MAML-reward learns from.
-
-    :param horizon: Steps of an episode.
-    :return: 50, or an episode.
-    """
-    return min(FRAGMENT_LENGTH, horizon)
 
 
 def _other(key: ModelKey, variant: str) -> ModelKey:
@@ -408,8 +399,11 @@ def _distinguishing(similarity: str | None, context: str | None, latent_dim: int
 
 
 def _expected(key: ModelKey) -> tuple[str | None, str | None, int]:
+    """What a model of this key is like: as its family's entry would make it, or as the algorithm's defaults do without one."""
     variant = VARIANTS[key.variant]
-    hyperparameters = training_plan(key).hyperparameters
+    hyperparameters = variant.hyperparameters
+    with contextlib.suppress(MissingEntryError):  # a family that nothing is trained on here
+        hyperparameters = training_plan(key).hyperparameters
     dim = int(hyperparameters.get("latent_dim", 5))
     if variant.algorithm == "pearl_sac":
         return None, None, dim

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_poem.benchmark.methods import VARIANTS
-from sb3_poem.benchmark.suites import SUITES, Budget, Training, family_id, family_name, hashable
+from sb3_poem.benchmark.suites import SUITES, Budget, Training, family_id, family_label, family_name, hashable
 from sb3_poem.cli.outputs import check_writable
 
 
@@ -80,12 +80,13 @@ def _check_models(arguments: argparse.Namespace) -> None:
         if not Path(folder).is_dir():
             raise ValueError(f"--models {folder}: there is no such folder")
     names = arguments.families or SUITES[arguments.suite].families
-    families = {family_name(family_id(name)) for name in names}
+    families = {family_id(name) for name in names}
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     for text in arguments.model:
         family, _, seed, _ = _parse_named(text)
         if family not in families:
-            raise ValueError(f"--model {text}: {family} is none of the families of this run: {', '.join(sorted(families))}")
+            known = ", ".join(sorted(map(family_label, families)))
+            raise ValueError(f"--model {text}: {family_label(family)} is none of the families of this run: {known}")
         if seed not in seeds:
             raise ValueError(f"--model {text}: {seed} is none of the seeds of this run: {', '.join(map(str, seeds))}")
 
@@ -140,4 +141,4 @@ def _parse_named(text: str) -> tuple[str, str, int, str]:
         raise ValueError(f"--model {text}: there is no variant {variant!r}; there are: {', '.join(VARIANTS)}")
     if not Path(path).exists():
         raise ValueError(f"--model {text}: there is no such file or folder")
-    return family_name(family_id(family)), variant, int(seed), path
+    return family_id(family), variant, int(seed), path

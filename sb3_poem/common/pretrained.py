@@ -80,6 +80,7 @@ def model_contents(model: "PEARLSAC", card: dict[str, Any] | None = None) -> tup
         "context_reward_statistics": model.context_reward_statistics,
         "num_timesteps": model.num_timesteps,
         "n_updates": model._n_updates,
+        "n_envs": model.n_envs,
         "card": card or {},
     }
     for name in SPACES:
@@ -177,7 +178,7 @@ def from_pretrained(algorithm: type[Model], folder: str | Path, env: Any = None,
         raise ValueError(f"{weights} is truncated, or no safetensors file: {error}") from error
     model = build_model(algorithm, config, tensors, str(folder), device)
     if env is not None:
-        model.set_env(algorithm._vectorise(env, len(model.train_tasks), model.trajectories_per_task))  # type: ignore[arg-type]
+        model.set_env(algorithm._vectorise(env, None, 1, model.n_envs))  # type: ignore[arg-type]
     return model
 
 
@@ -211,7 +212,11 @@ def build_model(
         model.env_kwargs = config.get("env_kwargs", {})
         if config.get("context_reward_statistics") is not None:
             model.context_reward_statistics = tuple(config["context_reward_statistics"])
-        model._n_updates, model.n_envs = config["n_updates"], 1
+        model._n_updates = config["n_updates"]
+        # not in the first models
+        model.n_envs = config.get("n_envs") or algorithm._default_copies(
+            len(tensors["train_tasks"]), model.trajectories_per_task
+        )
         model._statistics_known = True
         if model.target_entropy == "auto":  # which SAC would look up in the environment
             model.target_entropy = -float(np.prod(model.action_space.shape))  # type: ignore[arg-type]

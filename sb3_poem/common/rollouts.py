@@ -325,16 +325,18 @@ def seed_episodes(vec_env: VecEnv, seeds: Sequence[int]) -> None:
     :param vec_env: Any SB3 vector environment.
     :param seeds: One a copy.
     """
-    if hasattr(vec_env, "keep_tasks"):
+    keeps_tasks = hasattr(vec_env, "keep_tasks")
+    is_family = keeps_tasks or vec_env.has_attr("set_task")
+    if is_family and any(seed is not None for seed in vec_env.unwrapped._seeds):
+        vec_env.reset()  # whoever seeded the environment, as make_vec_env always does, chose its tasks, not these episodes
+    if keeps_tasks:
         family: Any = vec_env
         if family.tasks is None:  # nobody has chosen yet, so that the first seeds do
             seed_copies(vec_env, seeds)
             vec_env.reset()
         family.keep_tasks()
         seed_copies(vec_env, seeds)
-    elif vec_env.has_attr("set_task"):
-        if any(seed is not None for seed in vec_env.unwrapped._seeds):
-            vec_env.reset()  # whoever seeded the environment, as make_vec_env always does, chose its tasks, not these episodes
+    elif is_family:
         for copy, seed in enumerate(seeds):
             vec_env.set_attr("np_random", np.random.default_rng(seed), indices=[copy])
     else:

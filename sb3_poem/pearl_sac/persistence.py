@@ -1,6 +1,7 @@
 """How models and training runs are written and read: SB3's zip, checkpoints, and pretrained folders."""
 
 import contextlib
+import functools
 import io
 import pathlib
 import zipfile
@@ -11,8 +12,10 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3 import SAC
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_poem.common.checkpoint import read_checkpoint, restore_stores, save_checkpoint
 from sb3_poem.common.family import plain_id
@@ -27,6 +30,10 @@ DEFAULT_TRAIN_TASKS = 120
 def default_train_tasks(all_tasks: np.ndarray | None) -> int:
     """How many tasks to train on unless told: 120, or all of a smaller finite family."""
     return DEFAULT_TRAIN_TASKS if all_tasks is None else min(DEFAULT_TRAIN_TASKS, len(all_tasks))
+
+
+def _monitored(env_id: str) -> gym.Env:
+    return Monitor(gym.make(env_id))
 
 
 class PersistentSAC(SAC):
@@ -65,11 +72,16 @@ class PersistentSAC(SAC):
     fixed_arguments: ClassVar[tuple[str, ...]] = ("latent_dim", "similarity", "context")
 
     @staticmethod
+    def _default_copies(n_train_tasks: int, trajectories_per_task: int) -> int:
+        """One copy for each trajectory of an epoch, up to one per task or :data:`DEFAULT_TRAIN_TASKS`, whichever is more."""
+        return min(n_train_tasks * trajectories_per_task, max(n_train_tasks, DEFAULT_TRAIN_TASKS))
+
+    @classmethod
     def _vectorise(
-        env: GymEnv | str, n_train_tasks: int | None, trajectories_per_task: int, n_copies: int | None = None
+        cls, env: GymEnv | str, n_train_tasks: int | None, trajectories_per_task: int, n_copies: int | None = None
     ) -> GymEnv | str:
-        """A registered id of a family that has a vectorised version becomes ``n_copies``: unless given, one for each
-        trajectory of an epoch, up to one per task or :data:`DEFAULT_TRAIN_TASKS`, whichever is more.
+        """A registered id becomes ``n_copies``: unless given, :meth:`_default_copies` of a family that has a vectorised
+        version, and one of any other.
         """
         if not isinstance(env, str):
             return env
@@ -77,7 +89,7 @@ class PersistentSAC(SAC):
 
         env = plain_id(env)
         if gym.spec(env).vector_entry_point is None:
-            return env
+            return DummyVecEnv([functools.partial(_monitored, env)] * (n_copies or 1))
         from sb3_poem.common.vec_env import TaskVecEnv
 
         if n_copies is not None:
@@ -85,8 +97,7 @@ class PersistentSAC(SAC):
         if n_train_tasks is None:
             with contextlib.closing(gym.make(env)) as probe:
                 n_train_tasks = default_train_tasks(getattr(probe.unwrapped, "all_tasks", None))
-        n_copies = min(n_train_tasks * trajectories_per_task, max(n_train_tasks, DEFAULT_TRAIN_TASKS))
-        return TaskVecEnv.from_id(env, n_copies)
+        return TaskVecEnv.from_id(env, cls._default_copies(n_train_tasks, trajectories_per_task))
 
     def save(
         self,
@@ -128,9 +139,18 @@ class PersistentSAC(SAC):
             attribute = cls.saved_arguments.get(name, name)
             if name in kwargs and data.get(attribute) != changed[attribute]:
                 raise ValueError(f"{name} is {data.get(attribute)!r} in {path}, and cannot become {kwargs[name]!r}")
+        learns = str(data["ent_coef"]).startswith("auto")
+        if "ent_coef" in kwargs and str(kwargs["ent_coef"]).startswith("auto") != learns:
+            raise ValueError(
+                f"ent_coef is {data['ent_coef']!r} in {path}, and cannot become {kwargs['ent_coef']!r}: a coefficient that is "
+                "learned stays one, as does a fixed one"
+            )
+        if kwargs.get("n_train_tasks") not in (None, len(data["train_tasks"])):
+            raise ValueError(
+                f"n_train_tasks is {len(data['train_tasks'])} in {path}, and cannot become {kwargs['n_train_tasks']}"
+            )
         if env is not None:
-            copies = data["n_envs"] if data["n_envs"] > 1 else None
-            env = cls._vectorise(env, len(data["train_tasks"]), data["trajectories_per_task"], copies)
+            env = cls._vectorise(env, len(data["train_tasks"]), data["trajectories_per_task"], data["n_envs"])
         model = super().load(path, env=env, **changed)  # type: ignore[arg-type]
         if changed.get("seed") is not None:
             model.set_random_seed(changed["seed"])

@@ -30,6 +30,7 @@ class TaskSAC(PersistentSAC):
     precision: str
     n_train_tasks: int | None
     relabel_fraction: float
+    context_relabel_fraction: float
     shaping_coef: float = 0.0  # models of before it
     train_tasks: np.ndarray | None
     latent_means: np.ndarray | None
@@ -46,14 +47,6 @@ class TaskSAC(PersistentSAC):
                 f"n_train_tasks is {count}, but {family.env_id} is a finite family of {len(family.all_tasks)} tasks; "
                 f"use at most {len(family.all_tasks)}, or None for all"
             )
-        for name in ("relabel_fraction", "context_relabel_fraction"):
-            if getattr(self, name) > 0 and not family.shared_dynamics:
-                raise ValueError(f"{name} must be 0: the tasks of {family.env_id} do not share dynamics")
-        if self.shaping_coef > 0 and not family.has_potential:
-            raise ValueError(
-                f"shaping_coef must be 0: {family.env_id} has no potential; a family defines one by "
-                "_potential(tasks, observations)"
-            )
         self.env_id = family.env_id
         self.env_kwargs = family.env_kwargs
         self.task_space = family.task_space
@@ -62,9 +55,23 @@ class TaskSAC(PersistentSAC):
         self.latent_means = np.zeros((count, self.latent_dim))
         self.latent_variances = np.ones((count, self.latent_dim))
 
+    def _check_family(self, family: FamilyEnv) -> None:
+        """
+        :raises ValueError: if the model's arguments need what the family does not have
+        """
+        for name in ("relabel_fraction", "context_relabel_fraction"):
+            if getattr(self, name) > 0 and not family.shared_dynamics:
+                raise ValueError(f"{name} must be 0: the tasks of {family.env_id} do not share dynamics")
+        if self.shaping_coef > 0 and not family.has_potential:
+            raise ValueError(
+                f"shaping_coef must be 0: {family.env_id} has no potential; a family defines one by "
+                "_potential(tasks, observations)"
+            )
+
     def _family_of(self, env: VecEnv) -> FamilyEnv:
         """View of an environment, which must be of the model's own family once the model has one."""
         family = FamilyEnv(env, self.horizon)
+        self._check_family(family)
         if self.train_tasks is not None:
             family.check_same_family(self.task_space, self.reward_feature_dim)
         return family

@@ -10,6 +10,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 
 from sb3_poem.common.buffers import Segment
 from sb3_poem.common.collection import relabelled_returns
+from sb3_poem.common.family import FamilyEnv
 from sb3_poem.pearl_sac.losses import MetaBatch, TaskEmbeddings
 from sb3_poem.pearl_sac.pearl_sac import PEARLSAC
 from sb3_poem.pearl_sac.sampling import SamplingSAC
@@ -159,12 +160,11 @@ class POEMSAC(PEARLSAC):
     def _complete_policy_kwargs(self) -> None:
         self.policy_kwargs["two_encoder"] = self.similarity_metric == "two-encoder"
 
-    def _draw_tasks(self) -> None:
-        super()._draw_tasks()
-        assert self._family is not None
-        if self.preference_source == "relabel" and not self._family.shared_dynamics:
+    def _check_family(self, family: FamilyEnv) -> None:
+        super()._check_family(family)
+        if self.preference_source == "relabel" and not family.shared_dynamics:
             raise ValueError(
-                f'preference_source must be "rollout" or "auto": the tasks of {self.env_id} do not share dynamics, '
+                f'preference_source must be "rollout" or "auto": the tasks of {family.env_id} do not share dynamics, '
                 "so a trajectory of one cannot be relabelled for another"
             )
 

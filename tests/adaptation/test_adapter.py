@@ -11,6 +11,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv
 from worlds import Blinded, SpeedEnv, SpeedModel
 
+from sb3_poem import POEMSAC
 from sb3_poem.adaptation import (
     BoltzmannNoise,
     ExactNoise,
@@ -21,6 +22,7 @@ from sb3_poem.adaptation import (
     ReturnOracle,
     adapt_tasks,
 )
+from sb3_poem.resources import pretrained_folder
 
 GOAL = np.array([2.2])
 RULES = [{"inference": "bayes"}, {"inference": "bayes", "likelihood": "similarity"}, {"inference": "paper"}]
@@ -318,6 +320,25 @@ def test_the_oracles_noise_model_is_taken():
     assert adapter(oracle=MistakeOracle(0.3)).options.noise_model == MistakeNoise(0.3)
     assert adapter(oracle=MistakeOracle(0.3), noise_model=BoltzmannNoise()).options.noise_model == BoltzmannNoise()
     assert adapter(oracle=outside_oracle).inference.noise_model == ExactNoise()
+
+
+def test_numbers_of_numpy_can_be_saved():
+    adapter = PreferenceAdapter(SpeedModel(), make_env(), n_queries=np.int64(3), epsilon=np.float32(0.125), seed=0)
+    resumed = PreferenceAdapter.from_json(adapter.to_json(), SpeedModel(), make_env())
+    assert (resumed.options.n_queries, resumed.options.epsilon) == (3, 0.125)
+
+
+def test_a_library_in_an_environment_that_was_not_reset():
+    model = POEMSAC.from_pretrained(pretrained_folder("PointGoal"), device="cpu")
+    source = PreferenceAdapter(model, "poem/PointGoal-v0", oracle=ReturnOracle(), seed=0, n_queries=2)
+    source.adapt()
+    library = [trajectory for item in source.answers for trajectory in (item.left, item.right)]
+    adapter = PreferenceAdapter(model, "poem/PointGoal-v0", oracle=ReturnOracle(), library=library, seed=0, n_queries=2)
+    adapter.adapt()
+    assert adapter.done
+    env = gym.make("poem/PointGoal-v0")
+    with pytest.raises(RuntimeError, match=r"no task before its first reset\(\): reset it"):
+        PreferenceAdapter(model, env, oracle=ReturnOracle(), library=library, seed=0).adapt()
 
 
 class Looks:

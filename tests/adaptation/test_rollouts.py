@@ -84,6 +84,25 @@ def test_seeds_that_an_environment_was_made_with_do_not_reach_the_rollouts(kind)
     assert tasks[0] != tasks[1]
 
 
+@pytest.mark.parametrize("kind", [DummyVecEnv, TaskVecEnv])
+def test_the_environments_own_seeds_choose_its_tasks(kind):
+    single = gym.make("poem/PointGoal-v0")
+
+    def task_of(seed):
+        single.reset(seed=seed)
+        return single.unwrapped.task.tolist()
+
+    env = make_vec_env("poem/PointGoal-v0", 1, vec_env_cls=kind, seed=7)
+    for rollout_seed, seed in enumerate((7, 5, 6)):  # the first when it is made, the others later
+        if seed != 7:
+            env.seed(seed)
+        rollout_latents(Still(), env, LATENTS[:1], seed=rollout_seed)
+        assert env.get_attr("task")[0].tolist() == task_of(seed)
+    env.seed(11)
+    env.reset()
+    assert env.get_attr("task")[0].tolist() == task_of(11)
+
+
 def test_only_the_first_episode_counts():
     # A fast policy runs out of the world early; its copy starts again, which must leave no trace.
     latents = np.zeros((2, 5))

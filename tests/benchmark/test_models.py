@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from meta_toys import small
+from meta_toys import small, walks
 
 from sb3_poem import PEARLSAC, POEMSAC
 from sb3_poem.benchmark.families import FamilyFacts, family_facts
@@ -118,6 +118,29 @@ def test_the_plan_names_each_model_once_and_a_base_first(tmp_path: Path) -> None
     assert names == [(v, s) for s in range(2) for v in ("poem", "pearl", "maml-reward")]
     only = plan_for(ModelLibrary(Workplace(str(tmp_path))), "table3", ["PointGoal"], ["maml-reward"])
     assert [key.variant for key in only.models] == ["pearl", "maml-reward"]
+
+
+def test_named_models_of_two_families_of_one_name(tmp_path: Path) -> None:
+    for name in ("mine", "theirs"):
+        (tmp_path / name).write_bytes(b"")
+    named = tuple(
+        (f"{name}/PointGoal-v0", "poem", 0, str(tmp_path / file)) for name, file in (("my", "mine"), ("poem", "theirs"))
+    )
+    library = ModelLibrary(Workplace(str(tmp_path), named=named))
+    assert library.given(ModelKey("my/PointGoal-v0", "poem", 0)) == tmp_path / "mine"
+    assert library.given(ModelKey(POINT, "poem", 0)) == tmp_path / "theirs"
+
+
+def test_a_model_of_ones_own_family_needs_no_entry(tmp_path: Path) -> None:
+    arguments = {"n_train_tasks": 4, "horizon": 10, "meta_batch_size": 4}
+    model = small(POEMSAC, walks(2), latent_dim=2, **arguments)
+    model.env_id = "my/Walk-v0"
+    model.save_pretrained(tmp_path / "my-Walk-v0")
+    library = ModelLibrary(Workplace(str(tmp_path / "runs"), models=(str(tmp_path),)))
+    key = ModelKey("my/Walk-v0", "poem-d2", 0)
+    assert library.given(key) == tmp_path / "my-Walk-v0"
+    assert library.given(ModelKey("my/Walk-v0", "poem", 0)) is None  # which has five dimensions
+    assert library.load(key, walks(2)).latent_dim == 2
 
 
 def test_a_named_folder_without_a_model(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from meta_toys import ARCH, EPOCH, N_TASKS, POINT_GOAL, OtherWalk, Walk, differing, parameters, small, walks
+from meta_toys import ARCH, EPOCH, N_TASKS, POINT_GOAL, OtherWalk, Walk, WindyWalk, differing, parameters, small, walks
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import (
     BaseCallback,
@@ -843,3 +843,39 @@ def test_an_id_becomes_as_many_copies_as_in_training(algorithm: type[POEMSAC], t
     other = small(algorithm, TaskVecEnv.from_id(POINT_GOAL, 5), **arguments)
     other.save(tmp_path / "o.zip")
     assert algorithm.load(tmp_path / "o.zip", POINT_GOAL).n_envs == 5
+
+
+@one_is_enough
+def test_an_id_without_a_vectorised_version(algorithm: type[POEMSAC], tmp_path: Path) -> None:
+    gym.register("Strolling-v0", Walk, max_episode_steps=10)
+    try:
+        whole = small(algorithm, "Strolling-v0", n_train_tasks=4, meta_batch_size=4).learn(2 * 40)
+        half = small(algorithm, "Strolling-v0", n_train_tasks=4, meta_batch_size=4).learn(40)
+        half.save_checkpoint(tmp_path / "c.pt")
+        half.save(tmp_path / "m.zip")
+        half.save_pretrained(tmp_path / "p")
+        resumed = algorithm.load_checkpoint(tmp_path / "c.pt", "Strolling-v0", device="cpu").learn(
+            40, reset_num_timesteps=False
+        )
+        assert not differing(parameters(resumed), parameters(whole))
+        for loaded in (
+            algorithm.load(tmp_path / "m.zip", "Strolling-v0"),
+            algorithm.from_pretrained(tmp_path / "p", "Strolling-v0"),
+        ):
+            assert loaded.n_envs == 1
+    finally:
+        del gym.registry["Strolling-v0"]
+
+
+def test_arguments_that_the_family_cannot_have(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
+    small(algorithm, walks(3, WindyWalk), horizon=10, n_train_tasks=4).save(tmp_path / "windy.zip")
+    calm = small(algorithm, walks(3), horizon=10, n_train_tasks=4, relabel_fraction=0.5)
+    calm.save(tmp_path / "calm.zip")
+    with pytest.raises(ValueError, match=r"relabel_fraction must be 0: the tasks of .* do not share dynamics"):
+        algorithm.load(tmp_path / "windy.zip", walks(3, WindyWalk), relabel_fraction=0.5)
+    with pytest.raises(ValueError, match="relabel_fraction must be 0"):
+        calm.set_env(walks(3, WindyWalk))
+    with pytest.raises(ValueError, match=r"n_train_tasks is 4 in .*calm\.zip, and cannot become 2"):
+        algorithm.load(tmp_path / "calm.zip", n_train_tasks=2)
+    with pytest.raises(ValueError, match=r"ent_coef is 'auto' in .*calm\.zip, and cannot become 0\.1"):
+        algorithm.load(tmp_path / "calm.zip", ent_coef=0.1)

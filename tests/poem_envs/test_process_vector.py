@@ -108,6 +108,32 @@ def test_attributes_of_the_family_are_read_and_set_on_every_copy():
     np.testing.assert_allclose(after - before, 0.05)
 
 
+def test_attributes_outlive_an_interrupt():
+    envs = ProcessFamilyVector(Interrupted, num_envs=4, nthread=2, step_length=0.2)
+    envs.reset(seed=0)
+    envs.set_attribute("step_length", 0.05)
+    Interrupted.armed = 1
+    with pytest.raises(KeyboardInterrupt):
+        envs.step(np.full((4, 1), 0.625, dtype=np.float32))
+    before = envs.reset(seed=0)[0][:, 0]
+    np.testing.assert_allclose(envs.step(np.ones((4, 1), dtype=np.float32))[0][:, 0] - before, 0.05)
+
+
+def test_copies_that_could_not_be_made_are_tried_again(tmp_path):
+    class Sulking(Walk):
+        def __init__(self, **kwargs):
+            super().__init__(**kwargs)
+            if os.getpid() != parent and not (tmp_path / "sulked").exists():
+                (tmp_path / "sulked").touch()
+                raise OSError("not today")
+
+    parent = os.getpid()
+    envs = ProcessFamilyVector(Sulking, num_envs=2, nthread=2)
+    with pytest.raises(RuntimeError, match="not today"):
+        envs.reset(seed=0)
+    assert envs.reset(seed=0)[0].shape == (2, 2)
+
+
 class Single(Walk):
     observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
 
