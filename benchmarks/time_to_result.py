@@ -102,6 +102,8 @@ def main() -> None:
     given = arguments(__doc__, add_arguments)
     th.set_num_threads(given.threads)
     entry = hyperparameters(given.conf, given.env)
+    if given.from_step > entry["n_timesteps"]:
+        raise SystemExit(f"--from-step {given.from_step}: training ends after {entry['n_timesteps']:.0f} steps")
     results, rows = [], []
     for seed in given.seeds:
         clock = Clock(given.env, given.target, given.rules, 300 + seed, given.from_step, given.every)

@@ -85,3 +85,17 @@ def test_plot_refuses_other_shapes(returns: np.ndarray) -> None:
 def test_plot_refuses_a_limit_of_another_length() -> None:
     with pytest.raises(ValueError, match="limit needs one value"):
         plot_returns([0, 1, 2], np.zeros((3, 3)), limit=[1.0])
+
+
+@pytest.mark.parametrize("fps", [10, 30, 50, 67, 80, 125])
+def test_a_gif_takes_as_long_as_what_it_shows(fps: int, tmp_path: Path) -> None:
+    from PIL import Image
+
+    frames = [np.full((8, 8, 3), 2 * number, dtype=np.uint8) for number in range(100)]
+    write_video(frames, tmp_path / "a.gif", fps)
+    image, delays = Image.open(tmp_path / "a.gif"), []
+    for number in range(image.n_frames):
+        image.seek(number)
+        delays.append(image.info["duration"])
+    assert min(delays) >= 20
+    assert sum(delays) == pytest.approx(1000 * 100 / fps, abs=20)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from poem_envs.core import BOUNDS_TOLERANCE
-from poem_envs.headless import choose_headless_backend
+from poem_envs.mujoco_rendering import prepare_to_render
 from poem_envs.replay import ReplayFamily
 
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
@@ -234,8 +234,7 @@ class GoalFamily(ReplayFamily):
         """Render the current state as the environment does."""
         if self._task is None:
             raise RuntimeError("render() was called before the first reset()")
-        if hasattr(self.env.unwrapped, "mujoco_renderer"):
-            choose_headless_backend()
+        prepare_to_render(self.env, self.render_mode)
         with unchanged_physics(self.env):
             if self.render_task:
                 return self.env.render()

@@ -22,3 +22,13 @@ def choose_headless_backend() -> None:
             _logger.info("no display: rendering with MUJOCO_GL=%s", backend)
             return
     raise RuntimeError("rendering on a machine without a display needs libEGL or libOSMesa: install libegl1 or libosmesa6")
+
+
+def release_graphics() -> None:
+    """Let go of the EGL context that this thread rendered with last: it can be used in one thread at a time."""
+    egl = sys.modules.get("mujoco.egl")
+    if egl is None or egl.EGL_DISPLAY is None:
+        return
+    from OpenGL import EGL
+
+    EGL.eglMakeCurrent(egl.EGL_DISPLAY, EGL.EGL_NO_SURFACE, EGL.EGL_NO_SURFACE, EGL.EGL_NO_CONTEXT)

@@ -85,6 +85,50 @@ class StateRenderer:
         stays_closed(self)
 
 
+def renderer_inside(env: Any) -> Any:
+    """The ``MujocoRenderer`` of an environment that renders by itself; None where there is none.
+
+    :param env: the bare environment; mazes of gymnasium-robotics keep the robot's environment one deeper
+    """
+    for holder in (env, getattr(env, "ant_env", None), getattr(env, "point_env", None)):
+        renderer = getattr(holder, "mujoco_renderer", None)
+        if renderer is not None:
+            return renderer
+    return None
+
+
+def prepare_to_render(env: Any, render_mode: str | None) -> None:
+    """Choose a backend, and make an environment's graphics context the current one: Gymnasium does not when another
+    environment has rendered since, and gives an image of nothing.
+
+    :param env: a bare environment that renders by itself
+    :param render_mode: its render mode
+    """
+    renderer = renderer_inside(env)
+    if renderer is None or render_mode is None:
+        return
+    if render_mode != "human":
+        choose_headless_backend()
+    renderer._get_viewer(render_mode).make_context_current()
+
+
+def close_viewers(env: Any) -> None:
+    """Close what an environment renders with, so that a later rendering opens it anew: Gymnasium's own ``close`` keeps what
+    it has closed, and renders black with it.
+
+    :param env: a bare environment that renders by itself
+    """
+    renderer = renderer_inside(env)
+    for viewer in [] if renderer is None else renderer._viewers.values():
+        viewer.make_context_current()
+        if hasattr(viewer, "opengl_context"):
+            viewer.con.free()  # while its own context is current
+        viewer.close()
+    if renderer is not None:
+        renderer._viewers.clear()
+        renderer.viewer = None
+
+
 def close_at_exit(renderer: _Closable) -> None:
     """Close a renderer when the program ends, if it still is open then."""
     # A graphics context must go before the library that made it, which ends itself at exit: so register after its import.

@@ -13,6 +13,7 @@ import numpy as np
 
 from poem_envs.headless import choose_headless_backend
 from poem_envs.mujoco_fast_rendering import FastRenderer
+from poem_envs.mujoco_rendering import close_viewers, prepare_to_render
 
 SUPPORTED = "metaworld >= 3.1, < 4"
 
@@ -127,9 +128,10 @@ class Sawyer:
 
     def render(self) -> Any:
         """What Meta-World returns in its ``render_mode``; an image ``(height, width, 3)``, uint8, where it renders fast."""
-        choose_headless_backend()
         if not self.arguments["renders_fast"]:
+            prepare_to_render(self.env, self.env.render_mode)
             return self.env.render()
+        choose_headless_backend()
         if self._fast_renderer is None:
             env = self.env
             self._fast_renderer = FastRenderer(
@@ -139,7 +141,7 @@ class Sawyer:
 
     def close(self) -> None:
         """Close windows and graphics contexts, which a later rendering would open again."""
-        self.env.close()
+        close_viewers(self.env)
         if self._fast_renderer is not None:
             self._fast_renderer.close()
             self._fast_renderer = None

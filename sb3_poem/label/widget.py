@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from poem_envs.headless import release_graphics
 from sb3_poem.adaptation.adapter import PreferenceAdapter
 from sb3_poem.label.access import Access
 from sb3_poem.label.catalogue import Choice
@@ -17,7 +18,7 @@ from sb3_poem.label.hosting import BackgroundServer
 from sb3_poem.label.server import make_app
 from sb3_poem.label.sessions import Conversations
 from sb3_poem.label.store import Session, Store
-from sb3_poem.label.turns import CONVERSATION, Bench, Request
+from sb3_poem.label.turns import CONVERSATION, Bench, Request, Turn
 from sb3_poem.label.workshop import Workshop
 
 
@@ -54,8 +55,10 @@ class LabelWidget:
         bench = _AdaptersBench(adapter.model, adapter.env, env_id, self._start)
         self._temporary = tempfile.TemporaryDirectory() if store is None else None
         self._store = Store(Path(self._temporary.name) if self._temporary is not None else Path(store or "."))
-        # One thread: a graphics context belongs to the thread that rendered first.
-        workshop = Workshop(1, lambda: ThreadPoolExecutor(1), bench.turn)
+        release_graphics()  # the environment may have rendered in this thread
+        # One thread: a graphics context belongs to one at a time.
+        self._thread = ThreadPoolExecutor(1)
+        workshop = Workshop(1, lambda: self._thread, bench.turn)
         choice = Choice("notebook", Path(), type(adapter.model).__name__, env_id)
         options = {**adapter.options.to_dict(), "notebook": True}
         self._conversations = Conversations(
@@ -103,8 +106,9 @@ class LabelWidget:
         return self.sync().policy()
 
     def close(self) -> None:
-        """Stop the server."""
+        """Stop the server; adapter and environment are the caller's again."""
         self._server.close()
+        self._thread.shutdown(cancel_futures=True)
         self._store.close()
         if self._temporary is not None:
             self._temporary.cleanup()
@@ -122,6 +126,13 @@ class _AdaptersBench(Bench):
     def __init__(self, model: Any, env: Any, env_id: str, start: dict[str, Any]) -> None:
         super().__init__(model, env, env_id)
         self._start = start
+
+    def turn(self, request: Request) -> Turn:
+        """See :class:`Bench`. What it rendered with is the caller's again afterwards."""
+        try:
+            return super().turn(request)
+        finally:
+            release_graphics()
 
     def adapter(self, request: Request) -> PreferenceAdapter:
         """See :class:`Bench`."""

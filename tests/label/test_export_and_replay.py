@@ -6,6 +6,7 @@ import asyncio
 import json
 import shutil
 import sqlite3
+import time
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 from label_world import settled
 
-from sb3_poem import cli
+from sb3_poem import POEMSAC, cli
 from sb3_poem.adaptation import HumanOracle, PreferenceAdapter, ReturnOracle
 from sb3_poem.adaptation.policy import AdaptedPolicy
 from sb3_poem.common.trajectory import Trajectory
@@ -233,3 +234,27 @@ def test_an_adapted_policy_is_one_file(point_goal: Choice, tmp_path: Path) -> No
             AdaptedPolicy.from_bytes(broken)
     with pytest.raises(ValueError, match="not an adapted policy"):
         AdaptedPolicy.from_bytes((point_goal.folder / "model.safetensors").read_bytes())
+
+
+@pytest.mark.parametrize("quality", ["full", "fast"])
+def test_the_widget_takes_an_environment_that_was_rendered_and_gives_it_back(quality: str) -> None:
+    env = gym.make("poem/HalfCheetahVel-v0", render_mode="rgb_array", render_quality=quality, width=64, height=64)
+    try:
+        env.reset(seed=0)
+        before = env.render()
+    except Exception as error:
+        pytest.skip(f"this machine cannot render: {error}")
+    model = POEMSAC.from_pretrained(pretrained_folder("HalfCheetahVel"), device="cpu")
+    widget = LabelWidget(PreferenceAdapter(model, env, seed=0, n_queries=2, n_candidates=10))
+    state: dict[str, Any] = {}
+    for _ in range(600):
+        state = json.loads(urllib.request.urlopen(widget.url + "/state").read())
+        if state["phase"] == "question" or state.get("failed"):
+            break
+        time.sleep(0.1)
+    assert state["phase"] == "question", state
+    assert widget.sync().pending is not None
+    widget.close()
+    env.reset(seed=0)
+    np.testing.assert_array_equal(env.render(), before)
+    env.close()

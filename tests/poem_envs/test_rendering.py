@@ -129,3 +129,39 @@ def test_rendering_without_a_mode(env_id):
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="without a render_mode"):
         assert env.render() is None
+
+
+@pytest.mark.parametrize("env_id", ["poem/MetaWorldML1-v0", "poem/FetchReach-v0", "poem/AntMaze-v0"])
+def test_other_environments_that_render_or_close_change_nothing(env_id):
+    def image(env):
+        env.reset(seed=0)
+        return env.render()
+
+    def make(of):
+        return gym.make(of, render_mode="rgb_array")
+
+    env, cheetah, twin = make(env_id), make("poem/HalfCheetahVel-v0"), make(env_id)
+    first = image(env)
+    assert first.std() > 5
+    image(cheetah)
+    np.testing.assert_array_equal(image(env), first)
+    np.testing.assert_array_equal(image(twin), first)
+    cheetah.close()
+    twin.close()
+    np.testing.assert_array_equal(image(env), first)
+    env.close()
+    again = make(env_id)  # perhaps with the simulator of one that was closed
+    np.testing.assert_array_equal(image(again), first)
+    again.close()
+
+
+def test_tasks_of_different_manipulations_render_in_turn():
+    env = gym.make("poem/MetaWorldML10-v0", render_mode="rgb_array")
+    tasks = env.unwrapped.sample_tasks(3, np.random.default_rng(0))
+    images = []
+    for task in [*tasks, *tasks]:
+        env.reset(seed=0, options={"task": task})
+        images.append(env.render())
+    for first, second in zip(images[:3], images[3:], strict=True):
+        np.testing.assert_array_equal(first, second)
+    env.close()
