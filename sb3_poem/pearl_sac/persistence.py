@@ -1,7 +1,6 @@
 """How models and training runs are written and read: SB3's zip, checkpoints, and pretrained folders."""
 
 import contextlib
-import functools
 import io
 import pathlib
 import zipfile
@@ -12,10 +11,9 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3 import SAC
-from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_poem.common.checkpoint import read_checkpoint, restore_stores, save_checkpoint
 from sb3_poem.common.family import plain_id
@@ -30,10 +28,6 @@ DEFAULT_TRAIN_TASKS = 120
 def default_train_tasks(all_tasks: np.ndarray | None) -> int:
     """How many tasks to train on unless told: 120, or all of a smaller finite family."""
     return DEFAULT_TRAIN_TASKS if all_tasks is None else min(DEFAULT_TRAIN_TASKS, len(all_tasks))
-
-
-def _monitored(env_id: str) -> gym.Env:
-    return Monitor(gym.make(env_id))
 
 
 class PersistentSAC(SAC):
@@ -89,7 +83,7 @@ class PersistentSAC(SAC):
 
         env = plain_id(env)
         if gym.spec(env).vector_entry_point is None:
-            return DummyVecEnv([functools.partial(_monitored, env)] * (n_copies or 1))
+            return make_vec_env(env, n_copies or 1)
         from sb3_poem.common.vec_env import TaskVecEnv
 
         if n_copies is not None:
