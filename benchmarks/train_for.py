@@ -4,7 +4,8 @@
 
 Takes an entry of hyperparameters, changed by ``--set``, but for ``n_timesteps``: the learning rate falls from what the entry
 names to 0 over the time, however many steps that turns out to be. ``--start`` goes on from the weights of a pretrained folder;
-optimisers and replay buffers begin anew. The model is written every few epochs.
+optimisers and replay buffers begin anew, so let the rate rise from 0 at first (``--warm-up``): at a full rate a good policy is
+soon lost. The model is written every few epochs.
 """
 
 import argparse
@@ -31,13 +32,14 @@ class Clock(EpochCallback):
 
     :param seconds: The time
     :param rate: Learning rate at the start
+    :param warm_up: Seconds in which it rises from 0
     :param out: The model's file
     :param every: Epochs between two writes of it
     """
 
-    def __init__(self, seconds: float, rate: float, out: Path, every: int) -> None:
+    def __init__(self, seconds: float, rate: float, warm_up: float, out: Path, every: int) -> None:
         super().__init__()
-        self.seconds, self.rate, self.out, self.write_every = seconds, rate, out, every
+        self.seconds, self.rate, self.warm_up, self.out, self.write_every = seconds, rate, warm_up, out, every
         self.started = time.monotonic()
 
     @property
@@ -45,8 +47,14 @@ class Clock(EpochCallback):
         """Of the time that is over."""
         return min(1.0, (time.monotonic() - self.started) / self.seconds)
 
+    @property
+    def schedule(self) -> ConstantSchedule:
+        """Of the learning rate, until the next epoch."""
+        risen = min(1.0, self.share * self.seconds / self.warm_up) if self.warm_up > 0 else 1.0
+        return ConstantSchedule(self.rate * risen * (1.0 - self.share))
+
     def _on_epoch(self) -> None:
-        self.model.lr_schedule = ConstantSchedule(self.rate * (1.0 - self.share))
+        self.model.lr_schedule = self.schedule
         values = {name.split("/")[-1]: value for name, value in self.logger.name_to_value.items()}
         shown = {name: round(float(values[name]), 3) for name in SHOWN if name in values}
         print(
@@ -89,6 +97,7 @@ def main() -> None:
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="other hyperparameters")
     parser.add_argument("--env-set", nargs="+", default=[], metavar="KEY=VALUE", help="arguments of the environment")
     parser.add_argument("--start", type=Path, help="a pretrained folder to go on from")
+    parser.add_argument("--warm-up", type=float, default=0.0, metavar="SECONDS", help="let the rate rise from 0 for so long")
     parser.add_argument("--every", type=int, default=8, help="epochs between two writes of the model")
     parser.add_argument("--threads", type=int, help="of the simulation")
     parser.add_argument("--device", type=available_device, default="auto")
@@ -100,8 +109,8 @@ def main() -> None:
     rate = float(str(entry.pop("learning_rate")).removeprefix("lin_"))
     env = TaskVecEnv.from_id(given.env_id, entry.pop("n_envs"), nthread=given.threads, **pairs(given.env_set))
     model = make_model(entry, env, given.start, given.seed, given.device)
-    model.lr_schedule = ConstantSchedule(rate)
-    clock = Clock(given.seconds, rate, given.out, given.every)
+    clock = Clock(given.seconds, rate, given.warm_up, given.out, given.every)
+    model.lr_schedule = clock.schedule
     model.learn(10**12, callback=clock, log_interval=None, reset_num_timesteps=False)
     model.save(given.out)
     print(f"{given.out}: {model.num_timesteps:,} steps, {model._n_updates:,} updates", flush=True)
