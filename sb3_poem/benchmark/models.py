@@ -24,7 +24,7 @@ from sb3_poem.adaptation.state import read_json, write_json_atomically
 from sb3_poem.baselines import MAMLRewardModel, MetaReward, meta_train_reward
 from sb3_poem.baselines.fragments import default_fragment_length
 from sb3_poem.benchmark.hyperparameters import MissingEntryError, TrainingPlan, training_plan
-from sb3_poem.benchmark.locks import locked
+from sb3_poem.benchmark.locks import locked, try_lock
 from sb3_poem.benchmark.methods import META_ITERATIONS, META_ITERATIONS_OF, VARIANTS
 from sb3_poem.benchmark.provenance import provenance
 from sb3_poem.benchmark.suites import ModelKey, family_id, family_label
@@ -150,6 +150,20 @@ class ModelLibrary:
         """Whether the model is, or will be, saved along its training."""
         return self.given(key) is None
 
+    def lock_file(self, key: ModelKey) -> Path:
+        """Held by whoever trains the model."""
+        return self.folder(key) / ".lock"
+
+    def is_taken(self, key: ModelKey) -> bool:
+        """Whether the model, or one that it is made from, is missing and another process is training it."""
+        if self.given(key) is not None or (self.folder(key) / FINISHED).exists():
+            return False
+        base = VARIANTS[key.variant].base
+        if base is not None and self.is_taken(_other(key, base)):
+            return True
+        with try_lock(self.lock_file(key)) as free:
+            return not free
+
     def ensure(self, key: ModelKey, say: Say = print) -> dict[str, Any]:
         """
         Train the model if it is missing, or finish its training; another process that is at it is waited for.
@@ -167,7 +181,7 @@ class ModelLibrary:
             base = VARIANTS[key.variant].base
             if base is not None:
                 self.ensure(_other(key, base), say)
-            with locked(folder / ".lock", lambda: say(f"waiting for another process that trains {key}")) as lock:
+            with locked(self.lock_file(key), lambda: say(f"waiting for another process that trains {key}")) as lock:
                 if not (folder / FINISHED).exists():
                     self._derive(key, base) if base is not None else self._train(key, lock, say)
         return read_json(folder / FINISHED)

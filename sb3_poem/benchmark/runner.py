@@ -16,7 +16,7 @@ from sb3_poem.benchmark.suites import Cell
 def run_cells(cells: Sequence[Cell], library: ModelLibrary, store: Store, say: Say = print) -> list[str]:
     """
     Run cells, and keep each as soon as it is finished. It may be interrupted at any moment; what another process is at, or
-    has finished, is left to it.
+    has finished, is left to it, and cells whose model another process is training come last.
 
     :param cells: The cells.
     :param library: The models.
@@ -29,11 +29,11 @@ def run_cells(cells: Sequence[Cell], library: ModelLibrary, store: Store, say: S
     broken: dict[object, str] = {}
     for position, cell in enumerate(cells, start=1):
         with try_lock(_lock_file(cell, library, store)) as mine:
-            if not mine:
+            if not mine or (cell.key not in store and library.is_taken(cell.model_key)):
                 postponed.append(cell)
                 continue
             _run_one(cell, library, store, say, failures, broken, f"[{position}/{len(cells)}]")
-    for cell in postponed:  # whoever has them may have died
+    for cell in postponed:  # whoever has them, or trains for them, may have died
         with locked(_lock_file(cell, library, store), lambda cell=cell: say(f"waiting for another process: {cell}")):  # type: ignore[misc]
             _run_one(cell, library, store, say, failures, broken, "[postponed]")
     return failures

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -13,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sb3_poem.benchmark.locks import locked
 from sb3_poem.benchmark.models import ModelLibrary, Workplace
 from sb3_poem.benchmark.plan import make_plan
 from sb3_poem.benchmark.runner import run_cells
@@ -78,6 +80,25 @@ def test_a_training_that_fails_is_reported_and_the_rest_is_run(tmp_path: Path) -
     assert all("Unknown key 'gradient_stebs'" in failure and "did you mean" in failure for failure in failures)
     assert sum(line.startswith(("training", "resuming")) for line in lines) == 1  # not tried twice
     assert store.keys() == set()
+
+
+def test_cells_whose_model_another_process_trains_come_last(tmp_path: Path) -> None:
+    library, store = ModelLibrary(Workplace(str(tmp_path / "runs"))), Store(tmp_path / "store.sqlite")
+    plan = make_plan(TINY, library, store, None, ["poem-paper", "reward-oracle"], range(1), BUDGET, TRAINING, 1)
+    assert [cell.method for cell in plan.todo] == ["poem-paper", "reward-oracle"]
+    lines: list[str] = []
+    with contextlib.ExitStack() as other_process:
+        other_process.enter_context(locked(library.lock_file(plan.todo[0].model_key)))
+
+        def say(line: str) -> None:
+            lines.append(line)
+            assert "waiting" not in line  # this process would wait for ever
+            if "reward-oracle" in line:
+                other_process.close()
+
+        assert run_cells(plan.todo, library, store, say) == []
+    assert [line.split(", ")[1] for line in lines if line.startswith("[")] == ["reward-oracle", "poem-paper"]
+    assert len(store.keys()) == 2
 
 
 def sessions(file: Path) -> list[dict[str, float]]:
