@@ -56,6 +56,8 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, required=True, help="at least two")
     parser.add_argument("--others", type=int, default=600, help="tasks that the policies are chosen on")
     given = parser.parse_args()
+    if not 2 <= len(given.seeds) == len(given.models):
+        parser.error("--seeds and --models: name at least two seeds, and a model for each")
     measured = [
         limits(f"poem/{given.family}-v0", model, seed, given.others)
         for model, seed in zip(given.models, given.seeds, strict=True)
