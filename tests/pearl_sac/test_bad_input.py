@@ -19,12 +19,6 @@ from sb3_poem.common.buffers import TaskBatch
 NAN = float("nan")
 
 
-@pytest.fixture(params=[PEARLSAC, POEMSAC])
-def algorithm(request: pytest.FixtureRequest) -> type[PEARLSAC]:
-    """Both algorithms in turn."""
-    return request.param
-
-
 @pytest.mark.parametrize(
     ("argument", "value", "message"),
     [

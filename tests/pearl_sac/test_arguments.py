@@ -1,0 +1,227 @@
+"""Seeds and arguments do what they do in SB3's SAC."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from meta_toys import ARCH, EPOCH, N_TASKS, POINT_GOAL, assert_same_model, differing, parameters, small, walks
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+)
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_poem import PEARLSAC, POEMSAC
+from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.pearl_sac.policies import LatentPolicy
+from sb3_poem.poem_sac.policies import POEMPolicy
+
+#: For what is one code in both
+one_is_enough = pytest.mark.parametrize("algorithm", [POEMSAC])
+
+
+def test_a_seed_determines_everything(algorithm: type[PEARLSAC]) -> None:
+    first = small(algorithm).learn(2 * EPOCH)
+    th.manual_seed(99)
+    np.random.seed(99)  # noqa: NPY002 (to show that it does not matter)
+    second = small(algorithm).learn(2 * EPOCH)
+    assert_same_model(first, second)
+    assert th.equal(first.context.transitions, second.context.transitions)
+    third = small(algorithm, seed=1).learn(2 * EPOCH)
+    assert not np.array_equal(first.train_tasks, third.train_tasks)
+    different = differing(parameters(first), parameters(third))
+    assert sum(name.startswith("policy.") for name in different) > 20
+
+
+def test_training_leaves_the_global_generators_alone(algorithm: type[PEARLSAC]) -> None:
+    model = small(algorithm)
+    np.random.seed(3)  # noqa: NPY002
+    before_torch, before_numpy = th.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
+    model.learn(EPOCH)
+    assert th.equal(th.get_rng_state(), before_torch)
+    assert np.array_equal(np.random.get_state()[1], before_numpy)  # noqa: NPY002
+
+
+def test_the_kind_of_environment_does_not_matter(algorithm: type[PEARLSAC]) -> None:
+    ours = small(algorithm, TaskVecEnv.from_id(POINT_GOAL, 5)).learn(EPOCH)
+    theirs = small(algorithm, make_vec_env(POINT_GOAL, 5)).learn(EPOCH)
+    assert_same_model(ours, theirs)
+
+
+def test_tasks_come_from_the_family_and_the_seed(algorithm: type[PEARLSAC]) -> None:
+    tasks = small(algorithm, n_train_tasks=200).train_tasks
+    assert tasks.shape == (200, 1)
+    assert np.unique(tasks).size == 200
+    # uniform on [0, pi]: Kolmogorov-Smirnov at 1 %
+    deviation = np.abs(np.sort(tasks[:, 0]) / np.pi - (np.arange(200) + 0.5) / 200).max()
+    assert deviation < 1.63 / np.sqrt(200)
+    assert small(algorithm, walks(1), horizon=10, n_train_tasks=None).train_tasks.shape == (120, 1)
+
+
+def test_the_callers_policy_kwargs_stay_as_they_are(algorithm: type[PEARLSAC]) -> None:
+    policy_kwargs = {"net_arch": {key: list(value) for key, value in ARCH.items()}, "n_critics": 3}
+    model = small(algorithm, policy_kwargs=policy_kwargs)
+    assert policy_kwargs == {"net_arch": ARCH, "n_critics": 3}
+    assert len(model.policy.critic.members) == 3
+    small(algorithm, policy_kwargs=policy_kwargs)
+
+
+def test_net_arch_as_a_list_is_for_actor_and_critics(algorithm: type[PEARLSAC]) -> None:
+    policy = small(algorithm, policy_kwargs={"net_arch": [24, 12], "activation_fn": th.nn.Tanh}).policy
+    assert policy.net_arch["pi"] == policy.net_arch["qf"] == [24, 12]
+    assert policy.actor.mlp.output.in_features == 12
+    assert policy.encoder.mlp.output.in_features == 200
+    assert isinstance(policy.actor.mlp.activation, th.nn.Tanh)
+    with pytest.raises(ValueError, match=r"net_arch has unknown keys \['vf'\]; known are .*'decoder'.*"):
+        small(algorithm, policy_kwargs={"net_arch": {"vf": [1]}})
+
+
+def test_the_policy_can_be_a_class(algorithm: type[PEARLSAC]) -> None:
+    policy_class = {PEARLSAC: LatentPolicy, POEMSAC: POEMPolicy}[algorithm]
+    arguments = {"n_train_tasks": 2, "device": "cpu", "policy_kwargs": {"net_arch": ARCH}}
+    assert isinstance(algorithm(policy_class, POINT_GOAL, **arguments).policy, policy_class)
+    with pytest.raises(ValueError, match="Policy CnnPolicy unknown"):
+        algorithm("CnnPolicy", POINT_GOAL, **arguments)
+
+
+@one_is_enough
+def test_another_optimizer(algorithm: type[PEARLSAC]) -> None:
+    kwargs = {"net_arch": ARCH, "optimizer_class": th.optim.SGD, "optimizer_kwargs": {"momentum": 0.9}}
+    model = small(algorithm, policy_kwargs=kwargs).learn(EPOCH)
+    assert isinstance(model.policy.optimizer, th.optim.SGD)
+    assert model.policy.optimizer.param_groups[0]["momentum"] == 0.9
+
+
+class Record(BaseCallback):
+    """Notes a value at the start of every epoch and at the end."""
+
+    def __init__(self, read: Any) -> None:
+        super().__init__()
+        self.read, self.values = read, []
+
+    def _on_rollout_start(self) -> None:
+        self.values.append(self.read(self.model))
+
+    def _on_training_end(self) -> None:
+        self.values.append(self.read(self.model))
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def learning_rates(model: PEARLSAC) -> tuple[float, ...]:
+    optimizers = [model.policy.optimizer, model.ent_coef_optimizer]
+    return tuple(optimizer.param_groups[0]["lr"] for optimizer in optimizers)
+
+
+@one_is_enough
+def test_learning_rate_schedules_reach_the_optimisers(algorithm: type[PEARLSAC]) -> None:
+    record = Record(learning_rates)
+    small(algorithm, learning_rate=lambda remaining: 1e-3 * remaining).learn(4 * EPOCH, record)
+    # epochs train after their collection: with 3/4, 2/4, 1/4 and 0 of the run remaining
+    expected = [1e-3, 0.75e-3, 0.5e-3, 0.25e-3, 0.0]
+    np.testing.assert_allclose(record.values, np.repeat(np.array(expected)[:, None], 2, axis=1), atol=1e-12)
+
+
+@one_is_enough
+def test_a_schedule_never_turns_negative(algorithm: type[PEARLSAC]) -> None:
+    """Whole epochs overshoot the total; a learning rate below 0 would climb the loss."""
+    record = Record(learning_rates)
+    small(algorithm, learning_rate=lambda remaining: 1e-3 * remaining).learn(EPOCH + 1, record)
+    assert min(min(rates) for rates in record.values) >= 0.0
+
+
+@one_is_enough
+def test_entropy_coefficient(algorithm: type[PEARLSAC]) -> None:
+    fixed = small(algorithm, ent_coef=0.3).learn(EPOCH)
+    assert fixed.ent_coef_optimizer is None
+    assert fixed._entropy_coefficient().item() == pytest.approx(0.3)
+    learned = small(algorithm, ent_coef="auto_0.1")
+    assert learned._entropy_coefficient().item() == pytest.approx(0.1)
+    learned.learn(2 * EPOCH)
+    assert learned._entropy_coefficient().item() != pytest.approx(0.1, abs=1e-5)
+    # ten Adam steps of 3e-4 on the logarithm
+    assert abs(np.log(learned._entropy_coefficient().item() / 0.1)) <= 10 * 3e-4 * 1.01
+    with pytest.raises(ValueError, match="could not convert string to float"):
+        small(algorithm, ent_coef="little")
+
+
+@one_is_enough
+def test_target_entropy(algorithm: type[PEARLSAC]) -> None:
+    assert small(algorithm).target_entropy == -2.0
+    assert small(algorithm, target_entropy=-0.5).target_entropy == -0.5
+    # far below the policy's entropy alpha falls, far above it rises
+    falling = small(algorithm, target_entropy=-50.0).learn(EPOCH)._entropy_coefficient().item()
+    rising = small(algorithm, target_entropy=50.0).learn(EPOCH)._entropy_coefficient().item()
+    assert falling < 1.0 < rising
+
+
+def target_networks(model: PEARLSAC) -> th.Tensor:
+    return th.cat([parameter.flatten() for parameter in model.policy.critic_target.parameters()])
+
+
+def critic_networks(model: PEARLSAC) -> th.Tensor:
+    return th.cat([parameter.detach().flatten() for parameter in model.policy.critic.parameters()])
+
+
+@one_is_enough
+def test_target_critics_follow_slowly(algorithm: type[PEARLSAC]) -> None:
+    model = small(algorithm, gradient_steps=1, tau=0.25)
+    before = target_networks(model).clone()
+    assert th.equal(before, critic_networks(model))
+    model.learn(1)
+    th.testing.assert_close(target_networks(model), 0.75 * before + 0.25 * critic_networks(model))
+
+
+@one_is_enough
+def test_target_update_interval(algorithm: type[PEARLSAC]) -> None:
+    """Updates at gradient steps 0, 3, 6, ... with tau = 1 copy the critics."""
+    model, seen = small(algorithm, gradient_steps=7, target_update_interval=3, tau=1.0), []
+    update = model._update_targets
+
+    def spy() -> None:
+        update()
+        seen.append(model._n_updates)
+        assert th.equal(target_networks(model), critic_networks(model))
+
+    model._update_targets = spy  # type: ignore[method-assign]
+    model.learn(1)
+    assert seen == [0, 3, 6]
+
+
+@one_is_enough
+def test_gradient_steps_and_learning_starts(algorithm: type[PEARLSAC]) -> None:
+    assert small(algorithm, gradient_steps=0).learn(EPOCH)._n_updates == 0
+    assert small(algorithm, gradient_steps=-1, n_train_tasks=2).learn(1)._n_updates == 50
+    model = small(algorithm, learning_starts=EPOCH).learn(2 * EPOCH)  # the first epoch acts at random and learns nothing
+    assert model._n_updates == 5
+    first_actions = th.cat([model.replay_buffer.transitions(task).actions[:, :25] for task in range(N_TASKS)])
+    assert first_actions.abs().max() < 1.0
+    assert abs(first_actions.mean().item()) < 0.1
+    assert first_actions.std().item() == pytest.approx(1 / np.sqrt(3), rel=0.1)
+
+
+@one_is_enough
+def test_horizons_per_task_and_epoch(algorithm: type[PEARLSAC]) -> None:
+    model = small(algorithm, trajectories_per_task=3).learn(1)
+    assert model.num_timesteps == 3 * EPOCH
+    assert model.context.transitions.shape[:2] == (N_TASKS, 75)
+    assert (model.replay_buffer.counts == 75).all()
+    # contexts are the tasks' own
+    raw = model.replay_buffer.transitions(4).rewards[0]
+    assert sorted(model.context.rewards[4].tolist()) == pytest.approx(sorted(raw.tolist()), abs=1e-5)
+
+
+@one_is_enough
+def test_buffer_size_bounds_memory(algorithm: type[PEARLSAC]) -> None:
+    model = small(algorithm, buffer_size=30).learn(3 * EPOCH)
+    assert (model.replay_buffer.counts == 30).all()
+
+
+@pytest.mark.parametrize("precision", ["fp32", "bf16", "auto"])
+def test_precision(algorithm: type[PEARLSAC], precision: str) -> None:
+    model = small(algorithm, precision=precision).learn(EPOCH)
+    assert all(value.isfinite().all() for value in parameters(model).values())
+    assert all(value.dtype == th.float32 for value in model.policy.parameters())

@@ -1,0 +1,201 @@
+"""SB3's callbacks and logs."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from meta_toys import EPOCH, N_TASKS, POINT_GOAL, small
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CallbackList,
+    CheckpointCallback,
+    EvalCallback,
+    EveryNTimesteps,
+    StopTrainingOnMaxEpisodes,
+)
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
+
+from sb3_poem import PEARLSAC, POEMSAC
+
+#: For what is one code in both
+one_is_enough = pytest.mark.parametrize("algorithm", [POEMSAC])
+
+
+class StopAt(BaseCallback):
+    """Stops after some steps of the vectorised environment."""
+
+    def __init__(self, calls: int) -> None:
+        super().__init__()
+        self.last = calls
+
+    def _on_step(self) -> bool:
+        assert self.training_env is self.model.get_env()
+        return self.n_calls < self.last
+
+
+@pytest.mark.parametrize("calls", [1, 25, 26, 40])
+def test_a_callback_stops_training(algorithm: type[PEARLSAC], calls: int) -> None:
+    model = small(algorithm)
+    model.learn(10 * EPOCH, StopAt(calls))
+    assert model.num_timesteps == calls * N_TASKS
+    assert model._n_updates == 5 * ((calls - 1) // 25)
+    model.learn(EPOCH, reset_num_timesteps=False)  # and it goes on
+    assert model.num_timesteps == calls * N_TASKS + EPOCH
+
+
+@one_is_enough
+def test_sb3s_callbacks(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
+    events: list[int] = []
+
+    class Count(BaseCallback):
+        def _on_step(self) -> bool:
+            events.append(self.model.num_timesteps)
+            return True
+
+    evaluation = EvalCallback(
+        make_vec_env(POINT_GOAL, 1), n_eval_episodes=2, eval_freq=20, best_model_save_path=str(tmp_path), verbose=0
+    )
+    callbacks = CallbackList(
+        [
+            EveryNTimesteps(EPOCH, Count()),
+            CheckpointCallback(30, str(tmp_path), save_replay_buffer=True),
+            evaluation,
+            StopTrainingOnMaxEpisodes(3, verbose=0),  # of each copy
+        ]
+    )
+    model = small(algorithm)
+    model.learn(10 * EPOCH, callbacks)
+    assert model.num_timesteps == 3 * EPOCH
+    assert events == [EPOCH, 2 * EPOCH, 3 * EPOCH]
+    assert (tmp_path / "best_model.zip").is_file()
+    assert np.isfinite(evaluation.last_mean_reward)
+    saved = algorithm.load(tmp_path / f"rl_model_{30 * N_TASKS}_steps")
+    assert saved.num_timesteps == 30 * N_TASKS
+
+
+@one_is_enough
+def test_a_function_as_callback(algorithm: type[PEARLSAC]) -> None:
+    """SB3 takes a function of locals and globals too; it sees what it would see on SAC."""
+    seen: list[set[str]] = []
+
+    def callback(local_variables: dict[str, Any], _: dict[str, Any]) -> bool:
+        seen.append(set(local_variables))
+        return True
+
+    small(algorithm).learn(EPOCH, callback)
+    assert len(seen) == 25
+    assert {"infos", "dones", "rewards", "actions", "new_obs"} <= seen[0]
+
+
+@one_is_enough
+def test_progress_bar(algorithm: type[PEARLSAC], capsys: pytest.CaptureFixture[str]) -> None:
+    small(algorithm).learn(2 * EPOCH, progress_bar=True)
+    captured = capsys.readouterr()
+    assert "600/600" in captured.out + captured.err
+
+
+LOGGED = {
+    "rollout/train_task_return",
+    "rollout/ep_rew_mean",
+    "rollout/ep_len_mean",
+    "time/collection_fps",
+    "time/updates_per_second",
+    "time/fps",
+    "train/learning_rate",
+    "train/critic_loss",
+    "train/actor_loss",
+    "train/decoder_loss",
+    "train/kl",
+    "train/kl_ideal",
+    "train/aggregate_to_prior_kl",
+    "train/decoder_error",
+    "train/ent_coef",
+}
+LOGGED_BY_POEM = {"train/preference_loss", "train/preference_accuracy"}
+
+
+def test_csv_and_json_logs(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
+    model = small(algorithm)
+    model.set_logger(configure(str(tmp_path), ["csv", "json"]))
+    model.learn(3 * EPOCH)
+    rows = list(csv.DictReader((tmp_path / "progress.csv").open()))
+    lines = [json.loads(line) for line in (tmp_path / "progress.json").read_text().splitlines()]
+    promised = LOGGED | (LOGGED_BY_POEM if algorithm is POEMSAC else set())
+    for entries in (rows, lines):
+        assert [int(float(entry["time/total_timesteps"])) for entry in entries] == [EPOCH, 2 * EPOCH, 3 * EPOCH]
+        for entry in entries:
+            assert promised <= set(entry)
+            assert np.isfinite([float(entry[name]) for name in promised]).all()
+    assert float(rows[0]["train/kl_ideal"]) == pytest.approx(np.log(N_TASKS))
+    assert float(rows[0]["rollout/ep_len_mean"]) == 25
+    assert [int(row["train/n_updates"]) for row in rows] == [5, 10, 15]
+    # the first row is of the first epoch alone: twelve episodes, whose returns Monitor saw too
+    assert float(rows[0]["rollout/train_task_return"]) == pytest.approx(float(rows[0]["rollout/ep_rew_mean"]), rel=1e-5)
+
+
+@one_is_enough
+@pytest.mark.parametrize(("log_interval", "expected"), [(2, [2, 4]), (None, []), (1, [1, 2, 3, 4])])
+def test_log_interval_counts_epochs(
+    algorithm: type[PEARLSAC], tmp_path: Path, log_interval: int | None, expected: list[int]
+) -> None:
+    model = small(algorithm)
+    model.set_logger(configure(str(tmp_path), ["json"]))
+    model.learn(4 * EPOCH, log_interval=log_interval)
+    lines = [json.loads(line) for line in (tmp_path / "progress.json").read_text().splitlines()]
+    assert [line["time/total_timesteps"] // EPOCH for line in lines] == expected
+
+
+@one_is_enough
+def test_tensorboard(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    model = small(algorithm, tensorboard_log=str(tmp_path))
+    model.learn(2 * EPOCH)
+    model.learn(EPOCH, reset_num_timesteps=False)
+    model.learn(EPOCH, tb_log_name="named")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f"{algorithm.__name__}_1", "named_1"]
+    events = EventAccumulator(str(tmp_path / f"{algorithm.__name__}_1"))
+    events.Reload()
+    promised = LOGGED | (LOGGED_BY_POEM if algorithm is POEMSAC else set())
+    assert promised <= set(events.Tags()["scalars"])
+    assert [event.step for event in events.Scalars("train/kl")] == [EPOCH, 2 * EPOCH, 3 * EPOCH]
+
+
+@one_is_enough
+def test_verbose_prints_a_table(algorithm: type[PEARLSAC], capsys: pytest.CaptureFixture[str]) -> None:
+    small(algorithm, verbose=1).learn(EPOCH)
+    printed = capsys.readouterr().out
+    assert "Using cpu device" in printed
+    assert "decoder_error" in printed
+    small(algorithm, verbose=0).learn(EPOCH)
+    assert capsys.readouterr().out == ""
+
+
+@one_is_enough
+def test_monitors_episode_info(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
+    """Returns as SB3 logs them are those of the tasks; a Monitor file is written."""
+    env = make_vec_env(POINT_GOAL, 3, monitor_dir=str(tmp_path / "monitor"))
+    model = small(algorithm, env).learn(EPOCH)
+    episodes = list(model.ep_info_buffer)
+    assert [episode["l"] for episode in episodes] == [25] * N_TASKS
+    # copies end together, in waves of three tasks
+    own = [model.replay_buffer.transitions(task).rewards.sum() for task in range(N_TASKS)]
+    np.testing.assert_allclose([episode["r"] for episode in episodes], own, rtol=1e-4)
+    assert len(list((tmp_path / "monitor").glob("*.monitor.csv"))) == 3
+
+
+def test_a_model_from_a_gpu_goes_on_training_here(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
+    """There optimisers are captured in a graph, which Adam refuses on a processor."""
+    model = small(algorithm).learn(EPOCH)
+    for optimizer in (model.policy.optimizer, model.ent_coef_optimizer):
+        optimizer.param_groups[0]["capturable"] = True
+    model.save(tmp_path / "model.zip")
+    loaded = algorithm.load(tmp_path / "model.zip", env=POINT_GOAL, device="cpu")
+    loaded.learn(EPOCH, reset_num_timesteps=False)
+    assert loaded._n_updates == 10

@@ -1,0 +1,88 @@
+"""Which environments PEARLSAC and POEMSAC take, as SB3's SAC does."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from meta_toys import EPOCH, N_TASKS, POINT_GOAL, Walk, differing, parameters, small, walks
+from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
+
+from sb3_poem import PEARLSAC, POEMSAC
+from sb3_poem.common.vec_env import TaskVecEnv
+
+#: For what is one code in both
+one_is_enough = pytest.mark.parametrize("algorithm", [POEMSAC])
+
+OBS = np.random.default_rng(0).normal(size=(6, 2))
+
+
+@pytest.mark.parametrize(
+    "make_env",
+    [
+        pytest.param(lambda: POINT_GOAL, id="id"),
+        pytest.param(lambda: gym.make(POINT_GOAL), id="single"),
+        pytest.param(lambda: Monitor(gym.make(POINT_GOAL)), id="monitor"),
+        pytest.param(lambda: make_vec_env(POINT_GOAL, 5), id="dummy"),
+        pytest.param(lambda: VecMonitor(DummyVecEnv([functools.partial(gym.make, POINT_GOAL)] * 5)), id="vec-monitor"),
+        pytest.param(lambda: make_vec_env(POINT_GOAL, 5, vec_env_cls=TaskVecEnv), id="task-vec-env"),
+        pytest.param(lambda: TaskVecEnv.from_id(POINT_GOAL, 30), id="more-copies-than-tasks"),
+    ],
+)
+def test_any_number_of_environments(algorithm: type[PEARLSAC], make_env: Any) -> None:
+    """Copies that do not divide the tasks: the last wave is filled up, and the steps count."""
+    model = small(algorithm, make_env()).learn(1)
+    n_envs = model.env.num_envs
+    waves = -(-N_TASKS // n_envs)
+    assert model.num_timesteps == waves * n_envs * 25
+    assert model.n_envs == n_envs
+    counts = model.replay_buffer.counts
+    assert counts.sum() == model.num_timesteps
+    assert counts.min() == 25 * (waves * n_envs // N_TASKS)
+    assert len(model.ep_info_buffer) == min(100, waves * n_envs)
+    assert model._n_updates == 5
+    # the stored transitions are the tasks' own
+    for task in range(N_TASKS):
+        stored = model.replay_buffer.transitions(task)
+        expected = model.family.compute_reward(model.train_tasks[task], stored.features.numpy())
+        np.testing.assert_allclose(stored.rewards.numpy(), expected, atol=1e-5)
+
+
+def test_an_id_gets_a_copy_for_every_task(algorithm: type[PEARLSAC]) -> None:
+    model = small(algorithm)
+    assert isinstance(model.env, TaskVecEnv)
+    assert model.env.num_envs == N_TASKS
+    assert model.env_id == POINT_GOAL
+
+
+@one_is_enough
+def test_subprocesses(algorithm: type[PEARLSAC]) -> None:
+    env = SubprocVecEnv([functools.partial(gym.make, f"poem_envs:{POINT_GOAL}")] * 2, start_method="forkserver")
+    try:
+        model = small(algorithm, env).learn(EPOCH)
+        same = small(algorithm, DummyVecEnv([functools.partial(gym.make, POINT_GOAL)] * 2)).learn(EPOCH)
+        assert not differing(parameters(model), parameters(same))
+    finally:
+        env.close()
+
+
+def test_early_ends_and_unsymmetric_actions(algorithm: type[PEARLSAC]) -> None:
+    model = small(algorithm, walks(4, edge=0.4), horizon=10).learn(240)
+    assert model.num_timesteps == 240
+    terminated = th.cat([model.replay_buffer.transitions(task).terminated for task in range(N_TASKS)], dim=1)
+    assert 0 < terminated.sum() < terminated.numel()
+    assert model._episode_num > 24
+    actions, _ = model.predict(OBS, deterministic=False)
+    assert (actions >= -2.0).all()
+    assert (actions <= 4.0).all()
+
+
+def test_the_toys_are_environments() -> None:
+    check_env(Walk(edge=0.4))

@@ -1,0 +1,110 @@
+"""``predict`` and the policy: SB3's face, with a latent as the state."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch as th
+from meta_toys import POINT_GOAL, small, walks
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+
+from sb3_poem import PEARLSAC
+from sb3_poem.poem_sac.policies import POEMPolicy
+
+OBS = np.random.default_rng(0).normal(size=(6, 2))
+
+
+def test_predict_takes_latents_as_state(trained: PEARLSAC) -> None:
+    latents = np.random.default_rng(1).normal(size=(6, 5))
+    actions, state = trained.predict(OBS, state=latents, deterministic=True)
+    assert actions.shape == (6, 2)
+    assert np.array_equal(state, latents)
+    for index in range(6):  # one by one, with a single observation
+        action, state = trained.predict(OBS[index], state=latents[index], deterministic=True)
+        assert action.shape == (2,)
+        np.testing.assert_allclose(action, actions[index], atol=1e-6)
+        assert np.array_equal(state, latents[index : index + 1])
+        again, _ = trained.predict(OBS[index], state=state, deterministic=True)  # the state that came back
+        assert np.array_equal(again, action)
+    assert np.ptp(actions, axis=0).min() > 1e-4
+
+
+def test_predict_with_one_latent_for_all_and_with_none(trained: PEARLSAC) -> None:
+    latent = np.random.default_rng(1).normal(size=5)
+    for_all, state = trained.predict(OBS, state=latent, deterministic=True)
+    expected, _ = trained.predict(OBS, state=np.tile(latent, (6, 1)), deterministic=True)
+    np.testing.assert_allclose(for_all, expected, atol=1e-6)
+    assert state.shape == (6, 5)
+    nothing, state = trained.predict(OBS, deterministic=True)
+    prior_mean, _ = trained.predict(OBS, state=np.zeros((6, 5)), deterministic=True)
+    np.testing.assert_allclose(nothing, prior_mean, atol=1e-6)
+    assert np.array_equal(state, np.zeros((6, 5)))
+
+
+def test_predict_is_the_actor(trained: PEARLSAC) -> None:
+    """Against the networks put together by hand."""
+    latents = np.random.default_rng(1).normal(size=(6, 5))
+    policy = trained.policy
+    obs = ((th.as_tensor(OBS).float() - policy.obs_mean) / policy.obs_std).clamp(-10, 10)
+    embedding = th.as_tensor(latents).float()
+    if isinstance(policy, POEMPolicy):
+        embedding = policy.policy_mapping(embedding)
+    mean = policy.actor.mlp(th.cat([obs, embedding], dim=1))[:, :2]
+    actions, _ = trained.predict(OBS, state=latents, deterministic=True)
+    np.testing.assert_allclose(actions, th.tanh(mean).detach().numpy(), atol=1e-6)
+
+
+def test_actions_are_scaled_to_the_environment(algorithm: type[PEARLSAC]) -> None:
+    model = small(algorithm, walks(2), horizon=10)
+    latents = np.random.default_rng(1).normal(size=(6, 5))
+    actions, _ = model.predict(OBS, state=latents, deterministic=True)
+    scaled = model.policy.act(OBS, latents)
+    np.testing.assert_allclose(actions, -2.0 + 3.0 * (scaled + 1.0), atol=1e-5)
+    back = model.policy.scale_action_batch(th.as_tensor(actions))
+    np.testing.assert_allclose(back.numpy(), scaled, atol=1e-6)
+
+
+def test_predict_without_determinism_explores(trained: PEARLSAC) -> None:
+    many = np.tile(OBS[0], (200, 1))
+    th.manual_seed(0)
+    actions, _ = trained.predict(many, deterministic=False)
+    assert actions.std(axis=0).min() > 0.05
+    assert np.abs(actions).max() <= 1.0
+    th.manual_seed(0)
+    assert np.array_equal(trained.predict(many, deterministic=False)[0], actions)
+
+
+@pytest.mark.parametrize(
+    ("obs", "state", "message"),
+    [
+        (OBS, np.zeros(4), r"state has shape \(4,\), but a latent is \(5,\), or \(6, 5\)"),
+        (OBS, np.zeros((5, 5)), r"state has shape \(5, 5\)"),
+        (OBS, np.zeros((6, 4)), r"state has shape \(6, 4\)"),
+        (OBS, np.zeros((1, 6, 5)), r"state has shape"),
+        (OBS[0], np.zeros((2, 5)), r"state has shape \(2, 5\)"),
+        (OBS[:, :1], None, r"observation has shape \(1,\), but the policy takes \(2,\)"),
+        (np.zeros(3), None, r"observation has shape \(3,\)"),
+        (np.where(np.eye(6, 2, -3), np.nan, OBS), None, "observation 3 holds NaN or infinity"),
+        (np.where(np.eye(6, 2, -4), np.inf, OBS), None, "observation 4 holds NaN or infinity"),
+        (OBS, np.full(5, np.nan), "state .*NaN"),
+        (OBS, np.where(np.eye(6, 5, -2), np.nan, 0.0), "state .*NaN"),
+    ],
+)
+def test_predict_refuses(trained: PEARLSAC, obs: np.ndarray, state: np.ndarray | None, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        trained.predict(obs, state=state)
+
+
+def test_policy_forward_is_predict_at_the_priors_mean(trained: PEARLSAC) -> None:
+    scaled = trained.policy._predict(th.as_tensor(OBS), deterministic=True)
+    np.testing.assert_allclose(scaled.numpy(), trained.predict(OBS, deterministic=True)[0], atol=1e-6)
+
+
+def test_evaluate_policy(trained: PEARLSAC) -> None:
+    env = make_vec_env(POINT_GOAL, 3, seed=0)
+    mean, std = evaluate_policy(trained, env, n_eval_episodes=6)
+    assert -60.0 < mean < 0.0
+    assert std >= 0.0
+    lengths = evaluate_policy(trained, env, n_eval_episodes=3, return_episode_rewards=True)[1]
+    assert lengths == [25, 25, 25]

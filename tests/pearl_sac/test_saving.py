@@ -1,0 +1,288 @@
+"""Saving, loading, and what a loaded model keeps or is told anew."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from meta_toys import (
+    EPOCH,
+    N_TASKS,
+    POINT_GOAL,
+    OtherWalk,
+    Walk,
+    WindyWalk,
+    assert_same_model,
+    differing,
+    parameters,
+    small,
+    walks,
+)
+from stable_baselines3 import SAC
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_poem import PEARLSAC, POEMSAC
+from sb3_poem.common.vec_env import TaskVecEnv
+
+#: For what is one code in both
+one_is_enough = pytest.mark.parametrize("algorithm", [POEMSAC])
+
+OBS = np.random.default_rng(0).normal(size=(6, 2))
+
+
+@pytest.mark.parametrize("name", ["model", "model.zip", "deep/er/model"])
+def test_save_and_load(trained: PEARLSAC, tmp_path: Path, name: str) -> None:
+    trained.save(tmp_path / name)
+    assert (tmp_path / name).with_suffix(".zip").is_file()
+    loaded = type(trained).load(tmp_path / name)
+    assert_same_model(trained, loaded)
+    assert loaded.env is None
+    with pytest.raises(ValueError, match="has no environment"):
+        _ = loaded.family
+    loaded.save(str(tmp_path / "again"))
+    assert_same_model(trained, type(trained).load(str(tmp_path / "again.zip"), device="cpu"))
+
+
+def test_save_to_a_buffer(trained: PEARLSAC) -> None:
+    buffer = io.BytesIO()
+    trained.save(buffer)
+    buffer.seek(0)
+    assert_same_model(trained, type(trained).load(buffer))
+
+
+@pytest.mark.parametrize("make_env", [lambda: make_vec_env(POINT_GOAL, 3), lambda: gym.make(POINT_GOAL), lambda: POINT_GOAL])
+def test_loaded_models_continue_with_any_number_of_copies(trained: PEARLSAC, tmp_path: Path, make_env: Any) -> None:
+    trained.save(tmp_path / "model")
+    loaded = type(trained).load(tmp_path / "model", env=make_env())
+    assert_same_model(trained, loaded)
+    before = parameters(loaded)
+    loaded.learn(1, reset_num_timesteps=False)
+    assert loaded.num_timesteps == 2 * EPOCH + EPOCH
+    assert (loaded.epoch, loaded._n_updates) == (3, 15)
+    changed = differing(before, parameters(loaded))
+    assert {"policy.actor.mlp.output.weight", "policy.encoder.mlp.output.weight", "log_ent_coef"} <= set(changed)
+    assert not {"policy.obs_mean", "policy.reward_std"} & set(changed)  # statistics stay those of the first epoch
+    assert np.array_equal(loaded.train_tasks, trained.train_tasks)
+
+
+@one_is_enough
+def test_set_env_takes_another_number_of_copies(algorithm: type[PEARLSAC]) -> None:
+    model = small(algorithm).learn(EPOCH)
+    for env in (make_vec_env(POINT_GOAL, 2), TaskVecEnv.from_id(POINT_GOAL, 30), gym.make(POINT_GOAL)):
+        model.set_env(env)
+        model.learn(1, reset_num_timesteps=False)
+    assert model.num_timesteps == EPOCH + 300 + 750 + 300
+
+
+@one_is_enough
+def test_set_env_of_a_family_that_is_not_registered(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
+    """Its episodes' length is the model's to know."""
+    model = small(algorithm, walks(2), horizon=10).learn(1)
+    model.set_env(walks(3))
+    model.learn(1, reset_num_timesteps=False)
+    assert model.num_timesteps == 240
+    model.save(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model")
+    loaded.set_env(walks(4))
+    loaded.learn(1, reset_num_timesteps=False)
+    assert loaded.num_timesteps == 360
+    algorithm.load(tmp_path / "model", env=walks(5)).learn(1)
+    for env in (walks(2, OtherWalk), DummyVecEnv([OtherWalk])):
+        with pytest.raises(ValueError, match="own family"):
+            model.set_env(env)
+
+
+def test_set_env_of_another_family(algorithm: type[PEARLSAC]) -> None:
+    model = small(algorithm, "poem/HalfCheetahVel-v0", n_train_tasks=2)
+    env, family = model.env, model.family
+    for other in ("poem/HalfCheetahFwdBack-v0", "poem/AntVel-v0", POINT_GOAL):
+        with pytest.raises(ValueError, match=r"own family|[Oo]bservation spaces do not match"):
+            model.set_env(make_vec_env(other, 1))
+        with pytest.raises(ValueError, match="must not be wrapped in VecNormalize"):
+            model.set_env(VecNormalize(make_vec_env("poem/HalfCheetahVel-v0", 1)))
+        assert model.env is env  # a refused environment leaves the model as it was
+        assert model.family is family
+        assert model.n_envs == 2
+    with pytest.raises(ValueError, match="horizon is 200, but the environment ends episodes after 50 steps"):
+        model.set_env(make_vec_env("poem/HalfCheetahVel-v0", 1, env_kwargs={"max_episode_steps": 50}))
+
+
+def test_load_with_another_family(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
+    small(algorithm, "poem/HalfCheetahVel-v0", n_train_tasks=2).save(tmp_path / "model")
+    for other in ("poem/HalfCheetahFwdBack-v0", "poem/AntVel-v0"):
+        with pytest.raises(ValueError, match=r"own family|[Oo]bservation spaces do not match"):
+            algorithm.load(tmp_path / "model", env=make_vec_env(other, 1))
+        with pytest.raises(ValueError, match=r"own family|[Oo]bservation spaces do not match"):
+            algorithm.load(tmp_path / "model", env=other)
+
+
+def test_broken_and_foreign_files(trained: PEARLSAC, tmp_path: Path) -> None:
+    cls = type(trained)
+    trained.save(tmp_path / "model.zip")
+    content = (tmp_path / "model.zip").read_bytes()
+    broken = tmp_path / "broken.zip"
+    for bad in (content[: len(content) // 2], content[:-30], b"", b"hello", np.random.default_rng(0).bytes(5000)):
+        broken.write_bytes(bad)
+        with pytest.raises(ValueError, match=r"broken\.zip is truncated, or no model saved by"):
+            cls.load(broken)
+    middle = bytearray(content)
+    middle[len(content) // 2] ^= 0xFF
+    broken.write_bytes(middle)
+    with pytest.raises(ValueError, match=r"broken\.zip is truncated, or no model saved by"):
+        cls.load(broken)
+    with pytest.raises(FileNotFoundError):
+        cls.load(tmp_path / "nothing.zip")
+    SAC("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [4]}, buffer_size=10).save(tmp_path / "sac.zip")
+    with pytest.raises(ValueError, match=r"sac\.zip holds a model of another algorithm"):
+        cls.load(tmp_path / "sac.zip")
+    with pytest.raises(ValueError, match=r"model\.zip holds a model of another algorithm"):
+        (POEMSAC if cls is PEARLSAC else PEARLSAC).load(tmp_path / "model.zip")
+
+
+def test_get_and_set_parameters(trained: PEARLSAC, tmp_path: Path) -> None:
+    other = small(type(trained), seed=7)
+    assert differing(parameters(other), parameters(trained))
+    other.set_parameters(trained.get_parameters())
+    mine, theirs = parameters(other), parameters(trained)
+    assert not [name for name in differing(mine, theirs) if name != "log_ent_coef"]  # SB3 keeps it beside the parameters
+    latents = np.random.default_rng(1).normal(size=(6, 5))
+    actions = [model.predict(OBS, latents, deterministic=True)[0] for model in (other, trained)]
+    assert np.array_equal(*actions)
+    trained.save(tmp_path / "model")
+    third = small(type(trained), seed=8)
+    third.set_parameters(tmp_path / "model")
+    assert np.array_equal(third.predict(OBS, latents, deterministic=True)[0], actions[0])
+    with pytest.raises(ValueError, match="parameters do not match"):
+        third.set_parameters({"policy": trained.policy.state_dict()})
+    third.set_parameters({"policy": trained.policy.state_dict()}, exact_match=False)
+
+
+def test_policy_saves_alone(trained: PEARLSAC, tmp_path: Path) -> None:
+    """rl_zoo3 and users export ``model.policy``."""
+    trained.policy.save(tmp_path / "policy")
+    policy = type(trained.policy).load(tmp_path / "policy")
+    latents = np.random.default_rng(1).normal(size=(6, 5))
+    expected = trained.predict(OBS, latents, deterministic=True)[0]
+    assert np.array_equal(policy.predict(OBS, latents, deterministic=True)[0], expected)
+
+
+@one_is_enough
+def test_replay_buffer_saves_alone(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
+    model = small(algorithm).learn(EPOCH)
+    model.save_replay_buffer(tmp_path / "buffer")
+    other = small(algorithm)
+    other.load_replay_buffer(tmp_path / "buffer")
+    for task in range(N_TASKS):
+        stored = zip(other.replay_buffer.transitions(task), model.replay_buffer.transitions(task), strict=True)
+        assert all(th.equal(one, two) for one, two in stored)
+    other.learn(EPOCH)
+    assert other.replay_buffer.size() == 2 * EPOCH
+
+
+def test_parameters_come_with_their_standardisation(trained: PEARLSAC) -> None:
+    copy = small(type(trained), gradient_steps=0)
+    copy.set_parameters(trained.get_parameters())
+    before = copy.predict(OBS, deterministic=True)[0]
+    copy.learn(EPOCH)  # which collects, and learns nothing
+    assert np.array_equal(copy.predict(OBS, deterministic=True)[0], before)
+    assert np.array_equal(trained.predict(OBS, deterministic=True)[0], before)
+    fresh = small(type(trained), seed=5)
+    fresh.set_parameters(small(type(trained)).get_parameters())  # of a model that has seen nothing
+    assert th.equal(fresh.policy.obs_std, th.ones(2))
+    fresh.learn(EPOCH)
+    assert not th.equal(fresh.policy.obs_std, th.ones(2))
+
+
+@one_is_enough
+def test_arguments_of_a_model_that_is_loaded(algorithm: type[POEMSAC], trained: PEARLSAC, tmp_path: Path) -> None:
+    model = small(algorithm, similarity="inner", context="pearl", latent_dim=3)
+    model.save(tmp_path / "m.zip")
+    same = {"similarity": "inner", "context": "pearl", "latent_dim": 3}
+    loaded = algorithm.load(tmp_path / "m.zip", n_steps=5, kl_coef=0.7, device="cpu", **same)
+    assert (loaded.target_steps, loaded.kl_coef) == (5, 0.7)
+    assert loaded.similarity(np.zeros((2, 3)), np.zeros((1, 3))).shape == (2, 1)
+    for name, value in {"similarity": "two", "context": "poem", "latent_dim": 5}.items():
+        with pytest.raises(ValueError, match=f"{name} is .* in .*m.zip, and cannot become {value!r}"):
+            algorithm.load(tmp_path / "m.zip", **{name: value})
+
+
+def test_a_seed_changes_what_follows(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
+    small(algorithm).learn(EPOCH).save(tmp_path / "m.zip")
+
+    def further(seed: int | None, later: int | None = None) -> dict[str, th.Tensor]:
+        arguments = {} if seed is None else {"seed": seed}
+        model = algorithm.load(tmp_path / "m.zip", env=POINT_GOAL, device="cpu", **arguments)
+        if later is not None:
+            model.set_random_seed(later)
+        return parameters(model.learn(EPOCH, reset_num_timesteps=False))
+
+    one, two = further(1), further(2)
+    assert differing(one, two)
+    assert not differing(one, further(1))
+    assert not differing(two, further(None, 2))
+    assert not differing(further(None), further(None))
+    assert differing(further(None), one)
+
+
+@one_is_enough
+def test_an_id_becomes_as_many_copies_as_in_training(algorithm: type[POEMSAC], tmp_path: Path) -> None:
+    arguments = {"n_train_tasks": 4, "trajectories_per_task": 3, "meta_batch_size": 4}
+    whole = small(algorithm, **arguments).learn(3 * 12 * 25)
+    half = small(algorithm, **arguments).learn(12 * 25)
+    half.save_checkpoint(tmp_path / "c.pt")
+    half.save(tmp_path / "m.zip")
+    half.save_pretrained(tmp_path / "p")
+    resumed = algorithm.load_checkpoint(tmp_path / "c.pt", POINT_GOAL, device="cpu")
+    for loaded in (
+        resumed,
+        algorithm.load(tmp_path / "m.zip", POINT_GOAL),
+        algorithm.from_pretrained(tmp_path / "p", POINT_GOAL),
+    ):
+        assert loaded.n_envs == whole.n_envs == 12
+    resumed.learn(2 * 12 * 25, reset_num_timesteps=False)
+    assert not differing(parameters(resumed), parameters(whole))
+    other = small(algorithm, TaskVecEnv.from_id(POINT_GOAL, 5), **arguments)
+    other.save(tmp_path / "o.zip")
+    assert algorithm.load(tmp_path / "o.zip", POINT_GOAL).n_envs == 5
+
+
+@one_is_enough
+def test_an_id_without_a_vectorised_version(algorithm: type[POEMSAC], tmp_path: Path) -> None:
+    gym.register("Strolling-v0", Walk, max_episode_steps=10)
+    try:
+        whole = small(algorithm, "Strolling-v0", n_train_tasks=4, meta_batch_size=4).learn(2 * 40)
+        half = small(algorithm, "Strolling-v0", n_train_tasks=4, meta_batch_size=4).learn(40)
+        half.save_checkpoint(tmp_path / "c.pt")
+        half.save(tmp_path / "m.zip")
+        half.save_pretrained(tmp_path / "p")
+        resumed = algorithm.load_checkpoint(tmp_path / "c.pt", "Strolling-v0", device="cpu").learn(
+            40, reset_num_timesteps=False
+        )
+        assert not differing(parameters(resumed), parameters(whole))
+        for loaded in (
+            algorithm.load(tmp_path / "m.zip", "Strolling-v0"),
+            algorithm.from_pretrained(tmp_path / "p", "Strolling-v0"),
+        ):
+            assert loaded.n_envs == 1
+    finally:
+        del gym.registry["Strolling-v0"]
+
+
+def test_arguments_that_the_family_cannot_have(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
+    small(algorithm, walks(3, WindyWalk), horizon=10, n_train_tasks=4).save(tmp_path / "windy.zip")
+    calm = small(algorithm, walks(3), horizon=10, n_train_tasks=4, relabel_fraction=0.5)
+    calm.save(tmp_path / "calm.zip")
+    with pytest.raises(ValueError, match=r"relabel_fraction must be 0: the tasks of .* do not share dynamics"):
+        algorithm.load(tmp_path / "windy.zip", walks(3, WindyWalk), relabel_fraction=0.5)
+    with pytest.raises(ValueError, match="relabel_fraction must be 0"):
+        calm.set_env(walks(3, WindyWalk))
+    with pytest.raises(ValueError, match=r"n_train_tasks is 4 in .*calm\.zip, and cannot become 2"):
+        algorithm.load(tmp_path / "calm.zip", n_train_tasks=2)
+    with pytest.raises(ValueError, match=r"ent_coef is 'auto' in .*calm\.zip, and cannot become 0\.1"):
+        algorithm.load(tmp_path / "calm.zip", ent_coef=0.1)
