@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from gymnasium.envs.registration import register
 
-from poem_envs.core import TaskDefinition, TaskFamily
+from poem_envs.core import SignedPermutation, Symmetry, TaskDefinition, TaskFamily
 from poem_envs.vector import BatchFamily, BatchTaskFamily, TaskFamilyVector
 
 if TYPE_CHECKING:
@@ -20,6 +20,8 @@ __all__ = [
     "BatchTaskFamily",
     "GoalFamily",
     "ProcessFamilyVector",
+    "SignedPermutation",
+    "Symmetry",
     "TaskDefinition",
     "TaskFamily",
     "TaskFamilyVector",

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import sys
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -38,6 +38,47 @@ class _NoGoalEnvironment:
         return self._function.__get__(instance, owner)
 
 
+class SignedPermutation(NamedTuple):
+    """A reordering with changes of sign: entry i of the result is ``signs[i]`` times entry ``order[i]``.
+
+    :param order: ``(n,)`` indices, each once
+    :param signs: ``(n,)`` of 1 and -1
+    """
+
+    order: tuple[int, ...]
+    signs: tuple[int, ...]
+
+    def __call__(self, values: np.ndarray) -> np.ndarray:
+        """Of ``(..., n)``, a new array."""
+        return values[..., list(self.order)] * np.array(self.signs, dtype=values.dtype)
+
+    def then(self, other: SignedPermutation) -> SignedPermutation:
+        """This one first, the other next."""
+        order = tuple(self.order[i] for i in other.order)
+        return SignedPermutation(order, tuple(sign * self.signs[i] for i, sign in zip(other.order, other.signs, strict=True)))
+
+
+class Symmetry(NamedTuple):
+    """A symmetry of a family's dynamics, as the reflection of a robot whose left is like its right.
+
+    If an action takes the environment from one observation to the next, with some reward features, then the mirrored action
+    takes it from the one's mirror image to the other's, with the mirrored features. Nothing is said of rewards: those of what
+    is mirrored are computed from its features, for any task.
+
+    :param observations: of the entries of an observation
+    :param actions: of the entries of an action
+    :param features: of the reward features
+    """
+
+    observations: SignedPermutation
+    actions: SignedPermutation
+    features: SignedPermutation
+
+    def then(self, other: Symmetry) -> Symmetry:
+        """This one first, the other next."""
+        return Symmetry(*(mine.then(its) for mine, its in zip(self, other, strict=True)))
+
+
 class TaskDefinition:
     """The tasks of a family and their rewards: what its single and its vectorised environment have in common.
 
@@ -53,6 +94,8 @@ class TaskDefinition:
     reward_feature_dim: int
     #: Whether tasks differ in the reward alone, so that one task's trajectories can be relabelled with another's rewards.
     shared_dynamics: bool = True
+    #: Symmetries of the dynamics, by which training may see every transition in other forms too; none unless a family says so.
+    symmetries: tuple[Symmetry, ...] = ()
     #: The names of the sets that tasks can be drawn from, of which the first is for training.
     splits: tuple[str, ...] = ("train",)
     #: The one that :meth:`sample_tasks` draws from.

@@ -23,7 +23,7 @@ from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 
-from poem_envs.core import TaskFamily
+from poem_envs.core import Symmetry, TaskFamily
 from poem_envs.cores import available_cores
 from poem_envs.vector import TaskFamilyVector
 
@@ -262,6 +262,10 @@ class ProcessFamilyVector(TaskFamilyVector):
 
     def _potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
         return self._template._potential(tasks, observations)
+
+    @property
+    def symmetries(self) -> tuple[Symmetry, ...]:  # type: ignore[override]
+        return self._template.symmetries
 
     def _checked_tasks(self, tasks: npt.ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:
         return self._template._checked_tasks(tasks, shape, name)

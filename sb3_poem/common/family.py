@@ -7,6 +7,8 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_wrapper
 
+from poem_envs import Symmetry
+
 
 def plain_id(env_id: str) -> str:
     """An environment's id as the registry has it.
@@ -48,6 +50,7 @@ class FamilyEnv:
         self.all_tasks: np.ndarray | None = self._get("all_tasks")
         self.shared_dynamics = bool(self._get("shared_dynamics"))
         self.reward_feature_dim = int(self._get("reward_feature_dim"))
+        self.symmetries: tuple[Symmetry, ...] = self._get("symmetries") if env.has_attr("symmetries") else ()
         spec = self._get("spec")
         self.env_id: str | None = None if spec is None else spec.id
         given: dict[str, Any] = {} if spec is None else spec.kwargs

@@ -66,6 +66,9 @@ class PEARLSAC(SamplingSAC):
         are best stays as it is; where an action changes values by a small part of their spread, as on the way to a place,
         they are learned sooner. Action values, those in POEM's contexts too, are then without that share. Needs a family with
         a potential
+    :param mirror_fraction: Share of each task's batch that is seen in a symmetry of the family's dynamics, drawn among those
+        that it names, with rewards computed for what is then seen. What a robot learned to do in one direction, it then has
+        examples of in others. Needs a family with symmetries, and with shared dynamics
     :param noise_color: Exponent b of the power spectrum 1 / f^b of the policy's noise in training rollouts: 0 white, as in
         SAC; 1 pink, 2 red (Eberhard et al., ICLR 2023). Noise that keeps a direction for some steps moves a robot farther
     :param policy_delay: Gradient steps of critics and encoder for each of everything else, that is the actor, the decoder, the
@@ -118,6 +121,7 @@ class PEARLSAC(SamplingSAC):
         reward_scale: float | str = "auto",
         n_steps: int = 1,
         shaping_coef: float = 0.0,
+        mirror_fraction: float = 0.0,
         noise_color: float = 0.0,
         policy_delay: int = 1,
         horizon: int | None = None,
@@ -156,6 +160,7 @@ class PEARLSAC(SamplingSAC):
             ("relabel_fraction", relabel_fraction),
             ("context_relabel_fraction", context_relabel_fraction),
             ("shaping_coef", shaping_coef),
+            ("mirror_fraction", mirror_fraction),
         )
         for name, value in (("gamma", gamma), ("tau", tau), *fractions):
             if not 0.0 <= value <= 1.0:
@@ -178,6 +183,7 @@ class PEARLSAC(SamplingSAC):
         if shaping_coef > 0 and gamma == 1:
             raise ValueError("shaping_coef must be 0 with gamma=1: staying somewhere has no finite value then")
         self.shaping_coef = shaping_coef
+        self.mirror_fraction = mirror_fraction
         self.noise_color = noise_color
         self.policy_delay = policy_delay
         self.horizon = horizon

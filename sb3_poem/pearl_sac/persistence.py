@@ -55,6 +55,7 @@ class PersistentSAC(SAC):
             "reward_scale",
             "noise_color",
             "shaping_coef",
+            "mirror_fraction",
             "policy_delay",
             "horizon",
             "precision",

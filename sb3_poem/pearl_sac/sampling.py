@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import torch as th
 
+from poem_envs import SignedPermutation
 from sb3_poem.common.buffers import TaskBatch
 from sb3_poem.pearl_sac import losses
 from sb3_poem.pearl_sac.collecting import CollectingSAC
@@ -78,8 +79,8 @@ class SamplingSAC(CollectingSAC):
     def _sample_transitions(
         self, task_ids: th.Tensor, chosen: np.ndarray, batch_size: int
     ) -> tuple[TaskBatch, losses.Bootstraps | None]:
-        """``batch_size`` transitions for each task, ``relabel_fraction`` of them other tasks' with the task's own rewards; and
-        what the critics' targets are made of, if that is more than these.
+        """``batch_size`` transitions for each task, ``relabel_fraction`` of them other tasks' with the task's own rewards and
+        ``mirror_fraction`` seen in a symmetry; and what the critics' targets are made of, if that is more than these.
         """
         generator, buffer = self.generators.torch, self.replay_buffer
         sources = task_ids[:, None].expand(-1, batch_size)
@@ -88,14 +89,22 @@ class SamplingSAC(CollectingSAC):
             foreign = th.randint(buffer.n_tasks, (len(chosen), n_foreign), generator=generator, device=self.device)
             sources = th.cat([sources[:, n_foreign:], foreign], dim=1)
         slots = buffer.draw_slots(sources, generator)
-        transitions = self._relabelled(buffer.at(sources, slots), chosen, n_foreign)
+        mirrored = self._draw_mirrors(sources.shape) if self.mirror_fraction > 0 else None
+
+        def seen(slots: th.Tensor) -> TaskBatch:
+            stored = buffer.at(sources, slots)
+            if mirrored is None:
+                return self._relabelled(stored, chosen, n_foreign)
+            return self._relabelled(self._mirrored(stored, mirrored), chosen, batch_size)
+
+        transitions = seen(slots)
         if self.target_steps == 1 and self.shaping_coef == 0:
             return transitions, None
         last, rewards, going_on = transitions, transitions.rewards.clone(), ~transitions.ended
         discounts = th.full_like(rewards, self.gamma)
         for _ in range(self.target_steps - 1):
             slots = th.where(going_on, (slots + 1) % buffer.capacity, slots)
-            following = self._relabelled(buffer.at(sources, slots), chosen, n_foreign)
+            following = seen(slots)
             rewards += going_on * discounts * following.rewards
             discounts = th.where(going_on, self.gamma * discounts, discounts)
             last, going_on = following, going_on & ~following.ended
@@ -104,6 +113,29 @@ class SamplingSAC(CollectingSAC):
             potential = self._potential(transitions.observations, chosen)
             rewards += discounts * self._potential(last.next_observations, chosen) - potential
         return transitions, losses.Bootstraps(rewards, last.next_observations, discounts)
+
+    def _draw_mirrors(self, shape: th.Size) -> th.Tensor:
+        """By which symmetry each transition is seen, counted from 1; 0 as it was."""
+        generator, device = self.generators.torch, self.device
+        which = th.randint(1, len(self.family.symmetries) + 1, shape, generator=generator, device=device)
+        return which * (th.rand(shape, generator=generator, device=device) < self.mirror_fraction)
+
+    def _mirrored(self, transitions: TaskBatch, which: th.Tensor) -> TaskBatch:
+        """Transitions (tasks, batch) as seen by the symmetries of :meth:`_draw_mirrors`; their rewards stay as they were."""
+
+        def seen(values: th.Tensor, permutations: list[SignedPermutation]) -> th.Tensor:
+            width, device = values.shape[-1], self.device
+            order = th.tensor([list(range(width)), *(p.order for p in permutations)], device=device)
+            signs = th.tensor([[1.0] * width, *(p.signs for p in permutations)], device=device)
+            return values.gather(-1, order[which]) * signs[which]
+
+        of_observations, of_actions, of_features = (list(part) for part in zip(*self.family.symmetries, strict=True))
+        return transitions._replace(
+            observations=seen(transitions.observations, of_observations),
+            actions=seen(transitions.actions, of_actions),
+            next_observations=seen(transitions.next_observations, of_observations),
+            features=seen(transitions.features, of_features),
+        )
 
     def _potential(self, observations: th.Tensor, chosen: np.ndarray) -> th.Tensor:
         """What staying at observations (tasks, batch, obs_dim) would be worth, (tasks, batch)."""

@@ -32,6 +32,7 @@ class TaskSAC(PersistentSAC):
     relabel_fraction: float
     context_relabel_fraction: float
     shaping_coef: float = 0.0  # models of before it
+    mirror_fraction: float = 0.0  # likewise
     train_tasks: np.ndarray | None
     latent_means: np.ndarray | None
     latent_variances: np.ndarray | None
@@ -59,13 +60,18 @@ class TaskSAC(PersistentSAC):
         """
         :raises ValueError: if the model's arguments need what the family does not have
         """
-        for name in ("relabel_fraction", "context_relabel_fraction"):
+        for name in ("relabel_fraction", "context_relabel_fraction", "mirror_fraction"):
             if getattr(self, name) > 0 and not family.shared_dynamics:
                 raise ValueError(f"{name} must be 0: the tasks of {family.env_id} do not share dynamics")
         if self.shaping_coef > 0 and not family.has_potential:
             raise ValueError(
                 f"shaping_coef must be 0: {family.env_id} has no potential; a family defines one by "
                 "_potential(tasks, observations)"
+            )
+        if self.mirror_fraction > 0 and not family.symmetries:
+            raise ValueError(
+                f"mirror_fraction must be 0: {family.env_id} names no symmetries; a family of them sets `symmetries`, "
+                "a tuple of poem_envs.Symmetry"
             )
 
     def _family_of(self, env: VecEnv) -> FamilyEnv:

@@ -49,7 +49,7 @@ NAN = float("nan")
         *[("reward_scale", value, "reward_scale must be a positive number or") for value in (0, -1.0, NAN, "big", None)],
         *[
             (name, value, rf"{name} must lie in \[0, 1\], got")
-            for name in ("relabel_fraction", "shaping_coef")
+            for name in ("relabel_fraction", "shaping_coef", "mirror_fraction")
             for value in (-0.1, 1.1, NAN)
         ],
         ("precision", "fp16", "precision must be one of 'auto', 'bf16', 'fp32', got 'fp16'"),
