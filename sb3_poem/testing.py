@@ -28,8 +28,8 @@ def check_task_family(
     Check that an environment keeps the contract of a task family, so that training, relabelling and adaptation are right.
 
     It checks the spaces, the drawing of tasks, seeds, when a task takes effect, that the task is hidden, that relabelling is
-    exact, the potential (of a family that has one), the vectorised version (of a registered id that has one), rendering,
-    pickling and closing, in this order.
+    exact, the potential and the symmetries (of a family that has them), the vectorised version (of a registered id that has
+    one), rendering, pickling and closing, in this order.
 
     :param env: The id of a registered environment, or a class or function that makes one
     :param n_steps: How many steps of an episode to compare; the episode may be shorter
@@ -48,6 +48,7 @@ def check_task_family(
     check_hidden_task(make, n_steps, seed)
     check_relabelling(make, n_steps, seed)
     check_potential(make, n_steps, seed)
+    check_symmetries(make)
     if isinstance(env, str):
         check_registration(env)
         if gym.spec(env).vector_entry_point is not None:
@@ -245,6 +246,33 @@ def check_potential(make: MakeFamily, n_steps: int, seed: int) -> None:
         "from its arguments alone, by elementwise operations on the last dimension"
     )
     assert np.isfinite(together).all(), f"compute_potential must give finite numbers, but gave {together.tolist()}"
+
+
+def check_symmetries(make: MakeFamily) -> None:
+    """Symmetries fit the spaces. Whether the dynamics have them cannot be seen from outside: compare steps from a state and
+    from its mirror image in a test of your own.
+    """
+    env = make()
+    observation_space, action_space = env.observation_space, env.action_space
+    parts = (
+        ("observations", observation_space.shape[0], (observation_space.low, observation_space.high)),
+        ("actions", action_space.shape[0], (action_space.low, action_space.high)),
+        ("features", env.reward_feature_dim, None),
+    )
+    for number, symmetry in enumerate(env.symmetries):
+        for name, width, bounds in parts:
+            what, permutation = f"symmetries[{number}].{name}", getattr(symmetry, name)
+            assert sorted(permutation.order) == list(range(width)), (
+                f"{what}.order must hold each of the indices 0 to {width - 1} once, but is {permutation.order}"
+            )
+            assert len(permutation.signs) == width == sum(abs(sign) == 1 for sign in permutation.signs), (
+                f"{what}.signs must be {width} of 1 and -1, but is {permutation.signs}"
+            )
+            if bounds is not None:
+                given, mirrored = np.stack(bounds), np.sort([permutation(bound) for bound in bounds], axis=0)
+                assert np.array_equal(mirrored, given), (
+                    f"{what} must leave the bounds of the space as they are, but makes {mirrored.tolist()} of {given.tolist()}"
+                )
 
 
 def check_registration(env_id: str) -> None:
