@@ -1,6 +1,6 @@
 """Meta-batches: what gradient steps see of the tasks' experience."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import torch as th
@@ -89,13 +89,13 @@ class SamplingSAC(CollectingSAC):
             foreign = th.randint(buffer.n_tasks, (len(chosen), n_foreign), generator=generator, device=self.device)
             sources = th.cat([sources[:, n_foreign:], foreign], dim=1)
         slots = buffer.draw_slots(sources, generator)
-        mirrored = self._draw_mirrors(sources.shape) if self.mirror_fraction > 0 else None
+        mirrored = self._draw_mirror(sources.shape) if self.mirror_fraction > 0 else None
 
         def seen(slots: th.Tensor) -> TaskBatch:
             stored = buffer.at(sources, slots)
             if mirrored is None:
                 return self._relabelled(stored, chosen, n_foreign)
-            return self._relabelled(self._mirrored(stored, mirrored), chosen, batch_size)
+            return self._relabelled(mirrored(stored), chosen, batch_size)
 
         transitions = seen(slots)
         if self.target_steps == 1 and self.shaping_coef == 0:
@@ -114,27 +114,30 @@ class SamplingSAC(CollectingSAC):
             rewards += discounts * self._potential(last.next_observations, chosen) - potential
         return transitions, losses.Bootstraps(rewards, last.next_observations, discounts)
 
-    def _draw_mirrors(self, shape: th.Size) -> th.Tensor:
-        """By which symmetry each transition is seen, counted from 1; 0 as it was."""
-        generator, device = self.generators.torch, self.device
-        which = th.randint(1, len(self.family.symmetries) + 1, shape, generator=generator, device=device)
-        return which * (th.rand(shape, generator=generator, device=device) < self.mirror_fraction)
+    def _draw_mirror(self, shape: th.Size) -> Callable[[TaskBatch], TaskBatch]:
+        """A function that sees ``mirror_fraction`` of transitions (tasks, batch) in a symmetry, each always in the same; their
+        rewards stay as they were.
+        """
+        generator, device, symmetries = self.generators.torch, self.device, self.family.symmetries
+        which = th.randint(1, len(symmetries) + 1, shape, generator=generator, device=device)
+        which *= th.rand(shape, generator=generator, device=device) < self.mirror_fraction  # 0 is no symmetry
 
-    def _mirrored(self, transitions: TaskBatch, which: th.Tensor) -> TaskBatch:
-        """Transitions (tasks, batch) as seen by the symmetries of :meth:`_draw_mirrors`; their rewards stay as they were."""
-
-        def seen(values: th.Tensor, permutations: list[SignedPermutation]) -> th.Tensor:
-            width, device = values.shape[-1], self.device
+        def chosen(permutations: Sequence[SignedPermutation]) -> tuple[th.Tensor, th.Tensor]:
+            width = len(permutations[0].order)
             order = th.tensor([list(range(width)), *(p.order for p in permutations)], device=device)
             signs = th.tensor([[1.0] * width, *(p.signs for p in permutations)], device=device)
-            return values.gather(-1, order[which]) * signs[which]
+            return order[which], signs[which]
 
-        of_observations, of_actions, of_features = (list(part) for part in zip(*self.family.symmetries, strict=True))
-        return transitions._replace(
-            observations=seen(transitions.observations, of_observations),
-            actions=seen(transitions.actions, of_actions),
-            next_observations=seen(transitions.next_observations, of_observations),
-            features=seen(transitions.features, of_features),
+        of_observations, of_actions, of_features = map(chosen, zip(*symmetries, strict=True))
+
+        def seen(values: th.Tensor, order: th.Tensor, signs: th.Tensor) -> th.Tensor:
+            return values.gather(-1, order) * signs
+
+        return lambda transitions: transitions._replace(
+            observations=seen(transitions.observations, *of_observations),
+            actions=seen(transitions.actions, *of_actions),
+            next_observations=seen(transitions.next_observations, *of_observations),
+            features=seen(transitions.features, *of_features),
         )
 
     def _potential(self, observations: th.Tensor, chosen: np.ndarray) -> th.Tensor:
