@@ -5,7 +5,8 @@
 Takes an entry of hyperparameters, changed by ``--set``, but for ``n_timesteps``: the learning rate falls from what the entry
 names to 0 over the time, however many steps that turns out to be. ``--start`` goes on from the weights of a pretrained folder;
 optimisers and replay buffers begin anew, so let the rate rise from 0 at first (``--warm-up``): at a full rate a good policy is
-soon lost. The model is written every few epochs.
+soon lost. Where ``--set`` changes ``gamma``, the critics' outputs are scaled to what rewards then add up to. The model is
+written every few epochs.
 """
 
 import argparse
@@ -19,10 +20,20 @@ from common import available_device, hyperparameters
 from stable_baselines3.common.utils import ConstantSchedule
 
 from sb3_poem import POEMSAC
-from sb3_poem.common.callbacks import EpochCallback
+from sb3_poem.common.callbacks import DormantUnitsCallback, EpochCallback
 from sb3_poem.common.vec_env import TaskVecEnv
 
-SHOWN = ("train_task_return", "kl", "preference_accuracy", "ent_coef", "entropy", "collection_fps", "updates_per_second")
+SHOWN = (
+    "train_task_return",
+    "critic_loss",
+    "dormant_units",
+    "kl",
+    "preference_accuracy",
+    "ent_coef",
+    "entropy",
+    "collection_fps",
+    "updates_per_second",
+)
 #: Arguments whose attribute has another name
 ATTRIBUTES = {"n_steps": "target_steps"}
 
@@ -82,6 +93,10 @@ def make_model(entry: dict[str, Any], env: TaskVecEnv, start: Path | None, seed:
     if start is None:
         return POEMSAC(entry.pop("policy"), env, seed=seed, device=device, **entry)
     model = POEMSAC.from_pretrained(start, env=env, device=device)
+    with th.no_grad():
+        for critic in (*model.policy.critic.members, *model.policy.critic_target.members):
+            for parameter in critic.output.parameters():
+                parameter *= (1.0 - model.gamma) / (1.0 - entry.get("gamma", model.gamma))
     for name in entry.keys() - {"policy", "policy_kwargs", "ent_coef"}:  # which belong to the weights
         setattr(model, ATTRIBUTES.get(name, name), entry[name])
     return model
@@ -98,6 +113,7 @@ def main() -> None:
     parser.add_argument("--env-set", nargs="+", default=[], metavar="KEY=VALUE", help="arguments of the environment")
     parser.add_argument("--start", type=Path, help="a pretrained folder to go on from")
     parser.add_argument("--warm-up", type=float, default=0.0, metavar="SECONDS", help="let the rate rise from 0 for so long")
+    parser.add_argument("--recycle", type=int, metavar="EPOCHS", help="give dormant units new weights so often")
     parser.add_argument("--every", type=int, default=8, help="epochs between two writes of the model")
     parser.add_argument("--threads", type=int, help="of the simulation")
     parser.add_argument("--device", type=available_device, default="auto")
@@ -111,7 +127,8 @@ def main() -> None:
     model = make_model(entry, env, given.start, given.seed, given.device)
     clock = Clock(given.seconds, rate, given.warm_up, given.out, given.every)
     model.lr_schedule = clock.schedule
-    model.learn(10**12, callback=clock, log_interval=None, reset_num_timesteps=False)
+    callbacks = [DormantUnitsCallback(given.recycle)] if given.recycle else []
+    model.learn(10**12, callback=[*callbacks, clock], log_interval=None, reset_num_timesteps=False)
     model.save(given.out)
     print(f"{given.out}: {model.num_timesteps:,} steps, {model._n_updates:,} updates", flush=True)
 
