@@ -46,9 +46,11 @@ def available_device(name: str) -> str:
 
 def hyperparameters(conf: Path, env_id: str, **changes: Any) -> dict[str, Any]:
     """An environment's entry of a file of hyperparameters, some changed, ``policy_kwargs`` evaluated as rl_zoo3 does."""
+    from torch import nn
+
     entry = {**yaml.safe_load(conf.read_text())[env_id], **changes}
     if isinstance(entry.get("policy_kwargs"), str):
-        entry["policy_kwargs"] = eval(entry["policy_kwargs"])
+        entry["policy_kwargs"] = eval(entry["policy_kwargs"], {"nn": nn})
     return entry
 
 
