@@ -116,8 +116,8 @@ class DormantUnitsCallback(EpochCallback):
                 self.counts[f"{name}.hidden.{layer}"] = int(dormant.sum()), len(dormant)
                 if self.recycle:
                     self._renew(name, layer, dormant, generator)
-        dormant_count, units = (sum(column) for column in zip(*self.counts.values(), strict=True))
-        self.logger.record("train/dormant_units", dormant_count / units)
+        total, units = (sum(counts[i] for counts in self.counts.values()) for i in (0, 1))
+        self.logger.record("train/dormant_units", total / max(units, 1))  # networks may have no hidden layer
         if self.verbose > 0:
             print(f"Dormant units at {self.model.num_timesteps} steps: {self.counts}")
 

@@ -167,6 +167,12 @@ def test_counting_alone_changes_nothing() -> None:
     assert not differing(parameters(counted), parameters(small(POEMSAC).learn(3 * EPOCH)))
 
 
+def test_networks_without_hidden_layers_have_no_dormant_units() -> None:
+    callback = DormantUnitsCallback()
+    small(POEMSAC, policy_kwargs={"net_arch": {**ARCH, "pi": [], "qf": []}}).learn(EPOCH, callback)
+    assert callback.counts == {}
+
+
 def test_transitions_must_be_positive() -> None:
     with pytest.raises(ValueError, match="transitions must be at least 1 of each training task, got 0"):
         DormantUnitsCallback(transitions=0)
