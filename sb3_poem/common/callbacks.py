@@ -125,7 +125,7 @@ class DormantUnitsCallback(EpochCallback):
         """Actor and critics by name, and inputs to each, (tasks * transitions, width)."""
         model, policy = self.model, self.model.policy
         latents = th.as_tensor(model.task_latents, dtype=th.float32, device=model.device)
-        sources = rows(th.arange(len(latents), device=model.device)[:, None], self.transitions)[..., 0]
+        sources = th.arange(len(latents), device=model.device)[:, None].expand(-1, self.transitions)
         data = model.replay_buffer.sample_rows(sources, generator)
         with th.no_grad():
             obs, embedding = policy.standardise(data.observations), policy.policy_embedding(latents)
