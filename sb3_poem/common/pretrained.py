@@ -76,6 +76,7 @@ def model_contents(model: "PEARLSAC", card: dict[str, Any] | None = None) -> tup
         "layer_norm": model.policy.layer_norm,
         "n_critics": model.policy.n_critics,
         "reward_feature_dim": model.reward_feature_dim,
+        "obs_count": model.obs_count,
         "predicted_rewards_error": None if np.isnan(error) else error,  # NaN is no JSON
         "context_reward_statistics": model.context_reward_statistics,
         "num_timesteps": model.num_timesteps,
@@ -217,7 +218,7 @@ def build_model(
         model.n_envs = config.get("n_envs") or algorithm._default_copies(
             len(tensors["train_tasks"]), model.trajectories_per_task
         )
-        model._statistics_known = True
+        model.obs_count = config.get("obs_count")
         if model.target_entropy == "auto":  # which SAC would look up in the environment
             model.target_entropy = -float(np.prod(model.action_space.shape))  # type: ignore[arg-type]
         model.policy_kwargs["net_arch"] = config["net_arch"]

@@ -8,6 +8,7 @@ import numpy as np
 import torch as th
 from colorednoise import powerlaw_psd_gaussian
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.type_aliases import RolloutReturn
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -30,7 +31,8 @@ class CollectingSAC(TaskSAC):
     noise_color: float = 0.0  # models of before it have white noise
     epoch: int
     trajectories_per_task: int
-    _statistics_known: bool
+    #: Observations that are in the policy's mean and deviation; None where that is not known, and these stay as they are
+    obs_count: int | None
     _logs_pending: bool
 
     def collect_rollouts(  # type: ignore[override]
@@ -61,8 +63,7 @@ class CollectingSAC(TaskSAC):
         returns = self._measure_returns(epoch, callback)
         if returns is None:
             return RolloutReturn(self.num_timesteps - steps_before, 0, continue_training=False)
-        if not self._statistics_known:  # after the returns, which the policies that collected the epoch must earn
-            self._set_statistics(segments)
+        self._update_statistics(segments)  # after the returns, which the policies that collected the epoch must earn
         self._replace_context(epoch, returns)
         self.epoch += 1
         collected = self.num_timesteps - steps_before
@@ -109,17 +110,26 @@ class CollectingSAC(TaskSAC):
         noise = powerlaw_psd_gaussian(self.noise_color, (*shape, steps), random_state=self.generators.numpy)
         yield from th.as_tensor(noise, dtype=th.float32, device=self.device).movedim(-1, 0)
 
-    def _set_statistics(self, segments: list[Segment]) -> None:
-        """Standardise by the first epoch's mean and deviation."""
-        obs = np.concatenate([segment.observations.reshape(-1, segment.observations.shape[-1]) for segment in segments])
-        rewards = np.concatenate([segment.rewards.ravel() for segment in segments])
+    def _update_statistics(self, segments: list[Segment]) -> None:
+        """Standardise observations by the mean and deviation of all so far, as SB3's VecNormalize does: a robot that has
+        learned to run is far from what the first epoch's random actions showed. Rewards keep the first epoch's, in whose
+        units the critics learn.
+        """
+        if self.obs_count is None:
+            return
         policy = self.policy
+        running = RunningMeanStd(shape=policy.obs_mean.shape)
+        running.mean, running.count = policy.obs_mean.double().cpu().numpy(), self.obs_count
+        running.var = policy.obs_std.double().cpu().numpy() ** 2
+        running.update(np.concatenate([segment.observations.reshape(-1, *running.mean.shape) for segment in segments]))
         with th.no_grad():
-            policy.obs_mean.copy_(th.as_tensor(obs.mean(axis=0)))
-            policy.obs_std.copy_(th.as_tensor(np.maximum(obs.std(axis=0), MIN_STD)))
-            policy.reward_mean.fill_(float(rewards.mean()))
-            policy.reward_std.fill_(max(float(rewards.std()), MIN_STD))
-        self._statistics_known = True
+            policy.obs_mean.copy_(th.as_tensor(running.mean))
+            policy.obs_std.copy_(th.as_tensor(np.maximum(np.sqrt(running.var), MIN_STD)))
+            if self.obs_count == 0:
+                rewards = np.concatenate([segment.rewards.ravel() for segment in segments])
+                policy.reward_mean.fill_(float(rewards.mean()))
+                policy.reward_std.fill_(max(float(rewards.std()), MIN_STD))
+        self.obs_count = int(running.count)
 
     def _measure_returns(self, epoch: Segment, callback: BaseCallback) -> np.ndarray | None:
         """J[i, j]: the return of task j's policy on task i, (n_train_tasks, n_train_tasks); NaN where unknown."""

@@ -30,7 +30,8 @@ class PEARLSAC(SamplingSAC):
 
     Training alternates between an epoch's collection, in which every training task is rolled out under its own latest
     latent, and gradient steps on meta-batches of tasks. It keeps a replay buffer for every task and the contexts of the last
-    epoch, and learns a context encoder, a latent-conditioned actor and critics, and a reward decoder together.
+    epoch, and learns a context encoder, a latent-conditioned actor and critics, and a reward decoder together. Observations are
+    standardised by the mean and deviation of all that were collected.
 
     :param policy: The policy model to use (MlpPolicy)
     :param env: A task family: an environment, a vectorised environment, or a registered id (which is then vectorised)
@@ -195,7 +196,7 @@ class PEARLSAC(SamplingSAC):
         self.context: ContextStore | None = None
         self.context_reward_statistics: tuple[float, float] | None = None
         self.epoch = 0
-        self._statistics_known = False
+        self.obs_count: int | None = 0
         self._family: FamilyEnv | None = None
         self._logs_pending = False
         self.best_adapted_return = -np.inf  # kept with the model, for AdaptationEvalCallback
@@ -251,7 +252,10 @@ class PEARLSAC(SamplingSAC):
         """As SB3's. By what observations and rewards are standardised comes with the policy."""
         super().set_parameters(load_path_or_dict, exact_match, device)
         untouched = (self.policy.obs_mean == 0).all() & (self.policy.obs_std == 1).all()
-        self._statistics_known = not bool(untouched)
+        if untouched:
+            self.obs_count = 0
+        elif self.obs_count == 0:
+            self.obs_count = None
 
     def _complete_policy_kwargs(self) -> None:
         """Give the policy what only a subclass knows."""

@@ -137,7 +137,8 @@ def test_continues_training(trained: PEARLSAC, folder: Path) -> None:
         assert loaded.num_timesteps >= 3 * EPOCH
         changed = differing(before, parameters(loaded))
         assert {"policy.actor.mlp.output.weight", "policy.decoder.mlp.output.weight", "log_ent_coef"} <= set(changed)
-        assert "policy.obs_mean" not in changed
+        assert "policy.obs_mean" in changed
+        assert loaded.obs_count == trained.obs_count + loaded.num_timesteps - trained.num_timesteps
 
 
 VARIANTS = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +68,11 @@ def test_loaded_models_continue_with_any_number_of_copies(trained: PEARLSAC, tmp
     assert (loaded.epoch, loaded._n_updates) == (3, 15)
     changed = differing(before, parameters(loaded))
     assert {"policy.actor.mlp.output.weight", "policy.encoder.mlp.output.weight", "log_ent_coef"} <= set(changed)
-    assert not {"policy.obs_mean", "policy.reward_std"} & set(changed)  # statistics stay those of the first epoch
+    assert "policy.reward_std" not in changed  # rewards keep the first epoch's
+    assert (trained.obs_count, loaded.obs_count) == (2 * EPOCH, 3 * EPOCH)
+    third = th.cat([loaded.replay_buffer.transitions(task).observations for task in range(N_TASKS)])
+    mean = third.reshape(-1, 2).mean(dim=0)  # what the buffer, which is new, holds
+    th.testing.assert_close(loaded.policy.obs_mean, (2 * trained.policy.obs_mean + mean) / 3, atol=1e-5, rtol=0)
     assert np.array_equal(loaded.train_tasks, trained.train_tasks)
 
 
@@ -197,6 +202,18 @@ def test_parameters_come_with_their_standardisation(trained: PEARLSAC) -> None:
     assert th.equal(fresh.policy.obs_std, th.ones(2))
     fresh.learn(EPOCH)
     assert not th.equal(fresh.policy.obs_std, th.ones(2))
+
+
+def test_statistics_of_unknown_extent_stay(trained: PEARLSAC, tmp_path: Path) -> None:
+    """Those of models saved before they followed the training."""
+    trained.save_pretrained(tmp_path)
+    config = json.loads((tmp_path / "config.json").read_text())
+    del config["obs_count"]
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    old = type(trained).from_pretrained(tmp_path, env=POINT_GOAL)
+    old.learn(1, reset_num_timesteps=False)
+    assert th.equal(old.policy.obs_mean, trained.policy.obs_mean)
+    assert th.equal(old.policy.obs_std, trained.policy.obs_std)
 
 
 @one_is_enough

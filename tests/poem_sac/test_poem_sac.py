@@ -25,11 +25,12 @@ def transitions_of(model: PEARLSAC, start: int, stop: int) -> TaskBatch:
 
 
 def nearly_deterministic(model: PEARLSAC) -> PEARLSAC:
-    """Policies whose noise is below float32: every rollout of a latent is the same."""
+    """Policies whose noise is below float32, and whose observations stay as they are: every rollout of a latent is the same."""
     with th.no_grad():
         actions = model.action_space.shape[0]
         model.policy.actor.mlp.output.weight[actions:] = 0.0
         model.policy.actor.mlp.output.bias[actions:] = -20.0
+    model.obs_count = None
     return model
 
 
@@ -90,7 +91,7 @@ def test_returns_are_those_of_environments_of_every_task(sources: dict, source: 
 
 
 def test_measured_returns_equal_relabelled_ones(sources: dict) -> None:
-    """In the first epoch, where both see the same policies (and observations are not standardised yet)."""
+    """In the first epoch, where both see the same policies."""
     (_, relabelled), (_, measured) = sources["relabel"], sources["rollout"]
     assert np.array_equal(relabelled.latents[0], measured.latents[0])
     known = np.isfinite(measured.returns[0])
@@ -228,11 +229,12 @@ def test_values_are_zero_before_the_first_update() -> None:
     assert (model.context.transitions[..., 7] == 0).all()
 
 
-def test_observations_and_rewards_are_standardised_by_the_first_epoch() -> None:
+def test_observations_are_standardised_by_all_so_far_and_rewards_by_the_first_epoch() -> None:
     model = small(PEARLSAC, gradient_steps=1).learn(EPOCH)
-    first = transitions_of(model, 0, 25)
-    model.learn(EPOCH, reset_num_timesteps=False)
-    obs, rewards = first.observations.reshape(-1, 2).numpy(), first.rewards.numpy()
+    rewards = transitions_of(model, 0, 25).rewards.numpy()
+    model.learn(3 * EPOCH, reset_num_timesteps=False)
+    obs = transitions_of(model, 0, 100).observations.reshape(-1, 2).numpy()
+    assert model.obs_count == len(obs) == 4 * EPOCH
     np.testing.assert_allclose(model.policy.obs_mean.numpy(), obs.mean(axis=0), atol=1e-5)
     np.testing.assert_allclose(model.policy.obs_std.numpy(), obs.std(axis=0), rtol=1e-4)
     assert model.policy.reward_mean.item() == pytest.approx(rewards.mean(), abs=1e-5)
