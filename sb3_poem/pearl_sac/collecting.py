@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.common.buffers import ContextStore, Segment, TaskReplayBuffer
 from sb3_poem.common.collection import collect_segment
+from sb3_poem.pearl_sac.policies import OBSERVATION_CLIP
 from sb3_poem.pearl_sac.tasks import TaskSAC
 
 MIN_STD = 1e-3
@@ -147,6 +148,8 @@ class CollectingSAC(TaskSAC):
                 self.policy.standardise(th.as_tensor(values, device=self.device))
                 for values in (epoch.observations, epoch.next_observations)
             )
+            beyond = (obs.abs() == OBSERVATION_CLIP).any(dim=-1).float().mean()
+            self.logger.record("train/clipped_observations", beyond.item())
             actions = th.as_tensor(epoch.actions, device=self.device)
             rewards = th.as_tensor(epoch.rewards, dtype=th.float32, device=self.device)
             self.context_reward_statistics = (float(rewards.mean()), max(float(rewards.std()), MIN_STD))

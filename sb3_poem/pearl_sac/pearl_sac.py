@@ -30,8 +30,8 @@ class PEARLSAC(SamplingSAC):
 
     Training alternates between an epoch's collection, in which every training task is rolled out under its own latest
     latent, and gradient steps on meta-batches of tasks. It keeps a replay buffer for every task and the contexts of the last
-    epoch, and learns a context encoder, a latent-conditioned actor and critics, and a reward decoder together. Observations are
-    standardised by the mean and deviation of all that were collected.
+    epoch, and learns a context encoder, a latent-conditioned actor and critics, and a reward decoder together.
+    Observations are standardised by the mean and deviation of all that were collected.
 
     :param policy: The policy model to use (MlpPolicy)
     :param env: A task family: an environment, a vectorised environment, or a registered id (which is then vectorised)

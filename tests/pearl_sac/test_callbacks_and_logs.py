@@ -115,6 +115,7 @@ LOGGED = {
     "train/kl_ideal",
     "train/aggregate_to_prior_kl",
     "train/decoder_error",
+    "train/clipped_observations",
     "train/ent_coef",
 }
 LOGGED_BY_POEM = {"train/preference_loss", "train/preference_accuracy"}
@@ -137,6 +138,18 @@ def test_csv_and_json_logs(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
     assert [int(row["train/n_updates"]) for row in rows] == [5, 10, 15]
     # the first row is of the first epoch alone: twelve episodes, whose returns Monitor saw too
     assert float(rows[0]["rollout/train_task_return"]) == pytest.approx(float(rows[0]["rollout/ep_rew_mean"]), rel=1e-5)
+
+
+@one_is_enough
+def test_observations_beyond_the_bound_are_counted(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
+    model = small(algorithm)
+    model.obs_count, model.policy.obs_std[:] = None, 0.02
+    model.set_logger(configure(str(tmp_path), ["json"]))
+    model.learn(EPOCH)
+    seen = np.concatenate([model.replay_buffer.transitions(task).observations for task in range(N_TASKS)]).reshape(-1, 2)
+    share = (np.abs(seen) / 0.02 >= 10).any(axis=1).mean()
+    assert 0.05 < share < 0.95
+    assert json.loads((tmp_path / "progress.json").read_text())["train/clipped_observations"] == pytest.approx(share)
 
 
 @one_is_enough

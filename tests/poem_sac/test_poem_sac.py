@@ -25,7 +25,7 @@ def transitions_of(model: PEARLSAC, start: int, stop: int) -> TaskBatch:
 
 
 def nearly_deterministic(model: PEARLSAC) -> PEARLSAC:
-    """Policies whose noise is below float32, and whose observations stay as they are: every rollout of a latent is the same."""
+    """Policies without noise (to float32), whose observations stay as they are: every rollout of a latent is the same."""
     with th.no_grad():
         actions = model.action_space.shape[0]
         model.policy.actor.mlp.output.weight[actions:] = 0.0
