@@ -7,7 +7,7 @@ import pytest
 from scipy.special import ndtr
 from worlds import HORIZON, STEP_WEIGHT, SpeedModel
 
-from sb3_poem.adaptation.bayes import ERROR_CORRELATION, SIMILARITY_RESOLUTION, BayesInference
+from sb3_poem.adaptation.bayes import DECODED_STEPS, ERROR_CORRELATION, SIMILARITY_RESOLUTION, BayesInference, Thinning
 from sb3_poem.adaptation.decisions import decide, expected_fitness
 from sb3_poem.adaptation.inference import Snapshot, preference_log_likelihood
 from sb3_poem.adaptation.moves import (
@@ -317,3 +317,52 @@ def test_bad_options(model, arguments, message):
 def test_the_decoder_needs_trajectories():
     with pytest.raises(ValueError, match="needs the two trajectories"):
         make().tell(LEFT, np.zeros(5), np.ones(5))
+
+
+class Misled(SpeedModel):
+    """From some steps alone it takes the first trajectory for better than it is, by as much for every latent."""
+
+    def predicted_returns(self, latents, trajectories, max_steps=None):
+        returns = super().predicted_returns(latents, trajectories)
+        if max_steps is not None and len(trajectories[0]) > max_steps:
+            returns[:, 0] += 30.0
+        return returns
+
+
+def test_what_some_steps_alone_mislead_to_is_put_right():
+    steps = 2 * DECODED_STEPS
+    left, right = (
+        Trajectory(np.column_stack([np.zeros(steps + 1), np.full(steps + 1, v)]), np.zeros((steps, 1)), np.zeros(5))
+        for v in (1.0, 2.0)
+    )
+    truth, misled = make(SpeedModel()), make(Misled())
+    for inference in (truth, misled):
+        inference.tell(RIGHT, left, right)
+    np.testing.assert_allclose(misled.particles, truth.particles)
+    np.testing.assert_allclose(misled.weights, truth.weights)
+    prior = make()
+    assert SpeedModel.speed(truth.estimate()) > SpeedModel.speed(prior.estimate()) + 0.2  # it says something
+
+
+def test_thinning_is_a_line_and_what_is_off_it():
+    thin = np.linspace(-100.0, 100.0, 8)
+    signs = np.array([1.0, -1.0, -1.0, 1.0, 1.0, -1.0, -1.0, 1.0])  # orthogonal to a line
+    intercept, slope, error = Thinning.fit(thin, thin + 7.0 + 0.01 * thin + 2.0 * signs)
+    assert intercept == pytest.approx(7.0)
+    assert slope == pytest.approx(0.01, rel=0.02)
+    assert error == pytest.approx(2.0, rel=0.01)
+    # differences that hardly vary tell no slope
+    assert abs(Thinning.fit(thin / 1e4, thin / 1e4 + 20.0 * signs + thin).slope) < 0.01
+
+
+def test_a_snapshot_of_before_thinning_was_measured():
+    inference = make()
+    for answer, left, right in ANSWERS:
+        inference.tell(answer, at_speed(inference.model, left), at_speed(inference.model, right))
+    snapshot = inference.snapshot()
+    arrays = {name: array for name, array in snapshot.arrays.items() if name != "thinning"}
+    other = make(seed=1)
+    other.restore(Snapshot(snapshot.random_state, arrays), inference.answers)
+    for each in (inference, other):
+        each.tell(LEFT, at_speed(each.model, 1.9), at_speed(each.model, 0.7))
+    np.testing.assert_array_equal(other.particles, inference.particles)
