@@ -340,6 +340,13 @@ def test_what_some_steps_alone_mislead_to_is_put_right():
         inference.tell(RIGHT, left, right)
     np.testing.assert_allclose(misled.particles, truth.particles)
     np.testing.assert_allclose(misled.weights, truth.weights)
+    restored = make(Misled(), seed=1)  # which must know it, too, when particles are weighed again
+    restored.restore(misled.snapshot(), misled.answers)
+    for inference in (truth, misled, restored):
+        inference.tell(RIGHT, left, right)
+        np.testing.assert_allclose(inference.particles, truth.particles)
+        latents = truth.particles[:20]
+        np.testing.assert_allclose(*(each._answer_log_likelihoods(latents, each.answers) for each in (inference, truth)))
     prior = make()
     assert SpeedModel.speed(truth.estimate()) > SpeedModel.speed(prior.estimate()) + 0.2  # it says something
 
