@@ -199,8 +199,7 @@ class BayesInference(LatentInference):
                 'pass them, or choose likelihood="similarity"'
             )
         answer = Answer(preference, left, right)
-        self._thinning.append(self._measure_thinning(left, right))
-        self.log_weights = self.log_weights + self._answer_log_likelihoods(self.particles, [answer], calibrate=True)
+        self.log_weights = self.log_weights + self._answer_log_likelihoods(self.particles, [answer], new=True)
         self.answers.append(answer)
         if self.effective_size < self.n_candidates / 2:
             self._rejuvenate()
@@ -252,8 +251,8 @@ class BayesInference(LatentInference):
     def _decoder_error(self, steps: np.ndarray | float) -> Any:
         return self.model.predicted_rewards_error * np.sqrt(steps * ERROR_CORRELATION)
 
-    def _answer_log_likelihoods(self, latents: np.ndarray, answers: Sequence[Answer], calibrate: bool = False) -> np.ndarray:
-        """(m,) log P(answers | latent)."""
+    def _answer_log_likelihoods(self, latents: np.ndarray, answers: Sequence[Answer], new: bool = False) -> np.ndarray:
+        """(m,) log P(answers | latent); of a new one, on the particles, what else it tells is noted."""
         shown = [item for answer in answers for item in (answer.left, answer.right)]
         error: np.ndarray | float
         magnitude: np.ndarray | float
@@ -261,12 +260,14 @@ class BayesInference(LatentInference):
             values = self.model.predicted_returns(latents, shown, DECODED_STEPS)  # (m, 2 k)
             left, right = values[:, 0::2], values[:, 1::2]
             steps = np.array([len(item) for item in shown], dtype=np.float64)
+            if new:
+                self._thinning.append(self._measure_thinning(shown, values))
             intercepts, slopes, errors = self._thinning_of(len(answers)).T
             error = np.hypot(self._decoder_error(steps[0::2] + steps[1::2]), errors)
             magnitude = np.abs(left) + np.abs(right)
             difference = left - right
             difference = difference + intercepts + slopes * difference
-            if calibrate and self.has_similarity:
+            if new and self.has_similarity:
                 self._calibrate(latents, shown, values)
         else:
             values = self.model.similarity(latents, np.stack([latent_of(item) for item in shown]))
@@ -275,13 +276,13 @@ class BayesInference(LatentInference):
         probability = self.noise_model.probability_left(difference, error, magnitude)
         return preference_log_likelihood(np.log(probability), np.log1p(-probability), [a.preference for a in answers])
 
-    def _measure_thinning(self, left: Shown, right: Shown) -> Thinning:
-        if self.likelihood == "similarity" or max(len(left), len(right)) <= DECODED_STEPS:
+    def _measure_thinning(self, shown: Sequence[Shown], thin: np.ndarray) -> Thinning:
+        if max(map(len, shown)) <= DECODED_STEPS:
             return Thinning()
         quantiles = (np.arange(FULLY_DECODED) + 0.5) / FULLY_DECODED
-        some = self.particles[np.searchsorted(np.cumsum(self.weights), quantiles).clip(max=self.n_candidates - 1)]
-        thin, full = (self.model.predicted_returns(some, [left, right], steps) for steps in (DECODED_STEPS, None))
-        return Thinning.fit(thin[:, 0] - thin[:, 1], full[:, 0] - full[:, 1])
+        some = np.searchsorted(np.cumsum(self.weights), quantiles).clip(max=self.n_candidates - 1)
+        full = self.model.predicted_returns(self.particles[some], shown)
+        return Thinning.fit(thin[some, 0] - thin[some, 1], full[:, 0] - full[:, 1])
 
     def _thinning_of(self, n: int) -> np.ndarray:
         """(n, 3), of the last n answers; none where it was not measured, as in states of before it."""
