@@ -29,6 +29,8 @@ LIKELIHOODS = ("decoder", "similarity")
 QUERY_POLICIES = 64
 # Particles that a question's gain is averaged over.
 QUERY_PARTICLES = 128
+# The prior's policies that tell, at a decision, how widely S spreads.
+REFERENCE_POLICIES = 128
 # Smallest resolvable difference of S, as a share of the spread of its differences over random triples. A Gaussian error
 # of that size turns over 3 % of random preferences, which is what well-trained models were seen to get wrong.
 SIMILARITY_RESOLUTION = 0.1
@@ -142,6 +144,8 @@ class BayesInference(LatentInference):
         self._check_options()
         self.particles = self.prior.balanced_sample(n_candidates, self.rng)
         self.log_weights = np.zeros(n_candidates)
+        # Of a generator of its own: it must not move the particles', and is the same after a restart.
+        self._reference = self.prior.balanced_sample(REFERENCE_POLICIES, np.random.default_rng(0))
         self._spread, self._unit = self._similarity_scale()
         # Sums over answers that tie S to the decoder's returns: S dS, S dR, |R| and their number.
         self._calibration = np.zeros(4)
@@ -207,7 +211,8 @@ class BayesInference(LatentInference):
     def estimate(self) -> np.ndarray:
         """See :class:`LatentInference`."""
         training = getattr(self.model, "task_latents", None)
-        return decide(self.decision, self.model if self.has_similarity else None, self.particles, self.weights, training)
+        model, has_holes = self.model if self.has_similarity else None, self.prior.has_holes
+        return decide(self.decision, model, self.particles, self.weights, training, self._reference, has_holes)
 
     def _check_options(self) -> None:
         if self.likelihood == "similarity" and isinstance(self.noise_model, BoltzmannNoise) and self.noise_model.beta:

@@ -8,22 +8,32 @@ import numpy as np
 
 DECISIONS = ("expected-fitness", "posterior-mean", "most-likely")
 
-# How much fitter than the posterior mean's policy another one must look, in standard deviations of fitness over the
-# options, to be taken instead of it. S is an estimate, and the best-looking of hundreds of options is partly luck; the
-# mean is not chosen by it.
+# How much fitter than the posterior mean's policy another one must look to be taken instead of it, in standard deviations of
+# S over the prior's policies. S is an estimate, and the best-looking of hundreds of options is partly luck; the mean is not
+# chosen by it.
 MEAN_ADVANTAGE = 0.1
+# Options that look as fit as the best one to within this, for every task that is plausible (root mean square over the
+# posterior, in the same unit), are not told apart: at the far side of a cluster of latents S went on rising where returns
+# fell.
+ALIKE = 0.5
 
 
 def decide(
-    decision: str, model: Any | None, particles: np.ndarray, weights: np.ndarray, training_latents: np.ndarray | None
+    decision: str,
+    model: Any | None,
+    particles: np.ndarray,
+    weights: np.ndarray,
+    training_latents: np.ndarray | None,
+    reference: np.ndarray,
+    has_holes: bool = False,
 ) -> np.ndarray:
     """
     The latent to act on.
 
-    - "expected-fitness": the option whose policy has the highest fitness S(z, option), averaged over the posterior of z.
-      Options are the posterior mean, the particles and the training tasks' latents. Highest likelihood would run to
-      extreme latents, as the likelihood grows with their norm; and the mean of two separate modes fits neither.
-      S is standardised for each z, since tasks of large norm would outvote the others.
+    - "expected-fitness": the posterior mean if its policy is nearly as fit as any, else the middle of those options that S
+      does not tell from the fittest. Fitness is S(z, option), averaged over the posterior of z; options are the particles,
+      the posterior mean and the training tasks' latents. Highest likelihood would run to extreme latents, as the likelihood
+      grows with their norm, and so would highest fitness alone; and the mean of two separate modes fits neither.
     - "posterior-mean": the weighted mean of the particles.
     - "most-likely": the particle of the largest weight.
 
@@ -33,6 +43,9 @@ def decide(
     :param particles: (n, d).
     :param weights: (n,) summing to one.
     :param training_latents: (N, d) or None.
+    :param reference: (m, d) draws of the prior, whose policies give S its unit.
+    :param has_holes: Whether the prior is a mixture, with latents between its parts that no training has seen: S may think
+        much of their policies, so the posterior mean is no option.
     :return: (d,).
     :raises ValueError: If the decision is unknown.
     """
@@ -45,23 +58,38 @@ def decide(
         return mean
     if model is None:
         return particles[np.argmin(np.linalg.norm(particles - mean, axis=1))].copy()
-    options = [mean[None, :], particles]
+    options = [particles]
+    if not has_holes:
+        options.append(mean[None, :])
     if training_latents is not None:
         options.append(np.asarray(training_latents, dtype=np.float64))
     stacked = np.concatenate(options)
-    fitness = expected_fitness(model.similarity(particles, stacked), weights)
+    unit = model.similarity(particles, reference)
+    scores = standard_scores(model.similarity(particles, stacked), unit)
+    fitness = weights @ scores
     best = int(np.argmax(fitness))
-    return (stacked[best] if fitness[best] > fitness[0] + MEAN_ADVANTAGE else mean).copy()
+    if not has_holes and fitness[best] <= fitness[len(particles)] + MEAN_ADVANTAGE:
+        return mean
+    shares = weights * _alike(scores, scores[:, best], weights)[: len(particles)]
+    if not shares.any():
+        return stacked[best].copy()
+    middle = shares @ particles / shares.sum()
+    # What is like the best at either end need not be so in the middle.
+    of_middle = standard_scores(model.similarity(particles, middle[None, :]), unit)
+    return middle if _alike(of_middle, scores[:, best], weights)[0] else stacked[best].copy()
 
 
-def expected_fitness(similarities: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def standard_scores(similarities: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """
-    Mean standardised similarity of each option.
+    S in units that are the same for all tasks, as those of large norm would outvote the others.
 
     :param similarities: (n, options) S(z_i, option).
-    :param weights: (n,) summing to one.
-    :return: (options,).
+    :param reference: (n, m) S(z_i, policy) of the prior's policies, whose mean and standard deviation are 0 and 1.
+    :return: (n, options).
     """
-    centred = similarities - similarities.mean(axis=1, keepdims=True)
-    scale = centred.std(axis=1, keepdims=True)
-    return weights @ (centred / np.maximum(scale, 1e-12))
+    scale = reference.std(axis=1, keepdims=True)
+    return (similarities - reference.mean(axis=1, keepdims=True)) / np.maximum(scale, 1e-12)
+
+
+def _alike(scores: np.ndarray, best: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    return weights @ np.square(scores - best[:, None]) <= ALIKE**2
