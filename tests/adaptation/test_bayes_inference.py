@@ -214,6 +214,13 @@ class EitherOf:
         return np.repeat(-np.abs(np.abs(policies[:, 0]) - 2.0)[None, :], len(tasks), axis=0)
 
 
+class NearestTo:
+    """A policy that lies between all others looks best by far."""
+
+    def similarity(self, tasks, policies):
+        return np.repeat(-np.abs(policies[:, 0] - 0.8)[None, :], len(tasks), axis=0)
+
+
 TWO_CLUSTERS = np.concatenate([np.linspace(-2.4, -1.6, 30), np.linspace(1.6, 2.4, 30)])[:, None]
 
 
@@ -247,6 +254,9 @@ def test_a_mean_in_a_hole_of_the_prior_is_not_acted_on():
     args = "expected-fitness", SignOf(), TWO_CLUSTERS, lopsided, None, TWO_CLUSTERS
     assert decide(*args)[0] == pytest.approx(0.8)
     assert decide(*args, has_holes=True)[0] == pytest.approx(2.0)
+    args = "expected-fitness", NearestTo(), TWO_CLUSTERS, lopsided, None, TWO_CLUSTERS
+    assert decide(*args)[0] == pytest.approx(0.8)
+    assert 1.6 <= decide(*args, has_holes=True)[0] <= 2.4
 
 
 def test_a_training_task_that_fits_best_by_far_is_the_decision():
