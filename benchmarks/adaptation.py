@@ -69,9 +69,9 @@ def adapt(env_id: str, model: Path, rule: str, candidates: str, test_seed: int, 
 def order_on_test_tasks(env_id: str, model_file: Path, test_seed: int) -> dict[str, float]:
     """Property 1 on test tasks: preference accuracy and Kendall's tau."""
     from sb3_poem.adaptation.evaluation import known_task_return, preference_order
-    from sb3_poem.cli.models import load_model
     from sb3_poem.common.family import FamilyEnv
     from sb3_poem.common.vec_env import TaskVecEnv
+    from sb3_poem.loading import load_model
 
     model = load_model(str(model_file))
     env = TaskVecEnv.from_id(env_id, 60)

@@ -12,9 +12,9 @@ import torch as th
 from common import arguments, table, write
 from stable_baselines3.common.utils import ConstantSchedule
 
-from sb3_poem.cli.models import load_model
 from sb3_poem.common.callbacks import DormantUnitsCallback
 from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.loading import load_model
 
 COPIES = 60
 

@@ -4,7 +4,7 @@ import argparse
 import json
 from pathlib import Path
 
-from sb3_poem.cli.models import load_model
+from sb3_poem.loading import load_model
 
 REPOSITORY = Path(__file__).parents[1]
 

@@ -18,9 +18,9 @@ from sb3_poem.adaptation.limits import best_codebook
 from sb3_poem.benchmark.cells import SEED_STRIDE, SELECTION_EPISODES
 from sb3_poem.benchmark.provenance import commit, machine
 from sb3_poem.benchmark.suites import Budget
-from sb3_poem.cli.models import load_model
 from sb3_poem.common.family import FamilyEnv
 from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.loading import load_model
 
 COLUMNS = (0, 1, 2, 3, 5)
 

@@ -10,7 +10,6 @@ import re
 import subprocess
 import sys
 import time
-import zipfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -30,10 +29,9 @@ from sb3_poem.benchmark.provenance import provenance
 from sb3_poem.benchmark.suites import ModelKey, family_id, family_label
 from sb3_poem.common.pretrained import CONFIG, WEIGHTS, read_config
 from sb3_poem.common.vec_env import make_task_vec_env
+from sb3_poem.loading import ALGORITHMS, is_checkpoint
 from sb3_poem.pearl_sac import PEARLSAC
-from sb3_poem.poem_sac import POEMSAC
 
-ALGORITHMS: dict[str, type[PEARLSAC]] = {"poem_sac": POEMSAC, "pearl_sac": PEARLSAC}
 CHECKPOINT, MODEL, FINISHED, SESSIONS, LOG, REWARD = (
     "checkpoint.zip",
     "model.zip",
@@ -375,16 +373,9 @@ def _load_given(algorithm: type[PEARLSAC], path: Path, env: VecEnv, device: str)
     file = _find_content(path) if path.is_dir() else path
     if file.name == CONFIG:
         return algorithm.from_pretrained(path, env, device=device)
-    if _is_checkpoint(file):
+    if is_checkpoint(file):
         return algorithm.load_checkpoint(file, env, device=device)
     return algorithm.load(file, env, device=device)
-
-
-def _is_checkpoint(file: Path) -> bool:
-    if not zipfile.is_zipfile(file):
-        return False
-    with zipfile.ZipFile(file) as archive:
-        return any(Path(name).name == "data.pkl" for name in archive.namelist())
 
 
 def _is_variant(config: dict[str, Any], key: ModelKey) -> bool:

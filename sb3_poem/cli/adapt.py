@@ -33,13 +33,13 @@ from sb3_poem.adaptation import (
 from sb3_poem.adaptation.evaluation import evaluation_seed, held_out_tasks
 from sb3_poem.adaptation.human import HumanAnswer
 from sb3_poem.adaptation.oracles import compute_reward
-from sb3_poem.cli.models import load_model
 from sb3_poem.cli.outputs import check_output
 from sb3_poem.cli.report import Report, describe_task
 from sb3_poem.common.family import FamilyEnv
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.common.video import side_by_side, write_video
+from sb3_poem.loading import load_model
 
 DEFAULT_TASKS = 30
 # Copies that step in lockstep.

@@ -1,7 +1,6 @@
 """rl_zoo3's experiments on task families."""
 
 import inspect
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +15,10 @@ from stable_baselines3.common.vec_env import VecEnv
 from poem_envs import TaskFamily
 from sb3_poem.adaptation.callback import AdaptationEvalCallback
 from sb3_poem.cli.hyperparams import check_keys, check_numbers
-from sb3_poem.cli.models import ALGORITHMS
 from sb3_poem.cli.outputs import check_writable
 from sb3_poem.common.callbacks import TrainingCheckpointCallback
 from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.loading import ALGORITHMS, is_checkpoint
 from sb3_poem.pearl_sac import PEARLSAC
 from sb3_poem.resources import config_file
 
@@ -45,14 +44,6 @@ def is_task_family(env_id: str) -> bool | None:
     entry_point = gym.spec(env_id).entry_point
     creator = gym.envs.registration.load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
     return issubclass(creator, TaskFamily) if inspect.isclass(creator) else None
-
-
-def is_checkpoint(path: str) -> bool:
-    """Whether a file is a checkpoint of a training run, rather than a model that ``save`` wrote."""
-    if not zipfile.is_zipfile(path):
-        return False
-    with zipfile.ZipFile(path) as archive:
-        return any(Path(name).name == "data.pkl" for name in archive.namelist())
 
 
 class FamilyExperiment(ExperimentManager):

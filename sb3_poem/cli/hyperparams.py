@@ -5,7 +5,7 @@ import inspect
 from collections.abc import Sequence
 from typing import Any
 
-from sb3_poem.cli.models import ALGORITHMS
+from sb3_poem.loading import ALGORITHMS
 
 # What rl_zoo3 takes out of an entry for itself before the rest goes to the algorithm.
 ZOO_KEYS = frozenset(

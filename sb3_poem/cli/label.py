@@ -124,8 +124,8 @@ def run_export(arguments: argparse.Namespace) -> None:
 def run_replay(arguments: argparse.Namespace) -> None:
     """Feed the recorded answers to a model and a rule."""
     from sb3_poem.adaptation.state import write_json_atomically
-    from sb3_poem.cli.models import load_model
     from sb3_poem.label.replay import replay
+    from sb3_poem.loading import load_model
 
     check_output("--json", arguments.json, (".json",))
     console = Console()

@@ -11,8 +11,8 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 
 from sb3_poem.cli import has_display
 from sb3_poem.cli.experiment import make_experiment
-from sb3_poem.cli.models import ALGORITHMS
 from sb3_poem.cli.resume import resumed
+from sb3_poem.loading import ALGORITHMS
 
 # Those of our own that differ from rl_zoo3's; what the user gives comes later, and wins.
 DEFAULTS = {

@@ -1,0 +1,77 @@
+"""A model from its name: a file, a folder, or one that ships with the package."""
+
+import json
+import zipfile
+from pathlib import Path
+
+import torch as th
+
+from sb3_poem.common.pretrained import read_config
+from sb3_poem.pearl_sac import PEARLSAC
+from sb3_poem.poem_sac import POEMSAC
+from sb3_poem.resources import pretrained_folder, pretrained_names
+
+ALGORITHMS: dict[str, type[PEARLSAC]] = {"poem_sac": POEMSAC, "pearl_sac": PEARLSAC}
+BY_CLASS_NAME = {algorithm.__name__: algorithm for algorithm in ALGORITHMS.values()}
+
+
+def as_model(model: PEARLSAC | str | Path, device: th.device | str = "auto") -> PEARLSAC:
+    """A model as it is, or the one that a name stands for.
+
+    :param model: A model, or what :func:`load_model` takes
+    :param device: For a model that is loaded
+    :raises TypeError: if it is neither
+    """
+    if isinstance(model, PEARLSAC):
+        return model
+    if isinstance(model, (str, Path)):
+        return load_model(model, device)
+    what = f"the class {model.__name__}" if isinstance(model, type) else f"a {type(model).__name__}"
+    raise TypeError(
+        f"`model` is {what}, but must be a trained POEMSAC or PEARLSAC, a file or folder of one, or the name of a model "
+        f"that ships: {', '.join(pretrained_names())}"
+    )
+
+
+def load_model(name: str | Path, device: th.device | str = "auto") -> PEARLSAC:
+    """Load a model of either algorithm.
+
+    :param name: A file that ``save`` wrote (``.zip`` may be left out), a checkpoint, a folder that ``save_pretrained``
+        wrote, or the name of a shipped model
+    :param device: As PyTorch names it
+    :raises FileNotFoundError: if it is none of these; the message lists the shipped models
+    :raises ValueError: if a file is truncated, or of another program
+    """
+    path = Path(name)
+    archive = path if path.is_file() else path.with_name(f"{path.name}.zip")
+    if archive.is_file():
+        if is_checkpoint(archive):
+            state = th.load(archive, map_location="cpu", weights_only=True)
+            return BY_CLASS_NAME[state["algorithm"]].load_checkpoint(archive, device=device)
+        return _algorithm_of(archive).load(archive, device=device)
+    if not path.is_dir():
+        if path.suffix == ".zip" or len(path.parts) > 1:
+            raise FileNotFoundError(f"{name}: there is no such file or folder of a model")
+        path = pretrained_folder(str(name))
+    algorithm = read_config(path)["algorithm"]
+    if algorithm not in BY_CLASS_NAME:
+        raise ValueError(f"{path} holds a {algorithm}, known are {', '.join(BY_CLASS_NAME)}")
+    return BY_CLASS_NAME[algorithm].from_pretrained(path, device=device)
+
+
+def is_checkpoint(path: str | Path) -> bool:
+    """Whether a file is a checkpoint of a training run, rather than a model that ``save`` wrote."""
+    if not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return any(Path(name).name == "data.pkl" for name in archive.namelist())
+
+
+def _algorithm_of(archive: Path) -> type[PEARLSAC]:
+    """Whose model a file holds; where that cannot be told, ``POEMSAC.load`` says what is wrong with the file."""
+    try:
+        with zipfile.ZipFile(archive) as file:
+            data = json.loads(file.read("data"))
+    except (zipfile.BadZipFile, KeyError, ValueError):
+        return POEMSAC
+    return POEMSAC if "preference_coef" in data else PEARLSAC
