@@ -6,10 +6,11 @@ from pathlib import Path
 
 import torch as th
 
+from sb3_poem.common.checkpoint import read_checkpoint
 from sb3_poem.common.pretrained import read_config
 from sb3_poem.pearl_sac import PEARLSAC
 from sb3_poem.poem_sac import POEMSAC
-from sb3_poem.resources import pretrained_folder, pretrained_names
+from sb3_poem.resources import find_folder, pretrained_names
 
 ALGORITHMS: dict[str, type[PEARLSAC]] = {"poem_sac": POEMSAC, "pearl_sac": PEARLSAC}
 BY_CLASS_NAME = {algorithm.__name__: algorithm for algorithm in ALGORITHMS.values()}
@@ -44,19 +45,14 @@ def load_model(name: str | Path, device: th.device | str = "auto") -> PEARLSAC:
     """
     path = Path(name)
     archive = path if path.is_file() else path.with_name(f"{path.name}.zip")
+    if archive.suffix == ".safetensors":
+        raise ValueError(f"{name} holds no whole model: AdaptedPolicy.load reads a policy, and of a model name the folder")
     if archive.is_file():
         if is_checkpoint(archive):
-            state = th.load(archive, map_location="cpu", weights_only=True)
-            return BY_CLASS_NAME[state["algorithm"]].load_checkpoint(archive, device=device)
+            return _class_named(read_checkpoint(archive)["algorithm"], archive).load_checkpoint(archive, device=device)
         return _algorithm_of(archive).load(archive, device=device)
-    if not path.is_dir():
-        if path.suffix == ".zip" or len(path.parts) > 1:
-            raise FileNotFoundError(f"{name}: there is no such file or folder of a model")
-        path = pretrained_folder(str(name))
-    algorithm = read_config(path)["algorithm"]
-    if algorithm not in BY_CLASS_NAME:
-        raise ValueError(f"{path} holds a {algorithm}, known are {', '.join(BY_CLASS_NAME)}")
-    return BY_CLASS_NAME[algorithm].from_pretrained(path, device=device)
+    path = find_folder(path)
+    return _class_named(read_config(path)["algorithm"], path).from_pretrained(path, device=device)
 
 
 def is_checkpoint(path: str | Path) -> bool:
@@ -65,6 +61,12 @@ def is_checkpoint(path: str | Path) -> bool:
         return False
     with zipfile.ZipFile(path) as archive:
         return any(Path(name).name == "data.pkl" for name in archive.namelist())
+
+
+def _class_named(name: str, path: Path) -> type[PEARLSAC]:
+    if name not in BY_CLASS_NAME:
+        raise ValueError(f"{path} holds a {name}, known are {', '.join(BY_CLASS_NAME)}")
+    return BY_CLASS_NAME[name]
 
 
 def _algorithm_of(archive: Path) -> type[PEARLSAC]:

@@ -41,7 +41,7 @@ def pretrained_names() -> list[str]:
 
 def pretrained_folder(name: str) -> Path:
     """
-    The folder of a shipped model, for ``POEMSAC.from_pretrained``.
+    The folder of a shipped model.
 
     :param name: as :func:`pretrained_names` lists it
     :raises FileNotFoundError: if there is none of that name; the message lists those that there are
@@ -52,3 +52,20 @@ def pretrained_folder(name: str) -> Path:
         hint = f" Did you mean {close[0]!r}?" if close else ""
         raise FileNotFoundError(f"No model {name!r} is shipped; there are: {', '.join(names) or 'none'}.{hint}")
     return shipped_folder("pretrained") / name
+
+
+def find_folder(name: str | Path) -> Path:
+    """
+    The folder of a model.
+
+    :param name: a folder's path, or the name of a shipped model
+    :raises FileNotFoundError: if it is neither; the message lists the shipped models
+    """
+    path = Path(name)
+    if path.is_dir():
+        return path
+    if path.exists():
+        raise FileNotFoundError(f"{name} is a file, but must be the folder of a model; POEMSAC.load reads a model's file")
+    if path.suffix == ".zip" or len(path.parts) > 1:
+        raise FileNotFoundError(f"{name}: there is no such file or folder of a model")
+    return pretrained_folder(str(name))

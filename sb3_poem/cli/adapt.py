@@ -36,6 +36,7 @@ from sb3_poem.adaptation.oracles import compute_reward
 from sb3_poem.cli.outputs import check_output
 from sb3_poem.cli.report import Report, describe_task
 from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.foreign import environment_of
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.common.video import side_by_side, write_video
@@ -101,12 +102,10 @@ class Adaptation:
         self.seed: int = arguments.seed
         with console.status("Reading the model"):
             self.model = load_model(arguments.model, arguments.device)
-        env_id = arguments.env or self.model.env_id
-        if env_id is None:
-            raise ValueError(f"--env is needed: {arguments.model} does not say on which environment it was trained")
-        self.env_id: str = env_id
-        trained_with = dict(self.model.env_kwargs) if env_id == self.model.env_id else {}
-        self.env_kwargs = {**trained_with, **parse_env_kwargs(arguments.env_kwargs)}
+        given = parse_env_kwargs(arguments.env_kwargs)
+        self.env_id, self.env_kwargs = environment_of(
+            arguments.model, self.model.env_id, self.model.env_kwargs, arguments.env, given
+        )
         self.env = self._make_env()
         if arguments.record and max(arguments.record) > arguments.queries:
             raise ValueError(f"--record {max(arguments.record)} is more than --queries {arguments.queries}")
@@ -114,7 +113,9 @@ class Adaptation:
         try:
             family.check_same_family(self.model.task_space, self.model.reward_feature_dim)
         except ValueError as error:
-            raise ValueError(f"--env {env_id}, but {arguments.model} was trained on {self.model.env_id}: {error}") from error
+            raise ValueError(
+                f"--env {self.env_id}, but {arguments.model} was trained on {self.model.env_id}: {error}"
+            ) from error
         chosen = {name: getattr(arguments, name) for name in ("inference", "query_rule", "candidates", "n_candidates")}
         self.options = {name: value for name, value in chosen.items() if value is not None}
         self.tasks = self._choose_tasks(family)

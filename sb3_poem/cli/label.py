@@ -126,6 +126,7 @@ def run_replay(arguments: argparse.Namespace) -> None:
     from sb3_poem.adaptation.state import write_json_atomically
     from sb3_poem.label.replay import replay
     from sb3_poem.loading import load_model
+    from sb3_poem.resources import pretrained_folder
 
     check_output("--json", arguments.json, (".json",))
     console = Console()
@@ -138,7 +139,8 @@ def run_replay(arguments: argparse.Namespace) -> None:
             continue
         with console.status(f"Session {session.id}"):
             try:
-                model = load_model(arguments.model or session.model)
+                # a store may come from anybody: it names no file to unpickle
+                model = load_model(arguments.model or pretrained_folder(session.model))
             except FileNotFoundError:
                 if arguments.model is not None:
                     raise

@@ -41,9 +41,10 @@ def _tensors(context: ContextStore) -> dict[str, th.Tensor]:
     return {name: value.cpu() for name, value in vars(context).items() if value is not None}
 
 
-def read_checkpoint(path: str | Path, algorithm: str) -> dict[str, Any]:
+def read_checkpoint(path: str | Path, algorithm: str | None = None) -> dict[str, Any]:
     """Read what :func:`save_checkpoint` wrote.
 
+    :param algorithm: Name of the class whose run it must hold; None takes any
     :raises FileNotFoundError: if there is no such file
     :raises ValueError: if it is truncated, of another program, or of another algorithm
     """
@@ -55,7 +56,7 @@ def read_checkpoint(path: str | Path, algorithm: str) -> dict[str, Any]:
         raise ValueError(f"{path} is truncated, or no checkpoint of sb3_poem: {error}") from error
     if not isinstance(state, dict) or state.get("format") != FORMAT:
         raise ValueError(f"{path} is no checkpoint of this version of sb3_poem (expected {FORMAT!r})")
-    if state["algorithm"] != algorithm:
+    if algorithm not in (None, state["algorithm"]):
         raise ValueError(f"{path} holds a {state['algorithm']}; load it with {state['algorithm']}.load_checkpoint")
     return state
 

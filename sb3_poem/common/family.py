@@ -3,6 +3,7 @@
 import importlib
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_wrapper
@@ -54,7 +55,13 @@ class FamilyEnv:
         spec = self._get("spec")
         self.env_id: str | None = None if spec is None else spec.id
         given: dict[str, Any] = {} if spec is None else spec.kwargs
-        self.env_kwargs = {name: value for name, value in given.items() if name not in DRAWING_ARGUMENTS}
+        registered = gym.registry[spec.id].kwargs if spec is not None and spec.id in gym.registry else {}
+        #: What it was made with beyond its registration
+        self.env_kwargs = {
+            name: value
+            for name, value in given.items()
+            if name not in DRAWING_ARGUMENTS and not (name in registered and _equal(registered[name], value))
+        }
         limit = None if spec is None else spec.max_episode_steps
         steps = horizon if limit is None else limit
         if steps is None:
@@ -138,3 +145,8 @@ class FamilyEnv:
                 f"env ({self.env_id}) has tasks in {self.task_space} with {self.reward_feature_dim}. "
                 "Pass an environment of the model's own family."
             )
+
+
+def _equal(one: Any, other: Any) -> bool:
+    """Whether two arguments are the same, of what can be told so; a dictionary may hold arrays."""
+    return one is other or (not isinstance(other, dict) and np.array_equal(one, other))

@@ -1,6 +1,9 @@
 """Models as a folder of safetensors, JSON and a model card: nothing in it can run code."""
 
+import inspect
+import itertools
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -12,7 +15,10 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as tensors_to_bytes
 from torch import nn
 
+from sb3_poem.common.checks import check_whole
 from sb3_poem.common.files import write_atomically
+from sb3_poem.common.foreign import check_env_id
+from sb3_poem.resources import find_folder
 
 if TYPE_CHECKING:
     from sb3_poem.pearl_sac.pearl_sac import PEARLSAC
@@ -25,6 +31,11 @@ SPACES = ("observation_space", "action_space", "task_space")
 ARRAYS = ("train_tasks", "latent_means", "latent_variances")
 # rebuilt from the critics: half of their size for nothing otherwise
 DERIVED = "critic_target."
+#: Arguments that are kept beside an algorithm's ``saved_arguments``, as training left them
+LEARNED = ("target_entropy", "ent_coef", "learning_rate")
+#: The most that a file may ask for, of whole numbers
+LARGEST = {"n_envs": 10_000, "horizon": 100_000, "reward_feature_dim": 10_000, "buffer_size": 100_000_000}
+LARGEST_OF_OTHERS = 1_000_000
 
 
 def save_pretrained(model: "PEARLSAC", folder: str | Path, card: dict[str, Any] | None = None) -> None:
@@ -148,12 +159,30 @@ def read_config(folder: str | Path) -> dict[str, Any]:
     path = Path(folder) / CONFIG
     if not path.is_file():
         raise FileNotFoundError(f"{folder} is no folder of a pretrained model: it has no {CONFIG}")
+    return parse_config(path.read_bytes(), str(path))
+
+
+def parse_config(text: str | bytes, source: str) -> dict[str, Any]:
+    """The configuration of a model.
+
+    :param text: What :func:`config_text` wrote
+    :param source: Where it comes from, for the message
+    :raises ValueError: if it is truncated, of another program or version, or its ``env_id`` would
+        import a module
+    """
     try:
-        config = json.loads(path.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is truncated, or no configuration of sb3_poem: {error}") from error
-    if not isinstance(config, dict) or config.get("format") != FORMAT:
-        raise ValueError(f"{path} is not of this version of sb3_poem (expected format {FORMAT!r})")
+        config = json.loads(text)
+    except (ValueError, RecursionError) as error:  # of thousands of brackets
+        raise ValueError(f"{source} is truncated, or no configuration of sb3_poem: {error}") from error
+    found = config.get("format") if isinstance(config, dict) else None
+    if found != FORMAT:
+        raise ValueError(f"{source} is not of this version of sb3_poem: its format is {found!r}, expected {FORMAT!r}")
+    check_env_id(config.get("env_id"), source)
+    for name in ("env_kwargs", "arguments", "card"):
+        if not isinstance(config.get(name, {}), dict):
+            raise ValueError(f"{source}: {name} must be an object, but is a {type(config[name]).__name__}")
+    if not isinstance(config.get("algorithm"), str):
+        raise ValueError(f"{source} names no algorithm")
     return config
 
 
@@ -161,18 +190,17 @@ def from_pretrained(algorithm: type[Model], folder: str | Path, env: Any = None,
     """Read a model that :func:`save_pretrained` wrote.
 
     :param algorithm: Class of the model
-    :param folder: The folder
+    :param folder: The folder, or the name of a model that ships
     :param env: An environment of the model's family, if it shall be trained on
     :param device: "auto", "cpu", "cuda"
     :raises FileNotFoundError: if the folder does not hold a model
     :raises ValueError: if a file is truncated or foreign, the model is of another algorithm, or env of another family
     """
+    folder = find_folder(folder)
     config = read_config(folder)
-    if config.get("algorithm") is None:
-        raise ValueError(f"{folder} does not hold a complete {algorithm.__name__}: its {CONFIG} names no algorithm")
     if config["algorithm"] != algorithm.__name__:
         raise ValueError(f"{folder} holds a {config['algorithm']}; load it with {config['algorithm']}.from_pretrained")
-    weights = Path(folder) / WEIGHTS
+    weights = folder / WEIGHTS
     try:
         tensors = load_tensors(weights.read_bytes())
     except SafetensorError as error:
@@ -192,14 +220,17 @@ def build_model(
 ) -> Model:
     """Make a model from what :func:`model_contents` took it apart into.
 
+    No memory is taken for networks before the configuration has been found to agree with the tensors.
+
     :param algorithm: Class of the model
     :param config: Its configuration
     :param tensors: Its tensors
     :param source: Where they come from, for the message
     :param device: "auto", "cpu", "cuda"
-    :raises ValueError: if something is missing, or does not fit
+    :raises ValueError: if something is missing, does not fit, or is out of all proportion
     """
     try:
+        _check_numbers(algorithm, config, tensors)
         model = algorithm("MlpPolicy", None, device=device, _init_setup_model=False, **config["arguments"])  # type: ignore[arg-type]
         for name in SPACES:
             low, high = tensors[f"{name}.low"].numpy(), tensors[f"{name}.high"].numpy()
@@ -222,16 +253,65 @@ def build_model(
         if model.target_entropy == "auto":  # which SAC would look up in the environment
             model.target_entropy = -float(np.prod(model.action_space.shape))  # type: ignore[arg-type]
         model.policy_kwargs["net_arch"] = config["net_arch"]
-        model.policy_kwargs["activation_fn"] = getattr(nn, config.get("activation_fn", "ReLU"))
+        model.policy_kwargs["activation_fn"] = _named(nn, config.get("activation_fn", "ReLU"), nn.Module)
         if "optimizer_class" in config:  # not in the first models
-            model.policy_kwargs["optimizer_class"] = getattr(th.optim, config["optimizer_class"])
+            model.policy_kwargs["optimizer_class"] = _named(th.optim, config["optimizer_class"], th.optim.Optimizer)
             model.policy_kwargs["optimizer_kwargs"] = config["optimizer_kwargs"]
         model.policy_kwargs["layer_norm"] = config.get("layer_norm", False)
         model.policy_kwargs["n_critics"] = config.get("n_critics", 2)
+        _check_shapes(model, tensors)
         model._setup_model()
         state = {name.removeprefix("policy."): value for name, value in tensors.items() if name.startswith("policy.")}
         state |= {f"{DERIVED}{name.removeprefix('critic.')}": v for name, v in state.items() if name.startswith("critic.")}
         model.policy.load_state_dict(state)
-    except (AttributeError, KeyError, TypeError, RuntimeError) as error:
+    except Exception as error:  # what foreign data may raise is no closed list
         raise ValueError(f"{source} does not hold a complete {algorithm.__name__}: {error}") from error
     return model
+
+
+def _named(module: Any, name: str, base: type) -> Any:
+    found = getattr(module, name, None)
+    if not (isinstance(found, type) and issubclass(found, base)):
+        raise ValueError(f"{name!r} is no {base.__name__} of {module.__name__}")
+    return found
+
+
+def _check_numbers(algorithm: type["PEARLSAC"], config: dict[str, Any], tensors: dict[str, th.Tensor]) -> None:
+    """Refuse arguments that no model is saved with, and numbers of another size than a model's."""
+    parameters = inspect.signature(algorithm).parameters
+    for name, value in config["arguments"].items():
+        if name not in (*algorithm.saved_arguments, *LEARNED):
+            raise ValueError(f"`{name}` is no argument that a model is saved with")
+        if type(parameters[name].default) is int or (name in LARGEST and value is not None):
+            check_whole(name, value, -1, LARGEST.get(name, LARGEST_OF_OTHERS))
+        elif isinstance(value, float) and not math.isfinite(value):
+            raise ValueError(f"`{name}` must be finite, but is {value}")
+    n_tasks = len(tensors["train_tasks"])
+    if config["arguments"].get("n_train_tasks") not in (None, n_tasks):
+        raise ValueError(f"`n_train_tasks` is {config['arguments']['n_train_tasks']}, but there are {n_tasks} train_tasks")
+    for name, least in (("n_envs", 1), ("reward_feature_dim", 1), ("num_timesteps", 0), ("n_updates", 0), ("n_critics", 1)):
+        if config.get(name) is not None:
+            check_whole(name, config[name], least, LARGEST.get(name))
+    arch = config["net_arch"]
+    for width in itertools.chain(*arch.values()):
+        check_whole("net_arch", width, 1)
+    n_layers = sum(map(len, arch.values())) + config.get("n_critics", 2) * (len(arch["qf"]) + 1)
+    if n_layers > len(tensors):
+        raise ValueError(f"net_arch and n_critics ask for {n_layers} layers, but there are {len(tensors)} tensors")
+
+
+def _check_shapes(model: "PEARLSAC", tensors: dict[str, th.Tensor]) -> None:
+    """Refuse tensors of other shapes than the configured networks', of which an outline is made."""
+    assert model.train_tasks is not None
+    model._complete_policy_kwargs()
+    arguments = {**model.policy_kwargs, "optimizer_kwargs": {}}  # a fused one does not take outlines
+    with th.device("meta"):
+        outline = model.policy_class(model.observation_space, model.action_space, lambda _: 0.0, **arguments)
+    latents = (len(model.train_tasks), model.latent_dim)
+    expected = {"train_tasks": (latents[0], *model.task_space.shape), "latent_means": latents, "latent_variances": latents}
+    state = outline.state_dict().items()
+    expected |= {f"policy.{name}": tuple(value.shape) for name, value in state if not name.startswith(DERIVED)}
+    for name, shape in expected.items():
+        found = tuple(tensors[name].shape) if name in tensors else "missing"
+        if found != shape:
+            raise ValueError(f"the tensor {name} is {found}, but must be {shape} by the configuration")

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from sb3_poem.common.foreign import environment_of
 from sb3_poem.common.pretrained import CONFIG, read_config
 from sb3_poem.label.families import Description, describe
-from sb3_poem.resources import pretrained_folder, shipped_folder
+from sb3_poem.resources import find_folder, shipped_folder
 
 
 @dataclass(frozen=True)
@@ -49,20 +50,16 @@ def read_catalogue(
     :raises FileNotFoundError: If there is none.
     :raises ValueError: If a model is broken, or does not say its environment.
     """
-    if model is None:
-        folder = shipped_folder("pretrained")
-    else:
-        folder = Path(model) if Path(model).is_dir() else pretrained_folder(model)
+    folder = shipped_folder("pretrained") if model is None else find_folder(model)
     folders = [folder] if (folder / CONFIG).is_file() else sorted(file.parent for file in folder.glob(f"*/{CONFIG}"))
     if not folders:
         raise FileNotFoundError(f"--model {model}: {folder} holds no pretrained model (a folder with {CONFIG})")
     choices = []
     for one in folders:
         config = read_config(one)
-        chosen = env_id or config.get("env_id")
-        if chosen is None:
-            raise ValueError(f"--env is needed: {one} does not say on which environment it was trained")
-        trained_with = config.get("env_kwargs", {}) if chosen == config.get("env_id") else {}
-        arguments = tuple(sorted({**trained_with, **(env_kwargs or {})}.items()))
-        choices.append(Choice(one.resolve().name, one.resolve(), config["algorithm"], chosen, arguments))
+        own = config.get("env_id"), config.get("env_kwargs", {})
+        chosen, arguments = environment_of(str(one), *own, env_id, env_kwargs)
+        choices.append(
+            Choice(one.resolve().name, one.resolve(), config["algorithm"], chosen, tuple(sorted(arguments.items())))
+        )
     return choices

@@ -233,7 +233,6 @@ class PEARLSAC(SamplingSAC):
         if self.train_tasks is None:
             self._draw_tasks()
         assert self.train_tasks is not None
-        self.policy_kwargs.update(latent_dim=self.latent_dim, context_has_value=self.context_has_value)
         self._complete_policy_kwargs()
         self.replay_buffer_kwargs = {"n_tasks": len(self.train_tasks), "feature_dim": self.reward_feature_dim}
         generators = self.generators
@@ -258,7 +257,9 @@ class PEARLSAC(SamplingSAC):
             self.obs_count = None
 
     def _complete_policy_kwargs(self) -> None:
-        """Give the policy what only a subclass knows."""
+        """Give the policy what follows from the model's own arguments."""
+        self.policy_kwargs.pop("use_sde", None)
+        self.policy_kwargs.update(latent_dim=self.latent_dim, context_has_value=self.context_has_value)
 
     # ------------------------------------------------------------------ learning
 

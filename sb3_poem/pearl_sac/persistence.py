@@ -19,6 +19,7 @@ from sb3_poem.common.checkpoint import read_checkpoint, restore_stores, save_che
 from sb3_poem.common.family import plain_id
 from sb3_poem.common.files import write_atomically
 from sb3_poem.common.pretrained import from_pretrained, save_pretrained
+from sb3_poem.resources import pretrained_names
 
 SelfPersistent = TypeVar("SelfPersistent", bound="PersistentSAC")
 
@@ -116,9 +117,11 @@ class PersistentSAC(SAC):
         """As SB3's. ``env`` may be a registered id too: it becomes as many copies as the model was trained with. Further
         arguments are the constructor's; a ``seed`` begins new random streams.
 
-        :raises ValueError: if the file is truncated or holds another algorithm's model, env is of another family, or an
-            argument would change what the networks are
+        :raises ValueError: if it is a folder, the file is truncated or holds another algorithm's model, env is of another
+            family, or an argument would change what the networks are
         """
+        if not isinstance(path, io.BufferedIOBase):
+            cls._check_is_file(pathlib.Path(path))
         try:
             data, _, _ = load_from_zip_file(path, device="cpu", load_data=True)
         except (zipfile.BadZipFile, RuntimeError, EOFError, ValueError) as error:
@@ -150,6 +153,18 @@ class PersistentSAC(SAC):
         if changed.get("seed") is not None:
             model.set_random_seed(changed["seed"])
         return model
+
+    @classmethod
+    def _check_is_file(cls, path: pathlib.Path) -> None:
+        """
+        :raises ValueError: if it is a folder or a shipped model's name, for ``from_pretrained``
+        """
+        if path.is_file() or path.with_name(f"{path.name}.zip").is_file():
+            return
+        is_shipped = not path.exists() and str(path) in pretrained_names()
+        if path.is_dir() or is_shipped:
+            what = "the name of a model that ships" if is_shipped else "a folder"
+            raise ValueError(f"{path} is {what}: use {cls.__name__}.from_pretrained({str(path)!r})")
 
     def save_checkpoint(self, path: str | pathlib.Path) -> None:
         """Write everything to one file, from which :meth:`load_checkpoint` continues bit for bit. Between two epochs only.
@@ -185,7 +200,9 @@ class PersistentSAC(SAC):
         env: GymEnv | str | None = None,
         device: th.device | str = "auto",
     ) -> SelfPersistent:
-        """Read what :meth:`save_pretrained` wrote; see :func:`sb3_poem.common.pretrained.from_pretrained`."""
+        """Read what :meth:`save_pretrained` wrote, or a shipped model by its name; see
+        :func:`sb3_poem.common.pretrained.from_pretrained`.
+        """
         return from_pretrained(cast(Any, cls), folder, env, device)
 
     def _excluded_save_params(self) -> list[str]:

@@ -160,6 +160,7 @@ class POEMSAC(PEARLSAC):
         )
 
     def _complete_policy_kwargs(self) -> None:
+        super()._complete_policy_kwargs()
         self.policy_kwargs["two_encoder"] = self.similarity_metric == "two-encoder"
 
     def _check_family(self, family: FamilyEnv) -> None:

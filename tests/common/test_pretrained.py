@@ -203,7 +203,7 @@ def test_an_optimiser_that_cannot_be_named_is_refused(tmp_path: Path) -> None:
 
 def test_missing_files(trained: PEARLSAC, folder: Path) -> None:
     cls = type(trained)
-    with pytest.raises(FileNotFoundError, match="nowhere is no folder of a pretrained model"):
+    with pytest.raises(FileNotFoundError, match="nowhere: there is no such file or folder of a model"):
         cls.from_pretrained(folder.parent / "nowhere")
     (folder / "model.safetensors").rename(folder / "elsewhere")
     with pytest.raises(FileNotFoundError, match=r"model\.safetensors"):
@@ -231,9 +231,7 @@ def test_foreign_configurations(trained: PEARLSAC, folder: Path, text: str) -> N
         type(trained).from_pretrained(folder)
 
 
-@pytest.mark.parametrize(
-    "key", ["algorithm", "arguments", "net_arch", "observation_space", "task_space", "env_id", "num_timesteps"]
-)
+@pytest.mark.parametrize("key", ["arguments", "net_arch", "observation_space", "task_space", "env_id", "num_timesteps"])
 def test_incomplete_configurations(trained: PEARLSAC, folder: Path, key: str) -> None:
     config = json.loads((folder / "config.json").read_text())
     del config[key]
@@ -250,7 +248,7 @@ def test_foreign_weights(trained: PEARLSAC, folder: Path) -> None:
         cls.from_pretrained(folder)
     one_missing = {name: value for name, value in tensors.items() if name != "policy.actor.mlp.output.bias"}
     save_file(one_missing, path)
-    with pytest.raises(ValueError, match=r'folder does not hold a complete (.|\n)*"actor\.mlp\.output\.bias"'):
+    with pytest.raises(ValueError, match=r"folder does not hold a complete .*policy\.actor\.mlp\.output\.bias is missing"):
         cls.from_pretrained(folder)
     save_file({**tensors, "policy.actor.mlp.output.bias": th.zeros(7)}, path)
     with pytest.raises(ValueError, match="folder does not hold a complete"):
