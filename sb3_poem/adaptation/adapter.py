@@ -10,22 +10,27 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import gymnasium as gym
 import numpy as np
 
-from sb3_poem.adaptation.environments import as_vec_env
+from sb3_poem.adaptation.environments import as_vec_env, describe_model
 from sb3_poem.adaptation.inference import Answer, Snapshot
 from sb3_poem.adaptation.noise import NoiseModel
 from sb3_poem.adaptation.options import AdaptationOptions, inference_rng, rollout_seed
 from sb3_poem.adaptation.policy import AdaptedPolicy
 from sb3_poem.adaptation.preference import Preference, Query, as_preference
 from sb3_poem.adaptation.state import read_json, write_json_atomically
+from sb3_poem.common.checks import check_whole
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 Oracle = Callable[[Trajectory, Trajectory], Any]
+
+
+class OtherModelError(ValueError):
+    """A saved adaptation belongs to another model than the one that it was given."""
 
 
 class PreferenceAdapter:
@@ -127,8 +132,8 @@ class PreferenceAdapter:
         seed: int | None,
         library: Sequence[Trajectory] | None,
     ) -> None:
-        if seed is not None and seed < 0:
-            raise ValueError(f"`seed` must not be negative, but is {seed}")
+        if seed is not None:
+            check_whole("seed", seed, 0)
         self.model = model
         self.options = options
         self.seed = int(np.random.SeedSequence().generate_state(1)[0] >> 1) if seed is None else int(seed)
@@ -222,7 +227,13 @@ class PreferenceAdapter:
 
         :return: A policy with SB3's ``predict``.
         """
-        return AdaptedPolicy(self.model, self.inference.estimate())
+        return AdaptedPolicy(self.model, self.inference.estimate(), self.n_answers, self.env)
+
+    def __repr__(self) -> str:
+        rule = getattr(self.options, "inference", getattr(self.options, "strategy", None))
+        named = "" if rule is None else f", {rule}"
+        answers = f"{self.n_answers} of {self.options.n_queries} answers"
+        return f"{type(self).__name__}({describe_model(self.model)}{named}, {answers})"
 
     def adapt(self, oracle: Oracle | None = None, progress_bar: bool = False) -> AdaptedPolicy:
         """
@@ -289,7 +300,11 @@ class PreferenceAdapter:
         return {
             "format": self._format(),
             "version": FORMAT_VERSION,
-            "model": {"latent_dim": int(self.model.latent_dim), "env_id": getattr(self.model, "env_id", None)},
+            "model": {
+                "latent_dim": int(self.model.latent_dim),
+                "env_id": getattr(self.model, "env_id", None),
+                "digest": getattr(self.model, "digest", None),
+            },
             "seed": self.seed,
             "options": self.options.to_dict(),
             "uses_library": self.library is not None,
@@ -320,7 +335,8 @@ class PreferenceAdapter:
         :param oracle: Who answers in :meth:`adapt`. A stochastic oracle's own generator is its own affair.
         :param library: The same library, if there was one.
         :return: The adapter.
-        :raises ValueError: If the data is broken, of another version, or belongs to another model.
+        :raises OtherModelError: If the model has other weights, another family or another latent's dimension.
+        :raises ValueError: If the data is broken, or of another version.
         """
         if data.get("format") != cls._format():
             raise ValueError(f"not a saved adaptation: `format` is {data.get('format')!r}, not {cls._format()!r}")
@@ -371,7 +387,7 @@ class PreferenceAdapter:
         """
         try:
             data = json.loads(text)
-        except json.JSONDecodeError as error:
+        except (ValueError, RecursionError) as error:
             raise ValueError(f"not a saved adaptation: {error}") from error
         if not isinstance(data, dict):
             raise ValueError(f"not a saved adaptation: it holds a {type(data).__name__}, not an object")
@@ -410,9 +426,14 @@ def _pair_from_dict(data: dict[str, Any]) -> tuple[Trajectory, Trajectory]:
 
 def _check_same_model(facts: dict[str, Any], model: Any) -> None:
     if facts["latent_dim"] != model.latent_dim:
-        raise ValueError(
+        raise OtherModelError(
             f"the adaptation was saved with latent_dim={facts['latent_dim']}, but the model has {model.latent_dim}"
         )
     env_id = getattr(model, "env_id", None)
     if facts["env_id"] is not None and env_id is not None and facts["env_id"] != env_id:
-        raise ValueError(f"the adaptation was saved with a model for {facts['env_id']}, but this one is for {env_id}")
+        raise OtherModelError(f"the adaptation was saved with a model for {facts['env_id']}, but this one is for {env_id}")
+    if facts["digest"] != getattr(model, "digest", None):
+        raise OtherModelError(
+            f"the adaptation was saved with a model of other weights than this {describe_model(model)}: its latents mean "
+            "nothing here; pass the very model with which it began, or begin anew"
+        )

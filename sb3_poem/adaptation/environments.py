@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium as gym
@@ -34,7 +35,7 @@ def as_vec_env(env: gym.Env | str | VecEnv, render: bool = False) -> tuple[VecEn
 
 def check_model_fits(model: Any, vec_env: VecEnv) -> None:
     """
-    Refuse a model that was trained for other observations or actions.
+    Refuse a model of other observations or actions, and warn of one that was not trained.
 
     :param model: The model.
     :param vec_env: The environment.
@@ -44,11 +45,18 @@ def check_model_fits(model: Any, vec_env: VecEnv) -> None:
         expected, given = getattr(model, name), getattr(vec_env, name)
         if expected != given:
             raise ValueError(
-                f"the model does not belong to this environment: its {name} is {expected}"
-                f"{_for_env(model)}, but the environment's is {given}"
+                f"the model does not belong to this environment: its {name} is {expected} ({describe_model(model)}), but "
+                f"the environment's is {given}"
             )
+    if getattr(model, "num_timesteps", None) == 0:
+        warnings.warn(
+            f"{describe_model(model)} has not been trained (num_timesteps is 0), so that its policies differ by chance "
+            "alone; call learn(), or load a trained one",
+            stacklevel=5,  # where the adapter is made
+        )
 
 
-def _for_env(model: Any) -> str:
+def describe_model(model: Any) -> str:
+    """A model in a few words: its class, and the environment that it was trained on."""
     env_id = getattr(model, "env_id", None)
-    return "" if env_id is None else f" (trained on {env_id})"
+    return type(model).__name__ + ("" if env_id is None else f" on {env_id}")

@@ -13,6 +13,7 @@ from sb3_poem.adaptation.lockstep import OracleFactory, adapt_tasks
 from sb3_poem.adaptation.noise import NoiseModel
 from sb3_poem.adaptation.oracles import ReturnOracle, compute_reward
 from sb3_poem.adaptation.preference import Preference
+from sb3_poem.common.checks import check_whole
 from sb3_poem.common.rollouts import rollout_features, rollout_outcomes
 
 if TYPE_CHECKING:
@@ -39,6 +40,10 @@ class EpisodeOutcomes:
 
     returns: np.ndarray
     successes: np.ndarray | None
+
+    def __repr__(self) -> str:
+        rows, episodes = self.returns.shape
+        return f"EpisodeOutcomes({rows} times {episodes} episodes, mean return {self.returns.mean():.1f})"
 
 
 def evaluate_latents(
@@ -86,8 +91,7 @@ def evaluate_episodes(
             f"`latents` (n, latent_dim) and `tasks` (n, task_dim) must have equally many rows, "
             f"but have shapes {latents.shape} and {tasks.shape}"
         )
-    if n_episodes < 1:
-        raise ValueError(f"`n_episodes` must be at least 1, but is {n_episodes}")
+    check_whole("n_episodes", n_episodes, 1)
     n = len(latents)
     rows = np.tile(np.arange(n), n_episodes)
     outcomes = rollout_outcomes(model, vec_env, latents[rows], tasks[rows], seed, deterministic)
@@ -121,6 +125,11 @@ class AdaptationEvaluation:
     returns: np.ndarray
     preferences: list[list[Preference]]
     successes: np.ndarray | None = None
+
+    def __repr__(self) -> str:
+        means = ", ".join(f"{mean:.1f}" for mean in self.mean_returns)
+        answers = ", ".join(map(str, self.record_at))
+        return f"AdaptationEvaluation({len(self.tasks)} tasks, mean return {means} after {answers} answers)"
 
     @property
     def task_returns(self) -> np.ndarray:
@@ -198,8 +207,11 @@ def evaluate_adaptation(
     """
     from tqdm import tqdm
 
-    if not record_at or min(record_at) < 0:
-        raise ValueError(f"`record_at` must hold at least one number of answers, none negative, but is {tuple(record_at)}")
+    if len(record_at) == 0:
+        raise ValueError("`record_at` must hold at least one number of answers, but is empty")
+    for k in record_at:
+        check_whole("record_at", k, 0)
+    check_whole("n_episodes", n_episodes, 1)
     adapted = adapt_tasks(
         model,
         vec_env,
@@ -241,6 +253,10 @@ class KnownTaskReturn:
     candidate_latents: np.ndarray
     candidate_returns: np.ndarray
     successes: np.ndarray | None = None
+
+    def __repr__(self) -> str:
+        found = f"mean return {self.mean_return:.1f} of the best of {len(self.candidate_latents)} latents"
+        return f"KnownTaskReturn({len(self.tasks)} tasks, {found})"
 
     @property
     def mean_return(self) -> float:
@@ -300,8 +316,7 @@ def known_task_return(
     tasks = np.asarray(tasks, dtype=np.float64)
     if n_latents is None:
         n_latents = LATENTS_WITH_SHARED_DYNAMICS if _dynamics_are_shared(vec_env) else LATENTS_WITH_OWN_DYNAMICS
-    if n_latents < 1:
-        raise ValueError(f"`n_latents` must be at least 1, but is {n_latents}")
+    check_whole("n_latents", n_latents, 1)
     candidates = _draw_latents(model, n_latents, source, np.random.default_rng([seed, 2]))
     returns = return_matrix(model, vec_env, tasks, candidates, selection_episodes, evaluation_seed(seed, 1), deterministic)
     best = candidates[np.argmax(returns, axis=1)]

@@ -20,6 +20,7 @@ from sb3_poem.adaptation.queries import (
 )
 from sb3_poem.adaptation.queries import random_pair as draw_random_pair
 from sb3_poem.adaptation.state import generator_from_state, generator_state
+from sb3_poem.common.checks import check_whole
 from sb3_poem.common.trajectory import Trajectory, decode_array, encode_array
 
 # What a question compares: a trajectory, or where no trajectory is at hand the latent of the policy that would make it.
@@ -357,8 +358,7 @@ def check_inference_options(n_candidates: int, epsilon: float, candidates: str, 
     :param query_rule: One of ``QUERY_RULES``.
     :raises ValueError: If one is out of its range.
     """
-    if n_candidates < 2:
-        raise ValueError(f"`n_candidates` must be at least 2 (a question compares two), but is {n_candidates}")
+    check_whole("n_candidates", n_candidates, 2)  # a question compares two
     if not 0.0 <= epsilon < 0.5:
         raise ValueError(f"`epsilon` must lie in [0, 0.5), but is {epsilon}")
     if candidates not in SOURCES:

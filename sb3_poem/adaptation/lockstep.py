@@ -11,6 +11,7 @@ import numpy as np
 from sb3_poem.adaptation.adapter import PreferenceAdapter
 from sb3_poem.adaptation.options import inference_rng, rollout_seed
 from sb3_poem.adaptation.preference import Preference, as_preference
+from sb3_poem.common.checks import check_whole
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
 
@@ -35,6 +36,9 @@ class TaskAdaptations:
     record_at: tuple[int, ...]
     latents: np.ndarray
     preferences: list[list[Preference]]
+
+    def __repr__(self) -> str:
+        return f"TaskAdaptations({len(self.tasks)} tasks, after {', '.join(map(str, self.record_at))} answers)"
 
 
 def adapt_tasks(
@@ -80,6 +84,7 @@ def adapt_tasks(
     tasks = np.asarray(tasks, dtype=np.float64)
     if tasks.ndim != 2 or len(tasks) < 1:
         raise ValueError(f"`tasks` must have shape (n_tasks, task_dim) with at least one task, but has shape {tasks.shape}")
+    check_whole("seed", seed, 0)
     kept = _check_record_at(record_at, n_queries)
     oracles = [oracle_factory(env=vec_env, task=task, seed=seed + i) for i, task in enumerate(tasks)]
     settings = adapter.make_options(oracles[0], n_queries=n_queries, **options)
@@ -121,11 +126,12 @@ def adapt_tasks(
 
 
 def _check_record_at(record_at: Sequence[int] | None, n_queries: int) -> tuple[int, ...]:
-    if n_queries < 1:
-        raise ValueError(f"`n_queries` must be at least 1, but is {n_queries}")
+    check_whole("n_queries", n_queries, 1)
     if record_at is None:
         return tuple(range(n_queries + 1))
+    for k in record_at:
+        check_whole("record_at", k, 0)
     kept = tuple(sorted({int(k) for k in record_at}))
-    if not kept or kept[0] < 0 or kept[-1] > n_queries:
+    if not kept or kept[-1] > n_queries:
         raise ValueError(f"`record_at` must hold numbers from 0 to n_queries={n_queries}, but is {tuple(record_at)}")
     return kept

@@ -14,6 +14,7 @@ from sb3_poem.adaptation.environments import check_model_fits
 from sb3_poem.adaptation.inference import LatentInference, PaperInference
 from sb3_poem.adaptation.noise import NoiseModel, noise_model_from_dict
 from sb3_poem.adaptation.state import plain
+from sb3_poem.common.checks import check_whole
 from sb3_poem.common.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -44,8 +45,7 @@ class AdaptationOptions:
     deterministic: bool = True
 
     def __post_init__(self) -> None:
-        if self.n_queries < 1:
-            raise ValueError(f"`n_queries` must be at least 1, but is {self.n_queries}")
+        check_whole("n_queries", self.n_queries, 1)
         if self.inference not in INFERENCES:
             raise ValueError(f"`inference` must be one of {INFERENCES}, but is {self.inference!r}")
         if self.likelihood is not None and self.likelihood not in LIKELIHOODS:

@@ -69,7 +69,7 @@ def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
     """
     try:
         data = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{os.fspath(path)} is not a saved adaptation: {error}") from error
     if not isinstance(data, dict):
         raise ValueError(f"{os.fspath(path)} is not a saved adaptation: it holds a {type(data).__name__}, not an object")

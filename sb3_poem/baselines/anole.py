@@ -19,6 +19,7 @@ from sb3_poem.adaptation.queries import random_pair
 from sb3_poem.adaptation.state import plain
 from sb3_poem.baselines.berlekamp import n_distinguishable, worst_case_volumes
 from sb3_poem.baselines.fragments import default_fragment_length, replay_fragments
+from sb3_poem.common.checks import check_whole
 from sb3_poem.common.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -43,8 +44,8 @@ class ANOLEOptions:
 
     def __post_init__(self) -> None:
         for name in ("n_queries", "n_candidates", "n_pairs", "fragment_length"):
-            if getattr(self, name) is not None and getattr(self, name) < 1:
-                raise ValueError(f"`{name}` must be at least 1, but is {getattr(self, name)}")
+            if getattr(self, name) is not None:
+                check_whole(name, getattr(self, name), 1)
         if self.strategy not in STRATEGIES:
             raise ValueError(f"`strategy` must be one of {STRATEGIES}, but is {self.strategy!r}")
         if self.candidates not in SOURCES:

@@ -21,6 +21,7 @@ from sb3_poem.adaptation.inference import Answer, LatentInference, Shown, Snapsh
 from sb3_poem.adaptation.preference import Preference
 from sb3_poem.adaptation.state import plain
 from sb3_poem.baselines.maml_reward import JudgedPair, MetaReward
+from sb3_poem.common.checks import check_whole
 from sb3_poem.common.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -44,6 +45,14 @@ class MAMLRewardModel:
         self.observation_space, self.action_space = model.observation_space, model.action_space
         self.horizon, self.env_id = model.horizon, getattr(model, "env_id", None)
         self.actors: list[Any] = []
+
+    def __repr__(self) -> str:
+        return f"MAMLRewardModel({self.env_id})"
+
+    @property
+    def digest(self) -> str:
+        """Of the meta-trained reward's numbers."""
+        return self.reward.digest
 
     def add(self, actor: Any) -> np.ndarray:
         """Keep a copy of an actor, and give its latent (2,)."""
@@ -94,8 +103,7 @@ class MAMLRewardOptions:
 
     def __post_init__(self) -> None:
         for name in ("n_queries", "gradient_steps", "batch_size"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"`{name}` must be at least 1, but is {getattr(self, name)}")
+            check_whole(name, getattr(self, name), 1)
         if not self.learning_rate > 0:
             raise ValueError(f"`learning_rate` must be positive, but is {self.learning_rate}")
         if not 0.0 <= self.gamma <= 1.0:

@@ -17,6 +17,8 @@ from sb3_poem.adaptation.preference import Preference
 from sb3_poem.adaptation.state import read_json, write_json_atomically
 from sb3_poem.baselines.fragments import default_fragment_length, replay_fragments
 from sb3_poem.baselines.maml import Parameters, PreferencePairs, RewardNetwork, adapt_parameters, maml_loss
+from sb3_poem.common.checks import check_whole
+from sb3_poem.common.digest import digest_of
 from sb3_poem.common.files import write_atomically
 from sb3_poem.common.trajectory import Trajectory
 
@@ -56,8 +58,7 @@ class MetaReward:
     ) -> None:
         if not inner_learning_rate > 0:
             raise ValueError(f"`inner_learning_rate` must be positive, but is {inner_learning_rate}")
-        if inner_steps < 1:
-            raise ValueError(f"`inner_steps` must be at least 1, but is {inner_steps}")
+        check_whole("inner_steps", inner_steps, 1)
         self.policy, self.inner_learning_rate, self.inner_steps = policy, inner_learning_rate, inner_steps
         self.net_arch = tuple(int(width) for width in net_arch)
         in_dim = 2 * spaces.flatdim(policy.observation_space) + spaces.flatdim(policy.action_space)
@@ -65,6 +66,11 @@ class MetaReward:
             th.manual_seed(seed)
             self.network = RewardNetwork(in_dim, net_arch).to(policy.device)
         self.parameters: Parameters = {name: value.detach().clone() for name, value in self.network.named_parameters()}
+
+    @property
+    def digest(self) -> str:
+        """Of its numbers, the standardisation's included."""
+        return digest_of({**self.parameters, **{name: getattr(self.policy, name) for name in STANDARDISATION}})
 
     def save(self, folder: str | Path) -> None:
         """
@@ -199,8 +205,7 @@ def meta_train_reward(
     if not model.replay_buffer.counts.any():
         raise ValueError("`model` has an empty replay buffer (a loaded model has none): call load_replay_buffer")
     for name, value in (("n_iterations", n_iterations), ("n_support", n_support), ("n_query", n_query)):
-        if value < 1:
-            raise ValueError(f"`{name}` must be at least 1, but is {value}")
+        check_whole(name, value, 1)
     rng = np.random.default_rng([seed, 5])
     meta = MetaReward(model.policy, seed=seed, **arguments)
     length = default_fragment_length(model.horizon) if fragment_length is None else fragment_length

@@ -16,6 +16,7 @@ from sb3_poem.adaptation.inference import Answer, LatentInference, Shown
 from sb3_poem.adaptation.oracles import step_rewards
 from sb3_poem.adaptation.preference import Preference
 from sb3_poem.adaptation.state import plain
+from sb3_poem.common.checks import check_whole
 from sb3_poem.common.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -30,8 +31,7 @@ class RewardOracleOptions:
     deterministic: bool = True
 
     def __post_init__(self) -> None:
-        if self.n_queries < 1:
-            raise ValueError(f"`n_queries` must be at least 1, but is {self.n_queries}")
+        check_whole("n_queries", self.n_queries, 1)
 
     def check(self, model: Any, vec_env: VecEnv, library: Sequence[Trajectory] | None = None) -> None:
         """

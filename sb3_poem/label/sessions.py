@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from sb3_poem.adaptation.adapter import OtherModelError
 from sb3_poem.label.catalogue import Choice
 from sb3_poem.label.store import RefusedError, Session, Store
 from sb3_poem.label.turns import Request, Turn, load_choice
@@ -277,7 +278,8 @@ class Conversations:
             raise
         except Exception as error:
             _logger.exception("session %d: the %s after %d answers could not be made", session.id, wanted, answered)
-            presence.failed = str(error) if isinstance(error, RefusedError) else f"{type(error).__name__}; it is tried again"
+            told = isinstance(error, RefusedError | OtherModelError)
+            presence.failed = str(error) if told else f"{type(error).__name__}; it is tried again"
             presence.failed_at = time.monotonic()
 
     def _put_back(self, session: Session, answered: int, wanted: str, video: Path, made: Turn) -> None:

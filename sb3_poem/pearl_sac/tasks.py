@@ -11,6 +11,7 @@ from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.common.decoding import decoded_sums
+from sb3_poem.common.digest import digest_of
 from sb3_poem.common.family import FamilyEnv
 from sb3_poem.common.precision import hidden_dtype
 from sb3_poem.common.random import Generators
@@ -111,6 +112,14 @@ class TaskSAC(PersistentSAC):
         """Posterior means of the training tasks' latents, (n_train_tasks, latent_dim)."""
         assert self.latent_means is not None
         return self.latent_means
+
+    @property
+    def digest(self) -> str:
+        """Of what adaptation uses: all networks but the critics, and the training tasks' latents."""
+        state = self.policy.state_dict().items()
+        used: dict[str, Any] = {name: value for name, value in state if not name.startswith("critic")}
+        used |= {name: th.as_tensor(getattr(self, name)) for name in ("latent_means", "latent_variances")}
+        return digest_of(used)
 
     @property
     def aggregate_to_prior_kl(self) -> float:

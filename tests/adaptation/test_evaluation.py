@@ -37,7 +37,9 @@ def vec_env(n=10, **kwargs):
         (lambda: known_task_return(MODEL, vec_env(1), GOALS, 0), "`n_latents` must be at least 1"),
         (lambda: known_task_return(MODEL, vec_env(1), GOALS, source="all"), "`source` must be"),
         (lambda: evaluate_adaptation(MODEL, vec_env(1), GOALS, record_at=()), "`record_at` must hold"),
-        (lambda: evaluate_adaptation(MODEL, vec_env(1), GOALS, record_at=(-1, 2)), "`record_at` must hold"),
+        (lambda: evaluate_adaptation(MODEL, vec_env(1), GOALS, record_at=(-1, 2)), "`record_at` must be at least 0"),
+        (lambda: evaluate_adaptation(MODEL, vec_env(1), GOALS, record_at=(0, 2.5)), "`record_at` must be a whole number"),
+        (lambda: evaluate_adaptation(MODEL, vec_env(1), GOALS, n_episodes=2.5), "`n_episodes` must be a whole number"),
     ],
 )
 def test_bad_arguments(call, message):

@@ -1,5 +1,7 @@
 """MAML-reward's policy: SAC on a reward that is known, within the budget, and reproducible."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch as th
@@ -72,6 +74,17 @@ def test_a_pending_question_is_shown_again_by_a_model_that_was_made_anew(model, 
     again = resumed.ask()
     np.testing.assert_array_equal(again.left.actions, query.left.actions)
     np.testing.assert_array_equal(again.right.actions, query.right.actions)
+
+
+def test_another_reward_does_not_go_on_where_this_one_stood(model):
+    begun = MAMLRewardAdapter(model, walks(1), n_queries=3, seed=0, **FAST)
+    assert repr(begun) == "MAMLRewardAdapter(MAMLRewardModel, 0 of 3 answers)"
+    reward = copy.deepcopy(model.reward)
+    other = MAMLRewardModel(reward, model)
+    assert other.digest == model.digest
+    reward.parameters = {name: value + 0.1 for name, value in reward.parameters.items()}
+    with pytest.raises(ValueError, match="saved with a model of other weights than this MAMLRewardModel"):
+        MAMLRewardAdapter.from_json(begun.to_json(), other, walks(1))
 
 
 def test_what_will_not_do(trained, model):

@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
-from label_world import settled
+from label_world import make_conversations, settled
 
 from sb3_poem.adaptation.adapter import PreferenceAdapter
 from sb3_poem.adaptation.noise import MistakeNoise
@@ -94,6 +96,36 @@ def test_a_new_server_continues_at_the_same_question_with_the_same_posterior(
     assert view["belief"] == whole_view["belief"]
     for number in range(len(ANSWERS) + 1):
         assert contents(store, resumed, number) == contents(store, whole, number)
+
+
+def test_a_session_does_not_go_on_with_a_model_of_other_weights(
+    with_conversations: Callable[..., Any], store: Store, point_goal: Choice, tmp_path: Path
+) -> None:
+    async def first_half(conversations: Conversations) -> str:
+        session, token = await begin(conversations)
+        view = await settled(conversations, session)
+        await conversations.answer(session, view["turn"]["id"], "left")
+        return token
+
+    token = with_conversations(first_half)
+    model = load_choice(point_goal)
+    model.latent_means = model.latent_means + 0.1
+    model.save_pretrained(tmp_path / "PointGoal")
+
+    async def second_half() -> str:
+        conversations = make_conversations(store, replace(point_goal, folder=tmp_path / "PointGoal"))
+        session = await conversations.find(token)
+        assert session is not None
+        view = await conversations.view(session)
+        for _ in range(600):
+            if "failed" in view:
+                break
+            await asyncio.sleep(0.05)
+            view = await conversations.view(session)
+        await conversations.workshop.close()
+        return view["failed"]
+
+    assert "with a model of other weights" in asyncio.run(second_half())
 
 
 def test_undo_and_the_same_answer_lead_to_the_same_question(with_conversations: Callable[..., Any], store: Store) -> None:

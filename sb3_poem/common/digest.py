@@ -1,0 +1,20 @@
+"""A short name for what a model's numbers are."""
+
+import hashlib
+from collections.abc import Mapping
+
+import torch as th
+
+
+def digest_of(tensors: Mapping[str, th.Tensor]) -> str:
+    """The same for equal numbers under equal names, on whatever device and of whatever type.
+
+    :param tensors: By name
+    :return: Hexadecimal
+    """
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        value = tensors[name].detach().cpu().double()  # holds other types' numbers exactly
+        digest.update(f"{name} {tuple(value.shape)}".encode())
+        digest.update(value.contiguous().numpy().tobytes())
+    return digest.hexdigest()
