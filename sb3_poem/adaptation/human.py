@@ -83,6 +83,9 @@ class HumanOracle:
         self._write = write
         self._record = record
 
+    def __repr__(self) -> str:
+        return f"HumanOracle({self.n_asked} asked, videos in {self.folder})"
+
     def __call__(self, left: Trajectory, right: Trajectory) -> Preference:
         """
         Write the video, and ask until an answer is understood.

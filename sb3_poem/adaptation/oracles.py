@@ -37,6 +37,11 @@ class TaskOracle(ABC):
         # A stream of its own: an adaptation with the same seed draws its candidates from another (``inference_rng``).
         self.rng = np.random.default_rng(None if seed is None else [seed, ORACLE_STREAM])
 
+    def __repr__(self) -> str:
+        shown = {name: value for name, value in vars(self).items() if name not in ("env", "task", "rng")}
+        shown["task"] = "the environment's" if self.task is None else self.task.tolist()
+        return f"{type(self).__name__}({', '.join(f'{name}={value}' for name, value in shown.items())})"
+
     @property
     @abstractmethod
     def noise_model(self) -> NoiseModel:
@@ -127,15 +132,15 @@ class BoltzmannOracle(TaskOracle):
         seed: int | None = None,
     ) -> None:
         super().__init__(env, task, seed)
-        self._noise_model = BoltzmannNoise(beta)
+        self.noise = BoltzmannNoise(beta)
 
     @property
     def noise_model(self) -> NoiseModel:
         """Boltzmann, with this beta."""
-        return self._noise_model
+        return self.noise
 
     def _compare(self, left: float, right: float) -> Preference:
-        beta = self._noise_model.beta
+        beta = self.noise.beta
         if beta is None:
             magnitude = abs(left) + abs(right)
             beta = 1.0 / magnitude if magnitude > 0 else 0.0

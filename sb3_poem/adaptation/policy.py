@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sb3_poem.adaptation.environments import describe_model
 from sb3_poem.common.files import write_atomically
 
-FORMAT = "sb3_poem adapted policy 1"
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
+
+FORMAT = "sb3_poem adapted policy 2"
 LATENT = "latent"
 MODEL_PREFIX = "model."
 
@@ -23,13 +28,22 @@ class AdaptedPolicy:
 
     :param model: The model.
     :param latent: (d,).
+    :param n_answers: How many answers led to it.
+    :param env: The vector environment to whose task (its first copy's) it was adapted; None for a
+        policy from a file. It does not know the task itself.
     """
 
-    def __init__(self, model: Any, latent: np.ndarray) -> None:
+    def __init__(self, model: Any, latent: np.ndarray, n_answers: int = 0, env: VecEnv | None = None) -> None:
         self.model = model
+        self.n_answers = n_answers
+        self.env = env
         self.latent = np.asarray(latent, dtype=np.float64).copy()
         self.observation_space = model.observation_space
         self.action_space = model.action_space
+
+    def __repr__(self) -> str:
+        latent = ", ".join(f"{value:.2f}" for value in self.latent)
+        return f"AdaptedPolicy({describe_model(self.model)}, {self.n_answers} answers, latent=[{latent}])"
 
     def predict(
         self,
@@ -55,8 +69,8 @@ class AdaptedPolicy:
 
     def to_bytes(self) -> bytes:
         """
-        The policy as one safetensors file: the model, its configuration in the header, and the latent. Nothing in it can run
-        code.
+        The policy as one safetensors file: the model, its configuration in the header, the latent and
+        the number of answers. Nothing in it can run code.
 
         :return: The file's content, which :meth:`from_bytes` reads.
         """
@@ -67,21 +81,22 @@ class AdaptedPolicy:
 
         config, tensors = model_contents(self.model)
         named = {MODEL_PREFIX + name: value for name, value in tensors.items()}
-        return save({**named, LATENT: th.as_tensor(self.latent)}, {"format": FORMAT, "config": config_text(config)})
+        facts = {"format": FORMAT, "config": config_text(config), "n_answers": str(self.n_answers)}
+        return save({**named, LATENT: th.as_tensor(self.latent)}, facts)
 
-    def save_pretrained(self, path: str | os.PathLike[str]) -> None:
+    def save(self, path: str | os.PathLike[str]) -> None:
         """
         Write :meth:`to_bytes` to a file.
 
-        :param path: The file; a name that ends in ``.safetensors`` is best.
+        :param path: The file, whose name should end in ``.safetensors``.
         :raises OSError: If it cannot be written.
         """
         write_atomically(Path(path), self.to_bytes())
 
     @classmethod
-    def from_pretrained(cls, path: str | os.PathLike[str], device: str = "auto") -> AdaptedPolicy:
+    def load(cls, path: str | os.PathLike[str], device: str = "auto") -> AdaptedPolicy:
         """
-        Read what :meth:`save_pretrained` wrote, or what the page for answering gives for download.
+        Read what :meth:`save` wrote, or what the page for answering gives for download.
 
         :param path: The file.
         :param device: "auto", "cpu", "cuda".
@@ -102,10 +117,11 @@ class AdaptedPolicy:
         :return: The policy.
         :raises ValueError: If it is truncated, or of another program.
         """
+        import torch as th
         from safetensors import SafetensorError
         from safetensors.torch import load
 
-        from sb3_poem.common.pretrained import build_model
+        from sb3_poem.common.pretrained import build_model, parse_config
         from sb3_poem.pearl_sac import PEARLSAC
         from sb3_poem.poem_sac import POEMSAC
 
@@ -115,12 +131,21 @@ class AdaptedPolicy:
         except (SafetensorError, ValueError) as error:
             raise ValueError(f"{source} is truncated, or no safetensors file: {error}") from error
         facts = header.get("__metadata__", {})
-        if facts.get("format") != FORMAT or LATENT not in tensors:
-            raise ValueError(f"{source} is not an adapted policy of this version of sb3_poem (expected format {FORMAT!r})")
-        config = json.loads(facts["config"])
+        if facts.get("format") != FORMAT:
+            raise ValueError(
+                f"{source} is not an adapted policy of this version of sb3_poem: its format is "
+                f"{facts.get('format')!r}, expected {FORMAT!r}"
+            )
+        config = parse_config(facts.get("config", ""), source)
         algorithms: dict[str, type[PEARLSAC]] = {"POEMSAC": POEMSAC, "PEARLSAC": PEARLSAC}
-        if config.get("algorithm") not in algorithms:
-            raise ValueError(f"{source} holds a {config.get('algorithm')}, known are {', '.join(algorithms)}")
-        latent = tensors.pop(LATENT).numpy()
+        if config["algorithm"] not in algorithms:
+            raise ValueError(f"{source} holds a {config['algorithm']}, known are {', '.join(algorithms)}")
+        latent, n_answers = tensors.pop(LATENT, th.zeros(0)).double().numpy(), facts.get("n_answers", "")
         parts = {name.removeprefix(MODEL_PREFIX): value for name, value in tensors.items()}
-        return cls(build_model(algorithms[config["algorithm"]], config, parts, source, device), latent)
+        model = build_model(algorithms[config["algorithm"]], config, parts, source, device)
+        if latent.shape != (model.latent_dim,) or not np.isfinite(latent).all() or not re.fullmatch("[0-9]{1,9}", n_answers):
+            raise ValueError(
+                f"{source} is broken: an adapted policy has a finite latent of {model.latent_dim} numbers and a number of "
+                f"answers, but its latent has shape {latent.shape} and its answers are {n_answers!r}"
+            )
+        return cls(model, latent, int(n_answers))

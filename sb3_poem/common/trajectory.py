@@ -74,6 +74,11 @@ class Trajectory:
         if self.reward_features is not None and len(self.reward_features) != steps:
             raise ValueError(f"`reward_features` must hold one row a step ({steps}), but holds {len(self.reward_features)}")
 
+    def __repr__(self) -> str:
+        frames = "" if self.frames is None else f", {len(self.frames)} frames"
+        widths = f"{self.observations.shape[-1]} observations and {self.actions.shape[-1]} actions"
+        return f"Trajectory({len(self)} steps of {widths}{frames})"
+
     def __len__(self) -> int:
         """The number of steps T."""
         return len(self.actions)

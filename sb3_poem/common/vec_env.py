@@ -156,6 +156,10 @@ class TaskVecEnv(VecEnv):
         assert images is not None
         return images
 
+    def __repr__(self) -> str:
+        spec = self.vector_env.spec
+        return f"TaskVecEnv({'an unregistered family' if spec is None else spec.id}, {self.num_envs} copies)"
+
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         return [getattr(self._views[index], attr_name) for index in self._get_indices(indices)]
 

@@ -157,7 +157,7 @@ class _Pages:
         choice = self.conversations.catalogue.get(session.model)
         if turn is None or choice is None:
             raise RefusedError("the policy can be downloaded once its result is shown")
-        return AdaptedPolicy(self.conversations.load(choice), json.loads(turn["latent"])).to_bytes()
+        return AdaptedPolicy(self.conversations.load(choice), json.loads(turn["latent"]), answered).to_bytes()
 
     async def _find(self, request: Request) -> Session:
         token = request.path_params["token"]

@@ -223,8 +223,10 @@ class PEARLSAC(SamplingSAC):
             _init_setup_model=_init_setup_model,
         )
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({getattr(self, 'env_id', None)}, {self.num_timesteps:,} steps trained)"
+
     def _setup_model(self) -> None:
-        self.policy_kwargs.pop("use_sde", None)
         if self.env is not None:
             self._family = self._family_of(self.env)
             self.horizon = self._family.horizon

@@ -1,11 +1,14 @@
 """Ask and tell: the protocol, what it may see, and that it resumes exactly."""
 
 import json
+import re
+import warnings
 from functools import partial
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from gymnasium import spaces
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -14,15 +17,24 @@ from worlds import Blinded, SpeedEnv, SpeedModel
 from sb3_poem import POEMSAC
 from sb3_poem.adaptation import (
     BoltzmannNoise,
+    BoltzmannOracle,
     ExactNoise,
+    HumanOracle,
     MistakeNoise,
     MistakeOracle,
     Preference,
     PreferenceAdapter,
     ReturnOracle,
     adapt_tasks,
+    evaluate_adaptation,
+    evaluate_episodes,
+    known_task_return,
 )
-from sb3_poem.resources import pretrained_folder
+from sb3_poem.baselines.anole import ANOLEOptions
+from sb3_poem.baselines.maml_adapter import MAMLRewardOptions
+from sb3_poem.baselines.reward_oracle import RewardOracleOptions
+from sb3_poem.common.digest import digest_of
+from sb3_poem.common.vec_env import make_task_vec_env
 
 GOAL = np.array([2.2])
 RULES = [{"inference": "bayes"}, {"inference": "bayes", "likelihood": "similarity"}, {"inference": "paper"}]
@@ -38,6 +50,11 @@ def outside_oracle(left, right):
     """Knows the goal, and sees observations only."""
     left_miss, right_miss = (np.abs(trajectory.observations[1:, 1] - GOAL).sum() for trajectory in (left, right))
     return Preference.LEFT if left_miss < right_miss else Preference.RIGHT
+
+
+@pytest.fixture(scope="module")
+def point_goal():
+    return POEMSAC.from_pretrained("PointGoal", device="cpu")
 
 
 def adapter(env=None, seed=0, **kwargs):
@@ -189,7 +206,7 @@ def test_saving_replaces_the_file_only_once_the_new_one_is_whole(tmp_path, monke
         ("[1]", "holds a list"),
         ('{"format": "optuna"}', "`format` is 'optuna'"),
         ('{"format": "sb3_poem.PreferenceAdapter", "version": 99}', "version 99"),
-        ('{"format": "sb3_poem.PreferenceAdapter", "version": 1}', "incomplete"),
+        ('{"format": "sb3_poem.PreferenceAdapter", "version": 2}', "incomplete"),
     ],
 )
 def test_foreign_and_truncated_files_are_refused(tmp_path, content, message):
@@ -203,6 +220,118 @@ def test_another_models_file_is_refused():
     text = adapter().to_json()
     with pytest.raises(ValueError, match="latent_dim=5, but the model has 4"):
         PreferenceAdapter.from_json(text, SpeedModel(latent_dim=4), make_env())
+
+
+def test_the_same_weights_go_on_and_others_are_refused(point_goal, tmp_path):
+    env = make_task_vec_env(point_goal.env_id, 1)
+    begun = PreferenceAdapter(point_goal, env, oracle=ReturnOracle(), seed=0, n_queries=2, n_candidates=20)
+    answer(begun, 1, begun.oracle)
+    text = begun.to_json()
+    point_goal.save(tmp_path / "m.zip")
+    point_goal.save_pretrained(tmp_path / "folder")
+    for again in (POEMSAC.load(tmp_path / "m.zip", device="cpu"), POEMSAC.from_pretrained(tmp_path / "folder", device="cpu")):
+        assert again.digest == point_goal.digest
+        np.testing.assert_array_equal(PreferenceAdapter.from_json(text, again, env).policy().latent, begun.policy().latent)
+        with torch.no_grad():
+            again.policy.critic.members[0].output.bias += 1.0  # which adaptation does not use
+        assert again.digest == point_goal.digest
+        for tensor in (again.policy.actor.mlp.output.bias, again.policy.obs_mean, again.policy.reward_mapping.output.weight):
+            with torch.no_grad():
+                tensor += 0.01
+            with pytest.raises(ValueError, match="saved with a model of other weights than this POEMSAC on poem/PointGoal-v0"):
+                PreferenceAdapter.from_json(text, again, env)
+            with torch.no_grad():
+                tensor -= 0.01
+    other = POEMSAC.load(tmp_path / "m.zip", device="cpu")
+    other.latent_means = other.latent_means + 0.1
+    begun.save(tmp_path / "state.json")
+    with pytest.raises(ValueError, match="other weights"):
+        PreferenceAdapter.load(tmp_path / "state.json", other, env)
+
+
+def test_a_digest_is_of_the_numbers_not_of_how_they_are_kept():
+    numbers = torch.arange(6, dtype=torch.float32).reshape(2, 3) / 8
+    digest = digest_of({"a": numbers, "b": torch.ones(1)})
+    for kind in (torch.float64, torch.bfloat16, torch.float16):
+        assert digest_of({"b": torch.ones(1, dtype=torch.int64), "a": numbers.to(kind)}) == digest
+    assert digest_of({"a": numbers.T.contiguous().T, "b": torch.ones(1)}) == digest
+    assert digest_of({"a": numbers.reshape(3, 2), "b": torch.ones(1)}) != digest
+    assert digest_of({"a": numbers, "c": torch.ones(1)}) != digest
+    assert digest_of({"a": numbers + 1e-7, "b": torch.ones(1)}) != digest
+
+
+def test_a_model_that_was_not_trained(point_goal):
+    untrained = POEMSAC("MlpPolicy", point_goal.env_id, n_train_tasks=2, device="cpu")
+    env, tasks = make_task_vec_env(point_goal.env_id, 1), np.array([[0.5]])
+    calls = (
+        lambda model: PreferenceAdapter(model, env, n_candidates=10),
+        lambda model: evaluate_adaptation(model, env, tasks, record_at=[0], n_episodes=1),
+    )
+    for call in calls:
+        with pytest.warns(UserWarning, match="POEMSAC on poem/PointGoal-v0 has not been trained") as warned:
+            call(untrained)
+        assert [item.filename for item in warned if "not been trained" in str(item.message)] == [__file__]
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            call(point_goal)
+
+
+@pytest.mark.parametrize("value", [2.5, True, "10", -3, np.float64(4)])
+@pytest.mark.parametrize("name", ["n_queries", "n_candidates", "seed"])
+def test_only_whole_numbers_will_do(name, value):
+    calls = [
+        lambda: PreferenceAdapter(SpeedModel(), make_env(), **{name: value}),
+        lambda: adapt_tasks(SpeedModel(), DummyVecEnv([SpeedEnv]), np.array([[0.4]]), ReturnOracle, **{name: value}),
+    ]
+    if name == "n_queries":
+        calls += [lambda: ANOLEOptions(value), lambda: RewardOracleOptions(value), lambda: MAMLRewardOptions(value)]
+    for call in calls:
+        with pytest.raises(ValueError, match=f"`{name}` must be (a whole number|at least [012]), but is"):
+            call()
+
+
+def test_a_policy_knows_by_whose_answers_it_was_adapted(point_goal):
+    env = make_task_vec_env(point_goal.env_id, 2)
+    one = PreferenceAdapter(point_goal, env, oracle=ReturnOracle(), seed=0, n_queries=1, n_candidates=20)
+    assert (one.policy().n_answers, one.policy().env) == (0, env)
+    policy = one.adapt()
+    assert policy.n_answers == 1
+    assert policy.env is env
+    mean, _ = evaluate_policy(policy, policy.env, n_eval_episodes=2, warn=False)
+    assert np.isfinite(mean)
+    assert not any("task" in name for name in vars(policy))
+
+
+def test_what_a_notebook_shows(point_goal):
+    env, tasks = make_task_vec_env(point_goal.env_id, 2), np.array([[0.5], [1.5]])
+    one = PreferenceAdapter(point_goal, env, oracle=ReturnOracle(), seed=0, n_queries=2, n_candidates=20)
+    query, policy = one.ask(), one.policy()
+    latent = r"\[(-?\d\.\d\d, ){4}-?\d\.\d\d\]"
+    trajectory = r"Trajectory\(25 steps of 2 observations and 2 actions\)"
+    outcomes = evaluate_episodes(point_goal, env, np.zeros((2, 5)), tasks, 3)
+    adapted = evaluate_adaptation(point_goal, env, tasks, record_at=(0, 1), n_episodes=1, n_candidates=20)
+    shown = {
+        r"POEMSAC\(poem/PointGoal-v0, 105,000 steps trained\)": point_goal,
+        rf"AdaptedPolicy\(POEMSAC on poem/PointGoal-v0, 0 answers, latent={latent}\)": policy,
+        r"PreferenceAdapter\(POEMSAC on poem/PointGoal-v0, bayes, 0 of 2 answers\)": one,
+        r"PreferenceAdapter\(SpeedModel, paper, 0 of 10 answers\)": adapter(inference="paper"),
+        rf"Query\(left={trajectory}, right={trajectory}\)": query,
+        r"ReturnOracle\(task=the environment's\)": ReturnOracle(),
+        r"MistakeOracle\(rate=0.7, task=\[1.0\]\)": MistakeOracle(0.7, task=[1.0]),
+        r"BoltzmannOracle\(noise=BoltzmannNoise\(beta=2\), task=the environment's\)": BoltzmannOracle(2),
+        r"HumanOracle\(0 asked, videos in preference_queries\)": HumanOracle(),
+        r"EpisodeOutcomes\(2 times 3 episodes, mean return -\d+\.\d\)": outcomes,
+        r"AdaptationEvaluation\(2 tasks, mean return -\d+\.\d, -\d+\.\d after 0, 1 answers\)": adapted,
+        r"KnownTaskReturn\(2 tasks, mean return -\d+\.\d of the best of 6 latents\)": known_task_return(
+            point_goal, env, tasks, 6, 1
+        ),
+        r"TaskAdaptations\(2 tasks, after 0, 1, 2 answers\)": adapt_tasks(
+            point_goal, env, tasks, ReturnOracle, n_queries=2, n_candidates=20
+        ),
+        r"TaskVecEnv\(poem/PointGoal-v0, 2 copies\)": env,
+    }
+    for pattern, thing in shown.items():
+        assert re.fullmatch(pattern, repr(thing)), repr(thing)
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -272,7 +401,7 @@ def test_an_oracle_that_returns_something_else():
         ({"decision": "best"}, "`decision` must be one of"),
         ({"epsilon": 0.5}, "`epsilon` must lie in"),
         ({"n_candidates": 1}, "`n_candidates` must be at least 2"),
-        ({"seed": -1}, "`seed` must not be negative"),
+        ({"seed": -1}, "`seed` must be at least 0, but is -1"),
         ({"inference": "paper", "library": []}, "`library` needs"),
     ],
 )
@@ -328,8 +457,8 @@ def test_numbers_of_numpy_can_be_saved():
     assert (resumed.options.n_queries, resumed.options.epsilon) == (3, 0.125)
 
 
-def test_a_library_in_an_environment_that_was_not_reset():
-    model = POEMSAC.from_pretrained(pretrained_folder("PointGoal"), device="cpu")
+def test_a_library_in_an_environment_that_was_not_reset(point_goal):
+    model = point_goal
     source = PreferenceAdapter(model, "poem/PointGoal-v0", oracle=ReturnOracle(), seed=0, n_queries=2)
     source.adapt()
     library = [trajectory for item in source.answers for trajectory in (item.left, item.right)]

@@ -132,13 +132,14 @@ def test_replay_knows_a_model_by_its_folder_and_says_which_it_lacks(
     result, own = tmp_path / "replay.json", str(tmp_path / "models" / "PointGoal")
     assert cli.main(["label", "replay", "--store", str(store.folder), "--model", own, "--json", str(result)]) == 0
     assert json.loads(result.read_text())["sessions"][0]["action_error"] is None
-    with sqlite3.connect(store.folder / "answers.sqlite") as connection:
-        connection.execute("update sessions set model = 'gone'")
-    capsys.readouterr()
-    assert cli.main(["label", "replay", "--store", str(store.folder)]) == 1
-    shown = capsys.readouterr()
-    assert "recorded with a model 'gone'" in " ".join(shown.out.split())
-    assert "no session could be replayed" in shown.err
+    for gone in ("gone", str(tmp_path / "models" / "PointGoal")):  # a store that comes from elsewhere opens no other file
+        with sqlite3.connect(store.folder / "answers.sqlite") as connection:
+            connection.execute("update sessions set model = ?", (gone,))
+        capsys.readouterr()
+        assert cli.main(["label", "replay", "--store", str(store.folder)]) == 1
+        shown = capsys.readouterr()
+        assert f"recorded with a model '{gone}'" in " ".join(shown.out.split())
+        assert "no session could be replayed" in shown.err
 
 
 @pytest.mark.parametrize(
@@ -221,10 +222,11 @@ def _post(url: str, body: dict[str, Any]) -> None:
 def test_an_adapted_policy_is_one_file(point_goal: Choice, tmp_path: Path) -> None:
     model = load_choice(point_goal)
     latent = np.random.default_rng(0).standard_normal(model.latent_dim)
-    policy = AdaptedPolicy(model, latent)
+    policy = AdaptedPolicy(model, latent, 7)
     path = tmp_path / "policy.safetensors"
-    policy.save_pretrained(path)
-    again = AdaptedPolicy.from_pretrained(path)
+    policy.save(path)
+    again = AdaptedPolicy.load(path)
+    assert (again.n_answers, again.env) == (7, None)
     np.testing.assert_array_equal(again.latent, latent)
     observations = np.random.default_rng(1).standard_normal((5, 2))
     np.testing.assert_array_equal(again.predict(observations)[0], policy.predict(observations)[0])
