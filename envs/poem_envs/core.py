@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import sys
+from abc import ABC, ABCMeta, abstractmethod
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
@@ -16,6 +17,8 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
+
+from poem_envs.headless import has_display
 
 # Rounding in float32 policies and files may leave a value just outside its bounds: up to this it is clipped, not refused.
 BOUNDS_TOLERANCE = 1e-6
@@ -79,7 +82,7 @@ class Symmetry(NamedTuple):
         return Symmetry(*(mine.then(its) for mine, its in zip(self, other, strict=True)))
 
 
-class TaskDefinition:
+class TaskDefinition(ABC):
     """The tasks of a family and their rewards: what its single and its vectorised environment have in common.
 
     A subclass sets the attributes below and defines :meth:`_reward`; unless its tasks are uniform on ``task_space`` or
@@ -163,17 +166,17 @@ class TaskDefinition:
         """Optional, for families whose rewards say where to be rather than how to move."""
         raise NotImplementedError(f"{type(self).__name__} defines no _potential(tasks, observations)")
 
+    @abstractmethod
     def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
         """The reward function. Only elementwise operations, so that one step and a batch give the same bits."""
-        raise NotImplementedError
 
     def _draw_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draw from the distribution of an infinite family: uniform on ``task_space`` unless overridden."""
         return rng.uniform(self.task_space.low, self.task_space.high, size=(n, *self.task_space.shape))
 
+    @abstractmethod
     def _describe_episode(self, copy: int) -> str:
         """Where a copy's episode is, for error messages. Defined by the environment classes."""
-        raise NotImplementedError
 
     def _choose_split(self, split: str) -> None:
         """Set :attr:`split`, or raise a ValueError that lists those that there are."""
@@ -209,7 +212,41 @@ class TaskDefinition:
         return self.all_tasks[distance.argmin(axis=-1)]
 
 
-class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray]):
+class _NothingToRender:
+    """The ``metadata`` of families that cannot be rendered. Their classes have none: SB3 asks every
+    environment for RGB images first, and ``gym.make``, which looks at the class, would warn.
+    """
+
+    def __get__(self, instance: object, owner: type) -> dict[str, Any]:
+        if instance is None:
+            raise AttributeError(f"{owner.__name__} cannot be rendered, and has no metadata")
+        return {"render_modes": []}
+
+
+#: What a family must set, in its class or its constructor, and to what.
+REQUIRED_ATTRIBUTES = {
+    "observation_space": "a flat gymnasium.spaces.Box",
+    "action_space": "a flat gymnasium.spaces.Box, bounded below and above",
+    "task_space": "a gymnasium.spaces.Box of shape (task_dim,) and dtype float64",
+    "reward_feature_dim": "a whole number from 1 on",
+}
+
+
+class _FamilyType(ABCMeta):
+    """Looks at a family when it is made, whether or not its constructor called ``super().__init__``."""
+
+    def __call__(cls, *args: Any, **kwargs: Any) -> Any:
+        family = super().__call__(*args, **kwargs)
+        missing = {name: what for name, what in REQUIRED_ATTRIBUTES.items() if not hasattr(family, name)}
+        if missing:
+            wanted = ", ".join(f"{name} ({what})" for name, what in missing.items())
+            raise TypeError(f"the task family {cls.__name__} must set {wanted}; see poem_envs.TaskFamily")
+        modes = [mode for mode in family.metadata["render_modes"] if mode != "human" or has_display()]
+        family.metadata = {**family.metadata, "render_modes": modes}
+        return family
+
+
+class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
     """Base class of a single environment whose task is hidden.
 
     A subclass sets ``observation_space``, ``action_space``, ``task_space``, ``reward_feature_dim`` and defines three methods::
@@ -233,9 +270,12 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray]):
 
     The base class checks actions and tasks, draws and keeps the task, computes the reward and fills in the info.
 
-    **The task.** :meth:`set_task` chooses it, from the next reset on. As long as none was chosen, ``reset(seed=...)`` draws
-    one from the family's distribution, from a stream of its own that the seed determines; a reset without a seed keeps it.
-    Neither choice touches the random numbers of the episode itself, so two tasks see the same start.
+    **The task.** As long as none was chosen, ``reset(seed=...)`` draws one from the family's
+    distribution, from a stream of its own that the seed determines, and a reset without a seed keeps
+    it. :meth:`set_task` chooses one, from the next reset on, and then no seed draws another; so does
+    ``reset(options={"task": task})``. Gymnasium's wrappers forward no ``set_task``:
+    ``poem_envs.set_task(env, task)`` reaches through them. None of this touches the random numbers of
+    the episode itself, so two tasks see the same start.
 
     **The info** of every step holds ``"reward_features"``, ``(reward_feature_dim,)`` float64: everything that rewards of this
     family depend on (see :meth:`~TaskDefinition.compute_reward`). A family whose :meth:`_step_info` gives ``"success"``,
@@ -245,10 +285,11 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray]):
     :param render_mode: one of ``metadata["render_modes"]``, or None
     :param render_task: whether rendering shows the hidden task, for a developer who debugs
     :param split: one of :attr:`splits`, to draw tasks from
-    :raises ValueError: if there is no such split or render mode
+    :raises ValueError: if there is no such split or render mode, or no display for ``render_mode="human"``
+    :raises TypeError: if a method or an attribute is missing; the message says which
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (Gymnasium declares it so)
+    metadata: dict[str, Any] = _NothingToRender()  # type: ignore[assignment]
     render_task: bool = False
 
     # Class attributes, so that a subclass need not call super().__init__.
@@ -281,7 +322,7 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin an episode.
 
-        :param seed: makes this and the following episodes reproducible
+        :param seed: makes this and the following episodes reproducible; draws another task, unless one was chosen
         :param options: ``{"task": task}`` is short for :meth:`set_task` just before
         :return: the observation and an empty info
         """
@@ -324,13 +365,13 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray]):
             info["is_success"] = self._succeeded
         return observation, reward, bool(terminated), False, info
 
+    @abstractmethod
     def _begin_episode(self, rng: np.random.Generator) -> np.ndarray:
         """Put the environment into a start state and return its observation, a new array."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _simulate(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
         """Apply a valid action; return new arrays of observation and reward features, and whether the episode ended early."""
-        raise NotImplementedError
 
     def _step_info(self) -> dict[str, Any]:
         """Further entries of the info of the step just taken, say ``{"success": True}``: none unless overridden."""
@@ -351,7 +392,7 @@ def check_render_mode(render_mode: str | None, metadata: dict[str, Any]) -> None
 
     :param render_mode: what was asked for
     :param metadata: the environment's own
-    :raises ValueError: if it can render, but not so
+    :raises ValueError: if it can render, but not so, or not on this machine
     :raises TypeError: if it cannot render at all; upon that SB3's ``make_vec_env``, which always asks, makes it without
     """
     modes = metadata["render_modes"]
@@ -359,6 +400,8 @@ def check_render_mode(render_mode: str | None, metadata: dict[str, Any]) -> None
         raise TypeError(f"render_mode={render_mode!r} is not supported: this environment cannot be rendered")
     if render_mode is not None and render_mode not in modes:
         raise ValueError(f"render_mode={render_mode!r} is not supported, choose None or one of {modes}")
+    if render_mode == "human" and not has_display():
+        raise ValueError("render_mode='human' needs a display; use 'rgb_array' on a machine without one")
 
 
 def check_options(options: dict[str, Any] | None, known: frozenset[str]) -> dict[str, Any]:

@@ -8,13 +8,17 @@ import sys
 _logger = logging.getLogger(__name__)
 
 
+def has_display() -> bool:
+    """Whether windows can open; on systems other than Linux it is taken for granted."""
+    return sys.platform != "linux" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+
+
 def choose_headless_backend() -> None:
     """On a Linux machine without a display, let MuJoCo render through EGL or OSMesa, unless the user chose already.
 
     Left to itself, Gymnasium's renderer tries a window first, and goes on as if it had got one.
     """
-    has_display = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
-    if sys.platform != "linux" or has_display or "MUJOCO_GL" in os.environ:
+    if has_display() or "MUJOCO_GL" in os.environ:
         return
     for backend, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
         if ctypes.util.find_library(library):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from abc import abstractmethod
 from typing import Any
 
 import numpy as np
@@ -26,17 +27,17 @@ class ReplayFamily(TaskFamily):
     _start_state: np.ndarray | None = None
     _actions: list[np.ndarray]
 
+    @abstractmethod
     def _build(self) -> None:
         """Make the simulator. Called by the subclass's constructor, and for a copy."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _begin_simulation(self, rng: np.random.Generator) -> np.ndarray:
         """As :meth:`_begin_episode`."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _step_simulation(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
         """As :meth:`_simulate`."""
-        raise NotImplementedError
 
     def _begin_episode(self, rng: np.random.Generator) -> np.ndarray:
         self._start_rng, self._start_state, self._actions = copy.deepcopy(rng), None, []

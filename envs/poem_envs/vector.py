@@ -5,6 +5,7 @@ Both run the same code, the single one as a batch of one, so their results agree
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -44,33 +45,33 @@ class BatchFamily(TaskDefinition):
 
         def __init__(self, **kwargs: Any) -> None: ...
 
+    @abstractmethod
     def _allocate(self, n: int) -> None:
         """Make room for the states of ``n`` copies. Called once, by the constructor."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _begin_episodes(self, copies: np.ndarray, rngs: Sequence[np.random.Generator]) -> None:
         """Put some copies into a start state.
 
         :param copies: their numbers
         :param rngs: a generator for each of them
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Step all copies.
 
         :param actions: ``(n, action_dim)`` float64, valid
         :return: new arrays: reward features ``(n, reward_feature_dim)``, and whether each episode ended early ``(n,)``
         """
-        raise NotImplementedError
 
     def _step_infos(self) -> dict[str, np.ndarray]:
         """Further entries of the infos of the step just taken, a row for each copy: none unless overridden."""
         return {}
 
+    @abstractmethod
     def _observations(self) -> np.ndarray:
         """The observations of all copies, ``(n, obs_dim)``, a new array."""
-        raise NotImplementedError
 
     def _physics_state(self, copy: int) -> np.ndarray:
         """All that determines how a copy goes on, ``(state_dim,)``, a new array."""
@@ -259,7 +260,8 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin an episode in every copy.
 
-        :param seed: ``s`` seeds copy ``i`` with ``s + i``; or one seed (or None) for each copy
+        :param seed: ``s`` seeds copy ``i`` with ``s + i``; or one seed (or None) for each copy. It draws other tasks, except
+            for copies whose task was chosen
         :param options: ``{"tasks": tasks}`` is short for :meth:`set_tasks` just before
         :return: the observations ``(num_envs, obs_dim)`` and an empty info
         """

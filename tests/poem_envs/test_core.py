@@ -65,12 +65,48 @@ def test_a_minimal_family_in_sb3s_own_vec_env():
     assert vec_env.env_method("compute_reward", tasks, features, indices=[0])[0] == pytest.approx(rewards)
 
 
-@pytest.mark.filterwarnings("ignore:.*is being initialised with render_mode='rgb_array'")
+@pytest.mark.filterwarnings("error", "ignore:.*A Box observation space m.*imum value is")
 def test_a_minimal_family_in_make_vec_env():
+    """SB3 asks for RGB images first; that the family has none is nothing to be warned of."""
     gym.register("test/Walk1D-v0", entry_point=Walk1D, max_episode_steps=10)
-    vec_env = make_vec_env("test/Walk1D-v0", 2, seed=0)
-    assert vec_env.reset().shape == (2, 1)
-    assert vec_env.render_mode is None
+    try:
+        vec_env = make_vec_env("test/Walk1D-v0", 2, seed=0)
+        assert vec_env.reset().shape == (2, 1)
+        assert vec_env.render_mode is None
+        gymnasium_check_env(gym.make("test/Walk1D-v0").unwrapped)
+    finally:
+        del gym.registry["test/Walk1D-v0"]
+
+
+class NoReward(TaskFamily):
+    observation_space, action_space = Walk1D.observation_space, Walk1D.action_space
+    task_space, reward_feature_dim = Walk1D.task_space, 1
+    _begin_episode, _simulate = Walk1D._begin_episode, Walk1D._simulate
+
+
+class NoSpaces(TaskFamily):
+    """Its constructor does not call that of the base class, and sets one of four attributes."""
+
+    _begin_episode, _simulate, _reward = Walk1D._begin_episode, Walk1D._simulate, Walk1D._reward
+
+    def __init__(self):
+        self.observation_space = Walk1D.observation_space
+
+
+@pytest.mark.parametrize(
+    ("family", "message"),
+    [
+        (NoReward, "abstract.*NoReward.*_reward"),
+        (
+            NoSpaces,
+            r"NoSpaces must set action_space \(a flat .*Box, bounded.*\), task_space \(a .*Box of shape "
+            r"\(task_dim,\) and dtype float64\), reward_feature_dim \(a whole number",
+        ),
+    ],
+)
+def test_what_a_family_lacks_is_said_when_it_is_made(family, message):
+    with pytest.raises(TypeError, match=message):
+        family()
 
 
 def run_python(code):

@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 
 import poem_envs  # noqa: F401 (registers)
 
@@ -165,3 +166,13 @@ def test_tasks_of_different_manipulations_render_in_turn():
     for first, second in zip(images[:3], images[3:], strict=True):
         np.testing.assert_array_equal(first, second)
     env.close()
+
+
+@pytest.mark.filterwarnings("ignore:.*A Box observation space m.*imum value is")
+@pytest.mark.parametrize("env_id", ["poem/PointGoal-v0", "poem/HalfCheetahVel-v0"])
+def test_gymnasiums_checker_needs_no_display(env_id, monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    check_env(gym.make(env_id, width=64, height=64).unwrapped)
+    with pytest.raises(ValueError, match="render_mode='human' needs a display; use 'rgb_array'"):
+        gym.make(env_id, render_mode="human")
