@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 
 from poem_envs.core import BOUNDS_TOLERANCE
 from poem_envs.mujoco_rendering import prepare_to_render
@@ -36,15 +37,11 @@ class GoalFamily(ReplayFamily):
 
     An example::
 
-        gym.register(
-            "my/FetchSlide-v0",
-            entry_point=GoalFamily,
-            kwargs={"env": "gymnasium_robotics:FetchSlide-v4"},
-            max_episode_steps=50,
-        )
+        gym.register("my/FetchSlide-v0", entry_point=GoalFamily, kwargs={"env": "gymnasium_robotics:FetchSlide-v4"})
 
-    The environment's resets must depend on their seed alone. Time limits of its registration are left to the family's own, and
-    other wrappers than those of ``gym.make`` are refused.
+    The environment's resets must depend on their seed alone. Its time limit is the family's too (:attr:`max_episode_steps`),
+    unless the family is registered with another or ``gym.make`` is given one. Other wrappers than those of ``gym.make`` are
+    refused.
 
     :param env: an id, or a function that makes the environment
     :param observe_achieved_goal: whether the observation holds the achieved goal, which is needed unless
@@ -62,6 +59,9 @@ class GoalFamily(ReplayFamily):
 
     metadata = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012 (Gymnasium declares it so)
     _simulator_attributes = ("env", "_goal_env")
+    #: The time limit of the environment; None if it has none.
+    max_episode_steps: int | None = None
+    _spec: EnvSpec | None = None
 
     def __init__(
         self,
@@ -121,8 +121,28 @@ class GoalFamily(ReplayFamily):
                     f"env makes {env}: its {type(wrapper).__name__} would have no effect, since the family steps the "
                     "environment inside all wrappers. Make it without, or put what it does into the environment itself"
                 )
+            self.max_episode_steps = getattr(wrapper, "_max_episode_steps", self.max_episode_steps)
             wrapper = wrapper.env
         return wrapper  # the family checks actions itself, and a time limit of its own ends episodes
+
+    @property  # type: ignore[override]
+    def spec(self) -> EnvSpec | None:
+        """How the family is registered; None if it was not made by ``gym.make``."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        # gym.make sets this before it looks for the registration's time limit.
+        self._spec = spec
+        registered = None if spec is None else gym.registry.get(spec.id)
+        if registered is not None and registered.max_episode_steps is None:
+            registered.max_episode_steps = self.max_episode_steps
+
+    def step(self, action: npt.ArrayLike) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """See :class:`TaskFamily`; a family that was not made by ``gym.make`` keeps its time limit itself."""
+        observation, reward, terminated, _, info = super().step(action)
+        truncated = self._spec is None and self._elapsed_steps >= (self.max_episode_steps or np.inf)
+        return observation, reward, terminated, truncated, info
 
     def _build(self) -> None:
         self.env = self._make()

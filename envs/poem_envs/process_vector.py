@@ -183,7 +183,8 @@ class ProcessFamilyVector(TaskFamilyVector):
     :param family: a :class:`~poem_envs.TaskFamily` class, or a function that makes such an environment
     :param num_envs: number of copies
     :param nthread: number of processes; None for as many as this process may use cores
-    :param max_episode_steps: episodes are truncated after so many steps; None for never
+    :param max_episode_steps: episodes are truncated after so many steps; None for as many as a :class:`GoalFamily`'s
+        environment has, or never
     :param render_mode: as the family has them; ``"human"`` for one copy only
     :param render_task: whether rendering shows the hidden tasks
     :param family_kwargs: further arguments of the family
@@ -218,6 +219,8 @@ class ProcessFamilyVector(TaskFamilyVector):
                 f"family={family!r} makes a {type(self._template).__name__}, but it must make a poem_envs.TaskFamily"
             )
         self.metadata = {**self._template.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}
+        if max_episode_steps is None:
+            max_episode_steps = getattr(self._template, "max_episode_steps", None)
         self._copy_definition()
         observation_space, action_space = self._template.observation_space, self._template.action_space
         assert isinstance(observation_space, spaces.Box)

@@ -63,6 +63,8 @@ class FamilyEnv:
             if name not in DRAWING_ARGUMENTS and not (name in registered and _equal(registered[name], value))
         }
         limit = None if spec is None else spec.max_episode_steps
+        if limit is None and env.has_attr("max_episode_steps"):  # of a GoalFamily that was not made by gym.make
+            limit = self._get("max_episode_steps")
         steps = horizon if limit is None else limit
         if steps is None:
             raise ValueError("horizon is unknown: register the environment with max_episode_steps, or pass horizon=<steps>")

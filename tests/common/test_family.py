@@ -12,6 +12,7 @@ from meta_toys import POINT_GOAL, OtherWalk, TwoWalks, Walk, WindyWalk, walks
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
 
+from poem_envs import GoalFamily
 from sb3_poem.common.family import FamilyEnv
 from sb3_poem.common.vec_env import TaskVecEnv
 
@@ -97,6 +98,11 @@ def test_the_horizon_must_be_known_and_agree() -> None:
     with pytest.raises(ValueError, match="horizon is 30, but the environment ends episodes after 25 steps; they must agree"):
         FamilyEnv(make_vec_env(POINT_GOAL, 1), 30)
     assert FamilyEnv(make_vec_env(POINT_GOAL, 1), 25).horizon == 25
+
+
+def test_the_horizon_of_a_goal_family_is_that_of_its_environment() -> None:
+    family = GoalFamily("gymnasium_robotics:FetchReach-v4")
+    assert FamilyEnv(DummyVecEnv([lambda: family])).horizon == 50
 
 
 @pytest.mark.parametrize("horizon", [0, -5])

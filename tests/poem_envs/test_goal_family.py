@@ -1,12 +1,14 @@
 """Goal-conditioned environments as families, against those environments themselves."""
 
+import functools
+
 import gymnasium as gym
 import gymnasium_robotics
 import numpy as np
 import pytest
 from gymnasium import spaces
 
-from poem_envs import GoalFamily
+from poem_envs import GoalFamily, ProcessFamilyVector
 
 gym.register_envs(gymnasium_robotics)
 FETCH = [("poem/FetchReach-v0", "FetchReach-v4"), ("poem/FetchPush-v0", "FetchPush-v4")]
@@ -152,6 +154,42 @@ class RewardOfTheInfo(Reach):
 def test_environments_that_are_not_goal_conditioned(env, message):
     with pytest.raises(ValueError, match=message):
         GoalFamily(env)
+
+
+def length_of_an_episode(env):
+    env.reset(seed=0)
+    for step in range(1, 100):
+        if env.step(np.zeros(2))[3]:
+            return step
+    return None
+
+
+@pytest.fixture
+def reach_id():
+    family = functools.partial(GoalFamily, "test/Reach-v0")
+    gym.register("test/Reach-v0", Reach, max_episode_steps=7)
+    gym.register("test/ReachFamily-v0", family, vector_entry_point=functools.partial(ProcessFamilyVector, family))
+    gym.register("test/LongReachFamily-v0", family, max_episode_steps=11)
+    yield "test/ReachFamily-v0"
+    for name in ("test/Reach-v0", "test/ReachFamily-v0", "test/LongReachFamily-v0"):
+        del gym.registry[name]
+
+
+def test_the_environments_time_limit_is_the_familys(reach_id):
+    vector_env = gym.make_vec(reach_id, num_envs=2, nthread=1)
+    vector_env.reset(seed=0)
+    ends = [vector_env.step(np.zeros((2, 2)))[3].all() for _ in range(7)]
+    assert ends == [False] * 6 + [True]
+    env = gym.make(reach_id)
+    assert env.spec.max_episode_steps == gym.spec(reach_id).max_episode_steps == 7
+    assert length_of_an_episode(env) == length_of_an_episode(GoalFamily("test/Reach-v0")) == 7
+    assert length_of_an_episode(GoalFamily(lambda: gym.wrappers.TimeLimit(Reach(), 5))) == 5
+    assert length_of_an_episode(GoalFamily(Reach)) is None
+
+
+def test_a_time_limit_of_ones_own_goes_before_it(reach_id):
+    assert length_of_an_episode(gym.make("test/LongReachFamily-v0")) == 11
+    assert length_of_an_episode(gym.make(reach_id, max_episode_steps=12)) == 12
 
 
 def test_wrappers_that_would_have_no_effect():
