@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import poem_envs  # noqa: F401  registers the environments
+from poem_envs import set_task  # which registers the environments, too
 
 if TYPE_CHECKING:
     from sb3_poem.adaptation import (
@@ -65,6 +65,7 @@ __all__ = [
     "TaskVecEnv",
     "TrainingCheckpointCallback",
     "__version__",
+    "set_task",
 ]
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from gymnasium.envs.registration import register
 
 from poem_envs.core import SignedPermutation, Symmetry, TaskDefinition, TaskFamily
-from poem_envs.vector import BatchFamily, BatchTaskFamily, TaskFamilyVector
+from poem_envs.vector import BatchFamily, BatchTaskFamily, TaskFamilyVector, set_task
 
 if TYPE_CHECKING:
     from poem_envs.goal_family import GoalFamily
@@ -25,6 +25,7 @@ __all__ = [
     "TaskDefinition",
     "TaskFamily",
     "TaskFamilyVector",
+    "set_task",
 ]
 
 

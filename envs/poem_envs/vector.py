@@ -393,3 +393,41 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
             f"step {self._elapsed_steps[copy]} of episode {self._episodes[copy]} since reset(seed={self._seeds[copy]}) "
             f"in environment copy {copy}"
         )
+
+
+def set_task(env: Any, task: npt.ArrayLike) -> None:
+    """Choose the task of a family that may be inside wrappers, from the next reset on.
+
+    :param env: a ``gym.Env``, a Gymnasium ``VectorEnv``, or an SB3 ``VecEnv``
+    :param task: ``(task_dim,)``; of a vectorised environment for all copies, or
+        ``(num_envs, task_dim)``, one for each
+    :raises TypeError: if ``env`` is none of these, or no task family
+    :raises ValueError: if there are not as many tasks as copies, and as :meth:`TaskFamily.set_task`
+    """
+    if isinstance(env, gym.Env) and env.has_wrapper_attr("set_task"):
+        env.get_wrapper_attr("set_task")(task)
+    elif isinstance(env, gym.vector.SyncVectorEnv):
+        for single, row in zip(env.envs, _task_of_each(task, env.num_envs), strict=True):
+            set_task(single, row)
+    elif isinstance(env, gym.vector.VectorEnv) and isinstance(env.unwrapped, TaskFamilyVector):
+        env.unwrapped.set_tasks(_task_of_each(task, env.num_envs))
+    elif hasattr(env, "env_method") and env.has_attr("set_task"):  # SB3's, which is not imported here
+        for copy, row in enumerate(_task_of_each(task, env.num_envs)):
+            env.env_method("set_task", row, indices=[copy])
+    else:
+        raise TypeError(
+            f"env={env!r} must be a task family (poem_envs.TaskFamily), by itself, inside wrappers, or "
+            "vectorised within this process"
+        )
+
+
+def _task_of_each(task: npt.ArrayLike, num_envs: int) -> np.ndarray:
+    """A task for each copy, ``(num_envs, task_dim)``."""
+    tasks = np.asarray(task)
+    if tasks.ndim == 1:
+        return np.tile(tasks, (num_envs, 1))
+    if tasks.shape[:-1] != (num_envs,):
+        raise ValueError(
+            f"task has shape {tasks.shape}, expected (task_dim,) or (num_envs, task_dim) with num_envs={num_envs}"
+        )
+    return tasks

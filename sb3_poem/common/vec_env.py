@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import functools
 import time
 import warnings
@@ -23,6 +24,7 @@ from sb3_poem.common.family import plain_id
 
 # What these do, the vectorised environment or TaskVecEnv does itself.
 ABSORBED_WRAPPERS: tuple[type[gym.Wrapper], ...] = (TimeLimit, OrderEnforcing, PassiveEnvChecker, Monitor)
+MAKE_VEC_ARGUMENTS = frozenset({"max_episode_steps", "nthread", "num_envs", "vectorization_mode"})
 
 
 class TaskVecEnv(VecEnv):
@@ -49,14 +51,19 @@ class TaskVecEnv(VecEnv):
             raise ValueError("env_fns is empty; pass one function for each copy")
         env = env_fns[0]()
         wrappers = _wrappers(env)
-        self.vector_env = _vectorised(env, wrappers, len(env_fns), nthread)
-        self._wrapper_types = tuple(type(wrapper) for wrapper in wrappers)
-        self._monitor = next((wrapper for wrapper in wrappers if isinstance(wrapper, Monitor)), None)
+        vector_env = _vectorised(env, wrappers, len(env_fns), nthread)
         env.unwrapped.close()  # not env.close(): the monitor's file stays in use
+        self._wrap(vector_env, wrappers)
 
-        self._views = [_CopyView(self.vector_env, index) for index in range(len(env_fns))]
-        super().__init__(len(env_fns), self.vector_env.single_observation_space, self.vector_env.single_action_space)
-        self.metadata = self.vector_env.metadata
+    def _wrap(self, vector_env: TaskFamilyVector, wrappers: Sequence[gym.Wrapper]) -> None:
+        """Be the face of a vectorised family, which does what the wrappers do."""
+        self.vector_env = vector_env
+        self._wrapper_types = tuple(type(wrapper) for wrapper in wrappers)
+        self._monitor = next((each for each in wrappers if isinstance(each, Monitor)), None)
+        self._views = [_CopyView(vector_env, index) for index in range(vector_env.num_envs)]
+        observation_space = vector_env.single_observation_space
+        super().__init__(vector_env.num_envs, observation_space, vector_env.single_action_space)
+        self.metadata = vector_env.metadata
         self._actions: np.ndarray | None = None
         self._last_reward_features: np.ndarray | None = None
         self._returns = np.zeros(self.num_envs)
@@ -74,6 +81,21 @@ class TaskVecEnv(VecEnv):
         :param env_kwargs: Arguments of the environment
         """
         return cls([functools.partial(gym.make, env_id, **env_kwargs)] * n_envs, nthread=nthread)
+
+    @classmethod
+    def from_vector_env(cls, vector_env: TaskFamilyVector) -> TaskVecEnv:
+        """
+        The face of a vectorised family that there is.
+
+        :param vector_env: As ``gym.make_vec`` makes it
+        """
+        env, spec = cls.__new__(cls), vector_env.spec
+        if spec is not None:  # a single environment's: make_vec's own adds what gym.make does not take
+            kwargs = {key: spec.kwargs[key] for key in spec.kwargs.keys() - MAKE_VEC_ARGUMENTS}
+            limit = vector_env.max_episode_steps
+            vector_env.spec = dataclasses.replace(spec, kwargs=kwargs, max_episode_steps=limit)
+        env._wrap(vector_env, ())
+        return env
 
     @property
     def tasks(self) -> np.ndarray | None:
@@ -204,6 +226,24 @@ class TaskVecEnv(VecEnv):
         return {**self.__dict__, "_monitor": None}
 
 
+def as_task_vec_env(vector_env: gym.vector.VectorEnv) -> VecEnv:
+    """
+    Gymnasium's vectorised environment of a task family as one of SB3.
+
+    :param vector_env: As ``gym.make_vec`` makes it
+    :raises ValueError: If it is of no task family, or in a wrapper, or in Gymnasium's processes
+    """
+    if isinstance(vector_env, TaskFamilyVector):
+        return TaskVecEnv.from_vector_env(vector_env)
+    if isinstance(vector_env, gym.vector.SyncVectorEnv):
+        return DummyVecEnv([functools.partial(Monitor, env) for env in vector_env.envs])
+    raise ValueError(
+        f"env is a {type(vector_env).__name__}, but must be gym.make_vec(id, n) of a task family "
+        "(poem_envs.TaskFamily) without wrappers, or SB3's make_vec_env(id, n, vec_env_cls=...) with "
+        "TaskVecEnv, DummyVecEnv or SubprocVecEnv"
+    )
+
+
 def make_task_vec_env(env_id: str, n_envs: int, max_sequential: int = 8, **env_kwargs: Any) -> VecEnv:
     """
     Copies of a registered family: a :class:`TaskVecEnv`, or a ``DummyVecEnv`` of a family without a vectorised version.
@@ -216,7 +256,7 @@ def make_task_vec_env(env_id: str, n_envs: int, max_sequential: int = 8, **env_k
     env_id = plain_id(env_id)
     if gym.spec(env_id).vector_entry_point is not None:
         return TaskVecEnv.from_id(env_id, n_envs, **env_kwargs)
-    return DummyVecEnv([functools.partial(gym.make, env_id, **env_kwargs)] * min(n_envs, max_sequential))
+    return DummyVecEnv([lambda: Monitor(gym.make(env_id, **env_kwargs))] * min(n_envs, max_sequential))
 
 
 class _CopyView:

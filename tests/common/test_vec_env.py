@@ -15,11 +15,12 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecMonitor, VecNormalize
 
 from poem_envs import TaskFamily
-from sb3_poem.common.family import plain_id
-from sb3_poem.common.vec_env import TaskVecEnv, make_task_vec_env
+from sb3_poem import set_task
+from sb3_poem.common.family import FamilyEnv, plain_id
+from sb3_poem.common.vec_env import TaskVecEnv, as_task_vec_env, make_task_vec_env
 
 SMALL = {"buffer_size": 500, "batch_size": 16, "policy_kwargs": {"net_arch": [8]}, "device": "cpu"}
 FAMILIES = ["poem/PointGoal-v0", "poem/HalfCheetahVel-v0", "poem/AntFwdBack-v0", "poem/HumanoidDir2D-v0"]
@@ -162,6 +163,7 @@ class OnlySingle(TaskFamily):
     action_space = spaces.Box(-1, 1, (1,), np.float32)
     task_space = spaces.Box(-1, 1, (1,), np.float64)
     reward_feature_dim = 1
+    _begin_episode = _simulate = _reward = lambda self, *arguments: np.zeros(1)
 
 
 def test_refused_environments():
@@ -283,3 +285,65 @@ env = TaskVecEnv([lambda: gym.make("poem/PointGoal-v0")] * 2)
 assert env.reset().shape == (2, 2)
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+POINT = "poem/PointGoal-v0"
+
+
+@pytest.mark.parametrize(
+    ("make", "num_envs"),
+    [
+        (lambda: gym.make(POINT).unwrapped, None),
+        (lambda: gym.make(POINT), None),
+        (lambda: gym.wrappers.RecordEpisodeStatistics(Monitor(gym.make(POINT))), None),
+        (lambda: gym.make_vec(POINT, 3), 3),
+        (lambda: gym.wrappers.vector.RecordEpisodeStatistics(gym.make_vec(POINT, 3)), 3),
+        (lambda: gym.make_vec(POINT, 2, vectorization_mode="sync"), 2),
+        (lambda: make_vec_env(POINT, 2), 2),
+        (lambda: VecMonitor(TaskVecEnv.from_id(POINT, 3)), 3),
+    ],
+)
+def test_a_task_is_chosen_through_whatever_is_around_the_family(make, num_envs):
+    def tasks():
+        if isinstance(env, gym.Env):
+            return env.get_wrapper_attr("task")
+        if isinstance(env, gym.vector.SyncVectorEnv):
+            return np.stack(env.call("task"))
+        return env.unwrapped.tasks if isinstance(env, gym.vector.VectorEnv) else np.stack(env.get_attr("task"))
+
+    env = make()
+    set_task(env, [2.5])
+    env.reset()
+    assert (tasks() == 2.5).all()
+    if num_envs is None:
+        env.reset(seed=3)
+        assert (tasks() == 2.5).all()
+        return
+    of_each = np.linspace(0.5, 2.0, num_envs)[:, None]
+    set_task(env, of_each)
+    env.reset()
+    assert np.array_equal(tasks(), of_each)
+    for wrong in (2.5, [[1.0]] * (num_envs + 1)):
+        with pytest.raises(ValueError, match=rf"expected \(task_dim,\) or \(num_envs, task_dim\) with num_envs={num_envs}"):
+            set_task(env, wrong)
+
+
+def test_a_task_of_what_is_no_family():
+    cart_poles = (gym.make("CartPole-v1"), gym.make_vec("CartPole-v1", 2), make_vec_env("CartPole-v1", 2))
+    for env in (POINT, None, *cart_poles):
+        with pytest.raises(TypeError, match=r"must be a task family \(poem_envs.TaskFamily\)"):
+            set_task(env, [1.0])
+
+
+@pytest.mark.parametrize("mode", ["vector_entry_point", "sync"])
+def test_gymnasiums_vector_environments_are_taken_as_they_are(mode):
+    vector_env = gym.make_vec(POINT, 2, vectorization_mode=mode, step_length=0.1)
+    env = as_task_vec_env(vector_env)
+    family = FamilyEnv(env)
+    assert (family.num_envs, family.horizon, family.env_id, family.env_kwargs) == (2, 25, POINT, {"step_length": 0.1})
+    family.reset(np.array([[0.5], [2.0]]), seed=0)
+    set_task(vector_env, [1.0])  # the same copies
+    vector_env.reset()
+    assert np.array_equal(np.stack(env.get_attr("task")), [[1.0], [1.0]])
+    with pytest.raises(ValueError, match=r"env is a RecordEpisodeStatistics, but must be gym.make_vec\(id, n\)"):
+        as_task_vec_env(gym.wrappers.vector.RecordEpisodeStatistics(vector_env))
