@@ -3,6 +3,7 @@
 import json
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import torch as th
 
@@ -16,18 +17,18 @@ ALGORITHMS: dict[str, type[PEARLSAC]] = {"poem_sac": POEMSAC, "pearl_sac": PEARL
 BY_CLASS_NAME = {algorithm.__name__: algorithm for algorithm in ALGORITHMS.values()}
 
 
-def as_model(model: PEARLSAC | str | Path, device: th.device | str = "auto") -> PEARLSAC:
+def as_model(model: Any, device: th.device | str = "auto") -> Any:
     """A model as it is, or the one that a name stands for.
 
-    :param model: A model, or what :func:`load_model` takes
+    :param model: A model with latents, of whichever class, or what :func:`load_model` takes
     :param device: For a model that is loaded
     :raises TypeError: if it is neither
     """
-    if isinstance(model, PEARLSAC):
-        return model
     if isinstance(model, (str, Path)):
         return load_model(model, device)
-    what = f"the class {model.__name__}" if isinstance(model, type) else f"a {type(model).__name__}"
+    if hasattr(model, "latent_dim") and not isinstance(model, type):
+        return model
+    what = f"the class {model.__name__}" if isinstance(model, type) else f"of type {type(model).__name__}"
     raise TypeError(
         f"`model` is {what}, but must be a trained POEMSAC or PEARLSAC, a file or folder of one, or the name of a model "
         f"that ships: {', '.join(pretrained_names())}"

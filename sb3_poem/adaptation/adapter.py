@@ -7,10 +7,9 @@ import os
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import gymnasium as gym
 import numpy as np
 
-from sb3_poem.adaptation.environments import as_vec_env, describe_model
+from sb3_poem.adaptation.environments import Env, describe_model, model_and_env
 from sb3_poem.adaptation.inference import Answer, Snapshot
 from sb3_poem.adaptation.noise import NoiseModel
 from sb3_poem.adaptation.options import AdaptationOptions, inference_rng, rollout_seed
@@ -48,9 +47,15 @@ class PreferenceAdapter:
             adapter.tell(oracle(query.left, query.right))
         policy = adapter.policy()
 
-    :param model: A trained ``POEMSAC`` (or, within limits, ``PEARLSAC``).
-    :param env: The environment with the new task: a ``gym.Env``, its id, or an SB3 ``VecEnv``, of which the first copy is
-        watched.
+    The new task is the one in effect in :attr:`env`, or the one that its first reset draws. Measure
+    the policy there: ``evaluate_policy(policy, adapter.env)``. Another environment has another task;
+    ``env.reset(seed=...)`` draws another, too, unless one was chosen, by
+    ``sb3_poem.set_task(env, task)`` or ``reset(options={"task": task})``.
+
+    :param model: A trained ``POEMSAC`` (or, within limits, ``PEARLSAC``), a file or folder of one, or
+        the name of one that ships.
+    :param env: The environment with the new task: a ``gym.Env``, its id, or a vector environment of
+        Gymnasium's or SB3's, of which the first copy is watched.
     :param n_queries: How many answers are asked for at most (K).
     :param inference: "bayes", or "paper" (Algorithm 2 of Xu & Zhu 2025).
     :param query_rule: "worst-case" (eq. 10), "information-gain" or "random"; None takes "information-gain" for
@@ -69,8 +74,14 @@ class PreferenceAdapter:
     :param seed: Makes everything reproducible; None draws one, kept in ``seed``.
     :param deterministic: Whether policies act by their mode.
     :param library: For "bayes": trajectories to ask about instead of rolling out new ones.
+    :param render: Whether questions carry frames, for :meth:`Query.to_video`. An ``env`` that is no
+        id must have been made with ``render_mode="rgb_array"``.
     :raises ValueError: If an argument is out of its range, or the model belongs to another environment.
+    :raises TypeError: If an argument is of another kind.
     """
+
+    #: Where the new task is: the environment that was given or made from its id, as an SB3 VecEnv.
+    env: VecEnv
 
     #: What one task's and many tasks' adaptation by this method are built from.
     options_class: ClassVar[Any] = AdaptationOptions
@@ -78,7 +89,7 @@ class PreferenceAdapter:
     def __init__(
         self,
         model: Any,
-        env: gym.Env | str | VecEnv,
+        env: Env,
         *,
         n_queries: int = 10,
         inference: str = "bayes",
@@ -93,6 +104,7 @@ class PreferenceAdapter:
         seed: int | None = None,
         deterministic: bool = True,
         library: Sequence[Trajectory] | None = None,
+        render: bool = False,
     ) -> None:
         options = self.make_options(
             oracle,
@@ -107,7 +119,7 @@ class PreferenceAdapter:
             noise_model=noise_model,
             deterministic=deterministic,
         )
-        self._start(model, env, options, oracle, seed, library)
+        self._start(model, env, options, oracle, seed, library, render)
 
     @classmethod
     def make_options(cls, oracle: Any = None, **options: Any) -> Any:
@@ -126,27 +138,27 @@ class PreferenceAdapter:
     def _start(
         self,
         model: Any,
-        env: gym.Env | str | VecEnv,
+        env: Env,
         options: Any,
         oracle: Oracle | None,
         seed: int | None,
         library: Sequence[Trajectory] | None,
+        render: bool = False,
     ) -> None:
         if seed is not None:
             check_whole("seed", seed, 0)
-        self.model = model
         self.options = options
         self.seed = int(np.random.SeedSequence().generate_state(1)[0] >> 1) if seed is None else int(seed)
-        self.env, self._owns_env = as_vec_env(env, render=bool(getattr(oracle, "needs_frames", False)))
-        options.check(model, self.env, library)
-        self.oracle = oracle
-        if oracle is not None and hasattr(oracle, "bind") and getattr(oracle, "env", None) is None:
-            oracle.bind(self.env)
+        self.render = render
+        self.model, self.env = model_and_env(model, env, 1, render or bool(getattr(oracle, "needs_frames", False)))
+        self._owns_env = isinstance(env, str)
+        options.check(self.model, self.env, library)
+        self._take_oracle(oracle)
         self.library = None if library is None else list(library)
-        if self.library is not None and self._owns_env:  # in which nothing is rolled out, and no task is drawn but now
+        self.inference = options.make_inference(self.model, inference_rng(self.seed), self.library)
+        if self.inference.library is not None and self._owns_env:  # nothing is rolled out there: draw the task now
             self.env.seed(self.seed)
             self.env.reset()
-        self.inference = options.make_inference(model, inference_rng(self.seed), self.library)
         if hasattr(self.inference, "bind"):  # a method that is allowed to read rewards
             self.inference.bind(self.env)
         self._pending: Query | None = None
@@ -247,9 +259,7 @@ class PreferenceAdapter:
         oracle = self.oracle if oracle is None else oracle
         if oracle is None:
             raise ValueError("adapt() needs an oracle: pass it here or at construction, or use ask() and tell()")
-        if hasattr(oracle, "bind") and getattr(oracle, "env", None) is None:
-            oracle.bind(self.env)
-        self.oracle = oracle
+        self._take_oracle(oracle)
         from tqdm import tqdm
 
         with tqdm(total=self.options.n_queries, initial=self.n_answers, unit="query", disable=not progress_bar) as bar:
@@ -270,7 +280,22 @@ class PreferenceAdapter:
 
     @property
     def _needs_frames(self) -> bool | int:
-        return getattr(self.oracle, "needs_frames", False)
+        return getattr(self.oracle, "needs_frames", False) or self.render
+
+    def _take_oracle(self, oracle: Oracle | None) -> None:
+        self.oracle = oracle
+        if oracle is None:
+            return
+        if isinstance(oracle, type):
+            name = oracle.__name__
+            raise TypeError(f"`oracle` is the class {name}, but must be an object: {name}()")
+        if not callable(oracle):
+            raise TypeError(
+                "`oracle` must be called as oracle(left, right) and return a Preference, such as "
+                f"ReturnOracle(), but is {oracle!r}"
+            )
+        if hasattr(oracle, "bind") and getattr(oracle, "env", None) is None:
+            oracle.bind(self.env)
 
     def _make_query(self) -> Query:
         library = self.inference.library
@@ -321,10 +346,11 @@ class PreferenceAdapter:
         cls,
         data: dict[str, Any],
         model: Any,
-        env: gym.Env | str | VecEnv,
+        env: Env,
         *,
         oracle: Oracle | None = None,
         library: Sequence[Trajectory] | None = None,
+        render: bool = False,
     ) -> PreferenceAdapter:
         """
         Continue where :meth:`to_dict` stood: the same answers lead to the same policy as without the interruption.
@@ -334,6 +360,7 @@ class PreferenceAdapter:
         :param env: An environment with the same task.
         :param oracle: Who answers in :meth:`adapt`. A stochastic oracle's own generator is its own affair.
         :param library: The same library, if there was one.
+        :param render: See :class:`PreferenceAdapter`.
         :return: The adapter.
         :raises OtherModelError: If the model has other weights, another family or another latent's dimension.
         :raises ValueError: If the data is broken, or of another version.
@@ -342,13 +369,16 @@ class PreferenceAdapter:
             raise ValueError(f"not a saved adaptation: `format` is {data.get('format')!r}, not {cls._format()!r}")
         if data.get("version") != FORMAT_VERSION:
             raise ValueError(f"a saved adaptation of version {data.get('version')!r}; this program reads {FORMAT_VERSION}")
+        from sb3_poem.loading import as_model
+
+        model = as_model(model)
         try:
             _check_same_model(data["model"], model)
             if data["uses_library"] and library is None:
                 raise ValueError("this adaptation asks about a library of trajectories; pass the same `library` again")
             adapter = cls.__new__(cls)
             options = cls.options_class.from_dict(data["options"])
-            adapter._start(model, env, options, oracle, int(data["seed"]), library)
+            adapter._start(model, env, options, oracle, int(data["seed"]), library, render)
         except (KeyError, TypeError) as error:
             raise ValueError(f"a saved adaptation that is incomplete or broken: {error!r}") from error
         adapter.restore(data)
@@ -374,14 +404,14 @@ class PreferenceAdapter:
         return json.dumps(self.to_dict(), allow_nan=False)
 
     @classmethod
-    def from_json(cls, text: str, model: Any, env: gym.Env | str | VecEnv, **kwargs: Any) -> PreferenceAdapter:
+    def from_json(cls, text: str, model: Any, env: Env, **kwargs: Any) -> PreferenceAdapter:
         """
         :meth:`from_dict` of a JSON text.
 
         :param text: What :meth:`to_json` gave.
         :param model: The same model.
         :param env: An environment with the same task.
-        :param kwargs: ``oracle`` and ``library``.
+        :param kwargs: ``oracle``, ``library`` and ``render``.
         :return: The adapter.
         :raises ValueError: If the text is no JSON object, and as :meth:`from_dict`.
         """
@@ -402,14 +432,14 @@ class PreferenceAdapter:
         write_json_atomically(path, self.to_dict())
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], model: Any, env: gym.Env | str | VecEnv, **kwargs: Any) -> PreferenceAdapter:
+    def load(cls, path: str | os.PathLike[str], model: Any, env: Env, **kwargs: Any) -> PreferenceAdapter:
         """
         Continue from a file of :meth:`save`.
 
         :param path: The file.
         :param model: The same model.
         :param env: An environment with the same task.
-        :param kwargs: ``oracle`` and ``library``.
+        :param kwargs: ``oracle``, ``library`` and ``render``.
         :return: The adapter.
         :raises ValueError: If the file is truncated or foreign, and as :meth:`from_dict`.
         """

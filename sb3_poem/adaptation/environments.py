@@ -3,34 +3,51 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, Union
 
 import gymnasium as gym
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
+Env: TypeAlias = Union[gym.Env, gym.vector.VectorEnv, str, "VecEnv"]
+#: How many copies an id makes where many tasks are rolled out together.
+COPIES = 60
 
-def as_vec_env(env: gym.Env | str | VecEnv, render: bool = False) -> tuple[VecEnv, bool]:
+
+def model_and_env(model: Any, env: Env, n_copies: int = COPIES, render: bool = False) -> tuple[Any, VecEnv]:
     """
-    Any environment as an SB3 vector environment.
+    What adaptation is given, as it works with it.
 
-    :param env: A ``gym.Env``, its id, or an SB3 ``VecEnv``, which stays as it is.
-    :param render: Whether an environment that is made from its id renders RGB images.
-    :return: The vector environment, and whether it was made here from an id (and should be closed here).
-    :raises TypeError: If it is something else.
+    :param model: A model, a file or folder of one, or the name of one that ships.
+    :param env: A ``gym.Env``, its id, a Gymnasium ``VectorEnv`` or an SB3 ``VecEnv``; the latter stays
+        as it is. The id on which the model was trained makes it with the same arguments.
+    :param n_copies: How many copies an id makes.
+    :param render: Whether they render RGB images.
+    :return: The model, and a vector environment.
+    :raises TypeError: If one of them is something else.
+    :raises FileNotFoundError: If there is no such model.
     """
     from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+    from sb3_poem.common.family import plain_id
+    from sb3_poem.common.vec_env import as_task_vec_env, make_task_vec_env
+    from sb3_poem.loading import as_model
+
+    model = as_model(model)
     if isinstance(env, VecEnv):
-        return env, False
+        return model, env
     if isinstance(env, str):
-        made = gym.make(env, render_mode="rgb_array" if render else None)
-        return DummyVecEnv([lambda: made]), True
+        same = plain_id(env) == getattr(model, "env_id", None)
+        arguments = dict(getattr(model, "env_kwargs", {})) if same else {}
+        if render:
+            arguments["render_mode"] = "rgb_array"
+        return model, make_task_vec_env(env, n_copies, **arguments)
     if isinstance(env, gym.Env):
-        given = cast(gym.Env, env)
-        return DummyVecEnv([lambda: given]), False
-    raise TypeError(f"`env` must be a gymnasium.Env, an id, or an SB3 VecEnv, but is of type {type(env).__name__}")
+        return model, DummyVecEnv([lambda: env])
+    if isinstance(env, gym.vector.VectorEnv):
+        return model, as_task_vec_env(env)
+    raise TypeError(f"`env` must be a gymnasium.Env, an id, a Gymnasium VectorEnv or an SB3 VecEnv, but is {env!r}")
 
 
 def check_model_fits(model: Any, vec_env: VecEnv) -> None:

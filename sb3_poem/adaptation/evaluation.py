@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sb3_poem.adaptation.environments import Env, model_and_env
 from sb3_poem.adaptation.limits import information_limit
 from sb3_poem.adaptation.lockstep import OracleFactory, adapt_tasks
 from sb3_poem.adaptation.noise import NoiseModel
@@ -27,6 +28,7 @@ LATENTS_WITH_OWN_DYNAMICS, LATENTS_WITH_SHARED_DYNAMICS = 30, 300
 
 # Test tasks come from a stream of their own, so that no seed gives the tasks that a model was trained on.
 TEST_TASK_STREAM = 0x7E57
+N_TEST_TASKS = 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +50,7 @@ class EpisodeOutcomes:
 
 def evaluate_latents(
     model: Any,
-    vec_env: VecEnv,
+    env: Env,
     latents: np.ndarray,
     tasks: np.ndarray,
     n_episodes: int = 10,
@@ -58,12 +60,12 @@ def evaluate_latents(
     """
     True returns of latents on tasks, (n, n_episodes): those of :func:`evaluate_episodes`, with the same arguments.
     """
-    return evaluate_episodes(model, vec_env, latents, tasks, n_episodes, seed, deterministic).returns
+    return evaluate_episodes(model, env, latents, tasks, n_episodes, seed, deterministic).returns
 
 
 def evaluate_episodes(
     model: Any,
-    vec_env: VecEnv,
+    env: Env,
     latents: np.ndarray,
     tasks: np.ndarray,
     n_episodes: int = 10,
@@ -75,8 +77,8 @@ def evaluate_episodes(
 
     Episode e of row i always starts from the same seed, so the same rows with other latents are compared on equal starts.
 
-    :param model: A model.
-    :param vec_env: A vector environment of the task family.
+    :param model: See :func:`adapt_tasks`.
+    :param env: See :func:`adapt_tasks`.
     :param latents: (n, latent_dim).
     :param tasks: (n, task_dim), row i for latent i.
     :param n_episodes: Episodes per row.
@@ -85,6 +87,7 @@ def evaluate_episodes(
     :return: Returns and successes, each (n, n_episodes).
     :raises ValueError: If shapes do not fit or an episode is not finite.
     """
+    model, vec_env = model_and_env(model, env)
     latents, tasks = np.asarray(latents, dtype=np.float64), np.asarray(tasks, dtype=np.float64)
     if latents.ndim != 2 or tasks.ndim != 2 or len(latents) != len(tasks):
         raise ValueError(
@@ -180,8 +183,8 @@ class AdaptationEvaluation:
 
 def evaluate_adaptation(
     model: Any,
-    vec_env: VecEnv,
-    tasks: np.ndarray,
+    env: Env,
+    tasks: np.ndarray | int | None = None,
     oracle_factory: OracleFactory = ReturnOracle,
     *,
     record_at: Sequence[int] = (0, 1, 2, 5, 10),
@@ -193,9 +196,10 @@ def evaluate_adaptation(
     """
     Adapt to each task, and measure the true return of the policy after some numbers of answers.
 
-    :param model: A trained model.
-    :param vec_env: A vector environment of the task family.
-    :param tasks: (n_tasks, task_dim).
+    :param model: See :func:`adapt_tasks`.
+    :param env: See :func:`adapt_tasks`.
+    :param tasks: (n_tasks, task_dim), or a number: so many that no model was trained on, which ``seed``
+        draws, the same as in :func:`known_task_return`; None takes 30.
     :param oracle_factory: See :func:`adapt_tasks`.
     :param record_at: After how many answers to measure; the largest is the number of questions.
     :param n_episodes: Episodes per measurement.
@@ -212,6 +216,8 @@ def evaluate_adaptation(
     for k in record_at:
         check_whole("record_at", k, 0)
     check_whole("n_episodes", n_episodes, 1)
+    model, vec_env = model_and_env(model, env)
+    tasks = _test_tasks(model, vec_env, tasks, seed)
     adapted = adapt_tasks(
         model,
         vec_env,
@@ -283,8 +289,8 @@ class KnownTaskReturn:
 
 def known_task_return(
     model: Any,
-    vec_env: VecEnv,
-    tasks: np.ndarray,
+    env: Env,
+    tasks: np.ndarray | int | None = None,
     n_latents: int | None = None,
     n_episodes: int = 10,
     seed: int = 0,
@@ -300,9 +306,9 @@ def known_task_return(
     tasks share their dynamics every latent is rolled out once, and its trajectory relabelled for every task. The winners
     are then rolled out anew, so that the luck of having been chosen does not count.
 
-    :param model: A trained model.
-    :param vec_env: A vector environment of the task family.
-    :param tasks: (n_tasks, task_dim).
+    :param model: See :func:`adapt_tasks`.
+    :param env: See :func:`adapt_tasks`.
+    :param tasks: See :func:`evaluate_adaptation`.
     :param n_latents: How many latents to try; None for 300, or for 30 where tasks do not share their dynamics and every latent
         must be rolled out in every task.
     :param n_episodes: Fresh episodes per winner.
@@ -313,7 +319,8 @@ def known_task_return(
     :return: See :class:`KnownTaskReturn`.
     :raises ValueError: If an argument is out of its range.
     """
-    tasks = np.asarray(tasks, dtype=np.float64)
+    model, vec_env = model_and_env(model, env)
+    tasks = _test_tasks(model, vec_env, tasks, seed)
     if n_latents is None:
         n_latents = LATENTS_WITH_SHARED_DYNAMICS if _dynamics_are_shared(vec_env) else LATENTS_WITH_OWN_DYNAMICS
     check_whole("n_latents", n_latents, 1)
@@ -419,6 +426,15 @@ def held_out_tasks(family: FamilyEnv, n: int, seed: int) -> np.ndarray:
     if family.all_tasks is None:
         return family.sample_tasks(n, rng)
     return np.resize(family.sample_tasks(len(family.all_tasks), rng), (n, family.task_dim))
+
+
+def _test_tasks(model: Any, vec_env: VecEnv, tasks: np.ndarray | int | None, seed: int) -> np.ndarray:
+    if tasks is None or isinstance(tasks, (int, np.integer)):
+        from sb3_poem.common.family import FamilyEnv
+
+        n_tasks = N_TEST_TASKS if tasks is None else int(tasks)
+        return held_out_tasks(FamilyEnv(vec_env, model.horizon), n_tasks, seed)
+    return np.asarray(tasks, dtype=np.float64)
 
 
 def evaluation_seed(seed: int, stream: int = 0) -> int:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sb3_poem.adaptation.noise import MistakeNoise, NoiseModel
-from sb3_poem.adaptation.preference import Preference
+from sb3_poem.adaptation.preference import Preference, Query
 from sb3_poem.common.trajectory import Trajectory
 
 PROMPT = "Which is better? [l]eft, [r]ight, or [e]qual (can't tell): "
@@ -97,7 +97,9 @@ class HumanOracle:
         :raises RuntimeError: If the terminal is closed.
         """
         asked = time.time()
-        path = self._write_video(left, right)
+        name = f"query-{self.n_asked + 1:03d}.{self.video_format}"
+        path = Query(left, right).to_video(self.folder / name, self.fps)
+        self.n_asked += 1
         shown = time.time()
         self._write(f"Query {self.n_asked}: {path}")
         while True:
@@ -111,15 +113,3 @@ class HumanOracle:
                     self._record(HumanAnswer(answer, left, right, path, self.fps, asked, shown))
                 return answer
             self._write(f"{line.strip()!r} is no answer; type l, r or e.")
-
-    def _write_video(self, left: Trajectory, right: Trajectory) -> Path:
-        from sb3_poem.common.video import side_by_side, write_video
-
-        if not left.frames or not right.frames:
-            raise ValueError(
-                'the trajectories have no frames to show: make the environment with render_mode="rgb_array", '
-                "and let the adapter know this oracle (PreferenceAdapter(..., oracle=HumanOracle()))"
-            )
-        self.n_asked += 1
-        path = self.folder / f"query-{self.n_asked:03d}.{self.video_format}"
-        return write_video(side_by_side(left.frames, right.frames, ("LEFT", "RIGHT")), path, self.fps)

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from sb3_poem.adaptation.adapter import PreferenceAdapter
+from sb3_poem.adaptation.environments import Env, model_and_env
 from sb3_poem.adaptation.options import inference_rng, rollout_seed
 from sb3_poem.adaptation.preference import Preference, as_preference
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    from stable_baselines3.common.vec_env import VecEnv
 
 OracleFactory = Callable[..., Callable[[Trajectory, Trajectory], Any]]
 
@@ -43,7 +42,7 @@ class TaskAdaptations:
 
 def adapt_tasks(
     model: Any,
-    vec_env: VecEnv,
+    env: Env,
     tasks: np.ndarray,
     oracle_factory: OracleFactory,
     *,
@@ -61,10 +60,11 @@ def adapt_tasks(
     Task i is adapted as ``adapter(model, env, seed=seed + i, ...)`` would alone: with the same candidates, questions
     and reset seeds. (Matrix products may round otherwise in a batch than alone, in the last bits; and with
     ``deterministic=False`` the actions' noise is drawn for all rollouts of a question together.) The tasks are set in
-    ``vec_env`` for the rollouts, and known to the oracles; inference never sees them.
+    ``env`` for the rollouts, and known to the oracles; inference never sees them.
 
-    :param model: A trained model.
-    :param vec_env: A vector environment of the task family, of any number of copies; twice the number of tasks is best.
+    :param model: See :class:`PreferenceAdapter`.
+    :param env: See :class:`PreferenceAdapter`; a task family. Any number of copies will do; twice the
+        number of tasks is best, and an id makes 60.
     :param tasks: (n_tasks, task_dim).
     :param oracle_factory: Called as ``oracle_factory(env=vec_env, task=task, seed=seed + i)``, gives task i's oracle. The
         oracles' classes will do, and ``functools.partial(MistakeOracle, 0.1)``.
@@ -78,9 +78,12 @@ def adapt_tasks(
         ``n_candidates``, ``epsilon``, ``candidates``, ``likelihood``, ``decision``, ``noise_model``, ``deterministic``.
     :return: The estimates.
     :raises ValueError: If an argument is out of its range, or the model belongs to another environment.
+    :raises TypeError: If an argument is of another kind.
     """
     from tqdm import tqdm
 
+    model, vec_env = model_and_env(model, env)
+    _check_factory(oracle_factory)
     tasks = np.asarray(tasks, dtype=np.float64)
     if tasks.ndim != 2 or len(tasks) < 1:
         raise ValueError(f"`tasks` must have shape (n_tasks, task_dim) with at least one task, but has shape {tasks.shape}")
@@ -123,6 +126,17 @@ def adapt_tasks(
             inference.tell(answer, left, right)
             preferences[i].append(answer)
     return TaskAdaptations(tasks, kept, latents, preferences)
+
+
+def _check_factory(oracle_factory: OracleFactory) -> None:
+    try:
+        inspect.signature(oracle_factory).bind(env=None, task=None, seed=0)
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            "`oracle_factory` must be called as oracle_factory(env=..., task=..., seed=...) and return a "
+            "task's oracle, such as the class ReturnOracle or functools.partial(MistakeOracle, 0.1), but "
+            f"is {oracle_factory!r}: {error}"
+        ) from error
 
 
 def _check_record_at(record_at: Sequence[int] | None, n_queries: int) -> tuple[int, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from pathlib import Path
 from typing import Any
 
 from sb3_poem.common.trajectory import Trajectory
@@ -28,6 +29,26 @@ class Query:
 
     left: Trajectory
     right: Trajectory
+
+    def to_video(self, path: str | Path, fps: float = 20.0) -> Path:
+        """
+        Write both side by side, as MP4 or GIF by the file's suffix.
+
+        :param path: The file; missing folders are made.
+        :param fps: Frames per second.
+        :return: The path.
+        :raises ValueError: If they have no frames, or the suffix is another.
+        """
+        from sb3_poem.common.video import side_by_side, write_video
+
+        if not self.left.frames or not self.right.frames:
+            raise ValueError(
+                "the question has no frames to show: ask for them by PreferenceAdapter(..., render=True) "
+                "or oracle=HumanOracle(), with an environment's id, or an environment made with "
+                'render_mode="rgb_array"'
+            )
+        frames = side_by_side(self.left.frames, self.right.frames, ("LEFT", "RIGHT"))
+        return write_video(frames, path, fps)
 
 
 def as_preference(answer: Any) -> Preference:

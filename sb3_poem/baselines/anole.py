@@ -7,11 +7,10 @@ from dataclasses import asdict, dataclass
 from math import floor
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import gymnasium as gym
 import numpy as np
 
 from sb3_poem.adaptation.adapter import Oracle, PreferenceAdapter
-from sb3_poem.adaptation.environments import check_model_fits
+from sb3_poem.adaptation.environments import Env, check_model_fits
 from sb3_poem.adaptation.inference import SIGNS, Answer, LatentInference, Shown
 from sb3_poem.adaptation.preference import Preference
 from sb3_poem.adaptation.priors import SOURCES, make_prior
@@ -94,7 +93,8 @@ class ANOLEOptions:
         if buffer is None or not buffer.counts.any():
             raise ValueError(
                 "`model` has no experience to ask about, because its replay buffer is empty (a loaded model has none): "
-                "call load_replay_buffer, or pass a `library`, for instance of training_rollouts(model, env, 200)"
+                "call load_replay_buffer, or pass "
+                "library=sb3_poem.baselines.training_rollouts(model, env, 200), of another copy of the environment"
             )
         if vec_env.has_attr("shared_dynamics") and not vec_env.get_attr("shared_dynamics", indices=[0])[0]:
             raise ValueError(
@@ -263,7 +263,7 @@ class ANOLEAdapter(PreferenceAdapter):
     def __init__(
         self,
         model: Any,
-        env: gym.Env | str | VecEnv,
+        env: Env,
         *,
         n_queries: int = 10,
         strategy: str = "berlekamp",

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch as th
 
+from sb3_poem.adaptation.environments import Env, model_and_env
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    from stable_baselines3.common.vec_env import VecEnv
 
 MAX_ROUNDS = 50
 FRAGMENT_LENGTH = 50
@@ -69,28 +67,29 @@ def replay_fragments(model: Any, n: int, length: int, rng: np.random.Generator) 
     )
 
 
-def training_rollouts(model: Any, vec_env: VecEnv, n: int, seed: int = 0, deterministic: bool = False) -> list[Trajectory]:
+def training_rollouts(model: Any, env: Env, n: int, seed: int = 0, deterministic: bool = False) -> list[Trajectory]:
     """
     Episodes of training tasks under their own policies: a ``library`` for a model that was loaded without its replay buffer.
 
-    :param model: A trained :class:`PEARLSAC`.
-    :param vec_env: A vector environment of its family.
+    :param model: A trained :class:`PEARLSAC`, or its name, see :class:`PreferenceAdapter`.
+    :param env: An environment of its family, or its id, see :class:`PreferenceAdapter`. Tasks are set in it.
     :param n: How many.
     :param seed: Draws the training tasks and seeds the episodes.
     :param deterministic: Whether policies act by their mode.
     :return: n trajectories.
     """
+    model, vec_env = model_and_env(model, env)
     chosen = np.random.default_rng([seed, 4]).integers(len(model.train_tasks), size=n)
     return rollout_latents(model, vec_env, model.task_latents[chosen], model.train_tasks[chosen], seed, deterministic)
 
 
-def rollout_fragments(model: Any, vec_env: VecEnv, n: int, length: int, seed: int = 0) -> list[Trajectory]:
+def rollout_fragments(model: Any, env: Env, n: int, length: int, seed: int = 0) -> list[Trajectory]:
     """
     Fragments of :func:`training_rollouts`, one from a random place of each: what a replay buffer would hold of the present
     policies, for a model that was loaded without one.
 
-    :param model: A trained :class:`PEARLSAC`.
-    :param vec_env: A vector environment of its family.
+    :param model: A trained :class:`PEARLSAC`, or its name, see :class:`PreferenceAdapter`.
+    :param env: An environment of its family, or its id, see :class:`PreferenceAdapter`. Tasks are set in it.
     :param n: How many.
     :param length: Steps of a fragment; an episode that ended earlier is taken whole.
     :param seed: Of the training tasks, the episodes and the places.
@@ -98,7 +97,7 @@ def rollout_fragments(model: Any, vec_env: VecEnv, n: int, length: int, seed: in
     """
     rng = np.random.default_rng([seed, 6])
     fragments = []
-    for episode in training_rollouts(model, vec_env, n, seed):
+    for episode in training_rollouts(model, env, n, seed):
         steps = min(length, len(episode))
         start = int(rng.integers(len(episode) - steps + 1))
         features = episode.reward_features

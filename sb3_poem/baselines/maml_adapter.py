@@ -9,14 +9,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
 
 from sb3_poem.adaptation.adapter import Oracle, PreferenceAdapter
-from sb3_poem.adaptation.environments import check_model_fits
+from sb3_poem.adaptation.environments import Env, check_model_fits
 from sb3_poem.adaptation.inference import Answer, LatentInference, Shown, Snapshot
 from sb3_poem.adaptation.preference import Preference
 from sb3_poem.adaptation.state import plain
@@ -268,7 +267,7 @@ class MAMLRewardAdapter(PreferenceAdapter):
     def __init__(
         self,
         model: Any,
-        env: gym.Env | str | VecEnv,
+        env: Env,
         *,
         n_queries: int = 10,
         gradient_steps: int = 200,

@@ -11,7 +11,7 @@ import numpy as np
 import torch as th
 
 from sb3_poem.adaptation.adapter import Oracle, PreferenceAdapter
-from sb3_poem.adaptation.environments import check_model_fits
+from sb3_poem.adaptation.environments import Env, check_model_fits
 from sb3_poem.adaptation.inference import Answer, LatentInference, Shown
 from sb3_poem.adaptation.oracles import step_rewards
 from sb3_poem.adaptation.preference import Preference
@@ -184,7 +184,7 @@ class RewardOracleAdapter(PreferenceAdapter):
     def __init__(
         self,
         model: Any,
-        env: gym.Env | str | VecEnv,
+        env: Env,
         *,
         n_queries: int = 10,
         oracle: Oracle | None = None,

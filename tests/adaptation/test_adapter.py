@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from meta_toys import small
+from stable_baselines3 import SAC
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 from worlds import Blinded, SpeedEnv, SpeedModel
 
-from sb3_poem import POEMSAC
+from sb3_poem import POEMSAC, TaskVecEnv, set_task
 from sb3_poem.adaptation import (
     BoltzmannNoise,
     BoltzmannOracle,
@@ -35,6 +38,7 @@ from sb3_poem.baselines.maml_adapter import MAMLRewardOptions
 from sb3_poem.baselines.reward_oracle import RewardOracleOptions
 from sb3_poem.common.digest import digest_of
 from sb3_poem.common.vec_env import make_task_vec_env
+from sb3_poem.resources import pretrained_folder
 
 GOAL = np.array([2.2])
 RULES = [{"inference": "bayes"}, {"inference": "bayes", "likelihood": "similarity"}, {"inference": "paper"}]
@@ -57,8 +61,8 @@ def point_goal():
     return POEMSAC.from_pretrained("PointGoal", device="cpu")
 
 
-def adapter(env=None, seed=0, **kwargs):
-    return PreferenceAdapter(SpeedModel(), make_env() if env is None else env, seed=seed, **kwargs)
+def adapter(env=None, seed=0, model=None, **kwargs):
+    return PreferenceAdapter(model or SpeedModel(), make_env() if env is None else env, seed=seed, **kwargs)
 
 
 def answer(a, times, oracle=outside_oracle):
@@ -383,9 +387,10 @@ def test_the_protocol_is_kept():
     a.policy()
 
 
-def test_an_oracle_that_returns_something_else():
-    with pytest.raises(TypeError, match="an answer must be Preference"):
-        adapter(oracle=lambda left, right: 1).adapt()
+@pytest.mark.parametrize("nothing", [1, None, 0.3])
+def test_an_oracle_that_returns_something_else(nothing):
+    with pytest.raises(TypeError, match=f"an answer must be Preference.*but is {nothing} of type"):
+        adapter(oracle=lambda left, right: nothing).adapt()
     with pytest.raises(ValueError, match="adapt\\(\\) needs an oracle"):
         adapter().adapt()
 
@@ -425,8 +430,96 @@ def test_a_model_for_another_environment_is_refused():
 
     with pytest.raises(ValueError, match="does not belong to this environment: its observation_space"):
         adapter(Other())
-    with pytest.raises(TypeError, match=r"`env` must be a gymnasium\.Env, an id, or an SB3 VecEnv"):
-        adapter(3)
+    with pytest.raises(ValueError, match="does not belong to this environment: its observation_space"):
+        adapter("MountainCarContinuous-v0", model=POINT_GOAL)
+
+
+POINT_GOAL = "PointGoal"  # a model that ships
+POINT = "poem/PointGoal-v0"
+
+
+@pytest.mark.filterwarnings("error::UserWarning")
+def test_the_policy_is_for_the_task_of_the_adapters_environment():
+    """Elsewhere, evaluation meets another task; there, no Monitor is missing either."""
+    a = PreferenceAdapter(POINT_GOAL, POINT, oracle=ReturnOracle(), seed=0)
+    policy = a.adapt()
+    [task] = a.env.get_attr("task")
+    mean, _ = evaluate_policy(policy, a.env, n_eval_episodes=3)
+    assert mean > -11  # 25 steps; the best policies need ten of them for the way
+    np.testing.assert_array_equal(a.env.get_attr("task"), [task])
+    elsewhere = Monitor(gym.make(POINT))
+    assert evaluate_policy(policy, elsewhere, n_eval_episodes=1)[0] < -15
+    set_task(elsewhere, task)
+    assert evaluate_policy(policy, elsewhere, n_eval_episodes=3)[0] == pytest.approx(mean, abs=0.5)
+    a.close()
+
+
+@pytest.mark.parametrize(
+    "env",
+    [
+        lambda: POINT,
+        lambda: gym.make(POINT),
+        lambda: gym.make_vec(POINT, 2),
+        lambda: gym.make_vec(POINT, 2, vectorization_mode="sync"),
+        lambda: DummyVecEnv([lambda: gym.make(POINT)] * 2),
+        lambda: TaskVecEnv.from_id(POINT, 2),
+    ],
+)
+def test_models_and_environments_by_name_and_of_every_kind(env, point_goal):
+    expected = PreferenceAdapter(point_goal, POINT, oracle=ReturnOracle(), seed=0, n_queries=2).adapt()
+    for name in (POINT_GOAL, pretrained_folder(POINT_GOAL)):
+        policy = PreferenceAdapter(name, env(), oracle=ReturnOracle(), seed=0, n_queries=2).adapt()
+        np.testing.assert_allclose(policy.latent, expected.latent, atol=1e-6)
+
+
+def test_the_id_of_the_models_own_environment_makes_that():
+    env = TaskVecEnv.from_id(POINT, 2, step_length=0.1)
+    a = PreferenceAdapter(small(POEMSAC, env), POINT)
+    assert a.env.get_attr("step_length") == [0.1]
+
+
+def test_an_adaptation_resumes_by_names():
+    a = PreferenceAdapter(POINT_GOAL, POINT, seed=0, n_queries=2)
+    a.ask()
+    a.tell("left")
+    resumed = PreferenceAdapter.from_json(a.to_json(), POINT_GOAL, POINT)
+    np.testing.assert_array_equal(resumed.policy().latent, a.policy().latent)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"model": SAC("MlpPolicy", "Pendulum-v1")}, TypeError, "`model` is of type SAC, but must be a trained POEMSAC"),
+        ({"model": POEMSAC}, TypeError, "`model` is the class POEMSAC, but must be a trained POEMSAC"),
+        ({"model": None}, TypeError, "`model` is of type NoneType.*name of a model that ships: .*PointGoal"),
+        ({"model": "PointGaol"}, FileNotFoundError, "No model 'PointGaol' is shipped; there are: .*PointGoal"),
+        ({"model": "logs/model.zip"}, FileNotFoundError, "logs/model.zip: there is no such file or folder of a model"),
+        ({"env": 3}, TypeError, "`env` must be a gymnasium.Env, an id, a Gymnasium VectorEnv or an SB3 VecEnv, but is 3"),
+        ({"env": SpeedEnv}, TypeError, "`env` must be a gymnasium.Env, .* but is <class 'worlds.SpeedEnv'>"),
+        ({"env": "poem/PointGaol-v0"}, gym.error.NameNotFound, "(?i)PointGaol.*did you mean.*PointGoal"),
+        ({"oracle": ReturnOracle}, TypeError, r"`oracle` is the class ReturnOracle, but must be an object: ReturnOracle\(\)"),
+        ({"oracle": "return"}, TypeError, r"`oracle` must be called as oracle\(left, right\).* but is 'return'"),
+    ],
+)
+def test_arguments_of_another_kind(arguments, error, message):
+    with pytest.raises(error, match=message):
+        PreferenceAdapter(**{"model": POINT_GOAL, "env": POINT, **arguments})
+    if "oracle" in arguments:
+        with pytest.raises(error, match=message):
+            adapter().adapt(arguments["oracle"])
+
+
+def test_frames_for_ask_and_tell(tmp_path):
+    a = PreferenceAdapter(POINT_GOAL, POINT, seed=0, render=True)
+    query = a.ask()
+    assert len(query.left.frames) == len(query.left)
+    assert query.to_video(tmp_path / "query.gif").stat().st_size > 1000
+    resumed = PreferenceAdapter.from_json(a.to_json(), POINT_GOAL, POINT, render=True)
+    np.testing.assert_array_equal(resumed.ask().right.frames, query.right.frames)
+    with pytest.raises(ValueError, match=r"the question has no frames to show: .*PreferenceAdapter\(..., render=True\)"):
+        adapter().ask().to_video(tmp_path / "query.mp4")
+    with pytest.raises(ValueError, match='render_mode="rgb_array", but this one has None'):
+        adapter(render=True).ask()
 
 
 def test_an_id_and_a_vector_environment_will_do():

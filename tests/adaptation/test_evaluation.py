@@ -3,6 +3,7 @@
 import itertools
 from functools import partial
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from scipy.stats import kendalltau, norm
@@ -18,7 +19,10 @@ from sb3_poem.adaptation import (
     known_task_return,
     property_one,
 )
-from sb3_poem.adaptation.evaluation import preference_order, return_matrix
+from sb3_poem.adaptation.evaluation import held_out_tasks, preference_order, return_matrix
+from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.loading import load_model
 
 MODEL = SpeedModel()
 GOALS = np.linspace(0.05, 2.95, 30)[:, None]
@@ -45,6 +49,29 @@ def vec_env(n=10, **kwargs):
 def test_bad_arguments(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+@pytest.mark.parametrize(
+    "factory", [ReturnOracle(), MistakeOracle(0.1), "return", None, lambda left, right: Preference.LEFT, lambda task: None]
+)
+def test_an_oracle_in_place_of_what_makes_oracles(factory):
+    with pytest.raises(TypeError, match=r"`oracle_factory` must be called as oracle_factory\(env=.*the class ReturnOracle"):
+        evaluate_adaptation(MODEL, vec_env(1), GOALS, factory)
+
+
+def test_names_and_numbers_of_tasks_will_do():
+    """Held-out tasks, which the seed draws: those of the command line, and the same for both functions."""
+    result = evaluate_adaptation("PointGoal", "poem/PointGoal-v0", 3, record_at=(0, 2), n_episodes=1, seed=4)
+    env = TaskVecEnv.from_id("poem/PointGoal-v0", 4)
+    np.testing.assert_array_equal(result.tasks, held_out_tasks(FamilyEnv(env), 3, 4))
+    model = load_model("PointGoal", "cpu")
+    again = evaluate_adaptation(model, env, result.tasks, record_at=(0, 2), n_episodes=1, seed=4)
+    np.testing.assert_allclose(again.returns, result.returns, atol=1e-4)
+    known = known_task_return("PointGoal", gym.make_vec("poem/PointGoal-v0", 4), n_latents=8, n_episodes=1, seed=4)
+    assert known.tasks.shape == (30, 1)
+    np.testing.assert_array_equal(known.tasks[:3], result.tasks)
+    returns = evaluate_latents("PointGoal", gym.make("poem/PointGoal-v0"), result.latents[:, 1], result.tasks, 1, 7)
+    assert returns.shape == (3, 1)
 
 
 @pytest.mark.parametrize("copies", [1, 4, 40])

@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from meta_toys import Walk, WindyWalk, small, walks
+from meta_toys import EPOCH, POINT_GOAL, Walk, WindyWalk, small, walks
 from stable_baselines3.common.vec_env import DummyVecEnv
 from worlds import SpeedEnv, SpeedModel, SpeedVecEnv
 
@@ -207,6 +207,16 @@ def test_it_runs_on_a_trained_model_from_its_replay_buffer(trained):
     again = ANOLEOptions(n_queries=3, n_pairs=20, fragment_length=4).make_inference(trained, inference_rng(0))
     np.testing.assert_array_equal(again.candidates, adapter.inference.candidates)
     assert len(training_rollouts(trained, walks(4), 6)) == 6
+
+
+def test_it_takes_ids_and_names():
+    trained = small(PEARLSAC).learn(EPOCH)
+    policy = ANOLEAdapter(trained, POINT_GOAL, n_queries=2, n_pairs=5, seed=0, oracle=ReturnOracle()).adapt()
+    assert policy.latent.shape == (5,)
+    fragments = training_rollouts("PointGoal", POINT_GOAL, 4)
+    ANOLEAdapter("PointGoal", POINT_GOAL, n_queries=2, seed=0, library=fragments, oracle=ReturnOracle()).adapt()
+    with pytest.raises(ValueError, match=r"pass library=sb3_poem.baselines.training_rollouts\(model, env, 200\)"):
+        ANOLEAdapter("PointGoal", POINT_GOAL)
 
 
 class Blind(SpeedModel):
