@@ -13,6 +13,7 @@ from typing import Any
 
 import gymnasium
 
+from poem_envs.headless import has_display
 from sb3_poem import __version__
 from sb3_poem.cli.benchmark_arguments import add_benchmark
 
@@ -195,11 +196,6 @@ def use_offscreen_rendering() -> None:
         backend = offscreen_backend()
         if backend is not None:
             os.environ["MUJOCO_GL"] = backend
-
-
-def has_display() -> bool:
-    """Whether a window can be opened."""
-    return sys.platform != "linux" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 def can_draw() -> bool:

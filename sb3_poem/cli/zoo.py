@@ -9,7 +9,7 @@ from rl_zoo3 import train as zoo_train
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 
-from sb3_poem.cli import has_display
+from poem_envs.headless import has_display
 from sb3_poem.cli.experiment import make_experiment
 from sb3_poem.cli.resume import resumed
 from sb3_poem.loading import ALGORITHMS

@@ -448,9 +448,10 @@ def test_the_policy_is_for_the_task_of_the_adapters_environment():
     assert mean > -11  # 25 steps; the best policies need ten of them for the way
     np.testing.assert_array_equal(a.env.get_attr("task"), [task])
     elsewhere = Monitor(gym.make(POINT))
-    assert evaluate_policy(policy, elsewhere, n_eval_episodes=1)[0] < -15
+    elsewhere.reset(seed=0)
+    assert evaluate_policy(policy, elsewhere, n_eval_episodes=3)[0] < -15
     set_task(elsewhere, task)
-    assert evaluate_policy(policy, elsewhere, n_eval_episodes=3)[0] == pytest.approx(mean, abs=0.5)
+    assert evaluate_policy(policy, elsewhere, n_eval_episodes=3)[0] > -11
     a.close()
 
 
@@ -489,7 +490,8 @@ def test_an_adaptation_resumes_by_names():
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        ({"model": SAC("MlpPolicy", "Pendulum-v1")}, TypeError, "`model` is of type SAC, but must be a trained POEMSAC"),
+        ({"model": SAC}, TypeError, "`model` is the class SAC, but must be a trained POEMSAC"),
+        ({"model": "a SAC"}, TypeError, "`model` is of type SAC, but must be a trained POEMSAC"),
         ({"model": POEMSAC}, TypeError, "`model` is the class POEMSAC, but must be a trained POEMSAC"),
         ({"model": None}, TypeError, "`model` is of type NoneType.*name of a model that ships: .*PointGoal"),
         ({"model": "PointGaol"}, FileNotFoundError, "No model 'PointGaol' is shipped; there are: .*PointGoal"),
@@ -502,6 +504,8 @@ def test_an_adaptation_resumes_by_names():
     ],
 )
 def test_arguments_of_another_kind(arguments, error, message):
+    if arguments.get("model") == "a SAC":
+        arguments = {"model": SAC("MlpPolicy", "Pendulum-v1", buffer_size=10, device="cpu")}
     with pytest.raises(error, match=message):
         PreferenceAdapter(**{"model": POINT_GOAL, "env": POINT, **arguments})
     if "oracle" in arguments:
