@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import base64
-import binascii
 import hmac
 import ipaddress
+import re
 from dataclasses import dataclass, field
-from http.cookies import CookieError, SimpleCookie
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 MAX_BODY = 16 * 1024
-COOKIE = "sb3_poem_access"
+# With the server's port, since a browser sends what one server of a host has set to all of them.
+COOKIE = "sb3_poem_access_{port}"
 LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 # Somebody who guesses a password gets so many answers a second on each connection.
 PAUSE_AFTER_WRONG_PASSWORD = 0.5
@@ -108,10 +108,10 @@ class Gate:
             await refusal(scope, receive, send_with_headers)
             return
         body = await self._body(headers, receive) if scope["method"] not in ("GET", "HEAD") else b""
+        if isinstance(body, Response):
+            await body(scope, receive, send_with_headers)
+            return
         if body is None:
-            await PlainTextResponse(f"a request may hold {self.max_body} bytes at most\n", 413)(
-                scope, receive, send_with_headers
-            )
             return
         sent = False
 
@@ -134,39 +134,44 @@ class Gate:
         return None
 
     async def _ask_who(self, scope: Scope, headers: Headers) -> Response | None:
-        access = self.access
-        if access.password is not None and _has_password(headers, access.user or "", access.password):
+        access, authorization = self.access, headers.get("authorization", "")
+        if access.password is not None and _has_password(authorization, access.user or "", access.password):
             return None
+        given = cookies = None
         if access.token is not None:
-            if _same(_cookie(headers), access.token):
+            name = COOKIE.format(port=scope["server"][1])
+            cookies = _cookies(headers, name)
+            if any(_same(cookie, access.token) for cookie in cookies):
                 return None
             given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
             if _same(given, access.token):
-                response = RedirectResponse(scope["path"] or "/", 303)
+                # One slash: what follows two is another host.
+                response = RedirectResponse("/" + scope["path"].lstrip("/"), 303)
                 # Not "strict": a link that is clicked in somebody's mail would not be let in. Requests of other sites that
                 # write are refused in any case.
-                response.set_cookie(COOKIE, access.token, httponly=True, samesite="lax", max_age=30 * 86400)
+                response.set_cookie(name, access.token, httponly=True, samesite="lax", max_age=30 * 86400)
                 return response
-        if headers.get("authorization") or b"token=" in scope["query_string"]:
+        if authorization or cookies or given:
             await asyncio.sleep(PAUSE_AFTER_WRONG_PASSWORD)
         asks = {"WWW-Authenticate": 'Basic realm="sb3-poem", charset="UTF-8"'} if access.password is not None else {}
         return PlainTextResponse(
             "this page needs the link with its token, or the password, of whoever started it\n", 401, asks
         )
 
-    async def _body(self, headers: Headers, receive: Receive) -> bytes | None:
-        """The request's body, or None where it is too large, of which no more than the limit is read."""
+    async def _body(self, headers: Headers, receive: Receive) -> bytes | Response | None:
+        """The body; a refusal where it is too large, of which no more than the limit is read; None of who has left."""
+        too_large = PlainTextResponse(f"a request may hold {self.max_body} bytes at most\n", 413)
         length = headers.get("content-length", "0")
-        if not length.isdigit() or int(length) > self.max_body:
-            return None
+        if not re.fullmatch("[0-9]{1,9}", length) or int(length) > self.max_body:
+            return too_large
         body = b""
         while True:
             message = await receive()
             if message["type"] == "http.disconnect":
-                return body
+                return None
             body += message.get("body", b"")
             if len(body) > self.max_body:
-                return None
+                return too_large
             if not message.get("more_body", False):
                 return body
 
@@ -180,26 +185,23 @@ def _is_cross_site(headers: Headers) -> bool:
     if site is not None:
         return site not in ("same-origin", "none")
     origin = headers.get("origin")
-    return origin is not None and urlsplit(origin).netloc.lower() != headers.get("host", "").lower()
+    return origin is not None and origin.partition("://")[2].lower() != headers.get("host", "").lower()
 
 
-def _has_password(headers: Headers, user: str, password: str) -> bool:
-    scheme, _, credentials = headers.get("authorization", "").partition(" ")
+def _has_password(authorization: str, user: str, password: str) -> bool:
+    scheme, _, credentials = authorization.partition(" ")
     if scheme.lower() != "basic":
         return False
     try:
         given = base64.b64decode(credentials, validate=True).decode("utf-8")
-    except (binascii.Error, UnicodeDecodeError):
+    except ValueError:  # no base64, or no UTF-8 in it
         return False
     return _same(given, f"{user}:{password}")
 
 
-def _cookie(headers: Headers) -> str:
-    try:
-        morsel = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
-    except CookieError:
-        return ""
-    return "" if morsel is None else morsel.value
+def _cookies(headers: Headers, name: str) -> list[str]:
+    pairs = (pair.strip().partition("=") for pair in headers.get("cookie", "").split(";"))
+    return [value for key, _, value in pairs if key == name]
 
 
 def _same(given: str, right: str) -> bool:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import logging
+import re
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -24,10 +26,17 @@ from sb3_poem.label.export import session_record
 from sb3_poem.label.families import describe
 from sb3_poem.label.sessions import Conversations, FullError
 from sb3_poem.label.store import RefusedError, Session
+from sb3_poem.label.videos import StorageError
+
+_logger = logging.getLogger(__name__)
 
 PAGE = Path(__file__).with_name("page")
 MAX_WISH = 2000
 LONGEST_TOKEN = 64
+DISK_FULL = (
+    "This could not be kept: the disk of this server is full, or cannot be written. What you answered before is safe; "
+    "tell whoever runs the page, and try again when there is room."
+)
 # SQLite's whole numbers.
 LARGEST = 2**63 - 1
 
@@ -59,17 +68,19 @@ class _Pages:
             Route("/s/{token}/stop", self.session(self.stop), methods=["POST"]),
             Route("/s/{token}/verdict", self.session(self.verdict), methods=["POST"]),
             Route("/s/{token}/wish", self.session(self.wish), methods=["POST"]),
-            Route("/s/{token}/video/{number:int}", self.session(self.video)),
+            Route("/s/{token}/video/{number}", self.session(self.video)),
             Route("/s/{token}/answers.json", self.session(self.answers)),
             Route("/s/{token}/policy.safetensors", self.session(self.policy)),
             Mount("/static", StaticFiles(directory=PAGE / "static")),
         ]
-        return Starlette(
+        app = Starlette(
             routes=routes,
             middleware=[Middleware(Gate, access=access)],
-            exception_handlers={HTTPException: _http_error, RefusedError: _refused, FullError: _full},
+            exception_handlers=dict.fromkeys((HTTPException, RefusedError, FullError, StorageError), _say),
             lifespan=self.lifespan,
         )
+        app.router.redirect_slashes = False  # to http://, behind a proxy with TLS
+        return app
 
     @contextlib.asynccontextmanager
     async def lifespan(self, _: Starlette) -> AsyncIterator[None]:
@@ -131,8 +142,8 @@ class _Pages:
         return JSONResponse({})
 
     async def video(self, request: Request, session: Session) -> Response:
-        number = int(request.path_params["number"])
-        path = await asyncio.to_thread(self.conversations.video, session, number) if number <= LARGEST else None
+        number = re.fullmatch("[0-9]{1,18}", request.path_params["number"])
+        path = None if number is None else await asyncio.to_thread(self.conversations.video, session, int(number[0]))
         if path is None:
             raise HTTPException(404)
         # What a turn shows never changes, and only this browser may keep it.
@@ -184,19 +195,23 @@ async def _fields(request: Request, **kinds: type) -> dict[str, Any]:
     for name, kind in kinds.items():
         if type(data[name]) is not kind or (kind is int and not 0 <= data[name] <= LARGEST):
             raise HTTPException(400, f"`{name}` must be {'a whole number' if kind is int else 'a text'}")
+        if kind is str and any("\ud800" <= character <= "\udfff" for character in data[name]):
+            raise HTTPException(400, f"`{name}` holds half a character (a lone surrogate)")
     return data
 
 
-async def _http_error(request: Request, error: Exception) -> Response:
-    assert isinstance(error, HTTPException)
+async def _say(request: Request, error: Exception) -> Response:
+    """A sentence: plain for who sees it as a page, else JSON."""
+    words, headers = str(error), None
+    if isinstance(error, HTTPException):
+        words, status, headers = error.detail, error.status_code, error.headers
+    elif isinstance(error, StorageError):
+        _logger.error("%s", error)
+        words, status = DISK_FULL, 507
+    elif isinstance(error, FullError):
+        status, headers = 503, {"Retry-After": "60"}
+    else:
+        status = 409
     if "text/html" in request.headers.get("accept", ""):
-        return PlainTextResponse(f"{error.detail}\n", error.status_code, error.headers)
-    return JSONResponse({"error": error.detail}, error.status_code, error.headers)
-
-
-async def _refused(_: Request, error: Exception) -> Response:
-    return JSONResponse({"error": str(error)}, 409)
-
-
-async def _full(_: Request, error: Exception) -> Response:
-    return JSONResponse({"error": str(error)}, 503, {"Retry-After": "60"})
+        return PlainTextResponse(f"{words}\n", status, headers)
+    return JSONResponse({"error": words}, status, headers)

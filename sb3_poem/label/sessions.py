@@ -16,6 +16,7 @@ from sb3_poem.adaptation.adapter import OtherModelError
 from sb3_poem.label.catalogue import Choice
 from sb3_poem.label.store import RefusedError, Session, Store
 from sb3_poem.label.turns import Request, Turn, load_choice
+from sb3_poem.label.videos import StorageError
 from sb3_poem.label.workshop import LIKELY, POSSIBLE, WAITED_FOR, Job, Workshop
 
 _logger = logging.getLogger(__name__)
@@ -27,6 +28,8 @@ GONE_AFTER_SECONDS = 600.0
 AT_WORK_SECONDS = 60.0
 # While more people are at work than turns can be made at a time, films show every second step: half the work.
 CROWDED_FILM_EVERY = 2
+# Errors that say in words why a turn could not be made.
+TOLD = (RefusedError, OtherModelError, StorageError)
 # After a turn that could not be made: not at once again.
 RETRY_SECONDS = 5.0
 
@@ -43,7 +46,7 @@ class _Presence:
     #: (number of the question's turn or None at the start, preference, kind) -> the turn that follows.
     jobs: dict[tuple[int | None, str | None, str], Job] = field(default_factory=dict)
     task: asyncio.Task[None] | None = None
-    failed: str | None = None
+    failed: Exception | None = None
     failed_at: float = 0.0
 
 
@@ -121,6 +124,7 @@ class Conversations:
 
         :param session: The session.
         :return: JSON-ready.
+        :raises StorageError: If it cannot be kept.
         """
         presence = self._presence(session)
         session, answered, turn, before = await asyncio.to_thread(self._look, session.id)
@@ -140,8 +144,11 @@ class Conversations:
             view["belief"] = json.loads(shown["belief"])
         if turn is None or not (self.store.videos / turn["video"]).is_file():
             self._begin_turn(session, answered, wanted)
+            if isinstance(presence.failed, StorageError):
+                raise presence.failed
             if presence.failed is not None:
-                view["failed"] = presence.failed
+                told, kind = isinstance(presence.failed, TOLD), type(presence.failed).__name__
+                view["failed"] = str(presence.failed) if told else f"{kind}; it is tried again"
             return view
         if turn["shown"] is None:
             await asyncio.to_thread(self.store.mark_shown, turn["id"])
@@ -277,9 +284,10 @@ class Conversations:
         except asyncio.CancelledError:
             raise
         except Exception as error:
-            _logger.exception("session %d: the %s after %d answers could not be made", session.id, wanted, answered)
-            told = isinstance(error, RefusedError | OtherModelError)
-            presence.failed = str(error) if told else f"{type(error).__name__}; it is tried again"
+            words = "session %d: the %s after %d answers could not be made: %s"
+            trace = None if isinstance(error, TOLD) else error
+            _logger.error(words, session.id, wanted, answered, error, exc_info=trace)
+            presence.failed = error
             presence.failed_at = time.monotonic()
 
     def _put_back(self, session: Session, answered: int, wanted: str, video: Path, made: Turn) -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_poem.label.turns import Turn
+from sb3_poem.label.videos import StorageError
 
 SCHEMA_VERSION = 1
 SCHEMA = """
@@ -104,22 +105,27 @@ class Store:
     """
     The store. One connection, used by one thread at a time; several processes may open the same file.
 
-    :param folder: Where; it is made if missing. ``answers.sqlite`` is the store, ``videos/`` holds the videos.
+    Each method raises :class:`~sb3_poem.label.videos.StorageError` if the disk is full or broken.
+
+    :param folder: Where; it is made if missing, for its owner alone. ``answers.sqlite`` is the store, ``videos/`` holds the
+        videos.
     :raises ValueError: If the store is of another version.
     """
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
         self.videos = self.folder / "videos"
-        self.videos.mkdir(parents=True, exist_ok=True)
+        self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self.videos.mkdir(mode=0o700, exist_ok=True)
         self.path = self.folder / "answers.sqlite"
         self._lock = threading.RLock()
-        self._connection = sqlite3.connect(self.path, timeout=30.0, isolation_level=None, check_same_thread=False)
-        self._connection.row_factory = sqlite3.Row
-        self.path.chmod(0o600)
-        for setting in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON"):
-            self._connection.execute(f"PRAGMA {setting}")
-        self._make_tables()
+        with self._speaking():
+            self._connection = sqlite3.connect(self.path, timeout=30.0, isolation_level=None, check_same_thread=False)
+            self._connection.row_factory = sqlite3.Row
+            self.path.chmod(0o600)
+            for setting in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON"):
+                self._connection.execute(f"PRAGMA {setting}")
+            self._make_tables()
 
     def close(self) -> None:
         """Close the file."""
@@ -397,34 +403,42 @@ class Store:
         return len(orphans)
 
     @contextmanager
-    def _transaction(self) -> Iterator[sqlite3.Connection]:
+    def _speaking(self) -> Iterator[None]:
+        """One thread at a time, and SQLite's errors as sentences."""
         with self._lock:
+            try:
+                yield
+            except sqlite3.DatabaseError as error:
+                hint = " (is the disk full?)" if "disk I/O" in str(error) else ""
+                raise StorageError(f"{self.path} cannot be read or written: {error}{hint}") from error
+
+    @contextmanager
+    def _transaction(self) -> Iterator[sqlite3.Connection]:
+        with self._speaking():
             self._connection.execute("BEGIN IMMEDIATE")
             try:
                 yield self._connection
-            except BaseException:
-                self._connection.execute("ROLLBACK")
-                raise
-            self._connection.execute("COMMIT")
+                self._connection.execute("COMMIT")
+            finally:
+                if self._connection.in_transaction:
+                    self._connection.execute("ROLLBACK")
 
     def _make_tables(self) -> None:
-        with self._lock:
-            self._connection.execute("BEGIN IMMEDIATE")
-            version = self._connection.execute("PRAGMA user_version").fetchone()[0]
-            if version == 0:
-                for statement in SCHEMA.split(";"):
-                    self._connection.execute(statement)
-                self._connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
-            self._connection.execute("COMMIT")
+        with self._transaction() as connection:
+            version = connection.execute("PRAGMA user_version").fetchone()[0]
             if version not in (0, SCHEMA_VERSION):
                 raise ValueError(f"{self.path} is a store of version {version}; this program reads {SCHEMA_VERSION}")
+            if version == 0:
+                for statement in SCHEMA.split(";"):
+                    connection.execute(statement)
+                connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
 
     def _one(self, query: str, *arguments: Any) -> sqlite3.Row | None:
-        with self._lock:
+        with self._speaking():
             return self._connection.execute(query, arguments).fetchone()
 
     def _all(self, query: str, *arguments: Any) -> list[sqlite3.Row]:
-        with self._lock:
+        with self._speaking():
             return self._connection.execute(query, arguments).fetchall()
 
 

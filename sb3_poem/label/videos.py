@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-import tempfile
+import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,9 +13,14 @@ WIDTH, HEIGHT = 320, 240
 # Frames between which a player can start: seeking decodes at most so many.
 KEYFRAME_DISTANCE = 10
 ENCODER = [
+    *("-an", "-c:v", "libx264", "-pix_fmt", "yuv420p"),
     *("-preset", "ultrafast", "-crf", "24", "-bf", "0", "-threads", "1"),
     *("-g", str(KEYFRAME_DISTANCE), "-movflags", "+faststart"),
 ]
+
+
+class StorageError(OSError):
+    """What cannot be kept: the disk is full, say."""
 
 
 def write_clip(frames: Sequence[np.ndarray], path: Path, fps: float) -> None:
@@ -25,20 +30,28 @@ def write_clip(frames: Sequence[np.ndarray], path: Path, fps: float) -> None:
     :param frames: (height, width, 3) uint8 each, of one size.
     :param path: The file, which must end in ``.mp4``; its folder must exist.
     :param fps: Frames per second.
+    :raises StorageError: If it cannot be written.
     """
-    import imageio.v2 as imageio
+    from imageio_ffmpeg import get_ffmpeg_exe
 
-    descriptor, temporary = tempfile.mkstemp(prefix=".writing-", suffix=".mp4", dir=path.parent)
-    os.close(descriptor)
+    height, width = frames[0].shape[:2]
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:.02f}", "-i", "-"]
+    temporary = path.with_name(f".writing-{path.name}")
+    command = [get_ffmpeg_exe(), "-y", "-v", "error", *source, *ENCODER, str(temporary)]
     try:
-        imageio.mimwrite(
-            temporary, list(frames), format="FFMPEG", fps=fps, codec="libx264", macro_block_size=2, output_params=ENCODER
-        )
+        # Not imageio's writer, which takes no notice when ffmpeg fails at the end.
+        pixels = b"".join(frame.tobytes() for frame in frames)
+        done = subprocess.run(command, input=pixels, capture_output=True, check=False)
+        if done.returncode != 0:
+            words = done.stderr.decode(errors="replace").partition("\n")[0]
+            raise OSError(f"ffmpeg ended with status {done.returncode} {words}")
         with open(temporary, "rb") as file:
             os.fsync(file.fileno())
         os.replace(temporary, path)
+    except OSError as error:
+        raise StorageError(f"{path} cannot be written: {error}") from error
     finally:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 def pair(left: Sequence[np.ndarray], right: Sequence[np.ndarray]) -> list[np.ndarray]:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import urljoin, urlsplit
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from label_world import make_conversations
 from starlette.testclient import TestClient
 
 from sb3_poem.adaptation.policy import AdaptedPolicy
-from sb3_poem.label.access import MAX_BODY, Access, is_loopback
+from sb3_poem.label.access import MAX_BODY, PAUSE_AFTER_WRONG_PASSWORD, Access, is_loopback
 from sb3_poem.label.catalogue import Choice
 from sb3_poem.label.server import make_app
 from sb3_poem.label.store import Store
@@ -115,7 +116,16 @@ def test_no_path_leads_out(served: tuple[TestClient, Store], path: str) -> None:
 def test_video_numbers_that_are_names_lead_nowhere(served: tuple[TestClient, Store]) -> None:
     client, _ = served
     session = begin(client)
-    for name in ("../../answers.sqlite", "..%2f..%2fanswers.sqlite", "1.mp4", "-1", "%2fetc%2fpasswd", "99999999999999999999"):
+    for name in (
+        "../../answers.sqlite",
+        "..%2f..%2fanswers.sqlite",
+        "1.mp4",
+        "-1",
+        "%2fetc%2fpasswd",
+        "9" * 20,
+        "9" * 5000,
+        "%d9%a1",
+    ):
         assert client.get(f"{session}/video/{name}").status_code == 404, name
 
 
@@ -155,6 +165,8 @@ def test_repeated_late_and_contradicting_posts(served: tuple[TestClient, Store])
         (b'{"question": 99999999999999999999999, "preference": "left"}', "application/json", 400),
         (b'{"question": 1, "preference": ["left"]}', "application/json", 400),
         (b'{"question": 1, "preference": "left", "more": 1}', "application/json", 400),
+        (b'{"question": ' + b"9" * 5000 + b', "preference": "left"}', "application/json", 400),
+        (b'{"question": 1, "preference": "\\ud800"}', "application/json", 400),
         (b'{"question": 1, "preference": "middle"}', "application/json", 409),
         (b'{"question": 1, "preference": "left"}', "text/plain", 415),
         (b"question=1&preference=left", "application/x-www-form-urlencoded", 415),
@@ -186,7 +198,15 @@ def test_huge_bodies_are_refused_declared_or_not(served: tuple[TestClient, Store
     assert client.post(f"{session}/wish", json={"wish": "x" * MAX_BODY}).status_code == 413
     assert client.post(f"{session}/wish", json={"wish": "x" * 2001}).status_code == 409
     assert client.post(f"{session}/wish", json={"wish": "é" * 2000}).status_code == 200
+    assert client.post(f"{session}/wish", json={"wish": "\U0001f600"}).status_code == 200
+    for half in (b"\\ud800", b"\\udfff", b"\xed\xa0\x80"):
+        content = b'{"wish": "' + half + b'"}'
+        response = client.post(f"{session}/wish", content=content, headers={"Content-Type": "application/json"})
+        assert (response.status_code, "half a character" in response.text) == (400, True)
     assert client.post(f"{session}/wish", content=b"{}", headers={"Content-Length": "-5"}).status_code == 413
+    for length in (b"9" * 5000, b"\xb2", b"+1", b"0x1"):
+        response = client.post(f"{session}/wish", content=b"{}", headers={b"Content-Length": length})
+        assert response.status_code == 413
     read = 0
 
     def endless() -> Iterator[bytes]:
@@ -201,7 +221,12 @@ def test_huge_bodies_are_refused_declared_or_not(served: tuple[TestClient, Store
 def test_other_sites_cannot_post_and_other_names_are_not_answered(served: tuple[TestClient, Store]) -> None:
     client, _ = served
     session = _shared(client)
-    for headers in ({"Origin": "https://evil.example"}, {"Sec-Fetch-Site": "cross-site"}, {"Origin": "null"}):
+    for headers in (
+        {"Origin": "https://evil.example"},
+        {"Sec-Fetch-Site": "cross-site"},
+        {"Origin": "null"},
+        {"Origin": "http://["},
+    ):
         assert client.post("/start", data={"model": "PointGoal"}, headers=headers).status_code == 403
         assert client.post(f"{session}/stop", json={}, headers=headers).status_code == 403
     assert client.get("/", headers={"Host": "evil.example"}).status_code == 421
@@ -246,7 +271,6 @@ def test_a_password_or_a_token_is_asked_for(guarded: TestClient) -> None:
     assert guarded.get("/", auth=("ann", "wrong")).status_code == 401
     assert guarded.get("/?token=wrong").status_code == 401
     assert guarded.get("/", headers={"Authorization": "Basic %%%"}).status_code == 401
-    assert guarded.get("/", headers={"Cookie": "sb3_poem_access=wrong"}).status_code == 401
     assert guarded.get("/", auth=("ann", "a long password")).status_code == 200
     entry = guarded.get("/?token=" + "t" * 32)
     assert entry.status_code == 303
@@ -254,6 +278,50 @@ def test_a_password_or_a_token_is_asked_for(guarded: TestClient) -> None:
     assert "httponly" in entry.headers["set-cookie"].lower()
     assert "samesite=lax" in entry.headers["set-cookie"].lower()  # a browser keeps a strict one back after a click elsewhere
     assert guarded.get("/").status_code == 200  # the client keeps the cookie
+
+
+@pytest.mark.parametrize(
+    ("path", "headers"),
+    [
+        ("/", [(b"authorization", b"Basic YW5uOndyb25n")]),
+        ("/", [(b"authorization", b"Basic \xe9\xff")]),
+        ("/", [(b"authorization", b"\xff")]),
+        ("/?token=wrong", []),
+        ("/?%74oken=" + "9" * 5000, []),
+        ("/", [(b"cookie", b"sb3_poem_access_80=wrong")]),
+    ],
+)
+def test_who_guesses_waits(guarded: TestClient, path: str, headers: list[tuple[bytes, bytes]]) -> None:
+    begun = time.monotonic()
+    assert guarded.get(path, headers=headers).status_code == 401
+    assert time.monotonic() - begun >= PAUSE_AFTER_WRONG_PASSWORD
+
+
+@pytest.mark.parametrize(
+    "path", ["//evil.example/", "///evil.example/", "/%2Fevil.example/", "/%5Cevil.example/", "/%09/evil.example"]
+)
+def test_a_token_leads_to_no_other_site(guarded: TestClient, path: str) -> None:
+    entry = guarded.get(f"{HOST}{path}?token=" + "t" * 32)
+    assert entry.status_code == 303
+    assert urlsplit(urljoin(HOST, entry.headers["location"])).netloc == "localhost"
+
+
+def test_two_servers_of_one_host_keep_their_cookies(store: Store, point_goal: Choice) -> None:
+    jar = ""
+    clients = []
+    for port, token in ((7860, "a" * 32), (7861, "b" * 32)):
+        app = make_app(make_conversations(store, point_goal), Access(token=token))
+        clients.append(TestClient(app, base_url=f"{HOST}:{port}", follow_redirects=False))
+        jar += clients[-1].get(f"/?token={token}").headers["set-cookie"].partition(";")[0] + "; "
+        clients[-1].cookies.clear()
+    assert [client.get("/").status_code for client in clients] == [401, 401]
+    assert [client.get("/", headers={"Cookie": jar}).status_code for client in clients] == [200, 200]
+
+
+def test_no_redirect_names_a_scheme(served: tuple[TestClient, Store]) -> None:
+    client, _ = served
+    for path in ("/static", f"{_shared(client)}/", "/start/"):
+        assert client.get(path).status_code == 404  # behind a proxy with TLS it would name http://
 
 
 @pytest.mark.parametrize(
