@@ -112,7 +112,15 @@ def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
     server = parser.add_argument_group("the server")
     server.add_argument("--host", default="127.0.0.1", help="default: %(default)s, which only this machine reaches")
     server.add_argument("--port", type=_count(0), default=7860, help="default: %(default)s; 0 takes a free one")
-    server.add_argument("--auth", metavar="USER:PASSWORD", help="ask for a name and a password of at least 12 characters")
+    password = server.add_mutually_exclusive_group()
+    password.add_argument(
+        "--auth",
+        metavar="USER:PASSWORD",
+        help="ask for a name and a password of at least 12 characters; others on this machine see it in the list of processes",
+    )
+    password.add_argument(
+        "--auth-file", type=Path, metavar="FILE", help="read them from a file (default: from SB3_POEM_AUTH, if that is set)"
+    )
     server.add_argument("--token", action="store_true", help="let in only who has the link with the token, which is printed")
     server.add_argument("--allow-host", nargs="+", metavar="NAME", default=[], help="further names of this server")
     server.add_argument(

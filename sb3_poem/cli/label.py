@@ -2,6 +2,7 @@
 
 import argparse
 import importlib
+import os
 import secrets
 from pathlib import Path
 from typing import Any
@@ -9,9 +10,10 @@ from typing import Any
 from rich.console import Console
 
 from sb3_poem.cli.adapt import parse_env_kwargs
-from sb3_poem.cli.outputs import check_output, check_writable
+from sb3_poem.cli.outputs import check_output
 
 SHORTEST_PASSWORD = 12
+AUTH_VARIABLE = "SB3_POEM_AUTH"
 
 
 def run_label(arguments: argparse.Namespace) -> None:
@@ -36,7 +38,7 @@ def run_page(arguments: argparse.Namespace) -> None:
         raise ValueError(f"the page needs {error.name}: pip install 'sb3_poem[label]'") from None
     from sb3_poem.label.access import LOOPBACK, Access, is_loopback
     from sb3_poem.label.catalogue import read_catalogue
-    from sb3_poem.label.hosting import bind, make_server
+    from sb3_poem.label.hosting import bind, link_host, make_server
     from sb3_poem.label.server import make_app
     from sb3_poem.label.sessions import Conversations
     from sb3_poem.label.store import Store
@@ -44,19 +46,18 @@ def run_page(arguments: argparse.Namespace) -> None:
     from sb3_poem.label.workshop import Workshop, process_pool
 
     console = Console()
-    user, password = read_password(arguments.auth)
+    user, password = read_password(arguments.auth, arguments.auth_file)
     token = secrets.token_urlsafe(24) if arguments.token else None
     if not is_loopback(arguments.host) and password is None and token is None:
         raise ValueError(
             f"--host {arguments.host} lets other machines reach the page, where whoever comes can make this machine render "
-            "and read what it shows; add --token or --auth USER:PASSWORD"
+            "and read what it shows; add --token or --auth-file FILE"
         )
     for package in arguments.gym_packages:
         importlib.import_module(package)
     options = {"inference": arguments.inference, "mistake_rate": arguments.mistake_rate}
     adapter_options(options)  # says now what is out of range
     catalogue = read_catalogue(arguments.model, arguments.env, parse_env_kwargs(arguments.env_kwargs))
-    check_writable(arguments.store)
     listener = bind(arguments.host, arguments.port)
     port = listener.getsockname()[1]
     store = Store(arguments.store)
@@ -73,7 +74,8 @@ def run_page(arguments: argparse.Namespace) -> None:
     hosts = frozenset((*LOOPBACK, arguments.host.lower(), *(name.lower() for name in arguments.allow_host)))
     app = make_app(conversations, Access(user, password, token, hosts))
     query = "" if token is None else f"/?token={token}"
-    name = f"[{arguments.host}]" if ":" in arguments.host else arguments.host
+    name = link_host(listener, arguments.host)
+    name = f"[{name}]" if ":" in name else name
     console.print(f"The page is at http://{name}:{port}{query}", soft_wrap=True, highlight=False)
     console.print(
         f"Models: {', '.join(choice.name for choice in catalogue)}. Answers are kept in {store.path}.",
@@ -92,19 +94,25 @@ def run_page(arguments: argparse.Namespace) -> None:
         store.close()
 
 
-def read_password(auth: str | None) -> tuple[str | None, str | None]:
+def read_password(auth: str | None, file: Path | None) -> tuple[str | None, str | None]:
     """
-    Read ``USER:PASSWORD``.
+    Read ``USER:PASSWORD`` from the flag, else from the file, else from the environment.
 
     :raises ValueError: if it has another form, or the password is short
+    :raises OSError: if there is no such file
     """
+    source = "--auth"
+    if file is not None:
+        source, auth = f"--auth-file {file}", file.read_text(encoding="utf-8").rstrip("\r\n")
+    elif auth is None:
+        source, auth = AUTH_VARIABLE, os.environ.get(AUTH_VARIABLE)
     if auth is None:
         return None, None
     user, colon, password = auth.partition(":")
     if not user or not colon:
-        raise ValueError("--auth must have the form USER:PASSWORD")
+        raise ValueError(f"{source} must have the form USER:PASSWORD")
     if len(password) < SHORTEST_PASSWORD:
-        raise ValueError(f"--auth: the password must have at least {SHORTEST_PASSWORD} characters, but has {len(password)}")
+        raise ValueError(f"{source}: the password must have at least {SHORTEST_PASSWORD} characters, but has {len(password)}")
     return user, password
 
 
