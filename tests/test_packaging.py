@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import sysconfig
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -67,6 +68,19 @@ def test_every_tested_version_is_within_the_declared_ranges(setup_cfg: configpar
     assert len(requirements) > 20
     for requirement in requirements:
         assert requirement.specifier.contains(tested[canonicalize_name(requirement.name)]), requirement
+
+
+def test_the_supported_pythons_are_the_same_everywhere(setup_cfg: configparser.ConfigParser) -> None:
+    prefix = "Programming Language :: Python :: 3."
+    minors = [line.removeprefix(prefix) for line in setup_cfg["metadata"]["classifiers"].splitlines() if prefix in line]
+    first, last = f"3.{minors[0]}", f"3.{minors[-1]}"
+    assert (first, last) == ("3.11", "3.13")
+    assert setup_cfg["options"]["python_requires"] == f">={first}"
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]
+    assert settings["ruff"]["target-version"] == f"py{first.replace('.', '')}"
+    assert settings["mypy"]["python_version"] == first
+    assert f"sys.version_info < ({first.replace('.', ', ')})" in (ROOT / "Makefile").read_text()
+    assert f"Python {first} to {last}" in (ROOT / "README.md").read_text()
 
 
 def test_citation_names_this_version() -> None:

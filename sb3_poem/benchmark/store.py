@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -149,7 +149,7 @@ class Store:
         row = record.to_dict()
         for name in ("identity", "result", "provenance"):
             row[name] = json.dumps(row[name], sort_keys=True, allow_nan=False)
-        row["created"] = record.created or datetime.now(timezone.utc).isoformat(timespec="seconds")
+        row["created"] = record.created or datetime.now(UTC).isoformat(timespec="seconds")
         with self._engine.begin() as connection:
             return connection.execute(insert(_CELLS).on_conflict_do_nothing(), row).rowcount == 1
 
