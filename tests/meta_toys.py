@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
@@ -9,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from poem_envs import SignedPermutation, Symmetry, TaskFamily
@@ -177,6 +180,20 @@ LEARN: dict[str, Any] = {
     "device": "cpu",
 }
 LEARN_STEPS = 12 * 20 * POINT_GOAL_STEPS
+
+
+class Interrupt(BaseCallback):
+    """Sends this process a signal, as Ctrl-C does, once so many environment steps are done."""
+
+    def __init__(self, at: int, number: int = signal.SIGINT, times: int = 1) -> None:
+        super().__init__()
+        self.at, self.number, self.times = at, number, times
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == self.at:
+            for _ in range(self.times):
+                os.kill(os.getpid(), self.number)
+        return True
 
 
 def point_goal_bounds(tasks: np.ndarray) -> tuple[float, float]:

@@ -88,6 +88,43 @@ def test_shipped_files_of_other_names_are_not_found() -> None:
         resources.pretrained_folder("Nobody")
 
 
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["train", "--env", "poem/PointGoal-v0", "-c", "missing.yml"],
+        ["enjoy", "--algo", "ppo", "--env", "poem/PointGoal-v0", "--no-render", "-f", "missing"],
+        ["adapt", "--model", "missing.zip"],
+        ["label", "--model", "missing.zip"],
+        ["benchmark", "run", "--suite", "smoke", "--models", "missing"],
+    ],
+    ids=lambda command: command[0],
+)
+def test_modules_that_register_environments_are_found_in_the_working_folder(
+    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    # as for the console script, which has its own folder there
+    monkeypatch.setattr(sys, "path", [folder for folder in sys.path if folder not in ("", os.getcwd())])
+    (tmp_path / "families_here.py").write_text("print('families are registered')")
+    monkeypatch.delitem(sys.modules, "families_here", raising=False)
+    assert cli.main([*command, "--gym-packages", "families_here"]) == 1
+    shown = capsys.readouterr()
+    assert "families are registered" in shown.out
+    assert "missing" in shown.err
+    for name in ("families_there", "families_here.py"):
+        assert cli.main([*command, "--gym-packages", name]) == 1
+        assert (
+            f"--gym-packages {name}: there is no such module, neither installed nor in {tmp_path}" in capsys.readouterr().err
+        )
+
+
+def test_a_closed_standard_input_is_at_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdin", None)
+    assert cli.main(["adapt", "--model", "missing.zip"]) == 1
+    with pytest.raises(EOFError):
+        input()
+
+
 def without_display(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"):
         monkeypatch.delenv(name, raising=False)

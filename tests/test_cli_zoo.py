@@ -1,5 +1,9 @@
 """``sb3-poem train`` and ``enjoy``: rl_zoo3 with our algorithms, files and checks."""
 
+import os
+import shlex
+import signal
+import subprocess
 import sys
 from functools import partial
 from pathlib import Path
@@ -8,8 +12,9 @@ import gymnasium as gym
 import numpy as np
 import optuna
 import pytest
+import torch as th
 import yaml
-from meta_toys import WindyWalk
+from meta_toys import WindyWalk, differing, parameters
 from rl_zoo3 import ALGOS
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
@@ -144,7 +149,7 @@ def test_a_search_on_a_family_without_shared_dynamics(tmp_path: Path, monkeypatc
 
 
 def test_a_checkpoint_continues_bit_for_bit(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def parameters(run: int) -> dict[str, np.ndarray]:
+    def weights(run: int) -> dict[str, np.ndarray]:
         model = POEMSAC.load(tmp_path / f"logs/poem_sac/poem-PointGoal-v0_{run}/poem-PointGoal-v0.zip")
         assert model.num_timesteps == 600
         return {name: value.numpy() for name, value in model.policy.state_dict().items()}
@@ -171,7 +176,7 @@ def test_a_checkpoint_continues_bit_for_bit(config: Path, tmp_path: Path, monkey
     assert not (saved[-1].parent / "poem-PointGoal-v0.zip").exists()
 
     assert train(*flags, "-i", saved[-1]) == 0
-    whole, resumed = parameters(1), parameters(3)
+    whole, resumed = weights(1), weights(3)
     assert whole.keys() == resumed.keys()
     for name, value in whole.items():
         np.testing.assert_array_equal(value, resumed[name], err_msg=name)
@@ -273,6 +278,70 @@ def test_a_number_that_yaml_reads_as_text_is_named(tmp_path: Path, capsys: pytes
     assert "write 0.001" in error
 
 
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (("-params", "kl_coef:abc"), ("-params kl_coef:abc", "'abc'", "KEY:VALUE")),
+        (("-params", "kl_coef"), ("-params kl_coef", "KEY:VALUE")),
+        (("-params", "kl_coef:'abc'"), ("kl_coef in -params must be a number, got 'abc'",)),
+        (("-params", "kl_coef:'0.1'"), ("kl_coef in -params is the text '0.1'; write 0.1",)),
+        (("-params", "batch_size:2.5"), ("batch_size in -params must be a whole number, got 2.5",)),
+        (("-params", "learning_rate:'fast'"), ("learning_rate in -params must be a number, or 'lin_' and a number",)),
+        (("-params", "n_timesteps:0"), ("n_timesteps in -params must be a positive number, got 0",)),
+        (("-n", "0"), ("-n/--n-timesteps must be at least 1, got 0",)),
+        (("-n", "-300"), ("-n/--n-timesteps must be at least 1, got -300",)),
+        (("-c", "missing.yml"), ("-c missing.yml: there is no such file",)),
+        (("-c", "missing"), ("-c missing: there is no such module", ".yml")),
+        (("--env", "HalfCheetahVel"), ("--env HalfCheetahVel", "did you mean poem/HalfCheetahVel-v0?")),
+        (("--env", "nothing-like-it"), ("--env nothing-like-it", "--gym-packages")),
+        (("--gym-packages", "no_module"), ("--gym-packages no_module: there is no such module",)),
+    ],
+)
+def test_a_wrong_argument_is_named_before_training(
+    flags: tuple[str, ...],
+    words: tuple[str, ...],
+    config: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert train("-c", config, "-f", tmp_path / "logs", *flags) == 1
+    error = capsys.readouterr().err
+    assert all(word in error for word in words), error
+    assert not list((tmp_path / "logs").rglob("*.csv")), "nothing may have started"
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("", "must hold a mapping of hyperparameters for each environment id"),
+        ("[1, 2]", "must hold a mapping"),
+        ("poem/PointGoal-v0: 5", "must hold a mapping"),
+        ("poem/PointGoal-v0: {policy: MlpPolicy}", "entry 'poem/PointGoal-v0' has no 'n_timesteps'"),
+    ],
+)
+def test_a_file_of_another_form_is_refused(
+    content: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "other.yml").write_text(content)
+    assert train("-c", tmp_path / "other.yml", "-f", tmp_path / "logs") == 1
+    error = capsys.readouterr().err
+    assert f"{tmp_path / 'other.yml'}" in error
+    assert words in error
+
+
+@pytest.mark.parametrize("algorithm", ["poem_sac", "pearl_sac"])
+@pytest.mark.parametrize("key", ["env_wrapper", "vec_env_wrapper", "frame_stack", "normalize"])
+def test_what_changes_a_family_is_refused_before_training(
+    algorithm: str, key: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    value = {"frame_stack": 4, "normalize": True}.get(key, "gymnasium.wrappers.NormalizeReward")
+    config = write_entry(tmp_path / "wrapped.yml", **{key: value})
+    assert train("--algo", algorithm, "-c", config, "-f", tmp_path / "logs") == 1
+    error = capsys.readouterr().err
+    assert f"'{key}' in {config}, entry 'poem/PointGoal-v0' is not for {algorithm}: it changes what is seen or paid" in error
+    assert not list((tmp_path / "logs").rglob("*.csv")), "nothing may have started"
+
+
 def test_an_environment_that_is_no_task_family_is_refused(
     config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -294,69 +363,120 @@ def test_enjoy_without_a_display_says_what_to_do(monkeypatch: pytest.MonkeyPatch
     assert "--no-render" in capsys.readouterr().err
 
 
-# ---------------------------------------------------------------- --resume
+# ---------------------------------------------------------------- interruptions and --resume
+
+# an epoch of this configuration takes 150 steps
+LONG = ("--eval-freq", "-1", "-params", "n_timesteps:900")
 
 
-class InterruptionError(Exception):
+class CrashError(Exception):
     """Training was cut off."""
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, th.Tensor]:
+    """What training ends with when nothing interrupts it."""
+    folder = tmp_path_factory.mktemp("whole")
+    config = write_entry(folder / "small.yml")
+    assert train("-c", config, "-f", folder, *LONG) == 0
+    (run,) = (folder / "poem_sac").iterdir()
+    assert not (run / "checkpoint.zip").exists()  # nobody asked for it, and nothing is left to go on with
+    return parameters(POEMSAC.load(run / "poem-PointGoal-v0.zip"))
+
+
+def trained(folder: Path, run: int) -> POEMSAC:
+    return POEMSAC.load(folder / "poem_sac" / f"poem-PointGoal-v0_{run}" / "poem-PointGoal-v0.zip")
+
+
+def interrupts(path: Path, *callbacks: dict[str, int]) -> Path:
+    return write_entry(path, callback=[{"meta_toys.Interrupt": callback} for callback in callbacks])
+
+
 def test_resume_finishes_the_interrupted_run_of_the_same_seed_as_if_nothing_had_happened(
-    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    config: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    whole: dict[str, th.Tensor],
 ) -> None:
-    # an epoch of this configuration takes 150 steps
-    flags = ("-c", config, "--eval-freq", "-1", "--save-freq", "150", "-params", "n_timesteps:600")
-    assert train("-f", tmp_path / "whole", *flags) == 0
-    logs = tmp_path / "logs"
-    monkeypatch.setattr(POEMSAC, "train", interrupted_at(POEMSAC.train, call=3))
-    with pytest.raises(InterruptionError):
-        train("-f", logs, *flags, "--resume")  # nothing to continue: starts
-    monkeypatch.undo()
+    flags, logs = ("-c", config, *LONG), tmp_path / "logs"
+    learn, calls = POEMSAC.train, []
+
+    def crash(model: POEMSAC, **options: int) -> None:
+        calls.append(None)
+        if len(calls) == 4:
+            raise CrashError
+        learn(model, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(POEMSAC, "train", crash)
+        with pytest.raises(CrashError):
+            train("-f", logs, *flags, "--resume")
+    shown = capsys.readouterr().out
+    assert "has no checkpoint of poem/PointGoal-v0 with seed 0; training begins from zero" in shown
     assert train("-f", logs, "--seed", "1", *flags) == 0  # a newer run, of another seed
-    capsys.readouterr()
     assert train("-f", logs, *flags, "--resume") == 0
     assert "Resuming" in capsys.readouterr().out
-    one, two = (
-        POEMSAC.load(folder / "poem_sac" / run / "poem-PointGoal-v0.zip")
-        for folder, run in ((tmp_path / "whole", "poem-PointGoal-v0_1"), (logs, "poem-PointGoal-v0_3"))
-    )
-    assert one.num_timesteps == two.num_timesteps == 600
-    for ours, theirs in zip(one.policy.parameters(), two.policy.parameters(), strict=True):
-        assert ours.equal(theirs)
+    assert not differing(parameters(trained(logs, 3)), whole)
     assert train("-f", logs, *flags, "--resume") == 0
     assert "has finished already" in capsys.readouterr().out
     assert not (logs / "poem_sac" / "poem-PointGoal-v0_4").exists()
 
 
-def test_resume_goes_on_after_an_interrupt_from_the_keyboard(
-    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_ends_training_after_the_epoch_and_says_how_to_go_on(
+    number: int, tmp_path: Path, capfd: pytest.CaptureFixture[str], whole: dict[str, th.Tensor]
 ) -> None:
-    flags = ("-c", config, "--eval-freq", "-1", "--save-freq", "150", "-params", "n_timesteps:600", "-f", tmp_path)
-    for call in (1, 3):  # before the first checkpoint, and after
-        monkeypatch.setattr(POEMSAC, "train", interrupted_at(POEMSAC.train, call, KeyboardInterrupt))
-        assert train(*flags, "--resume") == 0
-        monkeypatch.undo()
-    folder = tmp_path / "poem_sac"
-    assert (folder / "poem-PointGoal-v0_2" / "poem-PointGoal-v0.zip").exists()  # what was learned so far
-    capsys.readouterr()
-    assert train(*flags, "--resume") == 0
-    assert "Resuming" in capsys.readouterr().out
-    assert POEMSAC.load(folder / "poem-PointGoal-v0_3" / "poem-PointGoal-v0.zip").num_timesteps == 600
-    (folder / "poem-PointGoal-v0_3" / "poem-PointGoal-v0.zip").write_bytes(b"half")
-    assert train(*flags, "--resume") == 1
-    assert "is truncated" in capsys.readouterr().err
+    config = interrupts(tmp_path / "c.yml", {"at": 480, "number": int(number)})
+    assert train("-c", config, "-f", tmp_path, *LONG) == 130
+    error = capfd.readouterr().err
+    assert "Stopping after this epoch" in error
+    stopped, _, command = error.splitlines()[-1].partition("; go on with: sb3-poem ")
+    assert stopped == "Interrupted at 600 of 900 steps"
+    assert trained(tmp_path, 1).num_timesteps == 600
+    assert cli.main(shlex.split(command)) == 0
+    assert not differing(parameters(trained(tmp_path, 2)), whole)
 
 
-def interrupted_at(method, call: int, error: type[BaseException] = InterruptionError):  # type: ignore[no-untyped-def]
-    calls = []
+def test_an_interrupt_of_the_program(tmp_path: Path, whole: dict[str, th.Tensor]) -> None:
+    config = interrupts(tmp_path / "c.yml", {"at": 480})
+    command = [sys.executable, "-m", "sb3_poem.cli", "train", "--env", "poem/PointGoal-v0", "--seed", "0", "-P"]
+    done = subprocess.run(
+        [*command, "-c", str(config), "-f", str(tmp_path), *LONG],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell's background jobs ignore it
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 130, done.stderr
+    assert "Interrupted at 600 of 900 steps; go on with: sb3-poem train --env poem/PointGoal-v0 --seed 0 -P" in done.stderr
+    assert train("-c", config, "-f", tmp_path, *LONG, "--resume") == 0
+    assert not differing(parameters(trained(tmp_path, 2)), whole)
 
-    def wrapped(*arguments, **options):  # type: ignore[no-untyped-def]
-        calls.append(None)
-        if len(calls) == call:
-            raise error
-        return method(*arguments, **options)
 
-    return wrapped
+def test_a_second_interrupt_stops_at_once_and_loses_no_older_checkpoint(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], whole: dict[str, th.Tensor]
+) -> None:
+    config = interrupts(tmp_path / "c.yml", {"at": 480}, {"at": 630, "times": 2})
+    flags = ("-c", config, "-f", tmp_path, *LONG)
+    assert train(*flags) == 130
+    assert train(*flags, "--resume") == 130  # within the first epoch of this run
+    error = capfd.readouterr().err.splitlines()[-1]
+    assert error == "Interrupted at 630 of 900 steps, before the first checkpoint; the same command begins again"
+    assert train(*flags, "--resume", "-params", "n_timesteps:900", "callback:None") == 0
+    assert "after 600 steps" in capfd.readouterr().out
+    assert not differing(parameters(trained(tmp_path, 3)), whole)
+
+
+def test_an_interrupt_before_the_first_checkpoint(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    config = interrupts(tmp_path / "c.yml", {"at": 60, "times": 2})
+    assert train("-c", config, "-f", tmp_path, *LONG) == 130
+    assert "before the first checkpoint; the same command begins again" in capfd.readouterr().err
+    assert train("-c", config, "-f", tmp_path, *LONG, "--resume") == 130
+    assert "has no checkpoint of poem/PointGoal-v0 with seed 0; training begins from zero" in capfd.readouterr().out
+    (tmp_path / "poem_sac" / "poem-PointGoal-v0_2" / "poem-PointGoal-v0.zip").write_bytes(b"half")
+    assert train("-c", config, "-f", tmp_path, *LONG, "--resume") == 1
+    assert "is truncated" in capfd.readouterr().err
 
 
 def test_resume_finds_the_checkpoint_itself(capsys: pytest.CaptureFixture[str]) -> None:

@@ -243,14 +243,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     :param argv: the arguments (default: those of this process)
     :return: the exit status
     """
+    if sys.stdin is None:  # it was closed, and its end is all that there is to read
+        sys.stdin = open(os.devnull)  # noqa: SIM115
     parser = build_parser()
     arguments, others = parser.parse_known_args(argv)
     if others and arguments.command not in ZOO_COMMANDS:
         parser.error(f"unrecognized arguments: {' '.join(others)}")
     try:
         return _run(arguments, others)
-    except KeyboardInterrupt:
-        print("Interrupted.", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        print(str(stop) or "Interrupted.", file=sys.stderr)
         return 130
     except (ValueError, TypeError, OSError, gymnasium.error.Error) as error:
         # The library says in these what the user gave and what would be right; a developer wants the place as well.

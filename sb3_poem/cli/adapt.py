@@ -2,7 +2,6 @@
 
 import argparse
 import ast
-import importlib
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -34,6 +33,7 @@ from sb3_poem.adaptation.evaluation import evaluation_seed, held_out_tasks
 from sb3_poem.adaptation.human import HumanAnswer
 from sb3_poem.adaptation.oracles import compute_reward
 from sb3_poem.cli.outputs import check_output
+from sb3_poem.cli.packages import import_packages
 from sb3_poem.cli.report import Report, describe_task
 from sb3_poem.common.family import FamilyEnv
 from sb3_poem.common.foreign import environment_of
@@ -64,8 +64,7 @@ def run_adapt(arguments: argparse.Namespace) -> None:
         raise ValueError("--plot needs returns, and with --oracle human only --task says by which goal to measure them")
     if arguments.store is not None and arguments.oracle != "human":
         raise ValueError(f"--store keeps a person's answers, but --oracle is {arguments.oracle}")
-    for package in arguments.gym_packages:
-        importlib.import_module(package)
+    import_packages(arguments.gym_packages)
     th.set_num_threads(arguments.num_threads)
     console = Console()
     adaptation = Adaptation(arguments, console)

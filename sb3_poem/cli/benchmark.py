@@ -1,13 +1,13 @@
 """``sb3-poem benchmark``: run suites into a store, and report what it holds."""
 
 import argparse
-import importlib
 from pathlib import Path
 from typing import Any
 
 from sb3_poem.benchmark.methods import VARIANTS
 from sb3_poem.benchmark.suites import SUITES, Budget, Training, family_id, family_label, family_name, hashable
 from sb3_poem.cli.outputs import check_writable
+from sb3_poem.cli.packages import import_packages
 
 
 def run_benchmark(arguments: argparse.Namespace) -> int:
@@ -31,8 +31,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from sb3_poem.benchmark.plan import describe, make_plan
     from sb3_poem.benchmark.runner import run_cells
 
-    for package in arguments.gym_packages:
-        importlib.import_module(package)
+    import_packages(arguments.gym_packages)
     training = Training(arguments.timesteps, tuple(sorted(_parse_params(arguments.params).items())))
     if not training.is_default and (arguments.models or arguments.model):
         raise ValueError("--models and --model hand over models that were trained already: leave out --timesteps and --params")

@@ -1,7 +1,12 @@
 """rl_zoo3's experiments on task families."""
 
+import contextlib
 import inspect
+import os
+import signal
+from collections.abc import Iterator
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import gymnasium as gym
@@ -10,11 +15,12 @@ import yaml
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import get_callback_list
+from stable_baselines3.common.callbacks import ProgressBarCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from poem_envs import TaskFamily
 from sb3_poem.adaptation.callback import AdaptationEvalCallback
-from sb3_poem.cli.hyperparams import check_keys, check_numbers
+from sb3_poem.cli.hyperparams import check_config, check_keys, check_numbers
 from sb3_poem.cli.outputs import check_writable
 from sb3_poem.common.callbacks import TrainingCheckpointCallback
 from sb3_poem.common.vec_env import TaskVecEnv
@@ -25,13 +31,55 @@ from sb3_poem.resources import config_file
 CHECKPOINT = "checkpoint.zip"
 
 
+class TrainingInterrupted(KeyboardInterrupt):
+    """
+    Training was interrupted, and what it had learned is saved.
+
+    :param message: how far it came
+    :param resumable: whether ``--resume`` finds a checkpoint of this run
+    """
+
+    def __init__(self, message: str, resumable: bool) -> None:
+        super().__init__(message)
+        self.resumable = resumable
+
+
+@contextlib.contextmanager
+def stopping_between_epochs(checkpoint: TrainingCheckpointCallback) -> Iterator[None]:
+    """Let the first Ctrl-C (or ``SIGTERM``) end training after the epoch at hand, and the second at once."""
+    signals = (signal.SIGINT, signal.SIGTERM)
+    before = {number: handler for number in signals if (handler := signal.getsignal(number)) is not signal.SIG_IGN}
+
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        restore()
+        checkpoint.stop()
+        # not print, which this signal may have interrupted
+        os.write(2, b"\nStopping after this epoch, to save it. Ctrl-C again stops at once.\n")
+
+    for number in before:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        restore()
+
+
 def make_experiment(args: Any, algo: str, env_id: str, log_folder: str, *rest: Any, **kwargs: Any) -> ExperimentManager:
     """
     The experiment that fits the algorithm; takes what rl_zoo3's ``train`` gives to its ``ExperimentManager``.
 
-    :raises ValueError: if one of our algorithms is given an environment that is no task family
+    :raises ValueError: if one of our algorithms is given an environment that is no task family, or for a number of steps or
+        a file of hyperparameters that cannot be
     :raises OSError: if a folder that a flag names cannot be written
     """
+    if args.n_timesteps < 1 and args.n_timesteps != -1:  # which is rl_zoo3's default, and takes the entry's
+        raise ValueError(f"-n/--n-timesteps must be at least 1, got {args.n_timesteps}")
+    if args.conf_file is not None:
+        check_config(args.conf_file)
     for folder in (log_folder, args.tensorboard_log, args.optimization_log_path):
         if folder:
             check_writable(folder)
@@ -59,8 +107,8 @@ class PoemExperiment(FamilyExperiment):
     """
     A meta-training run: with our hyperparameter files, evaluated by adaptation to held-out tasks, and resumable.
 
-    ``--eval-freq`` and ``--eval-episodes`` set up an :class:`AdaptationEvalCallback`. ``--save-freq`` writes, beside the
-    models, ``checkpoint.zip``, from which ``-i`` continues bit for bit.
+    ``--eval-freq`` and ``--eval-episodes`` set up an :class:`AdaptationEvalCallback`. ``checkpoint.zip``, from which
+    ``--resume`` continues bit for bit, is written as often as it costs little, or with the models of ``--save-freq``.
     """
 
     def __init__(self, args: Any, algo: str, env_id: str, *rest: Any, **kwargs: Any) -> None:
@@ -72,19 +120,32 @@ class PoemExperiment(FamilyExperiment):
         self.steps_per_checkpoint = self.save_freq
         # rl_zoo3's own evaluation would run the policy without telling it the task.
         self.eval_freq = -1
-        self.resumes = False
+        self.resumes = self.is_interrupted = False
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         try:
             hyperparams, saved = super().read_hyperparameters()
         except yaml.YAMLError as error:
             raise ValueError(f"{self.config} is not valid YAML: {error}") from error
-        custom = set(self.custom_hyperparams or ())
+        except (AttributeError, TypeError) as error:
+            raise ValueError(f"{self.config} must hold a mapping of hyperparameters for each environment id") from error
         source = f"{self.config}, entry {self.env_name.gym_id!r}"
-        check_keys(sorted(custom), self.algo, "-params")
-        check_keys(sorted(set(hyperparams) - custom), self.algo, source)
-        check_numbers({key: value for key, value in hyperparams.items() if key not in custom}, source)
+        custom = self.custom_hyperparams or {}
+        for given, place in (custom, "-params"), ({k: v for k, v in hyperparams.items() if k not in custom}, source):
+            check_keys(sorted(given), self.algo, place)
+            check_numbers(given, self.algo, place)
+        for key in ("n_timesteps", "policy"):
+            if key not in hyperparams:
+                raise ValueError(f"{source} has no {key!r}")
         return hyperparams, saved
+
+    def create_envs(self, *args: Any, **kwargs: Any) -> VecEnv:
+        # Ctrl-C reaches the processes of --vec-env subproc too, which must last until the epoch ends
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        try:
+            return super().create_envs(*args, **kwargs)
+        finally:
+            signal.signal(signal.SIGINT, before)
 
     def setup_experiment(self) -> tuple[Any, dict[str, Any]] | None:
         results = super().setup_experiment()
@@ -105,9 +166,9 @@ class PoemExperiment(FamilyExperiment):
                     verbose=self.verbose,
                 )
             )
-        if self.steps_per_checkpoint > 0:
-            path = Path(self.save_path) / CHECKPOINT
-            self.callbacks.append(TrainingCheckpointCallback(path, self._epochs(model, self.steps_per_checkpoint)))
+        every = self._epochs(model, self.steps_per_checkpoint) if self.steps_per_checkpoint > 0 else None
+        self.checkpoint = TrainingCheckpointCallback(Path(self.save_path) / CHECKPOINT, every)
+        self.callbacks.append(self.checkpoint)
 
     @staticmethod
     def _epochs(model: PEARLSAC, steps: int) -> int:
@@ -126,15 +187,29 @@ class PoemExperiment(FamilyExperiment):
         return model
 
     def learn(self, model: Any) -> None:
-        if not self.resumes:
-            super().learn(model)
-            return
+        log_interval = {-1: 1, -2: None}.get(self.log_interval, self.log_interval)
         try:
-            model.resume(self.callbacks, log_interval={-1: 1, -2: None}.get(self.log_interval, self.log_interval))
+            with stopping_between_epochs(self.checkpoint):
+                if self.resumes:
+                    model.resume(self.callbacks, log_interval)
+                else:
+                    model.learn(self.n_timesteps, self.callbacks, log_interval)
         except KeyboardInterrupt:
-            pass  # as rl_zoo3 has it: what was learned is saved
+            self.is_interrupted = True
+            for callback in self.callbacks:
+                if isinstance(callback, ProgressBarCallback):
+                    callback.on_training_end()
         finally:
             model.env.close()
+
+    def save_trained_model(self, model: Any) -> None:
+        super().save_trained_model(model)
+        done, total, saved = model.num_timesteps, model._total_timesteps, self.checkpoint.saved_steps
+        if done < total and self.is_interrupted:
+            kept = "" if saved == done else ", before the first checkpoint" if saved is None else f", saved at {saved:,}"
+            raise TrainingInterrupted(f"Interrupted at {done:,} of {total:,} steps{kept}", saved is not None)
+        if done >= total and self.steps_per_checkpoint <= 0:
+            self.checkpoint.path.unlink(missing_ok=True)
 
     def objective(self, trial: optuna.Trial) -> float:
         """

@@ -1,7 +1,6 @@
 """``sb3-poem label``: the page on which people answer, the data set of their answers, and what others make of these."""
 
 import argparse
-import importlib
 import os
 import secrets
 from pathlib import Path
@@ -11,6 +10,7 @@ from rich.console import Console
 
 from sb3_poem.cli.adapt import parse_env_kwargs
 from sb3_poem.cli.outputs import check_output
+from sb3_poem.cli.packages import import_packages
 
 SHORTEST_PASSWORD = 12
 AUTH_VARIABLE = "SB3_POEM_AUTH"
@@ -53,8 +53,7 @@ def run_page(arguments: argparse.Namespace) -> None:
             f"--host {arguments.host} lets other machines reach the page, where whoever comes can make this machine render "
             "and read what it shows; add --token or --auth-file FILE"
         )
-    for package in arguments.gym_packages:
-        importlib.import_module(package)
+    import_packages(arguments.gym_packages)
     options = {"inference": arguments.inference, "mistake_rate": arguments.mistake_rate}
     adapter_options(options)  # says now what is out of range
     catalogue = read_catalogue(arguments.model, arguments.env, parse_env_kwargs(arguments.env_kwargs))

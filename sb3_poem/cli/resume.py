@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import shlex
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,14 +12,11 @@ import yaml
 
 from sb3_poem.cli.experiment import CHECKPOINT
 
-#: Environment steps between two checkpoints of a run that ``--resume`` started, unless ``--save-freq`` says otherwise.
-SAVE_FREQ = "100000"
-
 
 def resumed(arguments: Sequence[str]) -> list[str] | None:
     """
     Replace ``--resume`` by what it means: ``-i CHECKPOINT`` of the last run of the same algorithm, environment and seed, or
-    nothing where no such run has left a checkpoint; and checkpoints on the way.
+    nothing, and a word about it, where no such run has left a checkpoint.
 
     :param arguments: those of ``train``, ``--algo`` among them
     :return: arguments for rl_zoo3; None if that run has finished already
@@ -33,14 +31,29 @@ def resumed(arguments: Sequence[str]) -> list[str] | None:
     given, _ = parser.parse_known_args(arguments)
     if given.trained_agent:
         raise ValueError("--resume finds the checkpoint by itself: leave out either --resume or -i/--trained-agent")
-    rest = ["--save-freq", SAVE_FREQ, *(argument for argument in arguments if argument != "--resume")]
-    run = last_run(Path(given.log_folder) / given.algo, given.env.replace("/", "-"), given.seed)
+    rest = [argument for argument in arguments if argument != "--resume"]
+    folder, env_name = Path(given.log_folder) / given.algo, given.env.replace("/", "-")
+    run = last_run(folder, env_name, given.seed)
     if run is None:
+        which = given.env if given.seed < 0 else f"{given.env} with seed {given.seed}"
+        print(f"--resume: {folder} has no checkpoint of {which}; training begins from zero")
         return rest
-    if is_complete(run / f"{given.env.replace('/', '-')}.zip"):
+    if is_complete(run / f"{env_name}.zip"):
         print(f"{run} has finished already; start another run without --resume, or train it further with -i")
         return None
-    return [*rest, "-i", str(run / CHECKPOINT)] if (run / CHECKPOINT).exists() else rest
+    return [*rest, "-i", str(run / CHECKPOINT)]
+
+
+def resume_command(arguments: Sequence[str]) -> str:
+    """
+    The command that goes on with a run of which a checkpoint is left.
+
+    :param arguments: those that the run was given
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("-i", "--trained-agent")
+    parser.add_argument("--resume", action="store_true")
+    return shlex.join(["sb3-poem", "train", *parser.parse_known_args(arguments)[1], "--resume"])
 
 
 def is_complete(model: Path) -> bool:
@@ -68,13 +81,13 @@ def last_run(folder: Path, env_name: str, seed: int) -> Path | None:
     :param env_name: environment id with - in place of /
     :param seed: as given to the run; negative: any
     """
-    runs = [
-        run
-        for run in folder.glob(f"{env_name}_*")
-        if ((run / CHECKPOINT).exists() or (run / f"{env_name}.zip").exists())
-        and (seed < 0 or _arguments(run / env_name / "args.yml").get("seed") == seed)
-    ]
-    return max(runs, key=lambda run: int(run.name.rpartition("_")[2]), default=None)
+    runs = sorted(folder.glob(f"{env_name}_*"), key=lambda run: int(run.name.removeprefix(env_name).split("_")[1]))
+    for run in reversed(runs):
+        if seed >= 0 and _arguments(run / env_name / "args.yml").get("seed") != seed:
+            continue
+        if (run / CHECKPOINT).exists() or is_complete(run / f"{env_name}.zip"):
+            return run
+    return None
 
 
 def _arguments(file: Path) -> dict[str, Any]:

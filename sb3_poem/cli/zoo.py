@@ -1,17 +1,24 @@
 """rl_zoo3's train and enjoy with this package's algorithms, environments and hyperparameters."""
 
+import argparse
+import difflib
 import sys
 from collections.abc import Sequence
+from typing import Any
 
+import gymnasium as gym
 from rl_zoo3 import ALGOS
 from rl_zoo3 import enjoy as zoo_enjoy
 from rl_zoo3 import train as zoo_train
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
+from rl_zoo3.utils import StoreDict
 
 from poem_envs.headless import has_display
-from sb3_poem.cli.experiment import make_experiment
-from sb3_poem.cli.resume import resumed
+from sb3_poem.benchmark.suites import family_label
+from sb3_poem.cli.experiment import TrainingInterrupted, make_experiment
+from sb3_poem.cli.packages import import_packages
+from sb3_poem.cli.resume import resume_command, resumed
 from sb3_poem.loading import ALGORITHMS
 
 # Those of our own that differ from rl_zoo3's; what the user gives comes later, and wins.
@@ -28,6 +35,43 @@ def register_algorithms() -> None:
     ALGOS.update(ALGORITHMS)
     HYPERPARAMS_SAMPLER.update(SAMPLERS)
     HYPERPARAMS_CONVERTER.update(CONVERTERS)
+
+
+class CheckedPairs(StoreDict):
+    """rl_zoo3's ``KEY:VALUE`` arguments, whose values are Python, with an error that names what is none."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        for pair in values:
+            key, _, text = pair.partition(":")
+            try:
+                super().__call__(parser, namespace, [pair], option_string)
+            except Exception as error:  # whatever the text raises
+                raise ValueError(
+                    f"{option_string} {pair}: must have the form KEY:VALUE with a Python value, and {text!r} is none "
+                    f"({error}); text needs quotes, as in \"{key}:'{text}'\""
+                ) from error
+
+
+def check_arguments(command: str, arguments: Sequence[str]) -> None:
+    """
+    Refuse what rl_zoo3 would stumble over, and import what ``--gym-packages`` names.
+
+    :param command: ``"train"`` or ``"enjoy"``
+    :param arguments: its arguments
+    :raises ValueError: if a value is no Python, or a module or the environment does not exist
+    """
+    parser = argparse.ArgumentParser(f"sb3-poem {command}", add_help=False, allow_abbrev=False)
+    for flags in (("-params", "--hyperparams"), ("--env-kwargs",), ("--eval-env-kwargs",)):
+        parser.add_argument(*flags, nargs="+", action=CheckedPairs)
+    parser.add_argument("--gym-packages", nargs="+", default=[])
+    parser.add_argument("--env", default="CartPole-v1")  # rl_zoo3's
+    given, _ = parser.parse_known_args(arguments)
+    import_packages(given.gym_packages)
+    if given.env not in gym.registry:
+        names = {name: env_id for env_id in gym.registry for name in (env_id, family_label(env_id))}
+        close = difflib.get_close_matches(given.env, names, n=1)
+        hint = f"did you mean {names[close[0]]}?" if close else "name the module that registers it by --gym-packages"
+        raise ValueError(f"--env {given.env}: there is no such environment; {hint}")
 
 
 def run_zoo(command: str, arguments: Sequence[str]) -> None:
@@ -49,6 +93,7 @@ def run_zoo(command: str, arguments: Sequence[str]) -> None:
             print("--resume: go on with the last run of the same algorithm, environment and seed, if it did not finish")
         print()
 
+    check_arguments(command, arguments)
     given = [*defaults, *arguments]
     if command == "train" and "--resume" in arguments:
         continued = resumed(given)
@@ -61,6 +106,9 @@ def run_zoo(command: str, arguments: Sequence[str]) -> None:
     zoo_train.ExperimentManager = make_experiment  # type: ignore[assignment,misc]
     try:
         zoo_train.train() if command == "train" else zoo_enjoy.enjoy()
+    except TrainingInterrupted as stop:
+        again = f"go on with: {resume_command(arguments)}" if stop.resumable else "the same command begins again"
+        raise KeyboardInterrupt(f"{stop}; {again}") from None
     except AssertionError as error:
         # rl_zoo3 asserts on what the user gave; an assertion without words is a defect.
         if not str(error):

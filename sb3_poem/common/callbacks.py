@@ -1,5 +1,7 @@
 """Callbacks of training."""
 
+import time
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -57,18 +59,39 @@ class EpochCallback(BaseCallback):
 class TrainingCheckpointCallback(EpochCallback):
     """Writes a checkpoint from which ``load_checkpoint`` and ``resume`` continue bit for bit, always to the same file.
 
+    A handler of Ctrl-C may call :meth:`stop`, so that nothing of what was learned is lost::
+
+        callback = TrainingCheckpointCallback("checkpoint.zip")
+        signal.signal(signal.SIGINT, lambda *_: callback.stop())
+        model.learn(500_000, callback)  # raises KeyboardInterrupt once the checkpoint is written
+        POEMSAC.load_checkpoint("checkpoint.zip", env).resume()  # later
+
     :param path: The file; it is replaced atomically
-    :param every: Epochs between two checkpoints; the end of training writes one too, unless it was stopped within an epoch
+    :param every: Epochs between two checkpoints; None: at most every 50 times as long as writing one takes, and training
+        goes on where it cannot be written. The end of training writes one too, unless it was stopped within an epoch
     :param verbose: 1 reports each write
     """
 
-    def __init__(self, path: str | Path, every: int = 1, verbose: int = 0) -> None:
-        super().__init__(every, verbose)
+    def __init__(self, path: str | Path, every: int | None = 1, verbose: int = 0) -> None:
+        super().__init__(1 if every is None else every, verbose)
         self.path = Path(path)
-        self._collecting = False
+        #: Environment steps that the last checkpoint holds; None before the first
+        self.saved_steps: int | None = None
+        self._paced = every is None
+        self._not_before = 0.0
+        self._stops = self._collecting = False
+
+    def stop(self) -> None:
+        """End training after the epoch at hand with a checkpoint and a ``KeyboardInterrupt``."""
+        self._stops = True
 
     def _on_rollout_start(self) -> None:
-        super()._on_rollout_start()
+        if self._stops:
+            self._stops = False
+            super()._on_training_end()  # writes, unless this epoch's is there
+            raise KeyboardInterrupt
+        if time.monotonic() >= self._not_before:
+            super()._on_rollout_start()
         self._collecting = True
 
     def _on_rollout_end(self) -> None:
@@ -79,9 +102,19 @@ class TrainingCheckpointCallback(EpochCallback):
             super()._on_training_end()
 
     def _on_epoch(self) -> None:
-        self.model.save_checkpoint(self.path)
-        if self.verbose > 0:
-            print(f"Checkpoint of {self.model.num_timesteps} steps: {self.path}")
+        started = time.monotonic()
+        try:
+            self.model.save_checkpoint(self.path)
+        except OSError as error:
+            if not self._paced:
+                raise
+            warnings.warn(f"no checkpoint of {self.model.num_timesteps} steps: {error}", stacklevel=2)
+        else:
+            self.saved_steps = self.model.num_timesteps
+            if self.verbose > 0:
+                print(f"Checkpoint of {self.model.num_timesteps} steps: {self.path}")
+        if self._paced:
+            self._not_before = time.monotonic() + 50 * (time.monotonic() - started)
 
 
 class DormantUnitsCallback(EpochCallback):

@@ -2,7 +2,7 @@
 
 import io
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import torch as th
 
@@ -32,9 +32,17 @@ def save_checkpoint(model: "PEARLSAC", path: str | Path) -> None:
         "replay_buffer": {name: th.as_tensor(value).cpu() for name, value in model.replay_buffer.state().items()},
         "context": None if context is None else _tensors(context),
     }
-    content = io.BytesIO()
-    th.save(state, content)
-    write_atomically(path, content.getbuffer())
+
+    def write(file: BinaryIO) -> None:
+        try:
+            th.save(state, file)
+        except RuntimeError as error:
+            # torch raises its own over what stopped its writing
+            if isinstance(error.__context__, (OSError, KeyboardInterrupt)):
+                raise error.__context__ from None
+            raise
+
+    write_atomically(path, write)
 
 
 def _tensors(context: ContextStore) -> dict[str, th.Tensor]:

@@ -3,14 +3,16 @@
 import contextlib
 import os
 import uuid
+from collections.abc import Callable
 from pathlib import Path
+from typing import BinaryIO
 
 
-def write_atomically(path: str | Path, content: bytes | memoryview) -> None:
+def write_atomically(path: str | Path, content: bytes | memoryview | Callable[[BinaryIO], object]) -> None:
     """Write a file completely or not at all: a crash, a kill or a full disk leaves the previous file whole.
 
     :param path: Where; missing folders are made
-    :param content: What
+    :param content: What, or a function that writes it to an open file
     :raises OSError: if the folder cannot be written or the disk is full; names the path
     """
     path = Path(path)
@@ -19,7 +21,7 @@ def write_atomically(path: str | Path, content: bytes | memoryview) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = str(path.parent / f".{path.name}.{uuid.uuid4().hex}")
         with open(temporary, "xb") as file:  # with the permissions that the user's umask leaves
-            file.write(content)
+            content(file) if callable(content) else file.write(content)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch as th
-from meta_toys import ARCH, EPOCH, POINT_GOAL, differing, parameters, small, walks
+from meta_toys import ARCH, EPOCH, N_TASKS, POINT_GOAL, differing, parameters, small, walks
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 
@@ -77,6 +80,54 @@ def test_a_stop_within_an_epoch_writes_no_checkpoint_of_half_an_epoch(tmp_path: 
     loaded = PEARLSAC.load_checkpoint(path, POINT_GOAL)
     assert (loaded.epoch, loaded.num_timesteps) == (2, 2 * EPOCH)
     assert not differing(parameters(loaded.resume()), parameters(small(PEARLSAC).learn(5 * EPOCH)))
+
+
+def test_a_training_that_is_told_to_stop_goes_on_bit_for_bit(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.pt"
+    checkpoint = TrainingCheckpointCallback(path, every=3)
+    with pytest.raises(KeyboardInterrupt):
+        small(PEARLSAC).learn(5 * EPOCH, [StopAt(EPOCH + N_TASKS, checkpoint), checkpoint])
+    loaded = PEARLSAC.load_checkpoint(path, POINT_GOAL)
+    assert loaded.num_timesteps == checkpoint.saved_steps == 2 * EPOCH
+    assert not differing(parameters(loaded.resume(checkpoint)), parameters(small(PEARLSAC).learn(5 * EPOCH)))
+
+
+class StopAt(BaseCallback):
+    def __init__(self, steps: int, checkpoint: TrainingCheckpointCallback) -> None:
+        super().__init__()
+        self.steps, self.checkpoint = steps, checkpoint
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == self.steps:
+            self.checkpoint.stop()
+        return True
+
+
+def test_checkpoints_that_take_long_are_rare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    saved = []
+
+    def save(model: PEARLSAC, path: Path) -> None:
+        saved.append(model.num_timesteps)
+        time.sleep(0.2)  # and so none for the next ten seconds
+
+    monkeypatch.setattr(PEARLSAC, "save_checkpoint", save)
+    small(PEARLSAC).learn(4 * EPOCH, TrainingCheckpointCallback(tmp_path / "c.pt", every=None))
+    assert saved == [EPOCH, 4 * EPOCH]  # the first, and the end
+
+
+def test_a_full_disk_ends_training_only_where_checkpoints_were_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match=r"could not write .*c\.pt \(No space left on device\)"):
+        small(PEARLSAC).learn(2 * EPOCH, TrainingCheckpointCallback(tmp_path / "c.pt"))
+    model = small(PEARLSAC)
+    with pytest.warns(UserWarning, match=r"no checkpoint of 300 steps: .* could not write .*c\.pt \(No space"):
+        model.learn(2 * EPOCH, TrainingCheckpointCallback(tmp_path / "c.pt", every=None))
+    assert model.num_timesteps == 2 * EPOCH
 
 
 # ---------------------------------------------------------------- dormant units

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -207,6 +208,18 @@ def test_saving_a_checkpoint_changes_nothing(tmp_path: Path) -> None:
 
 
 # ---------------------------------------------------------------- full disks and bad files
+
+
+def test_a_disk_that_is_full_half_way_is_named(tmp_path: Path) -> None:
+    model = small(PEARLSAC).learn(EPOCH)
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limit[1]))
+    try:
+        with pytest.raises(OSError, match=r"could not write .*c\.pt \(File too large\)"):
+            model.save_checkpoint(tmp_path / "c.pt")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_full_disk_leaves_the_previous_checkpoint_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import BinaryIO
 
 import pytest
 
@@ -29,6 +30,20 @@ def assert_untouched(path: Path) -> None:
 def test_replaces_the_file(path: Path, content: bytes | memoryview) -> None:
     write_atomically(path, content)
     assert path.read_bytes() == bytes(content)
+    assert os.listdir(path.parent) == [path.name]
+
+
+def test_a_function_may_write(path: Path) -> None:
+    write_atomically(path, lambda file: file.write(b"after"))
+    assert path.read_bytes() == b"after"
+
+    def fail(file: BinaryIO) -> None:
+        file.write(b"half")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_atomically(path, fail)
+    assert path.read_bytes() == b"after"
     assert os.listdir(path.parent) == [path.name]
 
 
