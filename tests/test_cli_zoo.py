@@ -11,6 +11,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import optuna
+import pandas as pd
 import pytest
 import torch as th
 import yaml
@@ -18,6 +19,7 @@ from meta_toys import WindyWalk, differing, parameters
 from rl_zoo3 import ALGOS
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
+from rl_zoo3.utils import SimpleLinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem import PEARLSAC, POEMSAC, cli, resources
@@ -58,17 +60,27 @@ def test_algorithms_are_registered() -> None:
     assert {"poem_sac", "pearl_sac"} <= set(HYPERPARAMS_SAMPLER) & set(HYPERPARAMS_CONVERTER)
 
 
+ENTRY = {"gamma": 0.85, "learning_rate": SimpleLinearSchedule(5e-3), "batch_size": 32, "kl_coef": 0.4, "reward_coef": 0.0}
+
+
 @pytest.mark.parametrize("algorithm", ["poem_sac", "pearl_sac"])
-def test_sampled_hyperparameters_are_arguments_of_the_algorithm(algorithm: str) -> None:
+def test_sampled_hyperparameters_are_arguments_of_the_algorithm_around_the_entry(algorithm: str) -> None:
     register_algorithms()
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
-    for _ in range(5):
+    draws = []
+    for _ in range(40):
         trial = study.ask()
-        sampled = HYPERPARAMS_SAMPLER[algorithm](trial, 2, 1, {})
-        check_keys(list(sampled), algorithm, "the sampler")
-        assert HYPERPARAMS_CONVERTER[algorithm](trial.params) == sampled
-        assert 0.9 < sampled["gamma"] < 1.0
-        assert sampled["batch_size"] & (sampled["batch_size"] - 1) == 0
+        draws.append(HYPERPARAMS_SAMPLER[algorithm](trial, 2, 1, {"entry": ENTRY}))
+        check_keys(list(draws[-1]), algorithm, "the sampler")
+        assert HYPERPARAMS_CONVERTER[algorithm](trial.params) == draws[-1]
+    for name, low, high in (("kl_coef", 0.1, 1.6), ("batch_size", 16, 64), ("gamma", 0.4, 0.9625), ("latent_dim", 3, 10)):
+        values = [draw[name] for draw in draws]
+        middle = sorted(values)[20]
+        assert low <= min(values) < middle < max(values) <= high + 1e-9, name
+    rates = [float(draw["learning_rate"].removeprefix("lin_")) for draw in draws]  # the schedule stays
+    assert 1.25e-3 <= min(rates) < 5e-3 < max(rates) <= 2e-2
+    assert "reward_coef" not in draws[0]  # nothing lies around 0
+    assert ("preference_coef" in draws[0]) == (algorithm == "poem_sac")
 
 
 @pytest.mark.parametrize("file", sorted(resources.shipped_folder("zoo_configs").glob("*.yml")), ids=lambda file: file.name)
@@ -182,19 +194,24 @@ def test_a_checkpoint_continues_bit_for_bit(config: Path, tmp_path: Path, monkey
         np.testing.assert_array_equal(value, resumed[name], err_msg=name)
 
 
-def test_hyperparameters_are_searched(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def sample(trial: optuna.Trial, *_: object) -> dict[str, float]:
-        return {"kl_coef": trial.suggest_float("kl_coef", 0.1, 1.0)}
-
-    monkeypatch.setitem(SAMPLERS, "poem_sac", sample)
+def test_hyperparameters_are_searched_around_the_entry_which_comes_first(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(experiment, "TrialAdaptationCallback", partial(experiment.TrialAdaptationCallback, n_tasks=2))
-    write_entry(config, n_timesteps=150)
+    entry = {"gamma": 0.9, "learning_rate": "lin_2e-3", "kl_coef": 0.2, "relabel_fraction": 0.5}
+    entry |= {"reward_coef": 0.3, "policy_coef": 0.5, "preference_coef": 3.0}
+    write_entry(config, n_timesteps=150, **entry)
     flags = ["-optimize", "--n-trials", 2, "--n-evaluations", 1, "--eval-episodes", 1, "--no-optim-plots"]
     assert train("-c", config, "-f", tmp_path / "logs", *flags) == 0
     (report,) = (tmp_path / "logs" / "poem_sac").glob("report_*.csv")
-    lines = report.read_text().splitlines()
-    assert len(lines) == 3
-    assert "params_kl_coef" in lines[0]
+    first, second = pd.read_csv(report).filter(like="params_").rename(columns=lambda name: name[7:]).to_dict("records")
+    own = {name: SMALL[name] for name in ("gradient_steps", "batch_size", "context_size", "meta_batch_size")}
+    own |= {"one_minus_gamma": 0.1, "lin_learning_rate": 2e-3, "latent_dim": 5, "tau": 0.005}
+    own |= {name: value for name, value in entry.items() if name.endswith(("_coef", "_fraction"))}
+    assert first == pytest.approx(own)
+    assert second.keys() == own.keys()
+    assert all(value / 4 <= second[name] <= 4 * value for name, value in own.items())
+    assert sum(second[name] != pytest.approx(value) for name, value in own.items()) > 8
 
 
 def test_our_vectorised_environment_collects(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,6 +21,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from poem_envs import TaskFamily
 from sb3_poem.adaptation.callback import AdaptationEvalCallback
 from sb3_poem.cli.hyperparams import check_config, check_keys, check_numbers
+from sb3_poem.cli.hyperparams_opt import entry_params
 from sb3_poem.cli.outputs import check_writable
 from sb3_poem.common.callbacks import TrainingCheckpointCallback
 from sb3_poem.common.vec_env import TaskVecEnv
@@ -211,13 +212,30 @@ class PoemExperiment(FamilyExperiment):
         if done >= total and self.steps_per_checkpoint <= 0:
             self.checkpoint.path.unlink(missing_ok=True)
 
+    def hyperparameters_optimization(self) -> None:
+        """As rl_zoo3's, but that the first trial of a study is the entry itself."""
+        create_study = optuna.create_study
+
+        def create_with_entry(**options: Any) -> optuna.Study:
+            study = create_study(**options)
+            if not study.trials:
+                study.enqueue_trial(entry_params(self.algo, self._hyperparams))
+            return study
+
+        optuna.create_study = create_with_entry  # rl_zoo3 has no place for it
+        try:
+            super().hyperparameters_optimization()
+        finally:
+            optuna.create_study = create_study
+
     def objective(self, trial: optuna.Trial) -> float:
         """
         What ``-optimize`` maximises: the return on held-out tasks after the most answers.
 
         :raises optuna.TrialPruned: if the trial is not worth finishing, or its hyperparameters made it fail
         """
-        sampled = HYPERPARAMS_SAMPLER[self.algo](trial, self.n_actions, self.n_envs, {})
+        arguments = {"entry": self._hyperparams}
+        sampled = self._preprocess_schedules(HYPERPARAMS_SAMPLER[self.algo](trial, self.n_actions, self.n_envs, arguments))
         env = self.create_envs(self.n_envs, no_log=True)
         if not env.get_attr("shared_dynamics", indices=[0])[0]:
             sampled["relabel_fraction"] = 0.0  # a reward of another task needs a transition that could be of it

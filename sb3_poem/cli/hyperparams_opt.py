@@ -1,68 +1,79 @@
-"""What ``sb3-poem train -optimize`` searches, in the form of rl_zoo3's samplers."""
+"""What ``sb3-poem train -optimize`` searches, in the form of rl_zoo3's samplers: a range around each value of an entry."""
 
+import inspect
+import math
 from collections.abc import Callable
 from typing import Any
 
 import optuna
+from rl_zoo3.utils import SimpleLinearSchedule
 
-# Kept by Optuna as exponents of two, given to the algorithm as numbers.
-POWERS_OF_TWO = ("batch_size", "context_size", "meta_batch_size")
+from sb3_poem.loading import ALGORITHMS
+
+#: Searched from a fourth to four times the entry's value
+SCALES = ("one_minus_gamma", "learning_rate", "tau", "kl_coef", "reward_coef", "policy_coef", "preference_coef")
+#: Searched from a half to twice the entry's value
+COUNTS = ("gradient_steps", "batch_size", "context_size", "meta_batch_size", "latent_dim")
+#: Searched up to so far from the entry's value
+FRACTIONS = {"relabel_fraction": 0.3}
+#: A learning rate that falls to zero, which rl_zoo3 writes ``lin_1e-3``, is searched under this name, and stays one
+LINEAR = "lin_learning_rate"
+
+Sampler = Callable[[optuna.Trial, int, int, dict[str, Any]], dict[str, Any]]
 
 
-def convert_params(sampled: dict[str, Any]) -> dict[str, Any]:
+def entry_params(algorithm: str, entry: dict[str, Any]) -> dict[str, Any]:
     """
-    Turn a trial's parameters into arguments of the algorithm.
+    The trial that is an entry itself, without what cannot be searched around it: 0, and as many gradient steps as are taken
+    in the environment (-1).
 
-    :param sampled: as :func:`sample_pearl_sac_params` or :func:`sample_poem_sac_params` named them
+    :param algorithm: name of the algorithm
+    :param entry: hyperparameters, learning rates as schedules
+    :return: values by the names of Optuna's parameters
     """
-    hyperparams = dict(sampled)
-    hyperparams["gamma"] = 1.0 - hyperparams.pop("one_minus_gamma")
-    for name in POWERS_OF_TWO:
-        hyperparams[name] = 2 ** hyperparams.pop(f"{name}_pow")
+    values = {name: parameter.default for name, parameter in inspect.signature(ALGORITHMS[algorithm]).parameters.items()}
+    values |= entry
+    values["one_minus_gamma"] = 1.0 - values["gamma"]
+    rate = values["learning_rate"]
+    if callable(rate):
+        values["learning_rate"] = rate(1.0)
+    params = {name: float(values[name]) for name in (*SCALES, *FRACTIONS) if name in values}
+    params |= {name: int(values[name]) for name in COUNTS}
+    if isinstance(rate, SimpleLinearSchedule):
+        params[LINEAR] = params.pop("learning_rate")
+    return {name: value for name, value in params.items() if value > 0 or name in FRACTIONS}
+
+
+def convert_params(params: dict[str, Any]) -> dict[str, Any]:
+    """
+    Turn a trial's parameters into hyperparameters as an entry has them.
+
+    :param params: under Optuna's names
+    """
+    hyperparams = dict(params)
+    if "one_minus_gamma" in hyperparams:
+        hyperparams["gamma"] = 1.0 - hyperparams.pop("one_minus_gamma")
+    if LINEAR in hyperparams:
+        hyperparams["learning_rate"] = f"lin_{hyperparams.pop(LINEAR)}"
     return hyperparams
 
 
-def _suggest(trial: optuna.Trial) -> dict[str, Any]:
-    return {
-        "one_minus_gamma": trial.suggest_float("one_minus_gamma", 0.003, 0.05, log=True),
-        "learning_rate": trial.suggest_float("learning_rate", 1e-4, 1e-3, log=True),
-        "tau": trial.suggest_float("tau", 0.002, 0.02, log=True),
-        "gradient_steps": trial.suggest_categorical("gradient_steps", [250, 500, 1000, 2000]),
-        "batch_size_pow": trial.suggest_int("batch_size_pow", 5, 8),
-        "context_size_pow": trial.suggest_int("context_size_pow", 5, 8),
-        "meta_batch_size_pow": trial.suggest_int("meta_batch_size_pow", 3, 5),
-        "latent_dim": trial.suggest_int("latent_dim", 2, 8),
-        "kl_coef": trial.suggest_float("kl_coef", 0.01, 3.0, log=True),
-        "reward_coef": trial.suggest_float("reward_coef", 0.05, 2.0, log=True),
-        "policy_coef": trial.suggest_float("policy_coef", 0.1, 2.0, log=True),
-        "relabel_fraction": trial.suggest_float("relabel_fraction", 0.0, 0.8),
-    }
+def _sampler(algorithm: str) -> Sampler:
+    def sample(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+        params: dict[str, Any] = {}
+        for name, value in entry_params(algorithm, additional_args.get("entry", {})).items():
+            if name in COUNTS:
+                params[name] = trial.suggest_int(name, max(1, math.ceil(value / 2)), 2 * value, log=True)
+            elif name in FRACTIONS:
+                reach = FRACTIONS[name]
+                params[name] = trial.suggest_float(name, max(0.0, value - reach), min(1.0, value + reach))
+            else:
+                high = 4 * value if name.endswith("_coef") else min(1.0, 4 * value)
+                params[name] = trial.suggest_float(name, value / 4, high, log=True)
+        return convert_params(params)
+
+    return sample
 
 
-def sample_pearl_sac_params(
-    trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
-) -> dict[str, Any]:
-    """
-    Arguments of :class:`~sb3_poem.PEARLSAC` for one trial.
-
-    :param trial: draws the values
-    :param n_actions: unused, as are the other two; rl_zoo3 gives them to every sampler
-    """
-    return convert_params(_suggest(trial))
-
-
-def sample_poem_sac_params(
-    trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
-) -> dict[str, Any]:
-    """
-    Arguments of :class:`~sb3_poem.POEMSAC` for one trial.
-
-    :param trial: draws the values
-    :param n_actions: unused, as are the other two; rl_zoo3 gives them to every sampler
-    """
-    return convert_params({**_suggest(trial), "preference_coef": trial.suggest_float("preference_coef", 0.5, 20.0, log=True)})
-
-
-Sampler = Callable[[optuna.Trial, int, int, dict[str, Any]], dict[str, Any]]
-SAMPLERS: dict[str, Sampler] = {"pearl_sac": sample_pearl_sac_params, "poem_sac": sample_poem_sac_params}
-CONVERTERS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {"pearl_sac": convert_params, "poem_sac": convert_params}
+SAMPLERS: dict[str, Sampler] = {name: _sampler(name) for name in ALGORITHMS}
+CONVERTERS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = dict.fromkeys(ALGORITHMS, convert_params)
