@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 
 from poem_envs import TaskFamily, TaskFamilyVector
-from sb3_poem.common.family import plain_id
+from sb3_poem.common.family import definition_problem, plain_id
 
 MakeFamily = Callable[..., Any]
 
@@ -71,23 +71,10 @@ class Episode:
 def check_spaces(make: MakeFamily, seed: int) -> None:
     """Boxes of the right shapes and types, which hold what the environment returns."""
     env = make()
-    for name, space in (("observation_space", env.observation_space), ("action_space", env.action_space)):
-        ok = isinstance(space, spaces.Box) and len(space.shape) == 1
-        assert ok, f"{name} must be a flat gymnasium.spaces.Box, but is {space}"
-    assert isinstance(env.action_space, spaces.Box)
-    assert env.action_space.is_bounded(), f"action_space must be bounded below and above, but is {env.action_space}"
-    space = getattr(env, "task_space", None)
-    ok = isinstance(space, spaces.Box) and len(space.shape) == 1 and space.dtype == np.float64
-    assert ok, f"task_space must be a Box of shape (task_dim,) and dtype float64, but is {space}"
-    assert isinstance(space, spaces.Box)
-    dim = getattr(env, "reward_feature_dim", None)
-    ok = bool(isinstance(dim, (int, np.integer)) and dim >= 1)
-    assert ok, f"reward_feature_dim must be a whole number from 1 on, but is {dim!r}"
-    if env.all_tasks is not None:
-        tasks = np.asarray(env.all_tasks)
-        ok = tasks.ndim == 2 and tasks.shape[1:] == space.shape and all(task in space for task in tasks)
-        assert ok, f"all_tasks must have shape (n, {space.shape[0]}) and lie in task_space {space}, but is {env.all_tasks}"
-        assert len(np.unique(tasks, axis=0)) == len(tasks), f"all_tasks must hold every task once, but is {tasks.tolist()}"
+    dim, task_space = getattr(env, "reward_feature_dim", None), getattr(env, "task_space", None)
+    observation_space, action_space = env.observation_space, env.action_space
+    problem = definition_problem(observation_space, action_space, task_space, dim, env.all_tasks)
+    assert problem is None, problem
     observation, _ = env.reset(seed=seed)
     _check_observation(observation, env, "reset")
     observation, reward, _, _, info = env.step(_actions(env, 1, seed)[0])

@@ -47,7 +47,8 @@ def collect_segment(
     :param episode_counts: (copies,) episodes begun so far, counted on here; for messages
     :param on_step: Given the local variables of a step; False ends the collection
     :return: The experience, or None if ``on_step`` ended the collection
-    :raises ValueError: if the environment returns NaN or infinity
+    :raises ValueError: if the environment returns NaN or infinity, or what
+        :meth:`FamilyEnv.check_experience` refuses
     """
     obs = family.reset(tasks, seed)
     check_finite("observations", obs, task_ids, episode_counts, 0)
@@ -91,6 +92,7 @@ def collect_segment(
         in_first_episode &= ~dones
         episode_counts += dones
         obs = new_obs
+    family.check_experience(tasks, seed, segment)
     return segment
 
 

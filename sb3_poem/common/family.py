@@ -1,14 +1,26 @@
 """What an algorithm needs to know of a task family, asked of any SB3 ``VecEnv`` of it."""
 
+import difflib
 import importlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import cloudpickle
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_wrapper
+from stable_baselines3.common.vec_env import VecEnv
 
 from poem_envs import Symmetry
+from sb3_poem.common.wrappers import WrapperError, unknown_wrappers
+
+if TYPE_CHECKING:
+    from sb3_poem.common.buffers import Segment
+
+# Arguments that change how an environment is drawn, not what it is.
+DRAWING_ARGUMENTS = {"render_mode", "render_task"}
+REQUIRED_ATTRIBUTES = ("task_space", "all_tasks", "shared_dynamics", "reward_feature_dim")
+#: Steps by which it is seen whether a wrapper changes a family
+COMPARED_STEPS = 10
 
 
 def plain_id(env_id: str) -> str:
@@ -16,43 +28,92 @@ def plain_id(env_id: str) -> str:
 
     :param env_id: As for ``gym.make``: an id, or ``"module:id"``, whose module is imported first
     :raises ModuleNotFoundError: if there is no such module
+    :raises gymnasium.error.NameNotFound: if there is no such id; the message names one like it
     """
     module, _, name = env_id.rpartition(":")
     if module:
         importlib.import_module(module)
+    if name not in gym.registry:
+        close = difflib.get_close_matches(name, gym.registry, n=1)
+        hint = f"did you mean {close[0]!r}?" if close else "nor any like it."
+        raise gym.error.NameNotFound(
+            f"No environment {name!r} is registered with Gymnasium, {hint} One of your own is "
+            "registered by an import of its module, as in 'module:id'"
+        )
     return name
 
 
-# Arguments that change how an environment is drawn, not what it is.
-DRAWING_ARGUMENTS = {"render_mode", "render_task"}
-REQUIRED_ATTRIBUTES = ("task_space", "all_tasks", "shared_dynamics", "reward_feature_dim")
+def no_family(env: str) -> str:
+    """What to say of an environment that is no task family.
+
+    :param env: How it describes itself
+    """
+    return (
+        f"env {env} is no task family: an environment whose reward depends on a hidden task. "
+        "Subclass poem_envs.TaskFamily, or make one of a goal-conditioned environment by "
+        "poem_envs.GoalFamily; docs/families.md has both as complete programs, and "
+        "sb3_poem.testing.check_task_family says what is missing"
+    )
+
+
+def definition_problem(
+    observation_space: spaces.Space,
+    action_space: spaces.Space,
+    task_space: Any,
+    reward_feature_dim: Any,
+    all_tasks: Any,
+) -> str | None:
+    """What is wrong with a family's attributes, and what would be right; None if nothing is."""
+    for name, space in (("observation_space", observation_space), ("action_space", action_space)):
+        if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+            return f"{name} must be a flat gymnasium.spaces.Box, but is {space}"
+    assert isinstance(action_space, spaces.Box)
+    if not action_space.is_bounded():
+        return f"action_space must be bounded below and above, but is {action_space}"
+    flat = isinstance(task_space, spaces.Box) and len(task_space.shape) == 1
+    if not flat or task_space.dtype != np.float64:
+        return f"task_space must be a Box of shape (task_dim,) and dtype float64, but is {task_space}"
+    if not isinstance(reward_feature_dim, (int, np.integer)) or reward_feature_dim < 1:
+        return f"reward_feature_dim must be a whole number from 1 on, but is {reward_feature_dim!r}"
+    if all_tasks is not None:
+        tasks, size = np.asarray(all_tasks), task_space.shape[0]
+        if tasks.shape[1:] != (size,) or not all(task in task_space for task in tasks):
+            return f"all_tasks must have shape (n, {size}) and lie in task_space {task_space}, but is {all_tasks}"
+        if len(np.unique(tasks, axis=0)) < len(tasks):
+            return f"all_tasks must hold every task once, but is {tasks.tolist()}"
+    return None
 
 
 class FamilyEnv:
     """View of a vectorised environment as a task family.
 
-    :param env: Vectorised environment whose copies are :class:`poem_envs.TaskFamily` environments
+    :param env: Vectorised environment whose copies are :class:`poem_envs.TaskFamily` environments.
+        Wrappers that change what is seen, done or paid are refused: those of Gymnasium and SB3 by
+        name, others by the first experience, see :meth:`check_experience`
     :param horizon: Steps of an episode; None reads the time limit of the environment's registration
-    :raises ValueError: if the environment is no task family, is wrapped in ``VecNormalize``, or no horizon is known
+    :raises ValueError: if the environment is no task family, a wrapper changes it, or no horizon is
+        known
     """
 
+    task_space: spaces.Box
+    reward_feature_dim: int
+
     def __init__(self, env: VecEnv, horizon: int | None = None) -> None:
-        if unwrap_vec_wrapper(env, VecNormalize) is not None:
-            raise ValueError(
-                "env must not be wrapped in VecNormalize: the model standardises observations itself, and relabelling "
-                "needs rewards as they are. Pass the environment without it (in YAML: no `normalize`)."
-            )
-        if not isinstance(env.observation_space, spaces.Box) or len(env.observation_space.shape) != 1:
-            raise ValueError(f"env must have a flat Box observation space, got {env.observation_space}")
-        if not isinstance(env.action_space, spaces.Box) or not env.action_space.is_bounded():
-            raise ValueError(f"env must have a bounded Box action space, got {env.action_space}")
         self.env = env
-        self.task_space: spaces.Box = self._get("task_space")
-        self.all_tasks: np.ndarray | None = self._get("all_tasks")
-        self.shared_dynamics = bool(self._get("shared_dynamics"))
-        self.reward_feature_dim = int(self._get("reward_feature_dim"))
+        name = str(env.env_method("__str__", indices=[0])[0])
+        missing = [attribute for attribute in REQUIRED_ATTRIBUTES if not env.has_attr(attribute)]
+        if "shared_dynamics" in missing:  # which a subclass of TaskFamily has without a word
+            raise ValueError(no_family(name))
+        attributes: list[Any] = [None if attribute in missing else self._get(attribute) for attribute in REQUIRED_ATTRIBUTES]
+        task_space, self.all_tasks, shared_dynamics, feature_dim = attributes
+        self._unknown_wrappers = ", ".join(unknown_wrappers(env))
+        problem = definition_problem(env.observation_space, env.action_space, task_space, feature_dim, self.all_tasks)
+        if problem is not None:
+            raise ValueError(f"env {name}: {problem}")
+        self.task_space, self.reward_feature_dim = task_space, int(feature_dim)
+        self.shared_dynamics = bool(shared_dynamics)
         self.symmetries: tuple[Symmetry, ...] = self._get("symmetries") if env.has_attr("symmetries") else ()
-        spec = self._get("spec")
+        spec = self._get("spec") if env.has_attr("spec") else None
         self.env_id: str | None = None if spec is None else spec.id
         given: dict[str, Any] = {} if spec is None else spec.kwargs
         registered = gym.registry[spec.id].kwargs if spec is not None and spec.id in gym.registry else {}
@@ -73,6 +134,57 @@ class FamilyEnv:
         if steps < 1:
             raise ValueError(f"horizon must be at least 1 step, got {steps}")
         self.horizon = int(steps)
+        self._experience_is_right = False
+
+    def check_experience(self, tasks: np.ndarray, seed: int, segment: "Segment") -> None:
+        """Whether rewards are :meth:`compute_reward`'s, and unknown wrappers leave the family as it is.
+        The first call looks, and the others take its word.
+
+        :param tasks: (copies, task_dim), those of the segment
+        :param seed: Of the reset that it began with
+        :param segment: Experience of all copies
+        :raises ValueError: if not
+        """
+        if self._experience_is_right:
+            return
+        wrappers = self._unknown_wrappers
+        expected = self.compute_reward(tasks[:, None, :], segment.features)
+        if expected.shape != segment.rewards.shape:
+            raise ValueError(
+                f"compute_reward must give tasks {tasks[:, None, :].shape} and features "
+                f"{segment.features.shape} rewards of shape {segment.rewards.shape}, but gave "
+                f"{expected.shape}: in _reward index the last dimension, as in tasks[..., i]"
+            )
+        wrong = np.argwhere(~np.isclose(segment.rewards, expected, rtol=1e-5, atol=1e-6))
+        if len(wrong):
+            copy, step = wrong[0]
+            what = (
+                f"env paid {segment.rewards[copy, step]:.6g} at step {step} of copy {copy}, but "
+                f'compute_reward(task, info["reward_features"]) is {expected[copy, step]:.6g}'
+            )
+            if wrappers:
+                raise WrapperError(f"{what}, by one of its wrappers {wrappers}")
+            raise ValueError(f"{what}; sb3_poem.testing.check_task_family says what to change")
+        if wrappers and not self._lives_through(tasks[0], seed, segment):
+            raise WrapperError(f"env's wrappers {wrappers} change what is seen or done")
+        self._experience_is_right = True
+
+    def _lives_through(self, task: np.ndarray, seed: int, segment: "Segment") -> bool:
+        """Whether the family without its wrappers repeats the first copy's experience."""
+        if self.env_id is None:
+            twin = cloudpickle.loads(cloudpickle.dumps(self._get("unwrapped")))
+        else:
+            twin = gym.make(self.env_id, disable_env_checker=True, **self.env_kwargs).unwrapped
+        low, high = twin.action_space.low, twin.action_space.high
+        twin.set_task(task)
+        seen = [twin.reset(seed=seed)[0]]
+        steps = min(COMPARED_STEPS, int(segment.first_episode[0].sum()))
+        for action in segment.actions[0, :steps]:
+            action = np.clip(low + 0.5 * (action + 1.0) * (high - low), low, high)
+            seen.append(twin.step(action)[0])
+        twin.close()
+        shown = [segment.observations[0, 0], *segment.next_observations[0, :steps]]
+        return np.allclose(np.array(seen, dtype=np.float32), shown, rtol=1e-4, atol=1e-4)
 
     @property
     def num_envs(self) -> int:
@@ -83,14 +195,7 @@ class FamilyEnv:
         return int(self.task_space.shape[0])
 
     def _get(self, name: str) -> Any:
-        if self.env.has_attr(name):  # asking for what is not there would end a worker of SubprocVecEnv
-            return self.env.get_attr(name, indices=[0])[0]
-        if name == "spec":
-            return None
-        raise ValueError(
-            f"env is no task family: it has no attribute {name!r}. A task family subclasses poem_envs.TaskFamily, "
-            f"which provides {', '.join(REQUIRED_ATTRIBUTES)}, sample_tasks, set_task and compute_reward."
-        )
+        return self.env.get_attr(name, indices=[0])[0]
 
     def sample_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draw (n, task_dim) tasks from the family's distribution."""

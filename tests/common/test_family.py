@@ -10,7 +10,7 @@ import pytest
 from gymnasium import spaces
 from meta_toys import POINT_GOAL, OtherWalk, TwoWalks, Walk, WindyWalk, walks
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 
 from poem_envs import GoalFamily
 from sb3_poem.common.family import FamilyEnv
@@ -54,41 +54,30 @@ def test_sampling_leaves_the_environments_generator_alone() -> None:
 def test_an_environment_that_is_no_family(vec_env_class) -> None:  # type: ignore[no-untyped-def]
     env = vec_env_class([functools.partial(gym.make, "Pendulum-v1")])
     try:
-        with pytest.raises(ValueError, match=r"env is no task family: it has no attribute 'task_space'.*TaskFamily"):
+        with pytest.raises(ValueError, match=r"env <.*<Pendulum-v1>.*> is no task family.*TaskFamily.*GoalFamily"):
             FamilyEnv(env)
     finally:
         env.close()
 
 
-def test_vec_normalize_is_refused_wherever_it_sits() -> None:
-    env = VecNormalize(make_vec_env(POINT_GOAL, 1))
-    for wrapped in (env, VecMonitor(env)):
-        with pytest.raises(ValueError, match="must not be wrapped in VecNormalize"):
-            FamilyEnv(wrapped)
-
-
-class Changed(gym.Wrapper):
-    """Spaces that no model of ours takes."""
-
-    def __init__(self, observation_space: spaces.Space | None = None, action_space: spaces.Space | None = None) -> None:
-        super().__init__(Walk())
-        self.observation_space = observation_space or self.env.observation_space
-        self.action_space = action_space or self.env.action_space
-
-
 @pytest.mark.parametrize("space", [spaces.Box(0, 1, (2, 2)), spaces.Discrete(3), spaces.Dict(a=spaces.Box(0, 1, (1,)))])
 def test_observations_must_be_flat(space: spaces.Space) -> None:
-    with pytest.raises(ValueError, match="flat Box observation space"):
-        FamilyEnv(DummyVecEnv([lambda: Changed(observation_space=space)]), 10)
+    with pytest.raises(ValueError, match=r"observation_space must be a flat gymnasium\.spaces\.Box, but is "):
+        FamilyEnv(walks(1, type("Changed", (Walk,), {"observation_space": space})), 10)
 
 
 @pytest.mark.parametrize(
-    "space",
-    [spaces.Discrete(3), spaces.Box(-np.inf, np.inf, (1,)), spaces.Box(0.0, np.inf, (1,)), spaces.Box(-np.inf, 0.0, (1,))],
+    ("space", "message"),
+    [
+        (spaces.Discrete(3), r"must be a flat gymnasium\.spaces\.Box, but is Discrete\(3\)"),
+        (spaces.Box(-np.inf, np.inf, (1,)), "must be bounded below and above"),
+        (spaces.Box(0.0, np.inf, (1,)), "must be bounded below and above"),
+        (spaces.Box(-np.inf, 0.0, (1,)), "must be bounded below and above"),
+    ],
 )
-def test_actions_must_be_bounded(space: spaces.Space) -> None:
-    with pytest.raises(ValueError, match="bounded Box action space"):
-        FamilyEnv(DummyVecEnv([lambda: Changed(action_space=space)]), 10)
+def test_actions_must_be_bounded(space: spaces.Space, message: str) -> None:
+    with pytest.raises(ValueError, match=f"action_space {message}"):
+        FamilyEnv(walks(1, type("Changed", (Walk,), {"action_space": space})), 10)
 
 
 def test_the_horizon_must_be_known_and_agree() -> None:
@@ -109,12 +98,6 @@ def test_the_horizon_of_a_goal_family_is_that_of_its_environment() -> None:
 def test_the_horizon_must_be_positive(horizon: int) -> None:
     with pytest.raises(ValueError, match=rf"horizon must be at least 1.*{horizon}"):
         FamilyEnv(walks(1), horizon)
-
-
-def test_frame_stacking_is_no_flat_family() -> None:
-    """Stacked observations are flat as well, so this works; what matters is that tasks still arrive."""
-    family = FamilyEnv(VecFrameStack(make_vec_env(POINT_GOAL, 2), 2))
-    assert family.reset(np.array([[0.5], [1.0]]), seed=0).shape == (2, 4)
 
 
 def test_another_family_is_told_apart() -> None:
