@@ -12,8 +12,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from sb3_poem.benchmark.provenance import commit, machine
 
 RESULTS = Path(__file__).parent / "results"
@@ -42,16 +40,6 @@ def available_device(name: str) -> str:
     if name.startswith("cuda") and not torch.cuda.is_available():
         raise argparse.ArgumentTypeError(f"{name}: torch {torch.__version__} sees no CUDA device here")
     return name
-
-
-def hyperparameters(conf: Path, env_id: str, **changes: Any) -> dict[str, Any]:
-    """An environment's entry of a file of hyperparameters, some changed, ``policy_kwargs`` evaluated as rl_zoo3 does."""
-    from torch import nn
-
-    entry = {**yaml.safe_load(conf.read_text())[env_id], **changes}
-    if isinstance(entry.get("policy_kwargs"), str):
-        entry["policy_kwargs"] = eval(entry["policy_kwargs"], {"nn": nn})
-    return entry
 
 
 def cores() -> int:

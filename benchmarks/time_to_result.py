@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from common import arguments, available_device, hyperparameters, table, write
+from common import arguments, available_device, table, write
 from rl_zoo3.utils import linear_schedule
 
 from sb3_poem import POEMSAC
@@ -22,6 +22,7 @@ from sb3_poem.adaptation.evaluation import evaluate_adaptation
 from sb3_poem.common.callbacks import EpochCallback
 from sb3_poem.common.family import FamilyEnv
 from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.resources import zoo_entry
 
 N_TASKS, N_EPISODES, N_QUERIES = 30, 10, 10
 
@@ -101,7 +102,7 @@ def main() -> None:
     """Measure, print, write."""
     given = arguments(__doc__, add_arguments)
     th.set_num_threads(given.threads)
-    entry = hyperparameters(given.conf, given.env)
+    entry = zoo_entry(given.conf, given.env)
     if given.from_step > entry["n_timesteps"]:
         raise SystemExit(f"--from-step {given.from_step}: training ends after {entry['n_timesteps']:.0f} steps")
     results, rows = [], []

@@ -16,12 +16,13 @@ from typing import Any
 
 import torch as th
 import yaml
-from common import available_device, hyperparameters
+from common import available_device
 from stable_baselines3.common.utils import ConstantSchedule
 
 from sb3_poem import POEMSAC
 from sb3_poem.common.callbacks import DormantUnitsCallback, EpochCallback
 from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.resources import zoo_entry
 
 SHOWN = (
     "train_task_return",
@@ -120,7 +121,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     th.set_num_threads(1)
-    entry = hyperparameters(given.conf, given.env_id, **pairs(given.set))
+    entry = zoo_entry(given.conf, given.env_id, **pairs(given.set))
     del entry["n_timesteps"]
     rate = float(str(entry.pop("learning_rate")).removeprefix("lin_"))
     env = TaskVecEnv.from_id(given.env_id, entry.pop("n_envs"), nthread=given.threads, **pairs(given.env_set))

@@ -2,6 +2,7 @@
 
 import difflib
 from pathlib import Path
+from typing import Any
 
 _PACKAGE = Path(__file__).resolve().parent
 
@@ -32,6 +33,27 @@ def config_file(algorithm: str) -> Path:
         names = ", ".join(sorted(file.stem for file in folder.glob("*.yml"))) or "none"
         raise FileNotFoundError(f"No hyperparameters are shipped for {algorithm!r}; there are: {names}")
     return path
+
+
+def zoo_entry(file: Path, env_id: str, **changes: Any) -> dict[str, Any]:
+    """
+    An environment's entry of a file of hyperparameters.
+
+    :param file: YAML in rl_zoo3's syntax; as there, Python in ``policy_kwargs`` is evaluated
+    :param env_id: the environment's id
+    :param changes: what shall differ
+    :raises ValueError: if the file has no entry for it; the message lists those that there are
+    """
+    import yaml
+    from torch import nn
+
+    entries = yaml.safe_load(file.read_text())
+    if env_id not in entries:
+        raise ValueError(f"{file.name} has no entry {env_id!r}; there are: {', '.join(entries)}")
+    entry = {**entries[env_id], **changes}
+    if isinstance(entry.get("policy_kwargs"), str):
+        entry["policy_kwargs"] = eval(entry["policy_kwargs"], {"nn": nn})
+    return entry
 
 
 def pretrained_names() -> list[str]:

@@ -28,6 +28,7 @@ from sb3_poem.cli.hyperparams import check_keys
 from sb3_poem.cli.hyperparams_opt import SAMPLERS
 from sb3_poem.cli.zoo import register_algorithms
 from sb3_poem.common.vec_env import make_task_vec_env
+from sb3_poem.pearl_sac.unsupported import UNSUPPORTED
 
 SMALL = {
     "policy": "MlpPolicy",
@@ -95,6 +96,16 @@ def test_shipped_hyperparameters_are_known_and_cover_the_environments(file: Path
         check_keys(list(entry), algorithm, f"{file}, {env_id}")
         assert entry["policy"] == "MlpPolicy"
         assert float(entry["n_timesteps"]) > 0
+
+
+@pytest.mark.parametrize("key", ["train_freq", "use_sde", "replay_buffer_class", "noise_type"])
+def test_what_only_sac_takes_is_refused_by_the_same_words(
+    key: str, config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config.write_text(yaml.safe_dump({"poem/PointGoal-v0": {**SMALL, key: "normal"}}))
+    assert train("-c", config, "-f", tmp_path / "logs") != 0
+    assert f"'{key}' in {config}" in (error := capsys.readouterr().err)
+    assert UNSUPPORTED[key] in error
 
 
 def test_train_then_enjoy_then_continue(config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

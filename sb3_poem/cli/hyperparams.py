@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from sb3_poem.loading import ALGORITHMS
+from sb3_poem.pearl_sac.unsupported import UNSUPPORTED
 
 # What rl_zoo3 takes out of an entry for itself before the rest goes to the algorithm.
 ZOO_KEYS = frozenset({"callback", "env_kwargs", "monitor_kwargs", "n_envs", "n_timesteps"})
@@ -37,12 +38,14 @@ def check_keys(keys: Sequence[str], algorithm: str, source: str) -> None:
     :param source: where the keys were read, for the message
     :raises ValueError: at the first key that neither takes; the message names it and what resembles it
     """
-    known = ZOO_KEYS | {name for name in inspect.signature(ALGORITHMS[algorithm]).parameters if not name.startswith("_")}
+    arguments = set(inspect.signature(ALGORITHMS[algorithm]).parameters) - {"unsupported"}
+    known = ZOO_KEYS | {name for name in arguments if not name.startswith("_")}
     for key in keys:
         if key in FLAG_OF_KEY:
             raise ValueError(f"{key!r} in {source} belongs on the command line: {FLAG_OF_KEY[key]}")
-        if key in REFUSED:
-            raise ValueError(f"{key!r} in {source} is not for {algorithm}: {REFUSED[key]}")
+        reason = REFUSED.get(key) or UNSUPPORTED.get(key)
+        if reason is not None:
+            raise ValueError(f"{key!r} in {source} is not for {algorithm}: {reason}")
         if key not in known:
             close = difflib.get_close_matches(key, known - set(FLAG_OF_KEY), n=3)
             hint = f"did you mean {' or '.join(map(repr, close))}?" if close else "nor anything like it."

@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices,
 
 from poem_envs.core import TaskFamily
 from poem_envs.vector import TaskFamilyVector
-from sb3_poem.common.family import plain_id
+from sb3_poem.common.family import no_family, plain_id
 
 # What these do, the vectorised environment or TaskVecEnv does itself.
 ABSORBED_WRAPPERS: tuple[type[gym.Wrapper], ...] = (TimeLimit, OrderEnforcing, PassiveEnvChecker, Monitor)
@@ -323,6 +323,9 @@ class _CopyView:
     def get_wrapper_attr(self, name: str) -> Any:
         return getattr(self, name)
 
+    def __str__(self) -> str:
+        return f"<{type(self._vector_env).__name__} instance>"
+
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") or name in ("_vector_env", *self._HIDDEN):
             raise AttributeError(f"a copy of a vectorised task family has no attribute {name!r}")
@@ -349,7 +352,7 @@ def _vectorised(env: gym.Env, wrappers: list[gym.Wrapper], num_envs: int, nthrea
     """The vectorised version of a single environment, from its registration and arguments."""
     bare, instead = env.unwrapped, "use DummyVecEnv instead of TaskVecEnv"
     if not isinstance(bare, TaskFamily):
-        raise ValueError(f"{bare} is no task family (a subclass of poem_envs.TaskFamily); {instead}")
+        raise ValueError(no_family(str(bare)))
     foreign = [type(wrapper).__name__ for wrapper in wrappers if not _is_absorbed(wrapper)]
     if foreign:
         allowed = ", ".join(kind.__name__ for kind in ABSORBED_WRAPPERS)

@@ -7,12 +7,14 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
+from gymnasium.vector import VectorEnv
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import LinearSchedule
 from torch import nn
 
 from sb3_poem.common.buffers import ContextStore, TaskBatch, TaskReplayBuffer
-from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.family import FamilyEnv, plain_id
 from sb3_poem.common.precision import MixedPrecision, hidden_dtype
 from sb3_poem.common.random import Generators
 from sb3_poem.pearl_sac import losses
@@ -21,6 +23,8 @@ from sb3_poem.pearl_sac.cuda_graph import GraphedStep, Step, prepare_optimizers
 from sb3_poem.pearl_sac.losses import MetaBatch, TaskEmbeddings
 from sb3_poem.pearl_sac.policies import LatentPolicy, MlpPolicy
 from sb3_poem.pearl_sac.sampling import SamplingSAC
+from sb3_poem.pearl_sac.unsupported import refuse_unknown, refuse_unsupported
+from sb3_poem.resources import config_file, zoo_entry
 
 SelfPEARLSAC = TypeVar("SelfPEARLSAC", bound="PEARLSAC")
 
@@ -33,8 +37,9 @@ class PEARLSAC(SamplingSAC):
     epoch, and learns a context encoder, a latent-conditioned actor and critics, and a reward decoder together.
     Observations are standardised by the mean and deviation of all that were collected.
 
-    :param policy: The policy model to use (MlpPolicy)
-    :param env: A task family: an environment, a vectorised environment, or a registered id (which is then vectorised)
+    :param policy: The policy model to use: "MlpPolicy", or a subclass of its class
+    :param env: A task family: an environment, a vectorised one of SB3 or Gymnasium, or a registered
+        id (which is then vectorised)
     :param learning_rate: Learning rate of all networks, a float or a schedule of the remaining progress
     :param buffer_size: Transitions kept for each training task
     :param learning_starts: Environment steps with uniformly random actions before learning
@@ -79,13 +84,17 @@ class PEARLSAC(SamplingSAC):
     :param stats_window_size: Episodes that the rollout logging averages over
     :param tensorboard_log: Log location for TensorBoard
     :param policy_kwargs: Additional arguments of the policy
-    :param verbose: 0 no output, 1 info, 2 debug
+    :param verbose: 0 no output, 1 how long an epoch is and a table after each, 2 debug
     :param seed: Seed of everything: tasks, networks, sampling, environments
     :param device: "auto", "cpu", "cuda"
     :param _init_setup_model: Whether to build the networks at creation
+    :param unsupported: Nothing: what SB3's SAC takes beyond these is refused
     :raises ValueError: for an environment that is no task family, and for arguments outside their range
+    :raises TypeError: for arguments that only SB3's SAC takes; the message says what to do instead
     """
 
+    #: The name of the algorithm on the command line, and of its file in ``zoo_configs/``
+    zoo_name: ClassVar[str] = "pearl_sac"
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy}
     saved_arguments: ClassVar[dict[str, str]] = {
         **SamplingSAC.saved_arguments,
@@ -98,7 +107,7 @@ class PEARLSAC(SamplingSAC):
     def __init__(
         self,
         policy: str | type[LatentPolicy],
-        env: GymEnv | str,
+        env: GymEnv | VectorEnv | str,
         learning_rate: float | Schedule = 3e-4,
         buffer_size: int = 100_000,
         learning_starts: int = 0,
@@ -134,7 +143,10 @@ class PEARLSAC(SamplingSAC):
         seed: int | None = None,
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
+        **unsupported: Any,
     ) -> None:
+        refuse_unknown(unsupported, type(self))
+        refuse_unsupported(policy_kwargs or (), f"{type(self).__name__}'s policy")
         for name, value, low in (
             ("batch_size", batch_size, 1),
             ("meta_batch_size", meta_batch_size, 1),
@@ -200,9 +212,17 @@ class PEARLSAC(SamplingSAC):
         self._family: FamilyEnv | None = None
         self._logs_pending = False
         self.best_adapted_return = -np.inf  # kept with the model, for AdaptationEvalCallback
+        self.n_timesteps: int | None = None  # what learn takes unless told, see from_zoo
+        self.policy_class = self._get_policy_from_name(policy)
+        given = self._vectorise(env, n_train_tasks, trajectories_per_task)
+        if _init_setup_model:
+            if given is None:
+                raise TypeError("env is None, but a new model needs an environment")
+            given = self._wrap_env(given, verbose)
+            self._family = self._family_of(given)  # before SB3 speaks of other policies
         super().__init__(
             policy,
-            self._vectorise(env, n_train_tasks, trajectories_per_task),
+            given,  # type: ignore[arg-type]
             learning_rate=learning_rate,
             buffer_size=buffer_size,
             learning_starts=learning_starts,
@@ -228,8 +248,7 @@ class PEARLSAC(SamplingSAC):
 
     def _setup_model(self) -> None:
         if self.env is not None:
-            self._family = self._family_of(self.env)
-            self.horizon = self._family.horizon
+            self.horizon = self.family.horizon
         self.generators = getattr(self, "generators", None) or Generators(self.seed, self.device)
         self.generators.to(self.device)
         if self.train_tasks is None:
@@ -240,6 +259,39 @@ class PEARLSAC(SamplingSAC):
         generators = self.generators
         super()._setup_model()
         self.generators = generators  # a model that is loaded goes on with its own
+
+    def _get_policy_from_name(self, policy_name: str | type[BasePolicy]) -> type[BasePolicy]:
+        """As SB3's, and of a class whether it is one of ours."""
+        ours = self.policy_aliases["MlpPolicy"]
+        if isinstance(policy_name, type) and issubclass(policy_name, ours):
+            return policy_name
+        if policy_name != "MlpPolicy":
+            raise ValueError(
+                f'policy is {policy_name!r}, but must be "MlpPolicy" or a subclass of {ours.__name__}: '
+                "observations are flat vectors. Put features of images into the family's observation; "
+                "poem_envs.GoalFamily flattens those of a goal-conditioned environment"
+            )
+        return ours
+
+    @classmethod
+    def from_zoo(cls: type[SelfPEARLSAC], env_id: str, **arguments: Any) -> SelfPEARLSAC:
+        """A new model with the hyperparameters that ship for an environment (``zoo_configs/``), as
+        ``sb3-poem train`` makes it. :meth:`learn` then knows for how many steps.
+
+        :param env_id: A registered id that has an entry
+        :param arguments: What shall differ: arguments of the constructor, ``n_envs`` (copies of the
+            environment) and ``n_timesteps``. With ``env``, another family is trained by this entry
+        :raises ValueError: if there is no entry; the message lists those that there are
+        """
+        entry = zoo_entry(config_file(cls.zoo_name), plain_id(env_id), **arguments)
+        timesteps, n_envs = int(entry.pop("n_timesteps")), entry.pop("n_envs")
+        rate = entry.get("learning_rate")
+        if isinstance(rate, str):  # rl_zoo3's syntax
+            entry["learning_rate"] = LinearSchedule(float(rate.removeprefix("lin_")), 0.0, 1.0)
+        entry["env"] = cls._vectorise(entry.get("env", env_id), None, 1, n_envs)
+        model = cls(**entry)
+        model.n_timesteps = timesteps
+        return model
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """As SB3's: what follows depends on the seed. The training tasks stay."""
@@ -486,22 +538,39 @@ class PEARLSAC(SamplingSAC):
 
     def learn(  # type: ignore[override]
         self: SelfPEARLSAC,
-        total_timesteps: int,
+        total_timesteps: int | None = None,
         callback: MaybeCallback = None,
         log_interval: int | None = 1,
-        tb_log_name: str = "PEARLSAC",
+        tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfPEARLSAC:
         """Train, in whole epochs, until at least ``total_timesteps`` environment steps are done.
 
+        :param total_timesteps: None takes those of the entry that :meth:`from_zoo` read
+        :param callback: As SB3's
         :param log_interval: Epochs between two dumps of the log; None never dumps
+        :param tb_log_name: None is the algorithm's name
+        :raises ValueError: if the number of steps is not known
         """
+        total_timesteps = self.n_timesteps if total_timesteps is None else total_timesteps
+        if total_timesteps is None:
+            raise ValueError(
+                "total_timesteps is missing, which only a model that from_zoo made knows: pass a "
+                f"number of environment steps; an epoch has {self.epoch_steps:,}"
+            )
+        if self.verbose > 0:
+            epoch, updates = self.epoch_steps, self.gradient_steps
+            print(
+                f"Training for {total_timesteps:,} steps in {-(-total_timesteps // epoch):,} epochs: "
+                f"each has {epoch:,} environment steps, then {updates if updates >= 0 else epoch:,} "
+                "gradient steps"
+            )
         super().learn(
             total_timesteps=total_timesteps,
             callback=callback,
             log_interval=log_interval,  # type: ignore[arg-type]
-            tb_log_name=tb_log_name,
+            tb_log_name=tb_log_name or type(self).__name__,
             reset_num_timesteps=reset_num_timesteps,
             progress_bar=progress_bar,
         )

@@ -11,14 +11,16 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3 import SAC
-from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.common.checkpoint import read_checkpoint, restore_stores, save_checkpoint
 from sb3_poem.common.family import plain_id
 from sb3_poem.common.files import write_atomically
 from sb3_poem.common.pretrained import from_pretrained, save_pretrained
+from sb3_poem.common.vec_env import as_task_vec_env, make_task_vec_env
+from sb3_poem.pearl_sac.unsupported import refuse_unsupported
 from sb3_poem.resources import pretrained_names
 
 SelfPersistent = TypeVar("SelfPersistent", bound="PersistentSAC")
@@ -74,26 +76,32 @@ class PersistentSAC(SAC):
 
     @classmethod
     def _vectorise(
-        cls, env: GymEnv | str, n_train_tasks: int | None, trajectories_per_task: int, n_copies: int | None = None
-    ) -> GymEnv | str:
-        """A registered id becomes ``n_copies``: unless given, :meth:`_default_copies` of a family that has a vectorised
-        version, and one of any other.
+        cls,
+        env: GymEnv | gym.vector.VectorEnv | str | None,
+        n_train_tasks: int | None,
+        trajectories_per_task: int,
+        n_copies: int | None = None,
+    ) -> GymEnv | None:
+        """What a model is given as its environment, as SB3 takes it. A registered id becomes
+        ``n_copies``: unless given, :meth:`_default_copies` of a family that has a vectorised version,
+        and of any other as many as :func:`make_task_vec_env` steps in turn.
+
+        :raises TypeError: if it is something else
+        :raises ValueError: if it is Gymnasium's vectorised environment of no task family
         """
-        if not isinstance(env, str):
+        if isinstance(env, gym.vector.VectorEnv):
+            return as_task_vec_env(env)
+        if env is None or isinstance(env, gym.Env | VecEnv):
             return env
-        import poem_envs  # noqa: F401
-
+        if not isinstance(env, str):
+            raise TypeError(f"env is {env!r}, but must be an environment, a vectorised one, or a registered id")
         env = plain_id(env)
-        if gym.spec(env).vector_entry_point is None:
-            return make_vec_env(env, n_copies or 1)
-        from sb3_poem.common.vec_env import TaskVecEnv
-
         if n_copies is not None:
-            return TaskVecEnv.from_id(env, n_copies)
+            return make_task_vec_env(env, n_copies, max_sequential=n_copies)
         if n_train_tasks is None:
             with contextlib.closing(gym.make(env)) as probe:
                 n_train_tasks = default_train_tasks(getattr(probe.unwrapped, "all_tasks", None))
-        return TaskVecEnv.from_id(env, cls._default_copies(n_train_tasks, trajectories_per_task))
+        return make_task_vec_env(env, cls._default_copies(n_train_tasks, trajectories_per_task))
 
     def save(
         self,
@@ -122,6 +130,7 @@ class PersistentSAC(SAC):
         """
         if not isinstance(path, io.BufferedIOBase):
             cls._check_is_file(pathlib.Path(path))
+        refuse_unsupported(kwargs, cls.__name__)
         try:
             data, _, _ = load_from_zip_file(path, device="cpu", load_data=True)
         except (zipfile.BadZipFile, RuntimeError, EOFError, ValueError) as error:

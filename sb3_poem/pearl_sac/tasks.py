@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from gymnasium.vector import VectorEnv
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
@@ -30,6 +31,7 @@ class TaskSAC(PersistentSAC):
     latent_dim: int
     precision: str
     n_train_tasks: int | None
+    trajectories_per_task: int
     relabel_fraction: float
     context_relabel_fraction: float
     shaping_coef: float = 0.0  # models of before it
@@ -41,8 +43,7 @@ class TaskSAC(PersistentSAC):
     _family: FamilyEnv | None
 
     def _draw_tasks(self) -> None:
-        assert self._family is not None, "a new model needs an environment"
-        family = self._family
+        family = self.family
         count = default_train_tasks(family.all_tasks) if self.n_train_tasks is None else self.n_train_tasks
         if family.all_tasks is not None and count > len(family.all_tasks):
             raise ValueError(
@@ -83,12 +84,16 @@ class TaskSAC(PersistentSAC):
             family.check_same_family(self.task_space, self.reward_feature_dim)
         return family
 
-    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """Change the environment, to one of the same family with any number of copies.
+    def set_env(self, env: GymEnv | VectorEnv | str, force_reset: bool = True) -> None:  # type: ignore[override]
+        """Change the environment, to one of the same family with any number of copies; a registered id
+        gets as many as the model has.
 
         :raises ValueError: if the environment is of another family; the model then keeps its own
         """
-        vec_env = self._wrap_env(env, self.verbose)
+        given = self._vectorise(env, None, 1, self.n_envs)
+        if given is None:
+            raise TypeError("env is None, but set_env needs an environment")
+        vec_env = self._wrap_env(given, self.verbose)
         check_for_correct_spaces(vec_env, self.observation_space, self.action_space)
         family = self._family_of(vec_env)
         self.n_envs = vec_env.num_envs  # experience is kept per task, not per copy
@@ -106,6 +111,17 @@ class TaskSAC(PersistentSAC):
                 raise ValueError("the model has no environment; give it one with set_env, or load it with env=...")
             self._family = self._family_of(self.env)
         return self._family
+
+    @property
+    def epoch_steps(self) -> int:
+        """Environment steps of an epoch's collection."""
+        assert self.train_tasks is not None
+        return self._steps_of(len(self.train_tasks) * self.trajectories_per_task)
+
+    def _steps_of(self, rollouts: int) -> int:
+        """Environment steps of so many rollouts, all copies of the environment at a time."""
+        n_envs = self.family.num_envs
+        return -(-rollouts // n_envs) * n_envs * self.family.horizon
 
     @property
     def task_latents(self) -> np.ndarray:

@@ -1,12 +1,13 @@
 """POEM: meta-RL whose task embedding preserves the order of preferences."""
 
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
+from gymnasium.vector import VectorEnv
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_poem.common.buffers import Segment
 from sb3_poem.common.collection import relabelled_returns
@@ -14,10 +15,9 @@ from sb3_poem.common.family import FamilyEnv
 from sb3_poem.pearl_sac.losses import MetaBatch, TaskEmbeddings
 from sb3_poem.pearl_sac.pearl_sac import PEARLSAC
 from sb3_poem.pearl_sac.sampling import SamplingSAC
+from sb3_poem.pearl_sac.unsupported import refuse_unknown
 from sb3_poem.poem_sac.losses import preference_loss
 from sb3_poem.poem_sac.policies import MlpPolicy, POEMPolicy
-
-SelfPOEMSAC = TypeVar("SelfPOEMSAC", bound="POEMSAC")
 
 SIMILARITIES = ("two-encoder", "inner")
 CONTEXTS = ("optimal", "pearl")
@@ -46,6 +46,7 @@ class POEMSAC(PEARLSAC):
     :param preference_group_size: Tasks whose policies are run on each other with "rollout"
     """
 
+    zoo_name: ClassVar[str] = "poem_sac"
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy}
     policy: POEMPolicy
     saved_arguments: ClassVar[dict[str, str]] = {
@@ -61,7 +62,7 @@ class POEMSAC(PEARLSAC):
     def __init__(
         self,
         policy: str | type[POEMPolicy],
-        env: GymEnv | str,
+        env: GymEnv | VectorEnv | str,
         learning_rate: float | Schedule = 3e-4,
         buffer_size: int = 100_000,
         learning_starts: int = 0,
@@ -101,7 +102,9 @@ class POEMSAC(PEARLSAC):
         seed: int | None = None,
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
+        **unsupported: Any,
     ) -> None:
+        refuse_unknown(unsupported, type(self))
         for name, value, known in (
             ("similarity", similarity, SIMILARITIES),
             ("context", context, CONTEXTS),
@@ -189,6 +192,18 @@ class POEMSAC(PEARLSAC):
     def _relabels(self) -> bool:
         return self.preference_source == "relabel" or (self.preference_source == "auto" and self.family.shared_dynamics)
 
+    @property
+    def epoch_steps(self) -> int:
+        """Environment steps of an epoch's collection, those that compare policies included."""
+        if self._relabels:
+            return super().epoch_steps
+        sizes = [len(group) for group in self._split(np.arange(len(self.task_latents)))]
+        return super().epoch_steps + self._steps_of(sum(size * (size - 1) for size in sizes))
+
+    def _split(self, tasks: np.ndarray) -> list[np.ndarray]:
+        """Groups of tasks, whose policies are run on each other's."""
+        return np.array_split(tasks, max(1, len(tasks) // self.preference_group_size))
+
     def _measure_returns(self, epoch: Segment, callback: BaseCallback) -> np.ndarray | None:
         assert self.train_tasks is not None
         n_tasks = len(self.train_tasks)
@@ -203,8 +218,7 @@ class POEMSAC(PEARLSAC):
         """Run the policies of random groups of tasks on each other's tasks; the transitions go to the tasks' buffers."""
         assert self.train_tasks is not None
         n_tasks, n_envs = len(returns), self.family.num_envs
-        order = self.generators.numpy.permutation(n_tasks)
-        self._groups = np.array_split(order, max(1, n_tasks // self.preference_group_size))
+        self._groups = self._split(self.generators.numpy.permutation(n_tasks))
         pairs = np.array([(i, j) for group in self._groups for i in group for j in group if i != j], dtype=np.int64)
         own_latents = epoch.latents.reshape(n_tasks, -1, self.latent_dim)[:, 0]
         slots = np.resize(np.arange(len(pairs)), -(-len(pairs) // n_envs) * n_envs)
@@ -233,14 +247,3 @@ class POEMSAC(PEARLSAC):
         similarity = embeddings.reward @ embeddings.policy.T  # eq. 3
         loss, accuracy = preference_loss(similarity, batch.returns)
         return self.preference_coef * loss, {"preference_loss": loss, "preference_accuracy": accuracy}
-
-    def learn(  # type: ignore[override]
-        self: SelfPOEMSAC,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int | None = 1,
-        tb_log_name: str = "POEMSAC",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfPOEMSAC:
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)

@@ -9,15 +9,14 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
+from meta_toys import Walk
 from stable_baselines3 import SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecMonitor, VecNormalize
 
-from poem_envs import TaskFamily
 from sb3_poem import set_task
 from sb3_poem.common.family import FamilyEnv, plain_id
 from sb3_poem.common.vec_env import TaskVecEnv, as_task_vec_env, make_task_vec_env
@@ -158,14 +157,6 @@ def test_set_attr():
         env.set_attr("task", [0.3])
 
 
-class OnlySingle(TaskFamily):
-    observation_space = spaces.Box(-1, 1, (1,), np.float64)
-    action_space = spaces.Box(-1, 1, (1,), np.float32)
-    task_space = spaces.Box(-1, 1, (1,), np.float64)
-    reward_feature_dim = 1
-    _begin_episode = _simulate = _reward = lambda self, *arguments: np.zeros(1)
-
-
 def test_refused_environments():
     def wrapped():
         return gym.wrappers.TimeAwareObservation(gym.make("poem/PointGoal-v0"))
@@ -176,7 +167,7 @@ def test_refused_environments():
         return env
 
     def only_single():
-        gym.register("test/OnlySingle-v0", entry_point=OnlySingle)
+        gym.register("test/OnlySingle-v0", entry_point=Walk)
         return gym.make("test/OnlySingle-v0")
 
     def keywords():

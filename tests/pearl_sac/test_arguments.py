@@ -12,6 +12,7 @@ from stable_baselines3.common.callbacks import (
     BaseCallback,
 )
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_poem import PEARLSAC, POEMSAC
 from sb3_poem.common.vec_env import TaskVecEnv
@@ -82,8 +83,10 @@ def test_the_policy_can_be_a_class(algorithm: type[PEARLSAC]) -> None:
     policy_class = {PEARLSAC: LatentPolicy, POEMSAC: POEMPolicy}[algorithm]
     arguments = {"n_train_tasks": 2, "device": "cpu", "policy_kwargs": {"net_arch": ARCH}}
     assert isinstance(algorithm(policy_class, POINT_GOAL, **arguments).policy, policy_class)
-    with pytest.raises(ValueError, match="Policy CnnPolicy unknown"):
-        algorithm("CnnPolicy", POINT_GOAL, **arguments)
+    for other in ("CnnPolicy", "MultiInputPolicy", SACPolicy):
+        message = rf'policy is .*, but must be "MlpPolicy" or a subclass of {policy_class.__name__}.*GoalFamily'
+        with pytest.raises(ValueError, match=message):
+            algorithm(other, POINT_GOAL, **arguments)
 
 
 @one_is_enough

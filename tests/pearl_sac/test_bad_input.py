@@ -3,18 +3,29 @@
 from __future__ import annotations
 
 import functools
+import inspect
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from meta_toys import ARCH, POINT_GOAL, Poisoned, TwoWalks, Walk, WindyWalk, differing, parameters, small, walks
+from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.sac.policies import SACPolicy
 
+from poem_envs import TaskFamily
 from sb3_poem import PEARLSAC, POEMSAC
 from sb3_poem.common.buffers import TaskBatch
+from sb3_poem.pearl_sac.policies import LatentPolicy
+from sb3_poem.pearl_sac.unsupported import UNSUPPORTED
+from sb3_poem.testing import check_task_family
 
 NAN = float("nan")
 
@@ -79,32 +90,127 @@ def test_arguments_of_poem(argument: str, value: Any, message: str) -> None:
         small(POEMSAC, **{argument: value})
 
 
+@pytest.mark.parametrize(
+    ("arguments", "instead"),
+    [
+        ({"action_noise": NormalActionNoise(np.zeros(2), np.ones(2))}, "noise_color=1"),
+        ({"optimize_memory_usage": True}, "buffer_size"),
+        ({"use_sde": True}, "noise_color=1"),
+        ({"sde_sample_freq": 4}, "noise_color=1"),
+        ({"use_sde_at_warmup": True}, "noise_color=1"),
+        ({"train_freq": 1}, "trajectories_per_task and gradient_steps"),
+        ({"replay_buffer_class": HerReplayBuffer}, "as HER does for goals; see buffer_size, relabel_fraction"),
+        ({"replay_buffer_kwargs": {"n_sampled_goal": 4}}, "GoalFamily"),
+        ({"policy_kwargs": {"features_extractor_class": FlattenExtractor}}, "net_arch"),
+        ({"policy_kwargs": {"share_features_extractor": True}}, "net_arch"),
+        ({"policy_kwargs": {"log_std_init": -2.0}}, "ent_coef and target_entropy"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_what_only_sac_takes(algorithm: type[PEARLSAC], arguments: dict[str, Any], instead: str) -> None:
+    name = next(iter(arguments.get("policy_kwargs", arguments)))
+    of_policy = "'s policy" if "policy_kwargs" in arguments else ""
+    with pytest.raises(TypeError, match=f"{algorithm.__name__}{of_policy} takes no '{name}': .*{instead}"):
+        small(algorithm, **arguments)
+
+
+def test_every_argument_of_sac_is_taken_or_refused_with_a_reason(algorithm: type[PEARLSAC]) -> None:
+    of_sac, of_its_policy, ours = (set(inspect.signature(kind).parameters) for kind in (SAC, SACPolicy, algorithm))
+    of_our_policy = set(inspect.signature(LatentPolicy).parameters)
+    assert of_sac - ours <= UNSUPPORTED.keys()
+    assert of_its_policy - of_our_policy <= UNSUPPORTED.keys()
+    assert not UNSUPPORTED.keys() & (ours | of_our_policy)
+
+
 def test_an_unknown_argument(algorithm: type[PEARLSAC]) -> None:
-    with pytest.raises(TypeError, match="train_freq"):
-        small(algorithm, train_freq=1)
+    message = f"{algorithm.__name__} got an unexpected keyword argument 'learning_rat'; did you mean 'learning_rate'"
+    with pytest.raises(TypeError, match=message):
+        small(algorithm, learning_rat=1)
+    with pytest.raises(TypeError, match="keyword argument 'xyz'"):
+        small(algorithm, xyz=1)
+    with pytest.raises(TypeError, match="POEMSAC got an unexpected keyword argument 'context_relabel_fraction'"):
+        small(POEMSAC, context_relabel_fraction=0.5)
+
+
+def test_loading_with_what_only_sac_takes(trained: PEARLSAC, tmp_path: Path) -> None:
+    trained.save(tmp_path / "model")
+    with pytest.raises(TypeError, match="takes no 'train_freq': "):
+        type(trained).load(tmp_path / "model", train_freq=1)
 
 
 # ---------------------------------------------------------------- environments
 
 
-@pytest.mark.parametrize("env", ["Pendulum-v1", functools.partial(gym.make, "Pendulum-v1")])
+class DictObservations(gym.Env):
+    observation_space = spaces.Dict(observation=Walk.observation_space)
+    action_space = Walk.action_space
+
+
+NO_FAMILY = r"env <.*> is no task family.*poem_envs\.TaskFamily.*poem_envs\.GoalFamily.*docs/families\.md"
+
+
+@pytest.mark.parametrize(
+    "env",
+    [
+        *("Pendulum-v1", functools.partial(gym.make, "Pendulum-v1")),
+        *("CartPole-v1", functools.partial(gym.make, "CartPole-v1")),  # with discrete actions
+        DictObservations,
+    ],
+)
 def test_no_task_family(algorithm: type[PEARLSAC], env: Any) -> None:
-    with pytest.raises(ValueError, match=r"env is no task family: it has no attribute 'task_space'.*poem_envs\.TaskFamily"):
+    with pytest.raises(ValueError, match=NO_FAMILY):
         small(algorithm, env() if callable(env) else env)
 
 
 def test_no_environment_at_all(algorithm: type[PEARLSAC]) -> None:
-    with pytest.raises(gym.error.NameNotFound, match="Nowhere"):
-        small(algorithm, "poem/Nowhere-v0")
-    with pytest.raises((AssertionError, ValueError, TypeError), match="environment"):
+    with pytest.raises(gym.error.NameNotFound, match=r"No environment 'xyzzy' is registered .* nor any like it"):
+        small(algorithm, "xyzzy")
+    for name in ("poem/HalfCheetahVel", "HalfCheetahVel-v0", "poem/HalfCheetaVel-v0"):
+        with pytest.raises(gym.error.NameNotFound, match="did you mean 'poem/HalfCheetahVel-v0'"):
+            small(algorithm, name)
+    with pytest.raises(TypeError, match="env is None, but a new model needs an environment"):
         small(algorithm, None)
+    for env in (3, Walk):
+        with pytest.raises(TypeError, match=r"env is .*, but must be an environment, a vectorised one, or a registered id"):
+            small(algorithm, env)
 
 
-def test_discrete_actions(algorithm: type[PEARLSAC]) -> None:
-    with pytest.raises(AssertionError, match=r"only supports .*Box.* as action spaces"):
-        small(algorithm, gym.make("CartPole-v1"))
-    with pytest.raises(ValueError, match="is no task family"):  # it has a vectorised version, which is looked at first
-        small(algorithm, "CartPole-v1")
+class Discrete(Walk):
+    action_space = spaces.Discrete(3)
+
+
+class NoTaskSpace(Walk):
+    @property
+    def task_space(self) -> spaces.Box:
+        raise AttributeError("as if it were not there")
+
+
+class FlatAllTasks(Walk):
+    all_tasks = np.array([0.5, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("family", "message"),
+    [
+        (Discrete, r"env .*Discrete.*: action_space must be a flat gymnasium.spaces.Box, but is Discrete\(3\)"),
+        (NoTaskSpace, r"env .*NoTaskSpace.*: task_space must be a Box of shape \(task_dim,\) and dtype float64, but is None"),
+        (FlatAllTasks, r"env .*FlatAllTasks.*: all_tasks must have shape \(n, 1\)"),
+    ],
+)
+def test_a_family_that_is_not_whole_is_refused_by_the_words_of_check_task_family(
+    algorithm: type[PEARLSAC], family: type[Walk], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        small(algorithm, family(), horizon=5)
+    with pytest.raises(AssertionError, match=message.partition(": ")[2]):
+        check_task_family(family)
+
+
+@pytest.mark.parametrize("method", ["_reward", "_simulate", "_begin_episode"])
+def test_a_family_without_a_method_cannot_be_made(method: str) -> None:
+    family = type("Part", (Walk,), {method: getattr(TaskFamily, method)})
+    with pytest.raises(TypeError, match=f"abstract class Part with.* abstract method '?{method}"):
+        family()
 
 
 def test_more_tasks_than_a_finite_family_has(algorithm: type[PEARLSAC]) -> None:
@@ -213,7 +319,7 @@ def test_sample_latents_and_sources(algorithm: type[PEARLSAC]) -> None:
 
 
 def test_no_task_family_after_all(algorithm: type[PEARLSAC]) -> None:
-    """Pieces of a family that are missing are named."""
+    """It has some of what a family has."""
 
     class Half(gym.Env):
         observation_space, action_space, task_space = Walk.observation_space, Walk.action_space, Walk.task_space
@@ -222,7 +328,7 @@ def test_no_task_family_after_all(algorithm: type[PEARLSAC]) -> None:
         def reset(self, **_: Any) -> tuple[np.ndarray, dict]:
             return np.zeros(2), {}
 
-    with pytest.raises(ValueError, match="has no attribute 'shared_dynamics'"):
+    with pytest.raises(ValueError, match=NO_FAMILY):
         small(algorithm, Half(), horizon=5, policy_kwargs={"net_arch": ARCH})
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -182,10 +182,28 @@ def test_tensorboard(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
 
 @one_is_enough
 def test_verbose_prints_a_table(algorithm: type[PEARLSAC], capsys: pytest.CaptureFixture[str]) -> None:
-    small(algorithm, verbose=1).learn(EPOCH)
-    printed = capsys.readouterr().out
-    assert "Using cpu device" in printed
-    assert "decoder_error" in printed
+    model = small(algorithm, verbose=1)
+    assert "Using cpu device" in capsys.readouterr().out
+
+    class Printed(BaseCallback):
+        """Notes how many tables there are when an epoch begins."""
+
+        tables: ClassVar[list[int]] = []
+        printed = ""
+
+        def _on_rollout_start(self) -> None:
+            Printed.printed += capsys.readouterr().out
+            self.tables.append(Printed.printed.count("decoder_error"))
+
+        def _on_step(self) -> bool:
+            return True
+
+    model.learn(2 * EPOCH + 1, Printed())
+    printed = Printed.printed + capsys.readouterr().out
+    sentence = "Training for 601 steps in 3 epochs: each has 300 environment steps, then 5 gradient steps"
+    assert printed.index(sentence) < printed.index("decoder_error")
+    assert printed.count("decoder_error") == 3
+    assert Printed.tables == [0, 0, 1]  # that of an epoch is printed when the next begins, right after this
     small(algorithm, verbose=0).learn(EPOCH)
     assert capsys.readouterr().out == ""
 

@@ -9,13 +9,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from meta_toys import EPOCH, N_TASKS, POINT_GOAL, Walk, differing, parameters, small, walks
+from meta_toys import EPOCH, N_TASKS, POINT_GOAL, Walk, WindyWalk, assert_same_model, differing, parameters, small, walks
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 
-from sb3_poem import PEARLSAC, POEMSAC
+from poem_envs import ProcessFamilyVector
+from sb3_poem import PEARLSAC, POEMSAC, AdaptationEvalCallback
 from sb3_poem.common.vec_env import TaskVecEnv
 
 #: For what is one code in both
@@ -60,6 +61,63 @@ def test_an_id_gets_a_copy_for_every_task(algorithm: type[PEARLSAC]) -> None:
     assert isinstance(model.env, TaskVecEnv)
     assert model.env.num_envs == N_TASKS
     assert model.env_id == POINT_GOAL
+
+
+def make_vec(n: int, **kwargs: Any) -> gym.vector.VectorEnv:
+    return gym.make_vec(POINT_GOAL, n, **kwargs)
+
+
+@pytest.mark.parametrize("mode", ["vector_entry_point", "sync"])
+def test_gymnasiums_vectorised_environment(algorithm: type[PEARLSAC], mode: str) -> None:
+    """A family's own, and copies that are stepped one after another."""
+    arguments = {"vectorization_mode": mode, "max_episode_steps": 12}
+    model = small(algorithm, make_vec(3, step_length=0.2, **arguments)).learn(N_TASKS * 12)
+    same = small(algorithm, make_vec_env(POINT_GOAL, 3, env_kwargs={"step_length": 0.2, "max_episode_steps": 12}))
+    assert_same_model(model, same.learn(N_TASKS * 12))
+    assert isinstance(model.env, TaskVecEnv if mode == "vector_entry_point" else DummyVecEnv)
+    assert model.horizon == 12
+    assert model.env_kwargs["step_length"] == 0.2
+    callback = AdaptationEvalCallback(n_tasks=2, record_at=(1,), n_episodes=1)
+    model.learn(1, callback)  # makes copies of it
+    model.set_env(make_vec(2, **arguments))
+    assert model.n_envs == 2
+
+
+def test_a_vectorised_environment_that_is_not_registered() -> None:
+    env = ProcessFamilyVector(Walk, num_envs=2, nthread=1, max_episode_steps=9)
+    assert small(POEMSAC, env, horizon=9).learn(1).num_timesteps == N_TASKS * 9
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: gym.make_vec("CartPole-v1", 2),
+        lambda: gym.vector.AsyncVectorEnv([functools.partial(gym.make, POINT_GOAL)]),
+        lambda: gym.wrappers.vector.RecordEpisodeStatistics(make_vec(2)),
+    ],
+    ids=["CartPoleVectorEnv", "AsyncVectorEnv", "RecordEpisodeStatistics"],
+)
+def test_other_vectorised_environments(make: Any, request: pytest.FixtureRequest) -> None:
+    env = make()
+    with pytest.raises(
+        ValueError, match=rf"env is a {type(env).__name__}, but must be gym.make_vec\(id, n\) of a task family"
+    ):
+        small(POEMSAC, env)
+    env.close()
+
+
+@pytest.mark.parametrize(("family", "n_envs"), [(Walk, 5), (WindyWalk, 2), (WindyWalk, 5)])
+def test_an_epoch_has_as_many_steps_as_it_says(algorithm: type[PEARLSAC], family: type[Walk], n_envs: int) -> None:
+    model = small(algorithm, walks(n_envs, family), horizon=10, n_train_tasks=7)
+    assert model.learn(1).num_timesteps == model.epoch_steps
+
+
+def test_set_env_takes_an_id(algorithm: type[PEARLSAC]) -> None:
+    model = small(algorithm)
+    model.set_env(POINT_GOAL)
+    assert model.n_envs == N_TASKS
+    with pytest.raises(TypeError, match="env is None, but set_env needs an environment"):
+        model.set_env(None)
 
 
 @one_is_enough

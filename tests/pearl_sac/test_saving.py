@@ -286,7 +286,7 @@ def test_an_id_without_a_vectorised_version(algorithm: type[POEMSAC], tmp_path: 
             algorithm.load(tmp_path / "m.zip", "Strolling-v0"),
             algorithm.from_pretrained(tmp_path / "p", "Strolling-v0"),
         ):
-            assert loaded.n_envs == 1
+            assert loaded.n_envs == 4
     finally:
         del gym.registry["Strolling-v0"]
 

@@ -1,0 +1,96 @@
+"""Models from the hyperparameters that ship."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import pytest
+import torch as th
+import yaml
+from meta_toys import EPOCH, POINT_GOAL, Walk, differing, parameters, small
+
+from sb3_poem import PEARLSAC, POEMSAC
+from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.loading import ALGORITHMS
+from sb3_poem.resources import config_file
+
+
+def test_arguments_are_those_of_the_entry(algorithm: type[PEARLSAC]) -> None:
+    entry = yaml.safe_load(config_file(algorithm.zoo_name).read_text())[POINT_GOAL]
+    model = algorithm.from_zoo(POINT_GOAL, seed=3, device="cpu", gamma=0.8)
+    for name in entry.keys() & model.saved_arguments.keys() - {"gamma"}:
+        assert getattr(model, model.saved_arguments[name]) == entry[name], name
+    assert (model.gamma, model.seed) == (0.8, 3)
+    assert (model.n_envs, model.n_timesteps) == (entry["n_envs"], int(entry["n_timesteps"]))
+    assert model.policy.net_arch["pi"] == [64, 64]
+
+
+def test_schedules_and_python_are_read_as_rl_zoo3_reads_them(algorithm: type[PEARLSAC]) -> None:
+    from rl_zoo3.exp_manager import ExperimentManager
+
+    env_id = "poem/HalfCheetahFwdBack-v0"
+    entry = yaml.safe_load(config_file(algorithm.zoo_name).read_text())[env_id]
+    expected: Any = ExperimentManager._preprocess_schedules({"learning_rate": entry["learning_rate"]})["learning_rate"]
+    model = algorithm.from_zoo(f"poem_envs:{env_id}", n_envs=2, device="cpu", _init_setup_model=False)
+    model._setup_lr_schedule()
+    for remaining in (1.0, 0.37, 0.0):
+        assert model.lr_schedule(remaining) == pytest.approx(expected(remaining), rel=1e-12)
+    assert model.policy_kwargs.items() >= eval(entry["policy_kwargs"], {"nn": th.nn}).items()
+
+
+def test_every_entry_makes_a_model(algorithm: type[PEARLSAC]) -> None:
+    for env_id in yaml.safe_load(config_file(algorithm.zoo_name).read_text()):
+        model = algorithm.from_zoo(env_id, n_envs=1, env=POINT_GOAL, _init_setup_model=False)
+        assert model.n_timesteps > 0
+
+
+def test_learn_takes_the_entrys_steps(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
+    model = algorithm.from_zoo(POINT_GOAL, seed=0, n_timesteps=3000, gradient_steps=1, device="cpu").learn()
+    assert model.num_timesteps == 3000  # two epochs of 60 tasks and 25 steps
+    model.save(tmp_path / "model")
+    assert algorithm.load(tmp_path / "model", POINT_GOAL).learn(reset_num_timesteps=False).num_timesteps == 6000
+    assert model.learn(1500).num_timesteps == 1500
+
+
+def test_learn_does_not_guess_how_long(algorithm: type[PEARLSAC]) -> None:
+    message = f"total_timesteps is missing, which only a model that from_zoo made knows: .* an epoch has {EPOCH}"
+    with pytest.raises(ValueError, match=message):
+        small(algorithm).learn()
+
+
+def test_another_family_by_an_entry() -> None:
+    gym.register("test/Walk-v0", Walk, max_episode_steps=10)
+    try:
+        for env in ("test/Walk-v0", gym.make("test/Walk-v0")):
+            model = POEMSAC.from_zoo(POINT_GOAL, env=env, n_envs=3, seed=0)
+            assert model.env_id == "test/Walk-v0"
+            assert model.n_envs == (3 if isinstance(env, str) else 1)
+    finally:
+        del gym.registry["test/Walk-v0"]
+
+
+def test_it_is_what_the_constructor_makes() -> None:
+    """With the same arguments, the same model."""
+    of_zoo = POEMSAC.from_zoo(POINT_GOAL, seed=0, n_timesteps=1500, gradient_steps=2, learning_rate=5e-3).learn()
+    entry = yaml.safe_load(config_file("poem_sac").read_text())[POINT_GOAL]
+    arguments = {name: entry[name] for name in entry.keys() & inspect.signature(POEMSAC).parameters.keys()}
+    changed = {"seed": 0, "gradient_steps": 2, "learning_rate": 5e-3, "env": TaskVecEnv.from_id(POINT_GOAL, 60)}
+    policy_kwargs = eval(entry["policy_kwargs"])
+    by_hand = POEMSAC(**{**arguments, **changed, "policy_kwargs": policy_kwargs}).learn(1500)
+    assert not differing(parameters(of_zoo), parameters(by_hand))
+
+
+def test_no_entry(algorithm: type[PEARLSAC]) -> None:
+    with pytest.raises(
+        ValueError, match=rf"{algorithm.zoo_name}.yml has no entry 'Pendulum-v1'; there are: poem/PointGoal-v0, "
+    ):
+        algorithm.from_zoo("Pendulum-v1")
+    with pytest.raises(gym.error.NameNotFound, match="did you mean 'poem/PointGoal-v0'"):
+        algorithm.from_zoo("poem/PointGoal")
+
+
+def test_the_names_are_those_of_the_command_line() -> None:
+    assert {name: kind.zoo_name for name, kind in ALGORITHMS.items()} == {name: name for name in ALGORITHMS}
