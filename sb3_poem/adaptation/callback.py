@@ -9,10 +9,15 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_poem.adaptation.adapter import PreferenceAdapter
+from sb3_poem.adaptation.environments import check_model_fits
 from sb3_poem.adaptation.evaluation import evaluate_adaptation, evaluate_latents, known_task_return, preference_order
 from sb3_poem.common.callbacks import EpochCallback
 from sb3_poem.common.family import FamilyEnv
 from sb3_poem.common.vec_env import make_task_vec_env
+
+# Options of adapt_tasks that are not the adapter's
+OF_ADAPT_TASKS = {"adapter", "library", "oracle_factory", "progress_bar"}
 
 
 class AdaptationEvalCallback(EpochCallback):
@@ -36,7 +41,9 @@ class AdaptationEvalCallback(EpochCallback):
         similarity is asked random queries unless they say otherwise
     :param env_kwargs: Arguments of the environment that differ from training's, for instance a ``split`` of its tasks
     :param verbose: 1 prints each result
-    :raises ValueError: for a number of tasks or episodes below 1
+    :raises ValueError: for a number of tasks or episodes below 1; when training starts, for an
+        environment that is not registered, or options that ``adapt_tasks`` does not take
+    :raises OSError: when training starts, if the folder cannot be made
     """
 
     def __init__(
@@ -66,7 +73,13 @@ class AdaptationEvalCallback(EpochCallback):
         self._env: VecEnv | None = None
 
     def _init_callback(self) -> None:
+        """Refuse before training what could not be evaluated or saved after some epochs of it."""
         super()._init_callback()
+        if self.best_model_save_path is not None:
+            self.best_model_save_path.mkdir(parents=True, exist_ok=True)
+        self._make_env()
+        adapter = self.adaptation_kwargs.get("adapter", PreferenceAdapter)
+        adapter.make_options(**{k: v for k, v in self.adaptation_kwargs.items() if k not in OF_ADAPT_TASKS})
         if self._best_model is not None and self._best_model.exists():  # a run that goes on
             self.best_return = getattr(self.model, "best_adapted_return", self.best_return)
 
@@ -75,9 +88,9 @@ class AdaptationEvalCallback(EpochCallback):
         return None if self.best_model_save_path is None else self.best_model_save_path / "best_model.zip"
 
     def _make_env(self) -> tuple[VecEnv, np.ndarray]:
-        family = self.model.family
         if self._env is None:
-            spec = family.env.get_attr("spec", indices=[0])[0]
+            training_env = self.model.family.env
+            spec = training_env.get_attr("spec", indices=[0])[0]
             if spec is None:
                 raise ValueError(
                     "AdaptationEvalCallback makes copies of the environment, which must be registered with Gymnasium; "
@@ -86,8 +99,9 @@ class AdaptationEvalCallback(EpochCallback):
             limit = spec.max_episode_steps
             arguments = {**spec.kwargs, **self.env_kwargs}
             self._env = make_task_vec_env(spec.id, 2 * self.n_tasks, max_episode_steps=limit, **arguments)
-        if self.env_kwargs:
-            family = FamilyEnv(self._env)
+            check_model_fits(self.model, self._env)
+        family = FamilyEnv(self._env, self.model.horizon)
+        family.check_same_family(self.model.task_space, self.model.reward_feature_dim)
         if family.all_tasks is not None and len(family.all_tasks) <= self.n_tasks:
             return self._env, family.all_tasks
         return self._env, family.sample_tasks(self.n_tasks, np.random.default_rng(self.seed))

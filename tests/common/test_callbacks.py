@@ -305,9 +305,19 @@ def test_evaluation_takes_the_training_environments_arguments() -> None:
     assert np.array_equal(again[1], tasks)
 
 
-def test_evaluation_needs_a_registered_family() -> None:
-    with pytest.raises(ValueError, match="must be registered with Gymnasium"):
-        small(POEMSAC, walks(2), horizon=10).learn(1, AdaptationEvalCallback(**QUICK))
+def test_what_cannot_be_evaluated_or_saved_is_refused_before_training(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    for model, arguments, error, message in (
+        (small(POEMSAC, walks(2), horizon=10), {}, ValueError, "must be registered with Gymnasium"),
+        (small(POEMSAC), {"adaptation_kwargs": {"inference": "bays"}}, ValueError, "inference"),
+        (small(POEMSAC), {"adaptation_kwargs": {"inferense": "bayes"}}, TypeError, "inferense"),
+        (small(POEMSAC), {"env_kwargs": {"step_lenght": 1.0}}, TypeError, "step_lenght"),
+        (small(POEMSAC), {"best_model_save_path": file / "best"}, OSError, str(file)),
+    ):
+        with pytest.raises(error, match=message):
+            model.learn(1, AdaptationEvalCallback(**QUICK, **arguments))
+        assert model.num_timesteps == 0
 
 
 @pytest.mark.parametrize("arguments", [{"n_tasks": 0}, {"n_episodes": 0}])
