@@ -1,5 +1,6 @@
 """Policy of PEARLSAC: an actor, critics, a context encoder and a reward decoder that share one latent."""
 
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -74,6 +75,7 @@ class LatentPolicy(SACPolicy):
         self.latent_dim = latent_dim
         self.context_has_value = context_has_value
         self.n_critics = n_critics
+        self._warned_of_no_latent = False
         self._build(lr_schedule)
 
     @staticmethod
@@ -191,7 +193,8 @@ class LatentPolicy(SACPolicy):
         """Actions for observations under task latents.
 
         :param observation: (obs_dim,) or (n, obs_dim)
-        :param state: Latent (latent_dim,), or one for each observation (n, latent_dim); None is the prior's mean
+        :param state: Latent (latent_dim,), or one for each observation (n, latent_dim); None is the
+            prior's mean, of which a warning tells once
         :param episode_start: Not used: a latent outlives episodes
         :param deterministic: Mean action instead of a sample
         :return: actions in the environment's units, and the latents (n, latent_dim)
@@ -206,6 +209,14 @@ class LatentPolicy(SACPolicy):
             raise ValueError(f"observation has shape {obs.shape[1:]}, but the policy takes {self.observation_space.shape}")
         if not np.all(np.isfinite(obs)):
             raise ValueError(f"observation {int(np.argwhere(~np.isfinite(obs))[0, 0])} holds NaN or infinity")
+        if state is None and not self._warned_of_no_latent:
+            self._warned_of_no_latent = True
+            warnings.warn(
+                "predict was called without a latent (its state), and acts for latent 0, that is for no "
+                "task: what it earns says little of the model. PreferenceAdapter(model, env, ...).adapt() "
+                "gives a policy for a task; AdaptationEvalCallback evaluates such policies in training",
+                stacklevel=3,
+            )
         latents = np.zeros(self.latent_dim) if state is None else np.asarray(state, dtype=np.float64)
         if latents.shape not in ((self.latent_dim,), (obs.shape[0], self.latent_dim), (1, self.latent_dim)):
             raise ValueError(

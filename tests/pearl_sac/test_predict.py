@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import warnings
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch as th
-from meta_toys import POINT_GOAL, small, walks
+from meta_toys import EPOCH, POINT_GOAL, small, walks
+from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from sb3_poem import PEARLSAC
+from sb3_poem import PEARLSAC, POEMSAC, AdaptationEvalCallback, PreferenceAdapter, ReturnOracle
 from sb3_poem.poem_sac.policies import POEMPolicy
 
 OBS = np.random.default_rng(0).normal(size=(6, 2))
@@ -40,6 +44,30 @@ def test_predict_with_one_latent_for_all_and_with_none(trained: PEARLSAC) -> Non
     prior_mean, _ = trained.predict(OBS, state=np.zeros((6, 5)), deterministic=True)
     np.testing.assert_allclose(nothing, prior_mean, atol=1e-6)
     assert np.array_equal(state, np.zeros((6, 5)))
+
+
+def test_a_latent_that_is_missing_is_told_once(tmp_path: Path) -> None:
+    model = small(POEMSAC).learn(EPOCH)
+    env, told = make_vec_env(POINT_GOAL, 1), "without a latent.*PreferenceAdapter.*AdaptationEvalCallback"
+    with pytest.warns(UserWarning, match=told) as warned:
+        evaluate_policy(model, env, n_eval_episodes=2)
+    assert len(warned) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.predict(OBS)
+    with pytest.warns(UserWarning, match=told):
+        small(POEMSAC).learn(EPOCH, EvalCallback(env, eval_freq=20, n_eval_episodes=1, best_model_save_path=str(tmp_path)))
+
+
+def test_what_tells_the_task_is_not_warned_of() -> None:
+    model = small(POEMSAC)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.predict(OBS, state=np.zeros(5))
+        model.learn(EPOCH, AdaptationEvalCallback(n_tasks=2, record_at=(1,), n_episodes=1))
+        env = make_vec_env(POINT_GOAL, 1)
+        policy = PreferenceAdapter(model, env, oracle=ReturnOracle(), n_queries=2, seed=0).adapt()
+        evaluate_policy(policy, env, n_eval_episodes=1)
 
 
 def test_predict_is_the_actor(trained: PEARLSAC) -> None:
