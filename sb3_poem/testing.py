@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -29,7 +28,7 @@ def check_task_family(
 
     It checks the spaces, the drawing of tasks, seeds, when a task takes effect, that the task is hidden, that relabelling is
     exact, the potential and the symmetries (of a family that has them), the vectorised version (of a registered id that has
-    one), rendering, pickling and closing, in this order.
+    one), rendering and closing, in this order.
 
     :param env: The id of a registered environment, or a class or function that makes one
     :param n_steps: How many steps of an episode to compare; the episode may be shorter
@@ -55,7 +54,6 @@ def check_task_family(
             check_vector_parity(env, env_kwargs, n_steps, seed)
     if render:
         check_rendering(make, n_steps, seed)
-    check_pickling(make, n_steps, seed)
     check_closing(make, seed)
 
 
@@ -332,30 +330,6 @@ def check_rendering(make: MakeFamily, n_steps: int, seed: int) -> None:
             "different: draw what marks the task only if self.render_task"
         )
     env.close()
-
-
-def check_pickling(make: MakeFamily, n_steps: int, seed: int) -> None:
-    """A copy goes on as the original does."""
-    env = make()
-    actions = _actions(env, 2 * n_steps, seed)
-    advice = "leave simulators and windows out of __getstate__, and restore the state (poem_envs.replay does it by replaying)"
-    _run(env, actions[:n_steps], seed=seed)
-    try:
-        twin = pickle.loads(pickle.dumps(env))
-    except Exception as error:
-        if "lambda" in str(error) or "<locals>" in str(error):
-            advice = "register a class or function of a module, with its arguments in gym.register(..., kwargs={...})"
-        raise AssertionError(
-            f"the environment must be picklable, but raised {type(error).__name__}: {error}; {advice}"
-        ) from error
-    for action in actions[n_steps:]:
-        mine, theirs = env.step(action), twin.step(action)
-        ok = np.array_equal(mine[0], theirs[0]) and mine[1:4] == theirs[1:4]
-        assert ok, f"a pickled copy must go on exactly as the original, but does not: {advice}"
-        if mine[2]:
-            break
-    ok = np.array_equal(env.reset()[0], twin.reset()[0]) and np.array_equal(env.task, twin.task)
-    assert ok, f"a pickled copy must begin the next episode exactly as the original, but does not: {advice}"
 
 
 def check_closing(make: MakeFamily, seed: int) -> None:

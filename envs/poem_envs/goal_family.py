@@ -12,9 +12,8 @@ import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
-from poem_envs.core import BOUNDS_TOLERANCE
+from poem_envs.core import BOUNDS_TOLERANCE, TaskFamily
 from poem_envs.mujoco_rendering import prepare_to_render
-from poem_envs.replay import ReplayFamily
 
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 GOAL_SITE = "target"
@@ -23,7 +22,7 @@ TAKEN_OFF = frozenset({"TimeLimit", "OrderEnforcing", "PassiveEnvChecker"})
 SetGoal = Callable[[gym.Env, np.ndarray], None]
 
 
-class GoalFamily(ReplayFamily):
+class GoalFamily(TaskFamily):
     """
     The task family of a goal-conditioned environment, such as those of gymnasium-robotics.
 
@@ -58,7 +57,6 @@ class GoalFamily(ReplayFamily):
     """
 
     metadata = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012 (Gymnasium declares it so)
-    _simulator_attributes = ("env", "_goal_env")
     #: The time limit of the environment; None if it has none.
     max_episode_steps: int | None = None
     _spec: EnvSpec | None = None
@@ -87,7 +85,7 @@ class GoalFamily(ReplayFamily):
         self._goal_env: gym.Env | None = None
         self._success: bool | None = None
         self._achieved_goal = np.zeros(0)
-        self._build()
+        self.env = self._make()
         self.metadata = {**self.env.metadata}
         super().__init__(render_mode=render_mode, render_task=render_task, split=split)
         self._define_spaces(goal_low, goal_high)
@@ -143,10 +141,6 @@ class GoalFamily(ReplayFamily):
         observation, reward, terminated, _, info = super().step(action)
         truncated = self._spec is None and self._elapsed_steps >= (self.max_episode_steps or np.inf)
         return observation, reward, terminated, truncated, info
-
-    def _build(self) -> None:
-        self.env = self._make()
-        self._goal_env = None
 
     def _check_reward(self) -> bool:
         """Whether ``compute_reward`` takes many goals at once; if not, it is called for one after another.
@@ -216,14 +210,14 @@ class GoalFamily(ReplayFamily):
         keys = GOAL_KEYS[: 1 + self._observe_achieved_goal]
         return np.concatenate([observation[key] for key in keys]).astype(np.float64)
 
-    def _begin_simulation(self, rng: np.random.Generator) -> np.ndarray:
+    def _begin_episode(self, rng: np.random.Generator) -> np.ndarray:
         assert self._task is not None
         observation, _ = self.env.reset(seed=int(rng.integers(2**31)))
         self._place_goal(self._task)
         self._success, self._achieved_goal = None, observation["achieved_goal"].copy()
         return self._observation(observation)
 
-    def _step_simulation(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+    def _simulate(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
         assert self._task is not None
         observation, reward, terminated, _, info = self.env.step(action.astype(self.action_space.dtype))
         self._check_step(observation, float(reward))

@@ -102,9 +102,6 @@ class _Humanoid(MujocoFamily):
         direction = (float(np.cos(task[0])), float(np.sin(task[0])))
         return [arrow(np.array([position[0], position[1], 2.0]), direction, length=1.0)]
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "_forward_data": None}
-
 
 class _HumanoidDir2D(_Humanoid):
     def __init__(self, *, forward_reward_weight: float = 1.25, healthy_reward: float = 5.0, **kwargs: Any) -> None:

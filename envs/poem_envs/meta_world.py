@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+from poem_envs.core import TaskFamily
 from poem_envs.mujoco_fast_rendering import renders_fast
 from poem_envs.process_vector import ProcessFamilyVector
-from poem_envs.replay import ReplayFamily
 from poem_envs.sawyer import (
     PlacementRefusedError,
     Sawyer,
@@ -30,7 +30,7 @@ TARGET_RADIUS = 0.05
 PUCK_TO_GOAL = 0.15
 
 
-class MetaWorldEnv(ReplayFamily):
+class MetaWorldEnv(TaskFamily):
     """What ML1 and ML10 have in common: observations, actions, simulators and their rendering.
 
     :param render_mode: ``"rgb_array"``, ``"human"`` or ``"depth_array"``
@@ -43,7 +43,6 @@ class MetaWorldEnv(ReplayFamily):
     """
 
     metadata = {"render_modes": ["human", "rgb_array", "depth_array"], "render_fps": 80}  # noqa: RUF012
-    _simulator_attributes = ("_sawyer",)
 
     def __init__(
         self,
@@ -66,9 +65,6 @@ class MetaWorldEnv(ReplayFamily):
             "camera_name": camera_name,
         }
         self._success = False
-        self._build()
-
-    def _build(self) -> None:
         self._sawyer: Sawyer | None = None
 
     def _place(self, task: np.ndarray, rng: np.random.Generator) -> tuple[str, np.ndarray]:
@@ -79,7 +75,7 @@ class MetaWorldEnv(ReplayFamily):
         """The reward features of the step just taken, of which Meta-World's own reward is given."""
         raise NotImplementedError
 
-    def _begin_simulation(self, rng: np.random.Generator) -> np.ndarray:
+    def _begin_episode(self, rng: np.random.Generator) -> np.ndarray:
         assert self._task is not None
         manipulation, placement = self._place(self._task, rng)
         if self._sawyer is None or self._sawyer.manipulation != manipulation:
@@ -88,7 +84,7 @@ class MetaWorldEnv(ReplayFamily):
         self._success = False
         return self._sawyer.reset(placement, self.render_task)
 
-    def _step_simulation(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+    def _simulate(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
         assert self._sawyer is not None
         try:
             observation, reward, self._success = self._sawyer.step(action)
@@ -119,7 +115,6 @@ class MetaWorldEnv(ReplayFamily):
             raise ValueError(f"state={state!r} must be finite and have shape {shape}, as get_physics_state() returns it")
         assert self._sawyer is not None
         self._sawyer.set_state(array)
-        self._restart_from(array)
 
     def render(self) -> Any:
         """Render the current state as ``render_mode`` says: an image ``(height, width, 3)`` for ``"rgb_array"``."""

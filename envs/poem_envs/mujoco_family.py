@@ -205,14 +205,6 @@ class MujocoFamily(BatchFamily):
             self._fast_renderer.close()
             self._fast_renderer = None
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {
-            **self.__dict__,
-            "_integrator": None,
-            "_renderer": None,
-            "_fast_renderer": None,
-        }  # threads and windows are made anew when needed
-
 
 class MujocoTaskEnv(MujocoFamily, BatchTaskFamily):
     """A single MuJoCo environment with a hidden task; see :class:`MujocoFamily`."""

@@ -89,9 +89,6 @@ class _PointGoal(BatchFamily):
             self._window.close()
             self._window = None
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_window": None}
-
 
 class PointGoalEnv(_PointGoal, BatchTaskFamily):
     r"""

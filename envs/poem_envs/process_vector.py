@@ -12,7 +12,7 @@ import pickle
 import subprocess
 import sys
 import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection, Pipe
 from typing import Any, NamedTuple
 
@@ -94,10 +94,6 @@ class CopyGroup:
         """Set an attribute of every copy."""
         for env in self.envs:
             setattr(env, name, value)
-
-    def dump(self) -> list[bytes]:
-        """Every copy, pickled."""
-        return [cloudpickle.dumps(env) for env in self.envs]
 
     def close(self) -> None:
         """Close every copy."""
@@ -284,15 +280,11 @@ class ProcessFamilyVector(TaskFamilyVector):
         self._last_observations = np.zeros((n, *space.shape), dtype=space.dtype)
         self._last_infos: dict[str, np.ndarray] = {}
 
-    def _start(self, dumps: Sequence[list[bytes]] | None = None) -> None:
+    def _start(self) -> None:
         """Start the workers; this process has the last, smallest group."""
         try:
             for index, (first, size) in enumerate(zip(self._firsts, self._sizes, strict=True)):
-                make = (
-                    functools.partial(_load_copies, dumps[index])
-                    if dumps
-                    else functools.partial(_make_copies, self._make, size, self._attributes)
-                )
+                make = functools.partial(_make_copies, self._make, size, self._attributes)
                 last = index == len(self._sizes) - 1
                 self._groups.append(CopyGroup(make(), first) if last else RemoteGroup(cloudpickle.dumps(make), first))
             self._receive({index: None for index in range(len(self._groups) - 1)})
@@ -399,20 +391,6 @@ class ProcessFamilyVector(TaskFamilyVector):
             group.close()
         self._groups = []
 
-    def _dumps(self) -> Iterator[list[bytes]]:
-        results = self._call("dump", {index: () for index in range(len(self._sizes))})
-        return (results[index] for index in sorted(results))
-
-    def __getstate__(self) -> dict[str, Any]:
-        dumps = list(self._dumps()) if self._groups else None
-        return {**self.__dict__, "_groups": dumps, "_make": cloudpickle.dumps(self._make)}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        dumps = state["_groups"]
-        self.__dict__.update({**state, "_groups": [], "_make": pickle.loads(state["_make"])})
-        if dumps is not None:
-            self._start(dumps)
-
 
 def _make_copies(make: Callable[[], TaskFamily], n: int, attributes: dict[str, Any]) -> list[TaskFamily]:
     envs = [make() for _ in range(n)]
@@ -420,7 +398,3 @@ def _make_copies(make: Callable[[], TaskFamily], n: int, attributes: dict[str, A
         for name, value in attributes.items():
             setattr(env, name, value)
     return envs
-
-
-def _load_copies(dumps: list[bytes]) -> list[TaskFamily]:
-    return [pickle.loads(dump) for dump in dumps]

@@ -220,11 +220,6 @@ class TaskVecEnv(VecEnv):
                 self._monitor.results_writer.write_row(episode)
         return episode
 
-    def __getstate__(self) -> dict[str, Any]:
-        if self._monitor is not None and self._monitor.results_writer is not None:
-            raise TypeError("a TaskVecEnv whose Monitor writes to a file cannot be pickled; make it without monitor_dir")
-        return {**self.__dict__, "_monitor": None}
-
 
 def as_task_vec_env(vector_env: gym.vector.VectorEnv) -> VecEnv:
     """

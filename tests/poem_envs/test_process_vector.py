@@ -1,8 +1,6 @@
 """Families vectorised over processes."""
 
-import copy
 import os
-import pickle
 import signal
 
 import numpy as np
@@ -149,20 +147,6 @@ def test_observations_have_the_type_of_their_space():
     envs = ProcessFamilyVector(Single, num_envs=3, nthread=2)
     assert envs.reset(seed=0)[0] in envs.observation_space
     assert envs.step(np.zeros((3, 1), dtype=np.float32))[0] in envs.observation_space
-
-
-@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda envs: pickle.loads(pickle.dumps(envs))])
-def test_copies_go_on_alike(duplicate, rng):
-    envs = ProcessFamilyVector(Walk, num_envs=4, nthread=2, max_episode_steps=6)
-    actions = rng.uniform(-1, 1, (9, 4, 1)).astype(np.float32)
-    run(envs, actions[:4])
-    twin = duplicate(envs)
-    for action in actions:
-        mine, theirs = envs.step(action), twin.step(action)
-        assert np.array_equal(mine[0][:, 0], theirs[0][:, 0])
-        assert np.array_equal(mine[1], theirs[1])
-    envs.close()
-    twin.close()
 
 
 @pytest.mark.parametrize("wrong", [0, 3])

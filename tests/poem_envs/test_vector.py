@@ -1,8 +1,5 @@
 """Vectorised families: bit for bit as many single environments."""
 
-import copy
-import pickle
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -199,16 +196,3 @@ def test_constructor_arguments():
     envs.reset(seed=0)
     truncations = [envs.step(np.zeros((2, 6)))[3].any() for _ in range(201)]
     assert not any(truncations)
-
-
-@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda envs: pickle.loads(pickle.dumps(envs))])
-def test_copies_go_on_alike(env_id, duplicate, rng):
-    envs = make_vec(env_id, 3, max_episode_steps=6)
-    actions = random_actions(envs, 9, rng)
-    envs.reset(seed=0)
-    for a in actions[:4]:
-        envs.step(a)
-    twin = duplicate(envs)
-    for a in actions:
-        for mine, theirs in zip(envs.step(a)[:4], twin.step(a)[:4], strict=True):
-            assert np.array_equal(mine, theirs)
