@@ -20,14 +20,13 @@ from common import available_device
 from stable_baselines3.common.utils import ConstantSchedule
 
 from sb3_poem import POEMSAC
-from sb3_poem.common.callbacks import DormantUnitsCallback, EpochCallback
+from sb3_poem.common.callbacks import EpochCallback
 from sb3_poem.common.vec_env import TaskVecEnv
 from sb3_poem.resources import zoo_entry
 
 SHOWN = (
     "train_task_return",
     "critic_loss",
-    "dormant_units",
     "kl",
     "preference_accuracy",
     "ent_coef",
@@ -114,7 +113,6 @@ def main() -> None:
     parser.add_argument("--env-set", nargs="+", default=[], metavar="KEY=VALUE", help="arguments of the environment")
     parser.add_argument("--start", type=Path, help="a pretrained folder to go on from")
     parser.add_argument("--warm-up", type=float, default=0.0, metavar="SECONDS", help="let the rate rise from 0 for so long")
-    parser.add_argument("--recycle", type=int, metavar="EPOCHS", help="give dormant units new weights so often")
     parser.add_argument("--every", type=int, default=8, help="epochs between two writes of the model")
     parser.add_argument("--threads", type=int, help="of the simulation")
     parser.add_argument("--device", type=available_device, default="auto")
@@ -128,8 +126,7 @@ def main() -> None:
     model = make_model(entry, env, given.start, given.seed, given.device)
     clock = Clock(given.seconds, rate, given.warm_up, given.out, given.every)
     model.lr_schedule = clock.schedule
-    callbacks = [DormantUnitsCallback(given.recycle)] if given.recycle else []
-    model.learn(10**12, callback=[*callbacks, clock], log_interval=None, reset_num_timesteps=False)
+    model.learn(10**12, callback=clock, log_interval=None, reset_num_timesteps=False)
     model.save(given.out)
     print(f"{given.out}: {model.num_timesteps:,} steps, {model._n_updates:,} updates", flush=True)
 

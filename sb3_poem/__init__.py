@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     )
     from sb3_poem.adaptation.callback import AdaptationEvalCallback
     from sb3_poem.baselines import ANOLEAdapter, MAMLRewardAdapter, RewardOracleAdapter
-    from sb3_poem.common.callbacks import DormantUnitsCallback, TrainingCheckpointCallback
+    from sb3_poem.common.callbacks import TrainingCheckpointCallback
     from sb3_poem.common.vec_env import TaskVecEnv
     from sb3_poem.pearl_sac import PEARLSAC
     from sb3_poem.poem_sac import POEMSAC
@@ -43,7 +43,6 @@ _HOME = {
     "HumanOracle": "sb3_poem.adaptation",
     "TaskVecEnv": "sb3_poem.common.vec_env",
     "AdaptationEvalCallback": "sb3_poem.adaptation.callback",
-    "DormantUnitsCallback": "sb3_poem.common.callbacks",
     "TrainingCheckpointCallback": "sb3_poem.common.callbacks",
 }
 
@@ -53,7 +52,6 @@ __all__ = [
     "ANOLEAdapter",
     "AdaptationEvalCallback",
     "BoltzmannOracle",
-    "DormantUnitsCallback",
     "HumanOracle",
     "MAMLRewardAdapter",
     "MistakeOracle",

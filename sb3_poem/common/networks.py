@@ -72,11 +72,6 @@ class MLP(nn.Module):
         """
         return self.evaluate(self.inputs(*parts), frozen)
 
-    @property
-    def layers(self) -> list[nn.Linear]:
-        """The hidden layers and the output, in order."""
-        return [*self.hidden, self.output]  # type: ignore[list-item]
-
     def inputs(self, *parts: th.Tensor) -> th.Tensor:
         """Put an input together for :meth:`evaluate`; networks of one shape may share it."""
         if self.low_precision is not None:
@@ -91,20 +86,6 @@ class MLP(nn.Module):
         for layer in self.hidden:
             h = self.activation(_linear(h, layer, frozen))
         return _linear(h, self.output, frozen).view(*x.shape[:-1], -1)
-
-
-def dormant_units(network: MLP, inputs: th.Tensor) -> list[th.Tensor]:
-    """Which units of each hidden layer are 0 on all inputs: (width,) of bool, layer by layer.
-
-    :param network: The network
-    :param inputs: (n, in_dim)
-    """
-    dormant, h = [], inputs
-    with th.no_grad():
-        for layer in network.hidden:
-            h = network.activation(layer(h))
-            dormant.append((h == 0).all(dim=0))
-    return dormant
 
 
 def _linear(x: th.Tensor, layer: nn.Module, frozen: bool) -> th.Tensor:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch as th
-from meta_toys import ARCH, EPOCH, N_TASKS, POINT_GOAL, differing, parameters, small, walks
+from meta_toys import EPOCH, N_TASKS, POINT_GOAL, differing, parameters, small, walks
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 
@@ -19,7 +19,6 @@ from sb3_poem import (
     PEARLSAC,
     POEMSAC,
     AdaptationEvalCallback,
-    DormantUnitsCallback,
     RewardOracleAdapter,
     TrainingCheckpointCallback,
 )
@@ -128,106 +127,6 @@ def test_a_full_disk_ends_training_only_where_checkpoints_were_asked_for(
     with pytest.warns(UserWarning, match=r"no checkpoint of 300 steps: .* could not write .*c\.pt \(No space"):
         model.learn(2 * EPOCH, TrainingCheckpointCallback(tmp_path / "c.pt", every=None))
     assert model.num_timesteps == 2 * EPOCH
-
-
-# ---------------------------------------------------------------- dormant units
-
-
-TWO_LAYERS = {"net_arch": {**ARCH, "pi": [32, 32], "qf": [32, 24]}}
-
-
-def with_dormant_units(algorithm: type[PEARLSAC]) -> tuple[PEARLSAC, dict[str, list[int]]]:
-    """A model after two epochs, some units of which were made inactive; the rate is 0, so that they stay so."""
-    model = small(algorithm, policy_kwargs=TWO_LAYERS).learn(2 * EPOCH)
-    model.lr_schedule = lambda _: 0.0
-    layers = {"actor.mlp.hidden.0": [0, 3], "critic.members.1.hidden.1": [2]}
-    for name, units in layers.items():
-        with th.no_grad():
-            model.policy.get_submodule(name).bias[units] = -1e4
-            if name.startswith("critic"):
-                model.policy.get_submodule(name.replace("critic", "critic_target")).bias[units] = -1e4
-    return model, layers
-
-
-def outputs(model: PEARLSAC) -> list[th.Tensor]:
-    """Of actor and critics on all that the replay buffer holds of the first task."""
-    data, policy = model.replay_buffer.transitions(0), model.policy
-    latents = th.as_tensor(model.task_latents[0], dtype=th.float32).expand(1, data.actions.shape[1], -1)
-    with th.no_grad():
-        obs = policy.standardise(data.observations)
-        return [policy.actor.mlp(obs, policy.policy_embedding(latents)), policy.critic(obs, data.actions, latents)]
-
-
-@pytest.mark.parametrize("algorithm", [PEARLSAC, POEMSAC])
-def test_dormant_units_are_counted_and_renewed(algorithm: type[PEARLSAC]) -> None:
-    model, layers = with_dormant_units(algorithm)
-    before, outputs_before = parameters(model), outputs(model)
-    callback = DormantUnitsCallback(transitions=3000)  # nearly every transition in the buffers is drawn
-    callback.init_callback(model)
-    callback.on_training_end()
-    for name, (dormant, units) in callback.counts.items():
-        assert units == model.policy.get_submodule(name).out_features
-        assert dormant >= len(layers.get(name, []))
-    counted = sum(dormant for dormant, _ in callback.counts.values())
-    assert model.logger.name_to_value["train/dormant_units"] == counted / sum(units for _, units in callback.counts.values())
-    for after, then in zip(outputs(model), outputs_before, strict=True):
-        np.testing.assert_allclose(after, then, atol=1e-5)
-    for name, units in layers.items():
-        layer, target = (model.policy.get_submodule(n) for n in (name, name.replace("critic", "critic_target")))
-        state = model.policy.optimizer.state
-        bound = layer.in_features**-0.5
-        assert layer.bias[units].abs().max() <= bound
-        assert 0.0 < layer.weight[units].abs().max() <= bound
-        assert state[layer.weight]["exp_avg_sq"][units].abs().max() == 0.0
-        if target is not layer:  # the actor has none
-            assert th.equal(layer.weight[units], target.weight[units])
-    assert differing(parameters(model), before)
-
-    again = DormantUnitsCallback(recycle=False)
-    model.learn(EPOCH, again, reset_num_timesteps=False)
-    assert sum(dormant for dormant, _ in again.counts.values()) < counted
-
-
-@pytest.mark.parametrize("recycle", [False, True])
-def test_a_dormant_unit_learns_once_it_was_renewed(recycle: bool) -> None:
-    model, _ = with_dormant_units(POEMSAC)
-    model.learn(EPOCH, DormantUnitsCallback(recycle=recycle), reset_num_timesteps=False)
-    incoming = model.policy.get_submodule("actor.mlp.hidden.0").weight
-    before = incoming[[0, 3]].detach().clone()
-    model.policy.optimizer.state.clear()  # what Adam remembers would move a dormant unit for a while
-    model.lr_schedule = lambda _: 1e-3
-    model.learn(3 * EPOCH, reset_num_timesteps=False)
-    assert (not th.equal(incoming[[0, 3]], before)) is recycle
-
-
-def test_counts_are_those_of_the_activations_themselves() -> None:
-    model, _ = with_dormant_units(POEMSAC)
-    callback = DormantUnitsCallback(recycle=False, transitions=3000)  # nearly every transition in the buffers is drawn
-    model.learn(EPOCH, callback, reset_num_timesteps=False)
-    active = []
-    for task, latent in enumerate(model.task_latents):
-        obs = model.policy.standardise(model.replay_buffer.transitions(task).observations[0]).numpy()
-        embedding = model.policy.policy_embedding(th.as_tensor(latent, dtype=th.float32)).detach().numpy()
-        layer = model.policy.actor.mlp.hidden[0]
-        inputs = np.hstack([obs, np.tile(embedding, (len(obs), 1))])
-        active.append((inputs @ layer.weight.detach().numpy().T + layer.bias.detach().numpy() > 0).any(axis=0))
-    assert callback.counts["actor.mlp.hidden.0"] == (int((~np.any(active, axis=0)).sum()), layer.out_features)
-
-
-def test_counting_alone_changes_nothing() -> None:
-    counted = small(POEMSAC).learn(3 * EPOCH, DormantUnitsCallback(recycle=False))
-    assert not differing(parameters(counted), parameters(small(POEMSAC).learn(3 * EPOCH)))
-
-
-def test_networks_without_hidden_layers_have_no_dormant_units() -> None:
-    callback = DormantUnitsCallback()
-    small(POEMSAC, policy_kwargs={"net_arch": {**ARCH, "pi": [], "qf": []}}).learn(EPOCH, callback)
-    assert callback.counts == {}
-
-
-def test_transitions_must_be_positive() -> None:
-    with pytest.raises(ValueError, match="transitions must be at least 1 of each training task, got 0"):
-        DormantUnitsCallback(transitions=0)
 
 
 # ---------------------------------------------------------------- evaluation
