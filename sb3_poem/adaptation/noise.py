@@ -25,7 +25,6 @@ LAPSE = 0.01
 class NoiseModel(Protocol):
     """P(LEFT) from the difference of two returns."""
 
-    uses_return_unit: bool
 
     def probability_left(self, difference: np.ndarray, error: np.ndarray | float, magnitude: np.ndarray | float) -> np.ndarray:
         """
@@ -73,7 +72,6 @@ class ExactNoise(_Serialisable):
     """The larger return always wins; what doubt there is comes from the prediction."""
 
     kind = "exact"
-    uses_return_unit = False
 
     def probability_left(self, difference: np.ndarray, error: np.ndarray | float, magnitude: np.ndarray | float) -> np.ndarray:
         """See :class:`NoiseModel`."""
@@ -90,7 +88,6 @@ class MistakeNoise(_Serialisable):
 
     rate: float = 0.2
     kind = "mistake"
-    uses_return_unit = False
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.rate <= 0.5:
@@ -111,7 +108,6 @@ class BoltzmannNoise(_Serialisable):
 
     beta: float | None = None
     kind = "boltzmann"
-    uses_return_unit = True
 
     def __post_init__(self) -> None:
         if self.beta is not None and not (np.isfinite(self.beta) and self.beta > 0):

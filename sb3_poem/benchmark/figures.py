@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SUFFIXES = (".png", ".pdf")
-PANEL_WIDTH, PANEL_HEIGHT, LEGEND_HEIGHT = 4.2, 3.0, 0.28
+PANEL_WIDTH, PANEL_HEIGHT = 4.2, 3.0
 TOLERANCE = "tolerance"
 COLOURS = {
     "poem-bayes": "#d62728",

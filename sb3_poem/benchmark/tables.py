@@ -17,7 +17,6 @@ from sb3_poem.benchmark.statistics import Summary, summarise
 from sb3_poem.benchmark.suites import EXACT, Entry, OracleSpec
 
 SHOWN_QUERIES = (1, 5, 10, 20)
-FORMATS = ("md", "latex", "csv", "json")
 
 
 @dataclass(frozen=True)

@@ -181,7 +181,6 @@ def test_majority_votes_stay_below_the_noisy_limit():
 
 
 class OtherNoise:
-    uses_return_unit = False
 
 
 @pytest.mark.parametrize(
