@@ -30,7 +30,6 @@ from sb3_poem import (
     AdaptationEvalCallback,
     ANOLEAdapter,
     BoltzmannOracle,
-    DormantUnitsCallback,
     HumanOracle,
     MAMLRewardAdapter,
     MistakeOracle,
@@ -471,7 +470,6 @@ TOOLS = [
         lambda _: unregistered(AdaptationEvalCallback(1, 1)),
         "registered",
     ),
-    argument(DormantUnitsCallback, "transitions", 0, "at least 1"),
     refused(
         "TrainingCheckpointCallback",
         lambda s: made().learn(1, TrainingCheckpointCallback(s / "poem")),

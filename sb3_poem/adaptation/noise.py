@@ -25,7 +25,6 @@ LAPSE = 0.01
 class NoiseModel(Protocol):
     """P(LEFT) from the difference of two returns."""
 
-
     def probability_left(self, difference: np.ndarray, error: np.ndarray | float, magnitude: np.ndarray | float) -> np.ndarray:
         """
         Probability that the oracle says LEFT, given that it says LEFT or RIGHT.

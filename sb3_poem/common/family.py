@@ -172,7 +172,13 @@ class FamilyEnv:
     def _lives_through(self, task: np.ndarray, seed: int, segment: "Segment") -> bool:
         """Whether the family without its wrappers repeats the first copy's experience."""
         if self.env_id is None:
-            twin = cloudpickle.loads(cloudpickle.dumps(self._get("unwrapped")))
+            try:
+                twin = cloudpickle.loads(cloudpickle.dumps(self._get("unwrapped")))
+            except Exception as error:
+                raise WrapperError(
+                    f"whether env's wrappers {self._unknown_wrappers} change it cannot be told without "
+                    f"a copy of env, which {type(error).__name__} prevents ({error}): register it"
+                ) from error
         else:
             twin = gym.make(self.env_id, disable_env_checker=True, **self.env_kwargs).unwrapped
         low, high = twin.action_space.low, twin.action_space.high
