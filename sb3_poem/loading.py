@@ -7,7 +7,7 @@ from typing import Any
 
 import torch as th
 
-from sb3_poem.common.checkpoint import read_checkpoint
+from sb3_poem.common.checkpoint import is_checkpoint, read_checkpoint
 from sb3_poem.common.pretrained import read_config
 from sb3_poem.pearl_sac import PEARLSAC
 from sb3_poem.poem_sac import POEMSAC
@@ -54,14 +54,6 @@ def load_model(name: str | Path, device: th.device | str = "auto") -> PEARLSAC:
         return _algorithm_of(archive).load(archive, device=device)
     path = find_folder(path)
     return _class_named(read_config(path)["algorithm"], path).from_pretrained(path, device=device)
-
-
-def is_checkpoint(path: str | Path) -> bool:
-    """Whether a file is a checkpoint of a training run, rather than a model that ``save`` wrote."""
-    if not zipfile.is_zipfile(path):
-        return False
-    with zipfile.ZipFile(path) as archive:
-        return any(Path(name).name == "data.pkl" for name in archive.namelist())
 
 
 def _class_named(name: str, path: Path) -> type[PEARLSAC]:

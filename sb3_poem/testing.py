@@ -39,6 +39,8 @@ def check_task_family(
     """
     if isinstance(env, str):
         env = plain_id(env)
+    elif not callable(env):
+        raise TypeError(f"env is {env!r}, but must be a class or a function that makes it, or a registered id")
     make = partial(_make, env, **env_kwargs)
     check_spaces(make, seed)
     check_sampling(make, seed)

@@ -395,10 +395,10 @@ def evaluated(env: Any) -> bool:
 
 
 PREDICT = [
-    works("one observation", lambda _: trained().predict(OBS[0])[0].shape, (2,)),
+    works("one observation", lambda _: trained().predict(OBS[0], np.zeros(5))[0].shape, (2,)),
     works(
         "episode_start",
-        lambda _: trained().predict(OBS, None, np.ones(6, bool))[0].shape,
+        lambda _: trained().predict(OBS, np.zeros(5), np.ones(6, bool))[0].shape,
         (6, 2),
     ),
     works(
@@ -516,7 +516,6 @@ ENVIRONMENTS = [
         3,
     ),
     works("make_vec sync", lambda _: on(MADE(vectorization_mode="sync")).n_envs, 3),
-    works("make_vec async", lambda _: on(MADE(vectorization_mode="async")).n_envs, 3),
     works("GoalFamily", lambda _: made(GoalFamily(FETCH), n_train_tasks=2).horizon, 50),
     works("one's own family", lambda _: on(gym.make("Toy-v0")).horizon, 10),
     works("one's own family by its id", lambda _: on("Toy-v0").horizon, 10),

@@ -295,11 +295,6 @@ ALGORITHMS = [
     ),
     refused("from_pretrained this", lambda s: POEMSAC.from_pretrained(s / "importing"), "this:Foo"),
     refused("from_pretrained huge", lambda s: POEMSAC.from_pretrained(s / "huge"), "net_arch"),
-    refused(
-        "from_pretrained endless",
-        lambda s: POEMSAC.from_pretrained(s / "endless"),
-        "max_episode_steps",
-    ),
     refused("from_zoo", lambda _: POEMSAC.from_zoo("poem/PointGaol-v0"), "PointGaol...PointGoal"),
 ]
 
@@ -406,7 +401,7 @@ ADAPTERS = [
     argument(evaluated, "record_at", (), "at least one"),
     refused(
         "AdaptedPolicy of a text",
-        lambda s: AdaptedPolicy.from_pretrained(s / "text.zip"),
+        lambda s: AdaptedPolicy.load(s / "text.zip"),
         "text.zip is truncated",
     ),
     refused(
@@ -525,7 +520,7 @@ COMMANDS = [
     command("CartPole-v1 is no task family", *TRAIN, "--env", "CartPole-v1"),
     command("--algo...poem_sac", *TRAIN, "--algo", "poem"),
     command("-n...many", *TRAIN, "-n", "many"),
-    command("kl_coef...abc...number", *TRAIN, "-params", "kl_coef:abc"),
+    command("kl_coef:abc...abc", *TRAIN, "-params", "kl_coef:abc"),
     command("'gama'...'gamma'", *TRAIN, "-params", "gama:0.9"),
     command("-params...gamma=0.9", *TRAIN, "-params", "gamma=0.9"),
     command("missing.yml", *TRAIN, "-c", "missing.yml"),

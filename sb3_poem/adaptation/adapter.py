@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from sb3_poem.adaptation.environments import Env, describe_model, model_and_env
+from sb3_poem.adaptation.environments import Env, describe_model, model_and_env, warn_if_untrained
 from sb3_poem.adaptation.inference import Answer, Snapshot
 from sb3_poem.adaptation.noise import NoiseModel
 from sb3_poem.adaptation.options import AdaptationOptions, inference_rng, rollout_seed
@@ -153,6 +153,7 @@ class PreferenceAdapter:
         self.model, self.env = model_and_env(model, env, 1, render or bool(getattr(oracle, "needs_frames", False)))
         self._owns_env = isinstance(env, str)
         options.check(self.model, self.env, library)
+        warn_if_untrained(self.model)
         self._take_oracle(oracle)
         self.library = None if library is None else list(library)
         self.inference = options.make_inference(self.model, inference_rng(self.seed), self.library)

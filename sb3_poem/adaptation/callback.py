@@ -61,6 +61,8 @@ class AdaptationEvalCallback(EpochCallback):
         super().__init__(every, verbose)
         if n_tasks < 1 or n_episodes < 1:
             raise ValueError(f"n_tasks and n_episodes must be at least 1, got {n_tasks} and {n_episodes}")
+        if not record_at:
+            raise ValueError("record_at must hold at least one number of answers, got none")
         self.n_tasks = n_tasks
         self.record_at = tuple(record_at)
         self.n_episodes = n_episodes
@@ -68,6 +70,8 @@ class AdaptationEvalCallback(EpochCallback):
         self.seed = seed
         self.adaptation_kwargs = dict(adaptation_kwargs or {})
         self.env_kwargs = dict(env_kwargs or {})
+        adapter = self.adaptation_kwargs.get("adapter", PreferenceAdapter)
+        adapter.make_options(**{k: v for k, v in self.adaptation_kwargs.items() if k not in OF_ADAPT_TASKS})
         self.best_return = -np.inf
         self.last_evaluation: dict[str, float] = {}
         self._env: VecEnv | None = None
@@ -78,8 +82,6 @@ class AdaptationEvalCallback(EpochCallback):
         if self.best_model_save_path is not None:
             self.best_model_save_path.mkdir(parents=True, exist_ok=True)
         self._make_env()
-        adapter = self.adaptation_kwargs.get("adapter", PreferenceAdapter)
-        adapter.make_options(**{k: v for k, v in self.adaptation_kwargs.items() if k not in OF_ADAPT_TASKS})
         if self._best_model is not None and self._best_model.exists():  # a run that goes on
             self.best_return = getattr(self.model, "best_adapted_return", self.best_return)
 

@@ -52,24 +52,32 @@ def model_and_env(model: Any, env: Env, n_copies: int = COPIES, render: bool = F
 
 def check_model_fits(model: Any, vec_env: VecEnv) -> None:
     """
-    Refuse a model of other observations or actions, and warn of one that was not trained.
+    Refuse a model of other observations, actions or tasks.
 
     :param model: The model.
     :param vec_env: The environment.
     :raises ValueError: If a space differs.
     """
-    for name in ("observation_space", "action_space"):
-        expected, given = getattr(model, name), getattr(vec_env, name)
+    names = ["observation_space", "action_space"]
+    if hasattr(model, "task_space") and vec_env.has_attr("task_space"):
+        names.append("task_space")
+    for name in names:
+        expected = getattr(model, name)
+        given = vec_env.get_attr(name, indices=[0])[0] if name == "task_space" else getattr(vec_env, name)
         if expected != given:
             raise ValueError(
                 f"the model does not belong to this environment: its {name} is {expected} ({describe_model(model)}), but "
                 f"the environment's is {given}"
             )
+
+
+def warn_if_untrained(model: Any) -> None:
+    """Warn of a model that no adaptation can help."""
     if getattr(model, "num_timesteps", None) == 0:
         warnings.warn(
             f"{describe_model(model)} has not been trained (num_timesteps is 0), so that its policies differ by chance "
             "alone; call learn(), or load a trained one",
-            stacklevel=5,  # where the adapter is made
+            stacklevel=4,
         )
 
 

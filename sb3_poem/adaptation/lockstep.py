@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sb3_poem.adaptation.adapter import PreferenceAdapter
-from sb3_poem.adaptation.environments import Env, model_and_env
+from sb3_poem.adaptation.environments import Env, model_and_env, warn_if_untrained
 from sb3_poem.adaptation.options import inference_rng, rollout_seed
 from sb3_poem.adaptation.preference import Preference, as_preference
 from sb3_poem.common.checks import check_whole
@@ -92,6 +92,7 @@ def adapt_tasks(
     oracles = [oracle_factory(env=vec_env, task=task, seed=seed + i) for i, task in enumerate(tasks)]
     settings = adapter.make_options(oracles[0], n_queries=n_queries, **options)
     settings.check(model, vec_env, library)
+    warn_if_untrained(model)
     inferences = [settings.make_inference(model, inference_rng(seed + i), library) for i in range(len(tasks))]
 
     for inference, task in zip(inferences, tasks, strict=True):

@@ -52,6 +52,8 @@ class AdaptationOptions:
             raise ValueError(f"`likelihood` must be one of {LIKELIHOODS} or None, but is {self.likelihood!r}")
         if self.decision not in DECISIONS:
             raise ValueError(f"`decision` must be one of {DECISIONS}, but is {self.decision!r}")
+        if self.noise_model is not None and not hasattr(self.noise_model, "probability_left"):
+            raise ValueError(f"`noise_model` must be None or an object as MistakeNoise(0.2), but is {self.noise_model!r}")
         if self.n_candidates is None:  # as a number, so that what is saved does not depend on the default
             object.__setattr__(self, "n_candidates", N_CANDIDATES[self.inference])
 

@@ -27,10 +27,11 @@ class AdaptedPolicy:
     SB3's that only predicts takes it for a model.
 
     :param model: The model.
-    :param latent: (d,).
+    :param latent: (latent_dim,).
     :param n_answers: How many answers led to it.
     :param env: The vector environment to whose task (its first copy's) it was adapted; None for a
         policy from a file. It does not know the task itself.
+    :raises ValueError: If the latent has another shape.
     """
 
     def __init__(self, model: Any, latent: np.ndarray, n_answers: int = 0, env: VecEnv | None = None) -> None:
@@ -38,6 +39,8 @@ class AdaptedPolicy:
         self.n_answers = n_answers
         self.env = env
         self.latent = np.asarray(latent, dtype=np.float64).copy()
+        if self.latent.shape != (model.latent_dim,):
+            raise ValueError(f"`latent` has shape {self.latent.shape}, but those of the model have ({model.latent_dim},)")
         self.observation_space = model.observation_space
         self.action_space = model.action_space
 

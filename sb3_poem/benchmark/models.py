@@ -27,9 +27,10 @@ from sb3_poem.benchmark.locks import locked, try_lock
 from sb3_poem.benchmark.methods import META_ITERATIONS, META_ITERATIONS_OF, VARIANTS
 from sb3_poem.benchmark.provenance import provenance
 from sb3_poem.benchmark.suites import ModelKey, family_id, family_label
+from sb3_poem.common.checkpoint import is_checkpoint
 from sb3_poem.common.pretrained import CONFIG, WEIGHTS, read_config
 from sb3_poem.common.vec_env import make_task_vec_env
-from sb3_poem.loading import ALGORITHMS, is_checkpoint
+from sb3_poem.loading import ALGORITHMS
 from sb3_poem.pearl_sac import PEARLSAC
 
 CHECKPOINT, MODEL, FINISHED, SESSIONS, LOG, REWARD = (

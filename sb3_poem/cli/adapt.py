@@ -32,7 +32,7 @@ from sb3_poem.adaptation import (
 from sb3_poem.adaptation.evaluation import evaluation_seed, held_out_tasks
 from sb3_poem.adaptation.human import HumanAnswer
 from sb3_poem.adaptation.oracles import compute_reward
-from sb3_poem.cli.outputs import check_output
+from sb3_poem.cli.outputs import check_device, check_output
 from sb3_poem.cli.packages import import_packages
 from sb3_poem.cli.report import Report, describe_task
 from sb3_poem.common.family import FamilyEnv
@@ -57,6 +57,7 @@ def run_adapt(arguments: argparse.Namespace) -> None:
     :raises ValueError: if they do not fit the model or the environment
     :raises OSError: if the model cannot be read, or a file not be written
     """
+    check_device(arguments.device)
     check_output("--json", arguments.json, (".json",))
     check_output("--plot", arguments.plot, (".png", ".pdf", ".svg"))
     check_output("--video", arguments.video, (".mp4", ".gif"))

@@ -24,8 +24,9 @@ from sb3_poem.cli.hyperparams import check_config, check_keys, check_numbers
 from sb3_poem.cli.hyperparams_opt import entry_params
 from sb3_poem.cli.outputs import check_writable
 from sb3_poem.common.callbacks import TrainingCheckpointCallback
+from sb3_poem.common.checkpoint import is_checkpoint
 from sb3_poem.common.vec_env import TaskVecEnv
-from sb3_poem.loading import ALGORITHMS, is_checkpoint
+from sb3_poem.loading import ALGORITHMS
 from sb3_poem.pearl_sac import PEARLSAC
 from sb3_poem.resources import config_file
 
@@ -127,7 +128,7 @@ class PoemExperiment(FamilyExperiment):
         try:
             hyperparams, saved = super().read_hyperparameters()
         except yaml.YAMLError as error:
-            raise ValueError(f"{self.config} is not valid YAML: {error}") from error
+            raise ValueError(f"{self.config} is not valid YAML: {' '.join(str(error).split())}") from error
         except (AttributeError, TypeError) as error:
             raise ValueError(f"{self.config} must hold a mapping of hyperparameters for each environment id") from error
         source = f"{self.config}, entry {self.env_name.gym_id!r}"

@@ -36,3 +36,17 @@ def check_output(flag: str, path: Path | None, suffixes: Sequence[str]) -> None:
     if path.suffix not in suffixes:
         raise ValueError(f"{flag} {path}: the name must end in {' or '.join(suffixes)}")
     check_writable(path.parent)
+
+
+def check_device(name: str) -> None:
+    """Refuse a device that PyTorch does not know.
+
+    :param name: What ``--device`` names
+    :raises ValueError: if it is none
+    """
+    import torch as th
+
+    try:
+        th.device("cpu" if name == "auto" else name)
+    except RuntimeError as error:
+        raise ValueError(f"--device {name}: there is no such device; there are auto, cpu and cuda") from error

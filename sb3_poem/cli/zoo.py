@@ -4,6 +4,7 @@ import argparse
 import difflib
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -17,8 +18,10 @@ from rl_zoo3.utils import StoreDict
 from poem_envs.headless import has_display
 from sb3_poem.benchmark.suites import family_label
 from sb3_poem.cli.experiment import TrainingInterrupted, make_experiment
+from sb3_poem.cli.outputs import check_device
 from sb3_poem.cli.packages import import_packages
 from sb3_poem.cli.resume import resume_command, resumed
+from sb3_poem.common.checkpoint import is_checkpoint
 from sb3_poem.loading import ALGORITHMS
 
 # Those of our own that differ from rl_zoo3's; what the user gives comes later, and wins.
@@ -58,15 +61,24 @@ def check_arguments(command: str, arguments: Sequence[str]) -> None:
 
     :param command: ``"train"`` or ``"enjoy"``
     :param arguments: its arguments
-    :raises ValueError: if a value is no Python, or a module or the environment does not exist
+    :raises ValueError: if a value is no Python, or a module, the environment, the device or the model does not exist
     """
     parser = argparse.ArgumentParser(f"sb3-poem {command}", add_help=False, allow_abbrev=False)
     for flags in (("-params", "--hyperparams"), ("--env-kwargs",), ("--eval-env-kwargs",)):
         parser.add_argument(*flags, nargs="+", action=CheckedPairs)
     parser.add_argument("--gym-packages", nargs="+", default=[])
     parser.add_argument("--env", default="CartPole-v1")  # rl_zoo3's
+    parser.add_argument("--algo", default="poem_sac")
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("-i", "--trained-agent")
     given, _ = parser.parse_known_args(arguments)
     import_packages(given.gym_packages)
+    check_device(given.device)
+    if given.trained_agent:
+        if not given.trained_agent.endswith(".zip") or not Path(given.trained_agent).is_file():
+            raise ValueError(f"-i {given.trained_agent}: there is no such file of a model, which ends in .zip")
+        if given.algo in ALGORITHMS and not is_checkpoint(given.trained_agent):
+            ALGORITHMS[given.algo].load(given.trained_agent, device="cpu")
     if given.env not in gym.registry:
         names = {name: env_id for env_id in gym.registry for name in (env_id, family_label(env_id))}
         close = difflib.get_close_matches(given.env, names, n=1)

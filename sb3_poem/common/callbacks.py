@@ -28,6 +28,13 @@ class EpochCallback(BaseCallback):
         self.every = every
         self._last_epoch = 0
 
+    def _init_callback(self) -> None:
+        if not hasattr(self.model, "epoch"):
+            raise TypeError(
+                f"{type(self).__name__} is for POEMSAC and PEARLSAC, which train in epochs, not for "
+                f"{type(self.model).__name__}"
+            )
+
     def _on_training_start(self) -> None:
         self._last_epoch = self.model.epoch
 

@@ -1,6 +1,7 @@
 """Checkpoints that hold all of a training run, so that it continues bit for bit."""
 
 import io
+import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -74,3 +75,11 @@ def restore_stores(model: "PEARLSAC", state: dict[str, Any]) -> None:
     model.replay_buffer.load_state(state["replay_buffer"])
     if state["context"] is not None:
         model.context = ContextStore(**{name: value.to(model.device) for name, value in state["context"].items()})
+
+
+def is_checkpoint(path: str | Path) -> bool:
+    """Whether a file is a checkpoint of a training run, rather than a model that ``save`` wrote."""
+    if not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return any(Path(name).name == "data.pkl" for name in archive.namelist())

@@ -18,3 +18,37 @@ def check_whole(name: str, value: Any, least: int, most: int | None = None) -> N
         raise ValueError(f"`{name}` must be at least {least}, but is {value}")
     if most is not None and value > most:
         raise ValueError(f"`{name}` must be at most {most}, but is {value}")
+
+
+def check_number(name: str, value: Any, low: float = -np.inf, high: float = np.inf) -> None:
+    """Refuse what is no finite number from ``low`` to ``high``.
+
+    :param name: Of the argument
+    :param value: True and False are none
+    :raises ValueError: names the argument and its value
+    """
+    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    if not (number and np.isfinite(value)):
+        raise ValueError(f"`{name}` must be a finite number, but is {value!r}")
+    if value < low:
+        raise ValueError(f"`{name}` must be at least {low:g}, but is {value}")
+    if value > high:
+        raise ValueError(f"`{name}` must be at most {high:g}, but is {value}")
+
+
+def check_number_or_auto(name: str, value: Any, low: float = -np.inf) -> None:
+    """Refuse what is neither a number from ``low`` on nor "auto" (or "auto_" and such a number).
+
+    :param name: Of the argument
+    :raises ValueError: names the argument and its value
+    """
+    if isinstance(value, str):
+        word, _, start = value.partition("_")
+        try:
+            known = word == "auto" and (not start or float(start) > 0)
+        except ValueError:
+            known = False
+        if not known:
+            raise ValueError(f'`{name}` must be a number or "auto", but is {value!r}')
+    else:
+        check_number(name, value, low)

@@ -293,6 +293,8 @@ def _check_numbers(algorithm: type["PEARLSAC"], config: dict[str, Any], tensors:
         if config.get(name) is not None:
             check_whole(name, config[name], least, LARGEST.get(name))
     arch = config["net_arch"]
+    if not isinstance(arch, dict) or not {"pi", "qf", "encoder", "decoder", "embedding"} <= arch.keys():
+        raise ValueError(f"net_arch must have the widths of pi, qf, encoder, decoder and embedding, but is {str(arch)[:60]}")
     for width in itertools.chain(*arch.values()):
         check_whole("net_arch", width, 1)
     n_layers = sum(map(len, arch.values())) + config.get("n_critics", 2) * (len(arch["qf"]) + 1)

@@ -49,6 +49,8 @@ class TaskVecEnv(VecEnv):
     def __init__(self, env_fns: Sequence[Callable[[], gym.Env]], nthread: int | None = None) -> None:
         if len(env_fns) < 1:
             raise ValueError("env_fns is empty; pass one function for each copy")
+        if not callable(env_fns[0]):
+            raise TypeError(f"env_fns must hold functions that make an environment, but holds {env_fns[0]!r}")
         env = env_fns[0]()
         wrappers = _wrappers(env)
         vector_env = _vectorised(env, wrappers, len(env_fns), nthread)

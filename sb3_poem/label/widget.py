@@ -44,6 +44,8 @@ class LabelWidget:
     """
 
     def __init__(self, adapter: PreferenceAdapter, store: str | Path | None = None, height: int = 900, port: int = 0) -> None:
+        if not isinstance(adapter, PreferenceAdapter):
+            raise TypeError(f"`adapter` must be a PreferenceAdapter, but is a {type(adapter).__name__}")
         if adapter.answers or adapter.pending is not None:
             raise ValueError("`adapter` has been asked already; give the widget a fresh one")
         if adapter.library is not None:

@@ -14,6 +14,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from torch import nn
 
 from sb3_poem.common.buffers import ContextStore, TaskBatch, TaskReplayBuffer
+from sb3_poem.common.checks import check_number, check_number_or_auto, check_whole
 from sb3_poem.common.family import FamilyEnv, plain_id
 from sb3_poem.common.precision import MixedPrecision, hidden_dtype
 from sb3_poem.common.random import Generators
@@ -146,8 +147,10 @@ class PEARLSAC(SamplingSAC):
         **unsupported: Any,
     ) -> None:
         refuse_unknown(unsupported, type(self))
+        if not isinstance(policy_kwargs, dict | None):
+            raise TypeError(f"policy_kwargs must be a dictionary of the policy's arguments, but is {policy_kwargs!r}")
         refuse_unsupported(policy_kwargs or (), f"{type(self).__name__}'s policy")
-        for name, value, low in (
+        for name, value, least in (
             ("batch_size", batch_size, 1),
             ("meta_batch_size", meta_batch_size, 1),
             ("context_size", context_size, 1),
@@ -158,26 +161,29 @@ class PEARLSAC(SamplingSAC):
             ("gradient_steps", gradient_steps, -1),
             ("learning_starts", learning_starts, 0),
             ("target_update_interval", target_update_interval, 1),
-            ("kl_coef", kl_coef, 0),
-            ("reward_coef", reward_coef, 0),
-            ("policy_coef", policy_coef, 0),
             ("n_steps", n_steps, 1),
-            ("noise_color", noise_color, 0),
             ("policy_delay", policy_delay, 1),
+            ("seed", 0 if seed is None else seed, 0),
         ):
-            if not value >= low:
-                raise ValueError(f"{name} must be at least {low}, got {value}")
+            check_whole(name, value, least)
+        for name, number, high in (
+            ("learning_rate", 0.0 if callable(learning_rate) else learning_rate, np.inf),
+            ("kl_coef", kl_coef, np.inf),
+            ("reward_coef", reward_coef, np.inf),
+            ("policy_coef", policy_coef, np.inf),
+            ("noise_color", noise_color, np.inf),
+            ("gamma", gamma, 1.0),
+            ("tau", tau, 1.0),
+            ("relabel_fraction", relabel_fraction, 1.0),
+            ("context_relabel_fraction", context_relabel_fraction, 1.0),
+            ("shaping_coef", shaping_coef, 1.0),
+            ("mirror_fraction", mirror_fraction, 1.0),
+        ):
+            check_number(name, number, 0.0, high)
+        check_number_or_auto("ent_coef", ent_coef, 0.0)
+        check_number_or_auto("target_entropy", target_entropy)
         if reward_scale != "auto" and not (isinstance(reward_scale, (int, float)) and reward_scale > 0):
             raise ValueError(f'reward_scale must be a positive number or "auto", got {reward_scale!r}')
-        fractions = (
-            ("relabel_fraction", relabel_fraction),
-            ("context_relabel_fraction", context_relabel_fraction),
-            ("shaping_coef", shaping_coef),
-            ("mirror_fraction", mirror_fraction),
-        )
-        for name, value in (("gamma", gamma), ("tau", tau), *fractions):
-            if not 0.0 <= value <= 1.0:
-                raise ValueError(f"{name} must lie in [0, 1], got {value}")
         hidden_dtype(precision, "cpu")  # refuses an unknown name now rather than at the first step
         if str(device).startswith("cuda") and not th.cuda.is_available():  # which SB3 says nothing of
             warnings.warn(f"device is {device!r}, but torch sees no CUDA device: the CPU is used", stacklevel=2)
@@ -217,7 +223,9 @@ class PEARLSAC(SamplingSAC):
         given = self._vectorise(env, n_train_tasks, trajectories_per_task)
         if _init_setup_model:
             if given is None:
-                raise TypeError("env is None, but a new model needs an environment")
+                raise TypeError(
+                    "env is None, but must be an environment of a task family, a vectorised one, or a registered id"
+                )
             given = self._wrap_env(given, verbose)
             self._family = self._family_of(given)  # before SB3 speaks of other policies
         super().__init__(
@@ -559,6 +567,9 @@ class PEARLSAC(SamplingSAC):
                 "total_timesteps is missing, which only a model that from_zoo made knows: pass a "
                 f"number of environment steps; an epoch has {self.epoch_steps:,}"
             )
+        check_number("total_timesteps", total_timesteps, 1)
+        if isinstance(callback, type):
+            raise TypeError(f"callback is the class {callback.__name__}, but must be an object: {callback.__name__}(...)")
         if self.verbose > 0:
             epoch, updates = self.epoch_steps, self.gradient_steps
             print(

@@ -1,6 +1,7 @@
 """How models and training runs are written and read: SB3's zip, checkpoints, and pretrained folders."""
 
 import contextlib
+import inspect
 import io
 import pathlib
 import zipfile
@@ -15,13 +16,16 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_poem.common.checkpoint import read_checkpoint, restore_stores, save_checkpoint
+from sb3_poem.common.checkpoint import is_checkpoint, read_checkpoint, restore_stores, save_checkpoint
 from sb3_poem.common.family import plain_id
 from sb3_poem.common.files import write_atomically
 from sb3_poem.common.pretrained import from_pretrained, save_pretrained
 from sb3_poem.common.vec_env import as_task_vec_env, make_task_vec_env
-from sb3_poem.pearl_sac.unsupported import refuse_unsupported
+from sb3_poem.pearl_sac.unsupported import refuse_unknown
 from sb3_poem.resources import pretrained_names
+
+#: Arguments of SB3's ``load`` beside the constructor's
+LOADING = {"custom_objects", "print_system_info", "force_reset"}
 
 SelfPersistent = TypeVar("SelfPersistent", bound="PersistentSAC")
 
@@ -94,7 +98,10 @@ class PersistentSAC(SAC):
         if env is None or isinstance(env, gym.Env | VecEnv):
             return env
         if not isinstance(env, str):
-            raise TypeError(f"env is {env!r}, but must be an environment, a vectorised one, or a registered id")
+            raise TypeError(
+                f"env is a {type(env).__name__}, but must be an environment, a vectorised one (DummyVecEnv, "
+                "SubprocVecEnv, TaskVecEnv), or a registered id"
+            )
         env = plain_id(env)
         if n_copies is not None:
             return make_task_vec_env(env, n_copies, max_sequential=n_copies)
@@ -130,7 +137,7 @@ class PersistentSAC(SAC):
         """
         if not isinstance(path, io.BufferedIOBase):
             cls._check_is_file(pathlib.Path(path))
-        refuse_unsupported(kwargs, cls.__name__)
+        refuse_unknown(kwargs.keys() - inspect.signature(cls).parameters.keys() - LOADING, cls)
         try:
             data, _, _ = load_from_zip_file(path, device="cpu", load_data=True)
         except (zipfile.BadZipFile, RuntimeError, EOFError, ValueError) as error:
@@ -168,7 +175,11 @@ class PersistentSAC(SAC):
         """
         :raises ValueError: if it is a folder or a shipped model's name, for ``from_pretrained``
         """
-        if path.is_file() or path.with_name(f"{path.name}.zip").is_file():
+        if path.is_file():
+            if is_checkpoint(path):
+                raise ValueError(f"{path} is a checkpoint: use {cls.__name__}.load_checkpoint({str(path)!r})")
+            return
+        if not path.is_dir() and path.with_name(f"{path.name}.zip").is_file():
             return
         is_shipped = not path.exists() and str(path) in pretrained_names()
         if path.is_dir() or is_shipped:

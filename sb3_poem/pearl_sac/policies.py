@@ -59,6 +59,8 @@ class LatentPolicy(SACPolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
+        if not (isinstance(activation_fn, type) and issubclass(activation_fn, nn.Module)):
+            raise TypeError(f"activation_fn must be a class of torch.nn, as nn.ReLU, but is {activation_fn!r}")
         BasePolicy.__init__(
             self,
             observation_space,

@@ -26,6 +26,8 @@ UNSUPPORTED = {
     **dict.fromkeys(("share_features_extractor", "normalize_images"), _FEATURES),
     **dict.fromkeys(("log_std_init", "use_expln", "clip_mean"), _DEVIATION),
 }
+#: Arguments of the policy, which people give to the algorithm
+POLICY_ARGUMENTS = ("net_arch", "activation_fn", "layer_norm", "n_critics", "optimizer_class", "optimizer_kwargs")
 
 
 def refuse_unsupported(names: Iterable[str], algorithm: str) -> None:
@@ -47,6 +49,8 @@ def refuse_unknown(names: Iterable[str], algorithm: type) -> None:
     """
     refuse_unsupported(names, algorithm.__name__)
     for name in names:
+        if name in POLICY_ARGUMENTS:
+            raise TypeError(f"{algorithm.__name__} takes {name!r} in policy_kwargs: policy_kwargs=dict({name}=...)")
         close = difflib.get_close_matches(name, inspect.signature(algorithm).parameters, n=1)
         hint = f"; did you mean {close[0]!r}?" if close else ""
         raise TypeError(f"{algorithm.__name__} got an unexpected keyword argument {name!r}{hint}")

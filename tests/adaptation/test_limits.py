@@ -181,6 +181,7 @@ def test_majority_votes_stay_below_the_noisy_limit():
 
 
 class OtherNoise:
+    pass
 
 
 @pytest.mark.parametrize(
