@@ -154,6 +154,7 @@ def run_replay(arguments: argparse.Namespace) -> None:
                 left_out.append(session.id)
                 console.print(
                     f"Session {session.id} was recorded with a model {session.model!r} that does not ship: name it by --model",
+                    soft_wrap=True,
                     highlight=False,
                 )
                 continue
