@@ -295,6 +295,11 @@ ALGORITHMS = [
     ),
     refused("from_pretrained this", lambda s: POEMSAC.from_pretrained(s / "importing"), "this:Foo"),
     refused("from_pretrained huge", lambda s: POEMSAC.from_pretrained(s / "huge"), "net_arch"),
+    refused(
+        "from_pretrained endless",
+        lambda s: adapter(POEMSAC.from_pretrained(s / "endless")),
+        "max_episode_steps",
+    ),
     refused("from_zoo", lambda _: POEMSAC.from_zoo("poem/PointGaol-v0"), "PointGaol...PointGoal"),
 ]
 

@@ -27,10 +27,13 @@ def model_and_env(model: Any, env: Env, n_copies: int = COPIES, render: bool = F
     :return: The model, and a vector environment.
     :raises TypeError: If one of them is something else.
     :raises FileNotFoundError: If there is no such model.
+    :raises ValueError: If the model's file asks for what it may not, see
+        :func:`sb3_poem.common.foreign.environment_of`.
     """
     from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
     from sb3_poem.common.family import plain_id
+    from sb3_poem.common.foreign import environment_of
     from sb3_poem.common.vec_env import as_task_vec_env, make_task_vec_env
     from sb3_poem.loading import as_model
 
@@ -38,8 +41,8 @@ def model_and_env(model: Any, env: Env, n_copies: int = COPIES, render: bool = F
     if isinstance(env, VecEnv):
         return model, env
     if isinstance(env, str):
-        same = plain_id(env) == getattr(model, "env_id", None)
-        arguments = dict(getattr(model, "env_kwargs", {})) if same else {}
+        own = getattr(model, "env_id", None), getattr(model, "env_kwargs", {})
+        _, arguments = environment_of(describe_model(model), *own, plain_id(env))
         if render:
             arguments["render_mode"] = "rgb_array"
         return model, make_task_vec_env(env, n_copies, **arguments)

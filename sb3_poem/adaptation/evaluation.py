@@ -212,7 +212,7 @@ def evaluate_adaptation(
     from tqdm import tqdm
 
     if len(record_at) == 0:
-        raise ValueError("`record_at` must hold at least one number of answers, but is empty")
+        raise ValueError(f"`record_at` must hold at least one number of answers, but is {tuple(record_at)}")
     for k in record_at:
         check_whole("record_at", k, 0)
     check_whole("n_episodes", n_episodes, 1)

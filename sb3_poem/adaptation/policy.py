@@ -31,16 +31,18 @@ class AdaptedPolicy:
     :param n_answers: How many answers led to it.
     :param env: The vector environment to whose task (its first copy's) it was adapted; None for a
         policy from a file. It does not know the task itself.
-    :raises ValueError: If the latent has another shape.
+    :raises ValueError: If the latent has another shape, or is not finite.
     """
 
     def __init__(self, model: Any, latent: np.ndarray, n_answers: int = 0, env: VecEnv | None = None) -> None:
         self.model = model
         self.n_answers = n_answers
         self.env = env
-        self.latent = np.asarray(latent, dtype=np.float64).copy()
+        self.latent = np.array(latent, dtype=np.float64)
         if self.latent.shape != (model.latent_dim,):
             raise ValueError(f"`latent` has shape {self.latent.shape}, but those of the model have ({model.latent_dim},)")
+        if not np.isfinite(self.latent).all():
+            raise ValueError(f"`latent` must be finite, but is {self.latent}")
         self.observation_space = model.observation_space
         self.action_space = model.action_space
 
@@ -146,9 +148,9 @@ class AdaptedPolicy:
         latent, n_answers = tensors.pop(LATENT, th.zeros(0)).double().numpy(), facts.get("n_answers", "")
         parts = {name.removeprefix(MODEL_PREFIX): value for name, value in tensors.items()}
         model = build_model(algorithms[config["algorithm"]], config, parts, source, device)
-        if latent.shape != (model.latent_dim,) or not np.isfinite(latent).all() or not re.fullmatch("[0-9]{1,9}", n_answers):
-            raise ValueError(
-                f"{source} is broken: an adapted policy has a finite latent of {model.latent_dim} numbers and a number of "
-                f"answers, but its latent has shape {latent.shape} and its answers are {n_answers!r}"
-            )
-        return cls(model, latent, int(n_answers))
+        if not re.fullmatch("[0-9]{1,9}", n_answers):
+            raise ValueError(f"{source} is broken: n_answers must be a whole number, but is {n_answers[:20]!r}")
+        try:
+            return cls(model, latent, int(n_answers))
+        except ValueError as error:
+            raise ValueError(f"{source} is broken: {error}") from error

@@ -70,7 +70,7 @@ def environment_of(
         if objection is not None:
             raise ValueError(
                 f"{source} asks for {chosen} with {name}={_short(value)}, but {objection}. If you want it so, say so "
-                f"yourself: --env-kwargs {name}:VALUE"
+                f"yourself: --env-kwargs {name}:VALUE, or in Python make the environment with it"
             )
     own = {name: tuple(value) if isinstance(value, list) else value for name, value in own.items()}
     return chosen, {**own, **given_kwargs}

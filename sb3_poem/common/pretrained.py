@@ -316,4 +316,4 @@ def _check_shapes(model: "PEARLSAC", tensors: dict[str, th.Tensor]) -> None:
     for name, shape in expected.items():
         found = tuple(tensors[name].shape) if name in tensors else "missing"
         if found != shape:
-            raise ValueError(f"the tensor {name} is {found}, but must be {shape} by the configuration")
+            raise ValueError(f"net_arch, latent_dim and the spaces make the tensor {name} {shape}, but it is {found}")
