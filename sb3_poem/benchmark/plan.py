@@ -5,18 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from sb3_poem.benchmark.estimate import Pace, cell_seconds, measure_pace, training_seconds
 from sb3_poem.benchmark.families import family_facts
 from sb3_poem.benchmark.hyperparameters import training_plan
 from sb3_poem.benchmark.methods import VARIANTS
 from sb3_poem.benchmark.models import ModelLibrary
 from sb3_poem.benchmark.store import Store
 from sb3_poem.benchmark.suites import Budget, Cell, ModelKey, Suite, Training
-
-# Seconds on one processor core, for an estimate before anything was measured: a gradient step with its share of collection
-# (HalfCheetah, networks of 256-256), and an adaptation with its evaluations.
-SECONDS_PER_UPDATE, SECONDS_PER_CELL = 0.045, 40.0
-# MAML-reward trains SAC for every task; greedy search predicts the returns of 200 fragments under 2^10 candidates.
-SECONDS_PER_LONG_CELL = {"maml-reward": 400.0, "anole-greedy": 250.0}
 
 
 @dataclass
@@ -32,6 +27,9 @@ class Plan:
     todo: list[Cell] = field(default_factory=list)
     done: list[Cell] = field(default_factory=list)
     skipped: list[tuple[Cell, str]] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        return f"{len(self.done)} cells done, {len(self.todo)} to do, {len(self.skipped)} not possible"
 
     @property
     def models(self) -> list[ModelKey]:
@@ -96,40 +94,46 @@ def make_plan(
 
 def describe(plan: Plan, library: ModelLibrary) -> list[str]:
     """
-    The plan in lines, with an estimate of its time on one core.
+    The plan in lines, with an estimate of its time on this machine, which takes a few seconds for each family.
 
     :param plan: The plan.
     :param library: Models.
     :return: Lines.
     """
-    lines = [f"{len(plan.done)} cells done, {len(plan.todo)} to do, {len(plan.skipped)} not possible"]
+    lines = [str(plan)]
     reasons: dict[str, int] = {}
     for _, reason in plan.skipped:
         reasons[reason] = reasons.get(reason, 0) + 1
     lines += [f"  not possible, {count} cells: {reason}" for reason, count in reasons.items()]
+    place = library.workplace
+
+    def pace(env_id: str) -> Pace:
+        return measure_pace(env_id, place.device, place.num_threads)
+
     seconds = 0.0
     if plan.models:
         lines.append("models:")
     for key in plan.models:
         state = library.state(key)
         text = f"  {key}: {state}"
-        if state in ("missing", "interrupted") and VARIANTS[key.variant].base is None:
-            training = training_plan(key)
-            estimate = training.updates * SECONDS_PER_UPDATE
+        if state in ("missing", "interrupted"):
+            estimate = training_seconds(key, pace(key.env_id))
             seconds += estimate
-            text += f", {training.timesteps:,} steps, {training.updates:,} updates, about {_minutes(estimate)} if from scratch"
+            base = VARIANTS[key.variant].base
+            if base is None:
+                training = training_plan(key)
+                text += f", {training.timesteps:,} steps, {training.updates:,} updates"
+            else:
+                text += f", from the experience of {base}"
+            text += f", about {_minutes(estimate)}" + (" if from scratch" if state == "interrupted" else "")
         elif state == "handed over":
             text += f" ({library.given(key)})"
-        elif state == "missing":
-            text += f", from the experience of {VARIANTS[key.variant].base}"
         lines.append(text)
     if plan.todo:
         lines.append("cells:")
-    lines += [f"  {cell}" for cell in plan.todo]
-    for cell in plan.todo:
-        seconds += SECONDS_PER_LONG_CELL.get(cell.method, SECONDS_PER_CELL)
-    if plan.todo:
-        lines.append(f"about {_minutes(seconds)} on one core of a free machine, if HalfCheetah is a guide")
+        lines += [f"  {cell}" for cell in plan.todo]
+        seconds += sum(cell_seconds(cell, pace(cell.env_id)) for cell in plan.todo)
+        lines.append(f"about {_minutes(seconds)} in one process, if this machine stays as busy as it is")
     return lines
 
 

@@ -52,13 +52,12 @@ def _run(arguments: argparse.Namespace) -> int:
     plan = make_plan(
         suite, library, store, arguments.families, arguments.methods, seeds, budget, training, arguments.snapshots
     )
-    lines = describe(plan, library)
     if arguments.list:
-        print("\n".join(lines))
+        print("\n".join(describe(plan, library)))
         return 0
     assert store is not None
     check_writable(arguments.runs)
-    print(lines[0] + f"; results in {arguments.store}", flush=True)
+    print(f"{plan}; results in {arguments.store}", flush=True)
     if arguments.backend == "ray":
         from sb3_poem.benchmark.ray_backend import RayOptions, run_with_ray
 

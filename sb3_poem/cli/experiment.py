@@ -59,8 +59,8 @@ def stopping_between_epochs(checkpoint: TrainingCheckpointCallback) -> Iterator[
     def stop(number: int, frame: FrameType | None) -> None:
         restore()
         checkpoint.stop()
-        # not print, which this signal may have interrupted
-        os.write(2, b"\nStopping after this epoch, to save it. Ctrl-C again stops at once.\n")
+        with contextlib.suppress(OSError):  # and not print, which this signal may have interrupted
+            os.write(2, b"\nStopping after this epoch, to save it. Ctrl-C again stops at once.\n")
 
     for number in before:
         signal.signal(number, stop)
