@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from sb3_poem.adaptation.environments import Env, model_and_env
 from sb3_poem.adaptation.limits import information_limit
-from sb3_poem.adaptation.lockstep import OracleFactory, adapt_tasks
+from sb3_poem.adaptation.lockstep import OracleFactory, TaskAdaptations, adapt_tasks
 from sb3_poem.adaptation.noise import NoiseModel
 from sb3_poem.adaptation.oracles import ReturnOracle, compute_reward
 from sb3_poem.adaptation.preference import Preference
@@ -191,6 +191,7 @@ def evaluate_adaptation(
     n_episodes: int = 10,
     seed: int = 0,
     progress_bar: bool = False,
+    on_record: Callable[[AdaptationEvaluation], None] | None = None,
     **options: Any,
 ) -> AdaptationEvaluation:
     """
@@ -205,12 +206,11 @@ def evaluate_adaptation(
     :param n_episodes: Episodes per measurement.
     :param seed: Task i adapts with seed + i; the episodes' seeds follow from it too.
     :param progress_bar: Whether to show one.
+    :param on_record: Called with all that is measured so far, after each measurement.
     :param options: Further options of :func:`adapt_tasks`; ``adapter`` chooses the method.
     :return: The returns.
     :raises ValueError: If an argument is out of its range.
     """
-    from tqdm import tqdm
-
     if len(record_at) == 0:
         raise ValueError(f"`record_at` must hold at least one number of answers, but is {tuple(record_at)}")
     for k in record_at:
@@ -218,6 +218,15 @@ def evaluate_adaptation(
     check_whole("n_episodes", n_episodes, 1)
     model, vec_env = model_and_env(model, env)
     tasks = _test_tasks(model, vec_env, tasks, seed)
+    start, deterministic = evaluation_seed(seed), options.get("deterministic", True)
+    outcomes: list[EpisodeOutcomes] = []
+
+    def measure(adapted: TaskAdaptations) -> None:
+        latents = adapted.latents[:, -1]
+        outcomes.append(evaluate_episodes(model, vec_env, latents, adapted.tasks, n_episodes, start, deterministic))
+        if on_record is not None:
+            on_record(_evaluation(adapted, outcomes))
+
     adapted = adapt_tasks(
         model,
         vec_env,
@@ -227,13 +236,14 @@ def evaluate_adaptation(
         record_at=record_at,
         seed=seed,
         progress_bar=progress_bar,
+        on_record=measure,
         **options,
     )
-    start, deterministic = evaluation_seed(seed), options.get("deterministic", True)
-    outcomes = [
-        evaluate_episodes(model, vec_env, latents, adapted.tasks, n_episodes, start, deterministic)
-        for latents in tqdm(adapted.latents.swapaxes(0, 1), unit="evaluation", disable=not progress_bar)
-    ]
+    return _evaluation(adapted, outcomes)
+
+
+def _evaluation(adapted: TaskAdaptations, outcomes: Sequence[EpisodeOutcomes]) -> AdaptationEvaluation:
+    """One outcome (n_tasks, n_episodes) for each number of answers."""
     returns = np.stack([outcome.returns for outcome in outcomes], axis=1)
     known = [outcome.successes for outcome in outcomes if outcome.successes is not None]
     successes = np.stack(known, axis=1) if len(known) == len(outcomes) else None

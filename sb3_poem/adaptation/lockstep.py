@@ -52,6 +52,7 @@ def adapt_tasks(
     seed: int = 0,
     library: Sequence[Trajectory] | None = None,
     progress_bar: bool = False,
+    on_record: Callable[[TaskAdaptations], None] | None = None,
     **options: Any,
 ) -> TaskAdaptations:
     """
@@ -74,6 +75,8 @@ def adapt_tasks(
     :param seed: Task i takes seed + i.
     :param library: See :class:`PreferenceAdapter`.
     :param progress_bar: Whether to show one.
+    :param on_record: Called with all that there is so far, each time that estimates are kept. It may
+        use ``vec_env``.
     :param options: Further options of the adapter; for :class:`PreferenceAdapter` ``inference``, ``query_rule``,
         ``n_candidates``, ``epsilon``, ``candidates``, ``likelihood``, ``decision``, ``noise_model``, ``deterministic``.
     :return: The estimates.
@@ -103,7 +106,10 @@ def adapt_tasks(
     latents = np.empty((len(tasks), len(kept), model.latent_dim))
     for query in tqdm(range(n_queries + 1), unit="query", disable=not progress_bar):
         if query in kept:
-            latents[:, kept.index(query)] = [inference.estimate() for inference in inferences]
+            row = kept.index(query)
+            latents[:, row] = [inference.estimate() for inference in inferences]
+            if on_record is not None:
+                on_record(TaskAdaptations(tasks, kept[: row + 1], latents[:, : row + 1].copy(), list(map(list, preferences))))
         if query == n_queries or query >= kept[-1]:
             break
         shown: list[Trajectory] = []

@@ -14,12 +14,13 @@ from sb3_poem.adaptation import (
     MistakeOracle,
     Preference,
     ReturnOracle,
+    adapt_tasks,
     evaluate_adaptation,
     evaluate_latents,
     known_task_return,
     property_one,
 )
-from sb3_poem.adaptation.evaluation import held_out_tasks, preference_order, return_matrix
+from sb3_poem.adaptation.evaluation import evaluation_seed, held_out_tasks, preference_order, return_matrix
 from sb3_poem.common.family import FamilyEnv
 from sb3_poem.common.vec_env import TaskVecEnv
 from sb3_poem.loading import load_model
@@ -211,3 +212,17 @@ def test_the_prior_of_the_toy_is_uniform_in_speed():
     # The closed forms above stand on it.
     quantiles = norm.ppf(np.linspace(0.1, 0.9, 9))
     np.testing.assert_allclose(MODEL.speed(quantiles[:, None]), np.linspace(0.3, 2.7, 9))
+
+
+def test_each_measurement_is_told_as_it_comes_and_changes_nothing():
+    tasks, told = GOALS[::12], []
+    measured = evaluate_adaptation(MODEL, vec_env(4), tasks, record_at=(0, 1, 3), n_episodes=2, on_record=told.append)
+    assert [one.record_at for one in told] == [(0,), (0, 1), (0, 1, 3)]
+    assert [len(one.preferences[0]) for one in told] == [0, 1, 3]
+    adapted = adapt_tasks(MODEL, vec_env(4), tasks, ReturnOracle, n_queries=3, record_at=(0, 1, 3))
+    np.testing.assert_array_equal(measured.latents, adapted.latents)
+    assert measured.preferences == adapted.preferences
+    for n, one in enumerate(told, 1):
+        np.testing.assert_array_equal(one.returns, measured.returns[:, :n])
+        alone = evaluate_latents(MODEL, vec_env(4), adapted.latents[:, n - 1], tasks, 2, evaluation_seed(0))
+        np.testing.assert_array_equal(one.returns[:, -1], alone)
