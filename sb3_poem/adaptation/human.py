@@ -94,7 +94,7 @@ class HumanOracle:
         :param right: Another.
         :return: The answer.
         :raises ValueError: If a trajectory has no frames.
-        :raises RuntimeError: If the terminal is closed.
+        :raises EOFError: If standard input has ended, or is closed.
         """
         asked = time.time()
         name = f"query-{self.n_asked + 1:03d}.{self.video_format}"
@@ -105,8 +105,8 @@ class HumanOracle:
         while True:
             try:
                 line = self._read(PROMPT)
-            except EOFError:
-                raise RuntimeError("no answer can be read: standard input is closed") from None
+            except (EOFError, RuntimeError):  # the latter where there is no standard input at all
+                raise EOFError("no answer can be read: standard input is closed") from None
             answer = ANSWERS.get(line.strip().lower())
             if answer is not None:
                 if self._record is not None:

@@ -6,7 +6,7 @@ import shutil
 from typing import Any
 
 from sb3_poem.adaptation.human import HumanAnswer
-from sb3_poem.label.store import Store
+from sb3_poem.label.store import Session, Store
 from sb3_poem.label.turns import Turn
 
 
@@ -21,6 +21,8 @@ class StoreRecorder:
     :param options: Of the adaptation, JSON-ready.
     :param n_queries: How many answers there will be at most.
     :param wish: What the person wants, in their own words.
+    :param resume: Whether to go on with the last terminal session that has answers and agrees in all
+        of this, if there is one. The adapter must be told first what :meth:`kept` gives.
     """
 
     def __init__(
@@ -32,12 +34,29 @@ class StoreRecorder:
         options: dict[str, Any] | None = None,
         n_queries: int = 10,
         wish: str = "",
+        resume: bool = False,
     ) -> None:
         self.store = store
-        self.session, _ = store.create_session(model, env_id, seed, options or {}, n_queries, source="terminal")
-        store.set_wish(self.session.id, wish)
-        self._count = 0
-        self._last: int | None = None
+        about = (model, env_id, seed, options or {}, n_queries)
+        found = self._last_session(*about) if resume else None
+        self.resumed = found is not None
+        self.session = found or store.create_session(*about, source="terminal")[0]
+        if wish:
+            store.set_wish(self.session.id, wish)
+        answers = store.answers(self.session.id)
+        self._count = len(answers)
+        self._last: int | None = answers[-1]["id"] if answers else None
+
+    def _last_session(self, *about: Any) -> Session | None:
+        for session in reversed(self.store.sessions()):
+            facts = (session.model, session.env_id, session.seed, session.options, session.step)
+            if session.source == "terminal" and facts == about and self.store.answers(session.id):
+                return session
+        return None
+
+    def kept(self) -> list[dict[str, Any]]:
+        """The session's answers so far: ``preference``, ``left`` and ``right`` of each."""
+        return self.store.conversation(self.session.id, self._count)
 
     def __call__(self, answer: HumanAnswer) -> None:
         """

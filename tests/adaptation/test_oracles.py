@@ -163,7 +163,7 @@ def test_a_persons_terminal_and_frames_are_needed(tmp_path):
     with pytest.raises(ValueError, match="no frames to show"):
         HumanOracle(tmp_path)(at_speed(1.0), at_speed(2.0))
     closed = HumanOracle(tmp_path, read=Terminal().read, write=lambda line: None)
-    with pytest.raises(RuntimeError, match="standard input is closed"):
+    with pytest.raises(EOFError, match="standard input is closed"):
         closed(at_speed(1.0, 2, frames(2, 0)), at_speed(1.0, 2, frames(2, 9)))
     with pytest.raises(ValueError, match='`video_format` must be "gif" or "mp4"'):
         HumanOracle(tmp_path, "avi")
