@@ -2,6 +2,7 @@
 
 import os
 import resource
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ from sb3_poem import cli, resources
 
 
 def sb3_poem(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "sb3_poem.cli", *arguments], capture_output=True, text=True, check=False)
+    return subprocess.run([sys.executable, "-m", "sb3_poem", *arguments], capture_output=True, text=True, check=False)
 
 
 def processor_seconds_of_children() -> float:
@@ -28,16 +29,57 @@ def test_help_is_immediate_and_names_every_command() -> None:
         done = sb3_poem("--help")
         seconds.append(processor_seconds_of_children() - start)
         assert done.returncode == 0, done.stderr
-        for command in ("train", "enjoy", "adapt"):
+        for command in cli.COMMANDS:
             assert f"\n    {command} " in done.stdout
     assert min(seconds) < 1.0, seconds
 
 
-def test_help_does_not_import_what_is_slow() -> None:
+@pytest.mark.parametrize("call", ["build_parser().format_help()", "main(['models'])"])
+def test_help_and_models_do_not_import_what_is_slow(call: str) -> None:
     slow = {"torch", "mujoco", "rl_zoo3", "matplotlib"}
-    code = f"import sys, sb3_poem.cli; sb3_poem.cli.build_parser().format_help(); print({slow} & set(sys.modules))"
+    code = f"import sys, sb3_poem.cli; sb3_poem.cli.{call}; print({slow} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "set()"
+    assert done.stdout.splitlines()[-1] == "set()"
+
+
+PARTS = [*([command] for command in cli.COMMANDS), ["label", "export"], ["label", "replay"], ["benchmark", "run"]]
+
+
+@pytest.mark.parametrize("command", [*PARTS, ["benchmark", "report"]], ids=" ".join)
+def test_help_ends_with_an_example(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main([*command, "--help"])
+    assert stop.value.code == 0
+    last = capsys.readouterr().out.strip().splitlines()[-1]
+    example = shlex.split(last.removeprefix("example:"))
+    assert example[: len(command) + 1][:2] == ["sb3-poem", command[0]], last
+    if command[0] != "train":  # whose arguments are rl_zoo3's
+        cli.build_parser().parse_args(example[1:])
+
+
+def test_models_are_listed_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["models"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines[1 : lines.index("")]] == resources.pretrained_names()
+    (vel,) = (line for line in lines if line.startswith("HalfCheetahVel "))
+    for word in ("poem/HalfCheetahVel-v0", "POEMSAC", "480,000", "-159.4 -> -27.0"):
+        assert word in vel
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("sb3-poem rec", {"record-video"}),
+        ("sb3-poem adapt --model HalfCheetahV", {"HalfCheetahVel"}),
+        ("sb3-poem enjoy --env poem/AntG", {"poem/AntGoal-v0"}),
+        ("sb3-poem adapt --oracle ", {"return", "boltzmann", "mistake", "human"}),
+    ],
+)
+def test_a_shell_completes_the_line(line: str, expected: set[str], tmp_path: Path) -> None:
+    request = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_IFS": "\n"}
+    environment = {**os.environ, **request, "_ARGCOMPLETE_STDOUT_FILENAME": str(tmp_path / "out")}
+    subprocess.run([sys.executable, "-m", "sb3_poem"], env=environment, check=True)
+    assert {word.strip() for word in (tmp_path / "out").read_text().splitlines()} == expected
 
 
 @pytest.mark.parametrize(
@@ -48,6 +90,7 @@ def test_help_does_not_import_what_is_slow() -> None:
         (["adapt"], "--model"),
         (["adapt", "--model", "x", "--colour", "red"], "--colour"),
         (["adapt", "--model", "x", "--queries", "0"], "at least 1"),
+        (["adapt", "--model", "x", "--queries", "2.5"], "--queries: invalid whole number value: '2.5'"),
         (["adapt", "--model", "x", "--tasks", "0"], "at least 1"),
         (["adapt", "--model", "x", "--oracle", "coin"], "invalid choice"),
     ],

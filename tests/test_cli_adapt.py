@@ -2,20 +2,24 @@
 
 import io
 import json
+import shlex
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from rl_zoo3.utils import SimpleLinearSchedule
 
-from sb3_poem import PEARLSAC, POEMSAC, MistakeOracle, PreferenceAdapter, TaskVecEnv, cli
-from sb3_poem.adaptation import evaluate_adaptation, information_limit, known_task_return
-from sb3_poem.cli.adapt import parse_env_kwargs
+from sb3_poem import PEARLSAC, POEMSAC, MistakeOracle, Preference, PreferenceAdapter, ReturnOracle, TaskVecEnv, cli
+from sb3_poem.adaptation import AdaptedPolicy, evaluate_adaptation, information_limit, known_task_return
+from sb3_poem.cli.subject import parse_env_kwargs
+from sb3_poem.label import Store
 
 SMALL = {"gradient_steps": 5, "meta_batch_size": 4, "batch_size": 16, "context_size": 16, "n_train_tasks": 12, "seed": 3}
 ENV_ID = "poem/PointGoal-v0"
+TINY = ["--env-kwargs", "width:48", "height:48"]  # videos that are made quickly
 
 
 @pytest.fixture(scope="module")
@@ -71,11 +75,15 @@ def test_json_holds_what_the_library_measures(
 def test_table_plot_and_video(model: tuple[POEMSAC, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     imageio = pytest.importorskip("imageio.v3")
     plot, video = tmp_path / "plot.png", tmp_path / "video.gif"
-    flags = ["--env", ENV_ID, "--queries", 2, "--tasks", 2, "--episodes", 1, "--record", 0, 2]
+    flags = ["--env", ENV_ID, "--queries", 2, "--tasks", 2, "--episodes", 1, "--record", 0, 2, *TINY]
     assert adapt(model[1], *flags, "--plot", plot, "--video", video) == 0
     shown = capsys.readouterr().out
     for words in ("answers", "limit", "std. error", "task known", str(plot), str(video)):
         assert words in shown
+    prose = " ".join(shown.split())
+    assert "task known: the best of 300 policies for each task, measured anew on 1 episodes" in prose
+    assert "limit: the best 2^answers of those 300 for these very tasks, chosen with the tasks in sight" in prose
+    assert shown.index("after 0 answers: return") < shown.index("after 2 answers: return") < shown.index("task known")
     assert plot.read_bytes().startswith(b"\x89PNG")
     frames = imageio.imread(video, index=None)
     assert len(frames) == model[0].horizon
@@ -132,10 +140,9 @@ def test_a_model_with_a_schedule_of_rl_zoo3_in_a_process_of_its_own(tmp_path: Pa
 
 
 def test_a_person_answers_with_a_task(model: tuple[POEMSAC, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "stdin", io.StringIO("what?\nr\n"))
+    answer_by(monkeypatch, tmp_path, "what?\nr\n")
     flags = ["--oracle", "human", "--queries", 1, "--task", 1.25, "--episodes", 1, "--json", tmp_path / "result.json"]
-    assert adapt(model[1], *flags) == 0
+    assert adapt(model[1], *flags, *TINY) == 0
     result = json.loads((tmp_path / "result.json").read_text())
     assert result["answers"] == [["right"]]
     assert result["tasks"] == [[1.25]]
@@ -145,14 +152,135 @@ def test_a_person_answers_with_a_task(model: tuple[POEMSAC, str], tmp_path: Path
 def test_a_person_answers_by_their_own_wish(
     model: tuple[POEMSAC, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "stdin", io.StringIO("l\n"))
+    answer_by(monkeypatch, tmp_path, "l\n")
     state, video = tmp_path / "state.json", tmp_path / "video.gif"
-    assert adapt(model[1], "--oracle", "human", "--queries", 1, "--json", state, "--video", video) == 0
+    assert adapt(model[1], "--oracle", "human", "--queries", 1, "--json", state, "--video", video, *TINY) == 0
     assert video.is_file()
     adapter = PreferenceAdapter.load(state, model[0], ENV_ID)
     assert adapter.done
     assert [answer.preference.value for answer in adapter.answers] == ["left"]
+
+
+def answer_by(monkeypatch: pytest.MonkeyPatch, folder: Path, answers: str | None) -> None:
+    """What a person types, in a working folder; None for a terminal without standard input."""
+    folder.mkdir(exist_ok=True)
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "stdin", None if answers is None else io.StringIO(answers))
+
+
+def test_a_person_who_stops_goes_on_later_as_if_they_had_not(
+    model: tuple[POEMSAC, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = ["--oracle", "human", "--queries", 3, "--seed", 2, *TINY]
+    answer_by(monkeypatch, tmp_path / "at once", "l\nr\nl\n")
+    assert adapt(model[1], *flags, "--save", "policy.safetensors") == 0
+    expected = AdaptedPolicy.load("policy.safetensors").latent
+    assert "record-video --model policy.safetensors" in capsys.readouterr().out
+
+    answer_by(monkeypatch, tmp_path / "twice", "l\n")  # then the input ends
+    assert adapt(model[1], *flags) == 0
+    shown = capsys.readouterr().out
+    assert "Standard input ended after 1 of 3 answers" in shown
+    assert "It believes that you mean a place near" in shown
+    again = f"sb3-poem adapt --model {model[1]} --oracle human --queries 3 --seed 2 {shlex.join(TINY)} --resume"
+    assert f"answer the rest:  {again}\n" in shown
+    monkeypatch.setattr(sys, "stdin", ThenInterrupt("r\n"))
+    assert adapt(model[1], *flags, "--resume") == 130
+    assert "Interrupted after 2 of 3 answers" in capsys.readouterr().out
+    answer_by(monkeypatch, tmp_path / "twice", "l\n")
+    assert cli.main(shlex.split(again)[1:]) == 0
+    assert "Query 3: " in capsys.readouterr().out
+
+    answer_by(monkeypatch, tmp_path / "twice", None)  # nothing is left to be asked
+    assert adapt(model[1], *flags, "--resume", "--save", "policy.safetensors") == 0
+    np.testing.assert_array_equal(AdaptedPolicy.load("policy.safetensors").latent, expected)
+    (session,) = Store("label_data").sessions()
+    assert [row["preference"] for row in Store("label_data").answers(session.id)] == ["left", "right", "left"]
+
+
+def interrupt(*_: object, **__: object) -> str:
+    raise KeyboardInterrupt
+
+
+class ThenInterrupt(io.StringIO):
+    """Somebody who types this and then Ctrl-C."""
+
+    def readline(self, *_: Any) -> str:
+        return super().readline() or interrupt()
+
+
+def test_a_session_of_another_model_of_that_name_is_not_gone_on_with(
+    model: tuple[POEMSAC, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = ["--oracle", "human", "--queries", 2, *TINY]
+    answer_by(monkeypatch, tmp_path, "l\n")
+    assert adapt(model[1], *flags, "--resume") == 0
+    assert "There is nothing to go on with" in capsys.readouterr().out
+    POEMSAC("MlpPolicy", ENV_ID, policy_kwargs={"net_arch": [16, 16]}, **{**SMALL, "seed": 4}).save(tmp_path / "model.zip")
+    answer_by(monkeypatch, tmp_path, "l\n")
+    assert adapt("model.zip", *flags, "--resume", "--candidates", "prior") == 0  # other options, so another session
+    capsys.readouterr()
+    assert adapt(model[1], *flags, "--resume", "--candidates", "prior") == 1
+    assert "question 1 of session 2 was another one" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("answers", ["", None])
+def test_a_person_without_standard_input_is_told(
+    model: tuple[POEMSAC, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    answers: str | None,
+) -> None:
+    answer_by(monkeypatch, tmp_path, answers)
+    assert adapt(model[1], "--oracle", "human", *TINY) == 1
+    assert "error: no answer can be read: standard input is closed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("after", "measured"), [(2, [0, 1, 2]), (None, [0, 1, 2, 3])])
+def test_an_interrupt_keeps_what_was_measured(
+    model: tuple[POEMSAC, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    after: int | None,
+    measured: list[int],
+) -> None:
+    """While the third question's answer is awaited, or while the best policies are looked for."""
+    if after is None:
+        monkeypatch.setattr("sb3_poem.cli.subject.known_task_return", interrupt)
+    else:
+        answers = iter([Preference.LEFT] * after)
+        monkeypatch.setattr(ReturnOracle, "__call__", lambda *_: next(answers, None) or interrupt())
+    monkeypatch.chdir(tmp_path)
+    files = ["--json", "a.json", "--plot", "a.png", "--save", "a.safetensors", "--video", "a.gif"]
+    assert adapt(model[1], "--queries", 3, "--tasks", 1, "--episodes", 1, *files) == 130
+    shown = capsys.readouterr().out
+    assert f"Interrupted after {measured[-1]} of 3 answers" in shown
+    assert "1 task, return oracle, incomplete" in shown
+    result = json.loads(Path("a.json").read_text())
+    assert result["queries"] == measured
+    assert len(result["task_returns"][0]) == len(measured)
+    assert result["complete"] is False
+    assert Path("a.png").read_bytes().startswith(b"\x89PNG")
+    assert AdaptedPolicy.load("a.safetensors").latent.shape == (model[0].latent_dim,)
+    assert not Path("a.gif").exists()
+
+
+def test_an_interrupt_before_anything_was_measured(
+    model: tuple[POEMSAC, str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sb3_poem.adaptation.evaluation.rollout_outcomes", interrupt)
+    assert adapt(model[1]) == 130
+    assert capsys.readouterr().err.endswith("Interrupted.\n")
+
+
+def test_the_policy_of_one_task_is_saved(model: tuple[POEMSAC, str], tmp_path: Path) -> None:
+    flags = ["--queries", 2, "--task", 1.0, "--episodes", 1, "--save", tmp_path / "a.safetensors"]
+    assert adapt(model[1], *flags) == 0
+    expected = evaluate_adaptation(model[0], TaskVecEnv.from_id(ENV_ID, 2), np.array([[1.0]]), record_at=[2], n_episodes=1)
+    saved = AdaptedPolicy.load(tmp_path / "a.safetensors")
+    np.testing.assert_allclose(saved.latent, expected.latents[0, -1], rtol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -167,6 +295,10 @@ def test_a_person_answers_by_their_own_wish(
         (["--oracle", "human", "--tasks", 3], "one task"),
         (["--queries", 5, "--record", 0, 6], "--record 6 is more than --queries 5"),
         (["--oracle", "human", "--plot", "a.png"], "--plot needs returns"),
+        (["--save", "a.safetensors"], "--save keeps the policy of one task, but 30 are adapted: add --tasks 1"),
+        (["--save", "a.zip", "--tasks", 1], "must end in .safetensors"),
+        (["--store", "a"], "--store is about a person's answers, but --oracle is return"),
+        (["--resume"], "--resume is about a person's answers, but --oracle is return"),
         (["--oracle", "mistake", "--mistake-rate", 1.5], "1.5"),
         (["--oracle", "boltzmann", "--beta", -1.0], "-1.0"),
         (["--json", "a.txt"], "must end in .json"),

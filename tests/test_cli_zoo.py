@@ -118,8 +118,15 @@ def test_train_then_enjoy_then_continue(config: Path, tmp_path: Path, capsys: py
     assert saved["n_train_tasks"] == len(model.task_latents) == 6
 
     capsys.readouterr()
-    assert cli.main(["enjoy", "--env", "poem/PointGoal-v0", "-f", str(logs), "--no-render", "-n", "60"]) == 0
-    assert "2 Episodes" in capsys.readouterr().out
+    enjoy = ["enjoy", "--env", "poem/PointGoal-v0", "-f", str(logs), "--no-render", "--episodes", "2", "--queries", "1"]
+    assert cli.main(enjoy) == 0
+    shown = capsys.readouterr().out
+    assert f"Policy of {run / 'poem-PointGoal-v0.zip'}, adapted by the oracle" in shown
+    assert "Episode 2: return" in shown
+    assert cli.main([*enjoy, "--exp-id", "1", "-n", "60"]) == 0
+    assert "Episode 3: return" in capsys.readouterr().out
+    assert cli.main([*enjoy, "--exp-id", "7"]) == 1
+    assert "there is no run 7 of poem_sac on poem/PointGoal-v0" in capsys.readouterr().err
 
     assert train("-c", config, "-f", logs, "--eval-freq", -1, "-i", run / "poem-PointGoal-v0.zip", "-n", 150) == 0
     assert (logs / "poem_sac" / "poem-PointGoal-v0_2" / "poem-PointGoal-v0.zip").is_file()
@@ -377,18 +384,14 @@ def test_an_environment_that_is_no_task_family_is_refused(
     assert "Pendulum-v1 is no task family" in capsys.readouterr().err
 
 
-def test_algorithms_of_rl_zoo3_still_work(tmp_path: Path) -> None:
+def test_algorithms_of_rl_zoo3_still_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["--algo", "ppo", "--env", "Pendulum-v1", "-n", "256", "--eval-freq", "-1", "--verbose", "0"]
     settings = ["-params", "n_envs:1", "n_steps:128", "-f", str(tmp_path)]
     assert cli.main(["train", *arguments, *settings]) == 0
     assert (tmp_path / "ppo" / "Pendulum-v1_1" / "Pendulum-v1.zip").is_file()
-
-
-def test_enjoy_without_a_display_says_what_to_do(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    assert cli.main(["enjoy", "--env", "poem/PointGoal-v0"]) == 1
-    assert "--no-render" in capsys.readouterr().err
+    enjoy = ["enjoy", "--algo", "ppo", "--env", "Pendulum-v1", "-f", str(tmp_path), "-n", "200", "--no-render"]
+    assert cli.main(enjoy) == 0
+    assert "1 Episodes" in capsys.readouterr().out
 
 
 # ---------------------------------------------------------------- interruptions and --resume

@@ -105,7 +105,7 @@ class HumanOracle:
         while True:
             try:
                 line = self._read(PROMPT)
-            except (EOFError, RuntimeError):  # the latter where there is no standard input at all
+            except EOFError:
                 raise EOFError("no answer can be read: standard input is closed") from None
             answer = ANSWERS.get(line.strip().lower())
             if answer is not None:

@@ -113,7 +113,7 @@ def _say(line: str) -> None:
 
 
 def _parse_params(pairs: list[str]) -> dict[str, Any]:
-    from sb3_poem.cli.adapt import parse_env_kwargs
+    from sb3_poem.cli.subject import parse_env_kwargs
 
     try:
         given = parse_env_kwargs(pairs)

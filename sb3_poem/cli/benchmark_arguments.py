@@ -32,8 +32,16 @@ def add_benchmark(commands: Any, count: Count) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parts = parser.add_subparsers(dest="part", required=True, metavar="{run,report}")
-    run = parts.add_parser("run", help="train what is missing, adapt, evaluate; goes on where it was interrupted")
-    report = parts.add_parser("report", help="write the tables and figures of what the store holds")
+    run = parts.add_parser(
+        "run",
+        help="train what is missing, adapt, evaluate; goes on where it was interrupted",
+        epilog="example: sb3-poem benchmark run --suite smoke",
+    )
+    report = parts.add_parser(
+        "report",
+        help="write the tables and figures of what the store holds",
+        epilog="example: sb3-poem benchmark report --suite smoke --out results",
+    )
     _add_run_arguments(run, count)
     _add_report_arguments(report, count)
 

@@ -8,9 +8,9 @@ from typing import Any
 
 from rich.console import Console
 
-from sb3_poem.cli.adapt import parse_env_kwargs
 from sb3_poem.cli.outputs import check_output
 from sb3_poem.cli.packages import import_packages
+from sb3_poem.cli.subject import parse_env_kwargs
 
 SHORTEST_PASSWORD = 12
 AUTH_VARIABLE = "SB3_POEM_AUTH"

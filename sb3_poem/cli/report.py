@@ -2,7 +2,7 @@
 
 import platform
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -16,6 +16,7 @@ from sb3_poem.adaptation import AdaptationEvaluation, KnownTaskReturn
 from sb3_poem.adaptation.state import write_json_atomically
 from sb3_poem.plotting import plot_returns
 
+TABLE_WIDTH = 76
 VERSIONED = ("sb3_poem", "stable_baselines3", "torch", "gymnasium", "mujoco", "numpy")
 
 
@@ -27,35 +28,46 @@ class Report:
     :param title: of the table and the plot
     :param settings: JSON-ready: the model, the environment, who answered and how it was asked
     :param evaluation: returns after numbers of answers
-    :param known: returns if the tasks were known
+    :param known: returns if the tasks were known; None if that was not measured
     """
 
     title: str
     settings: dict[str, Any]
     evaluation: AdaptationEvaluation
-    known: KnownTaskReturn
+    known: KnownTaskReturn | None
 
     @property
-    def limits(self) -> list[float]:
-        """The most that any method can earn from so many error-free answers on these tasks, (n_records,)."""
-        return [self.known.limit(n) for n in self.evaluation.record_at]
+    def limits(self) -> list[float] | None:
+        """What the best 2^k of the policies that were tried earn on these tasks, (n_records,)."""
+        return None if self.known is None else [self.known.limit(n) for n in self.evaluation.record_at]
 
     def table(self) -> Table:
         """Return, its standard error over tasks, the limit and, where a family has it, the success rate after each answer."""
-        table = Table(title=self.title, caption="limit: the most that any method can earn from so many error-free answers")
+        known, limits = self.known, self.limits
         rates = self.evaluation.success_rates
+        table = Table(title=self.title, caption=self._caption(), caption_justify="left", min_width=TABLE_WIDTH)
         for name in ("answers", "return", "std. error", "limit", *(() if rates is None else ("success rate",))):
             table.add_column(name, justify="right")
-        returns = self.evaluation.task_returns
-        errors = returns.std(axis=0, ddof=1) / np.sqrt(len(returns)) if len(returns) > 1 else np.full(returns.shape[1], np.nan)
-        means = returns.mean(axis=0)
-        for row, (n, mean, error, limit) in enumerate(zip(self.evaluation.record_at, means, errors, self.limits, strict=True)):
+        for row, (n, mean, error) in enumerate(_means(self.evaluation)):
+            limit = "" if limits is None else f"{limits[row]:.1f}"
             rate = [] if rates is None else [f"{rates[row]:.2f}"]
-            table.add_row(str(n), f"{mean:.1f}", "" if np.isnan(error) else f"{error:.1f}", f"{limit:.1f}", *rate)
-        table.add_section()
-        rate = [] if self.known.success_rate is None else [f"{self.known.success_rate:.2f}"]
-        table.add_row("task known", f"{self.known.mean_return:.1f}", "", "", *rate)
+            table.add_row(str(n), f"{mean:.1f}", "" if np.isnan(error) else f"{error:.1f}", limit, *rate)
+        if known is not None:
+            table.add_section()
+            rate = [] if known.success_rate is None else [f"{known.success_rate:.2f}"]
+            table.add_row("task known", f"{known.mean_return:.1f}", "", "", *rate)
         return table
+
+    def _caption(self) -> str | None:
+        if self.known is None:
+            return None
+        n, episodes = len(self.known.candidate_latents), self.known.returns.shape[1]
+        return (
+            f"task known: the best of {n} policies for each task, measured anew on {episodes} episodes.\n"
+            f"limit: the best 2^answers of those {n} for these very tasks, chosen with the tasks in "
+            "sight: an optimistic bound for error-free answers that choose among these policies, "
+            "not for any method."
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready: every task's return after every answer, the limit, the known-task return, and how it came about."""
@@ -64,10 +76,18 @@ class Report:
             "versions": {"python": platform.python_version(), **{name: version(name) for name in VERSIONED}},
             **self.settings,
             **self.evaluation.to_dict(),
+            **self._known_to_dict(),
+        }
+
+    def _known_to_dict(self) -> dict[str, Any]:
+        if self.known is None:
+            return {}
+        rate = self.known.success_rate
+        return {
             "limit": self.limits,
             "known_task_return": self.known.mean_return,
             "known_task_returns": self.known.returns.mean(axis=1).tolist(),
-            **({} if self.known.success_rate is None else {"known_task_success_rate": self.known.success_rate}),
+            **({} if rate is None else {"known_task_success_rate": rate}),
         }
 
     def write(self, console: Console, json_file: Path | None, plot_file: Path | None) -> None:
@@ -88,13 +108,25 @@ class Report:
                 evaluation.record_at,
                 evaluation.task_returns,
                 self.limits,
-                self.known.mean_return,
+                None if self.known is None else self.known.mean_return,
                 title=self.title,
                 path=plot_file,
             )
             console.print(f"Wrote {plot_file}")
 
 
-def describe_task(task: Sequence[float] | np.ndarray) -> str:
-    """A task's numbers in one line."""
-    return ", ".join(f"{value:.3g}" for value in task)
+def row_text(evaluation: AdaptationEvaluation) -> str:
+    """The last row of what was measured so far, in a line."""
+    n, mean, error = list(_means(evaluation))[-1]
+    text = f"after {n} answer{'s' * (n != 1)}: return {mean:.1f}"
+    if not np.isnan(error):
+        text += f", std. error {error:.1f}"
+    rates = evaluation.success_rates
+    return text if rates is None else f"{text}, success rate {rates[-1]:.2f}"
+
+
+def _means(evaluation: AdaptationEvaluation) -> Iterator[tuple[int, float, float]]:
+    """Number of answers, mean return over tasks, its standard error (NaN for one task): a row each."""
+    returns = evaluation.task_returns
+    errors = returns.std(axis=0, ddof=1) / np.sqrt(len(returns)) if len(returns) > 1 else np.full(returns.shape[1], np.nan)
+    return zip(evaluation.record_at, returns.mean(axis=0), errors, strict=True)

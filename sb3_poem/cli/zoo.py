@@ -27,7 +27,7 @@ from sb3_poem.loading import ALGORITHMS
 # Those of our own that differ from rl_zoo3's; what the user gives comes later, and wins.
 DEFAULTS = {
     "train": ["--algo", "poem_sac", "--eval-freq", "100000", "--eval-episodes", "2"],
-    "enjoy": ["--algo", "poem_sac", "--folder", "logs"],
+    "enjoy": ["--folder", "logs"],
 }
 
 
@@ -88,7 +88,7 @@ def check_arguments(command: str, arguments: Sequence[str]) -> None:
 
 def run_zoo(command: str, arguments: Sequence[str]) -> None:
     """
-    Run rl_zoo3's program with our algorithms registered; ``poem_sac`` and the folder ``logs`` are the defaults.
+    Run rl_zoo3's program with our algorithms registered; ``logs`` is the default folder.
     Training evaluates by adaptation, which takes a while, and so less often and on fewer episodes than rl_zoo3's default.
 
     :param command: ``"train"`` or ``"enjoy"``
@@ -97,7 +97,7 @@ def run_zoo(command: str, arguments: Sequence[str]) -> None:
     register_algorithms()
     defaults = DEFAULTS[command]
     if command == "enjoy" and not has_display() and not {"--no-render", "-h", "--help"} & set(arguments):
-        raise OSError("there is no display to draw on: add --no-render, or see `sb3-poem adapt --video FILE`")
+        raise OSError("there is no display to draw on: add --no-render")
 
     if {"-h", "--help"} & set(arguments):
         print(f"Defaults here: {' '.join(defaults)}")

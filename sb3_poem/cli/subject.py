@@ -1,0 +1,172 @@
+"""What ``adapt``, ``enjoy`` and ``record-video`` work on: a model, its environment and test tasks."""
+
+import argparse
+import ast
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+# A model that rl_zoo3 trained may hold its schedules.
+# Importing it replaces Gymnasium's TimeLimit, so it comes first.
+import rl_zoo3  # noqa: F401
+import torch as th
+from rich.console import Console
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_poem.adaptation import AdaptedPolicy, KnownTaskReturn, Trajectory, known_task_return
+from sb3_poem.adaptation.evaluation import evaluation_seed, held_out_tasks
+from sb3_poem.adaptation.oracles import compute_reward
+from sb3_poem.cli.packages import import_packages
+from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.foreign import environment_of
+from sb3_poem.common.rollouts import rollout_latents
+from sb3_poem.common.vec_env import make_task_vec_env
+from sb3_poem.common.video import side_by_side, write_video
+from sb3_poem.loading import load_model
+
+# Copies that step in lockstep: for many tasks, and for one, whose questions need but two of them.
+COPIES, COPIES_FOR_ONE_TASK = 60, 20
+# Episodes per latent when looking for a task's best: the fewer, the more luck counts in the limit.
+SELECTION_EPISODES = 3
+POLICY_SUFFIX = ".safetensors"
+
+
+def parse_env_kwargs(pairs: list[str]) -> dict[str, Any]:
+    """Read ``KEY:VALUE`` arguments; a value is a Python literal, or else a string.
+
+    :raises ValueError: if there is no colon
+    """
+    kwargs = {}
+    for pair in pairs:
+        key, colon, text = pair.partition(":")
+        if not colon or not key.isidentifier():
+            raise ValueError(f"--env-kwargs {pair}: must have the form KEY:VALUE")
+        try:
+            kwargs[key] = ast.literal_eval(text)
+        except (ValueError, SyntaxError):
+            kwargs[key] = text
+    return kwargs
+
+
+def describe_task(task: Sequence[float] | np.ndarray) -> str:
+    """A task's numbers in one line."""
+    return ", ".join(f"{value:.3g}" for value in task)
+
+
+def say(text: str) -> None:
+    """Print a line as it is, and at once."""
+    print(text, flush=True)
+
+
+class Subject:
+    """A model, an environment with many copies (``env``), and test tasks.
+
+    :param arguments: The command line's
+    :param console: Where to say what takes its time
+    :param n_tasks: How many tasks are drawn, unless ``--task`` names the only one
+    :param copies: How many of the environment step at once
+    :raises ValueError: if the arguments do not fit the model or the environment
+    :raises OSError: if the model cannot be read
+    """
+
+    def __init__(self, arguments: argparse.Namespace, console: Console, n_tasks: int, copies: int = COPIES) -> None:
+        self.console = console
+        self.seed: int = arguments.seed
+        import_packages(arguments.gym_packages)
+        th.set_num_threads(arguments.num_threads)
+        #: (latent_dim,) of a file that holds a policy, which is adapted already
+        self.latent: np.ndarray | None = None
+        with console.status("Reading the model"):
+            if Path(arguments.model).suffix == POLICY_SUFFIX:
+                policy = AdaptedPolicy.load(arguments.model, arguments.device)
+                self.model, self.latent = policy.model, policy.latent
+            else:
+                self.model = load_model(arguments.model, arguments.device)
+        given = parse_env_kwargs(arguments.env_kwargs)
+        self.env_id, self.env_kwargs = environment_of(
+            arguments.model, self.model.env_id, self.model.env_kwargs, arguments.env, given
+        )
+        self.env = make_task_vec_env(self.env_id, copies, **self.env_kwargs)
+        family = FamilyEnv(self.env)
+        try:
+            family.check_same_family(self.model.task_space, self.model.reward_feature_dim)
+        except ValueError as error:
+            raise ValueError(
+                f"--env {self.env_id}, but {arguments.model} was trained on {self.model.env_id}: {error}"
+            ) from error
+        #: (n_tasks, task_dim)
+        self.tasks = self._choose_tasks(arguments.task, family, n_tasks)
+
+    def _choose_tasks(self, task: list[float] | None, family: FamilyEnv, n_tasks: int) -> np.ndarray:
+        if task is None:
+            return held_out_tasks(family, n_tasks, self.seed)
+        if len(task) != family.task_dim:
+            raise ValueError(f"--task needs {family.task_dim} numbers for {self.env_id}, got {len(task)}")
+        return np.array([task], dtype=np.float64)
+
+    def known_task_return(self, n_episodes: int) -> KnownTaskReturn:
+        """The best of the model's policies for each task.
+
+        :param n_episodes: How many are measured for each
+        """
+        selection = min(n_episodes, SELECTION_EPISODES)
+        return known_task_return(
+            self.model, self.env, self.tasks, n_episodes=n_episodes, seed=self.seed, selection_episodes=selection
+        )
+
+    def make_env(self, render_mode: str | None, show_task: bool) -> DummyVecEnv:
+        """A single environment with the first task.
+
+        :param render_mode: ``"rgb_array"``, ``"human"`` or None
+        :param show_task: Whether the hidden task is drawn
+        :raises ValueError: if the environment cannot render so
+        """
+        env = DummyVecEnv([partial(self._make_env, render_mode, {"render_task": True} if show_task else {})])
+        env.env_method("set_task", self.tasks[0])
+        return env
+
+    def _make_env(self, render_mode: str | None, options: dict[str, Any]) -> gym.Env:
+        env = gym.make(self.env_id, render_mode=render_mode, **self.env_kwargs, **options)
+        if render_mode is not None and render_mode not in env.metadata.get("render_modes", ()):
+            raise ValueError(f"{self.env_id} cannot be shown: it has no render mode {render_mode!r}")
+        return env
+
+    def roll_out(self, env: DummyVecEnv, latent: np.ndarray, episode: int = 0, frames: bool = False) -> Trajectory:
+        """An episode of a policy on the first task.
+
+        :param env: What :meth:`make_env` made
+        :param latent: (latent_dim,)
+        :param episode: Its number; equal numbers start alike
+        :param frames: Whether to keep its frames
+        """
+        seed = evaluation_seed(self.seed) + episode
+        return rollout_latents(self.model, env, latent[None], self.tasks[:1], [seed], frames=frames)[0]
+
+    def true_return(self, episode: Trajectory) -> float:
+        """What an episode earns on the first task."""
+        assert episode.reward_features is not None
+        return float(compute_reward(self.env, self.tasks[0], episode.reward_features).sum())
+
+    def film(self, latents: Sequence[np.ndarray], captions: Sequence[str], path: Path, show_task: bool) -> None:
+        """Film one policy on the first task, or two side by side from the same start.
+
+        :param latents: One or two, (latent_dim,) each
+        :param captions: What is written above each of two
+        :param path: MP4 or GIF
+        :param show_task: Whether the task is drawn, and what was earned on it is written
+        """
+        env = self.make_env("rgb_array", show_task)
+        with self.console.status("Filming"):
+            clips = [self.roll_out(env, latent, frames=True) for latent in latents]
+            frames = clips[0].frames or []
+            if len(clips) > 1:
+                earned = [f": {self.true_return(clip):.1f}" if show_task else "" for clip in clips]
+                left, right = (caption + words for caption, words in zip(captions, earned, strict=True))
+                frames = side_by_side(frames, clips[1].frames or [], (left, right))
+            write_video(frames, path, float(env.get_attr("metadata")[0].get("render_fps", 20)))
+        env.close()
+        say(f"Wrote {path}" + (f" (task {describe_task(self.tasks[0])})" if show_task else ""))
