@@ -567,7 +567,7 @@ class PEARLSAC(SamplingSAC):
                 "total_timesteps is missing, which only a model that from_zoo made knows: pass a "
                 f"number of environment steps; an epoch has {self.epoch_steps:,}"
             )
-        check_number("total_timesteps", total_timesteps, 1)
+        check_number("total_timesteps", total_timesteps, 0)
         if isinstance(callback, type):
             raise TypeError(f"callback is the class {callback.__name__}, but must be an object: {callback.__name__}(...)")
         if self.verbose > 0:

@@ -1,0 +1,108 @@
+"""What README and guides show is what runs: their Python blocks and commands, with small budgets."""
+
+import io
+import re
+import shlex
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import pytest
+from sybil import Document
+from sybil.evaluators.python import PythonEvaluator
+from sybil.parsers.markdown import CodeBlockParser
+
+from sb3_poem import PEARLSAC, POEMSAC, PreferenceAdapter, cli
+from sb3_poem.resources import config_file, shipped_folder
+
+TOP = Path(__file__).parents[1]
+PAGES = ("README.md", *(f"docs/{page.name}" for page in sorted((TOP / "docs").glob("*.md"))))
+LEARN = PEARLSAC.learn
+
+#: Further words by subcommand, of which the last counts: as little as can be done
+SMALL = {
+    "train": "-n 1500 --n-trials 1 --verbose 0",
+    "enjoy": "--no-render --queries 1",
+    "record-video": "--queries 1",
+    "adapt": "--tasks 1 --episodes 1 --queries 2",
+    "benchmark": "--list",
+}
+#: Pages to be served, and tables of records that a run has to make first: only read
+ONLY_READ = ("label", "benchmark report", "benchmark run --backend ray")
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working folder with what the commands name."""
+    shutil.copy(config_file("poem_sac"), tmp_path / "my.yml")
+    (tmp_path / "pretrained").symlink_to(shipped_folder("pretrained"))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def learn_little(model: PEARLSAC, *arguments: Any, **options: Any) -> PEARLSAC:
+    """One epoch with two gradient steps."""
+    model.gradient_steps = 2
+    return LEARN(model, 1, **options)
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if "```python" in (TOP / page).read_text()])
+def test_python_blocks_run(page: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(PEARLSAC, "learn", learn_little)
+    env = gym.make("poem/HalfCheetahVel-v0", render_mode="rgb_array")
+    env.reset(seed=0)
+    registered = dict(gym.registry)
+    document = Document.parse(str(TOP / page), CodeBlockParser("python", PythonEvaluator()))
+    document.namespace.update(
+        __name__="__main__",
+        env=env,
+        model=POEMSAC.from_pretrained("HalfCheetahVel"),
+        your_answer=lambda left, right: "left",
+    )
+    example_policy = PreferenceAdapter("PointGoal", "poem/PointGoal-v0", seed=0).policy()
+    example_policy.save(folder / "adapted_policy.safetensors")
+    try:
+        for example in document.examples():
+            example.evaluate()
+    finally:
+        gym.registry.clear()
+        gym.registry.update(registered)
+
+
+def commands(page: str) -> Iterator[str]:
+    """The lines of ``sb3-poem`` in a page, without their comments."""
+    for block in re.findall(r"^```\w*\n(.*?)^```", (TOP / page).read_text(), flags=re.DOTALL | re.MULTILINE):
+        for line in block.splitlines():
+            if line.startswith("sb3-poem "):
+                yield line.split(" #")[0].strip()
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if list(commands(page))])
+def test_commands_are_understood(page: str, capsys: pytest.CaptureFixture[str]) -> None:
+    for command in commands(page):
+        words = shlex.split(command)[1:]
+        given, others = cli.build_parser().parse_known_args(words)
+        assert not others or given.command == "train", command
+
+
+def test_readme_s_commands_run(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    for command in commands("README.md"):
+        if any(set(some.split()) <= set(command.split()) for some in ONLY_READ):
+            continue
+        little = re.sub("HalfCheetahVel|AntGoal", "PointGoal", command)
+        # the third run is the one that keeps a checkpoint, by --save-freq
+        words = shlex.split(little.replace("_1/checkpoint", "_3/checkpoint"))[1:]
+        monkeypatch.setattr("sys.stdin", io.StringIO("l\n" * 20))
+        more = SMALL.get(words[0], "").split()
+        if "human" in words:
+            more = ["--queries", "2"]
+        if words[0] == "train" and "-P" not in words:  # whose best model is adapted further down
+            more += ["--eval-freq", "-1"]
+        assert cli.main([*words, *more]) == 0, (command, capsys.readouterr().err[-2000:])
+
+
+def test_every_kind_of_command_is_shown() -> None:
+    shown = {command.split()[1] for page in PAGES for command in commands(page)}
+    assert {"train", "enjoy", "adapt", "label", "benchmark", "record-video", "models"} <= shown
