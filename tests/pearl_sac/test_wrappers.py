@@ -78,7 +78,7 @@ class OwnVec(VecEnvWrapper):
         (wrappers.ClipAction, "ClipAction"),
         (wrappers.TimeAwareObservation, "TimeAwareObservation"),
         (functools.partial(wrappers.RepeatAction, num_repeats=2), "RepeatAction"),
-        (Wet, r"ActionWrapper \(its wrappers: Monitor, Wet, TimeLimit, "),
+        (Wet, r"ActionWrapper \(its wrappers: Monitor, Wet, \w*TimeLimit, "),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -86,7 +86,7 @@ class OwnVec(VecEnvWrapper):
 def test_known_wrappers_are_refused_by_name(wrap: Wrap, name: str, monitor: bool) -> None:
     env = wrap(Monitor(gym.make(POINT_GOAL)) if monitor else gym.make(POINT_GOAL))
     if monitor:
-        name = name.replace("Monitor, Wet, TimeLimit", "Wet, Monitor, TimeLimit")
+        name = name.replace("Monitor, Wet", "Wet, Monitor")
     with pytest.raises(ValueError, match=f"env must not be wrapped in {name}.*the family itself"):
         small(POEMSAC, env)
 
