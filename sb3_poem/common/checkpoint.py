@@ -82,4 +82,6 @@ def is_checkpoint(path: str | Path) -> bool:
     if not zipfile.is_zipfile(path):
         return False
     with zipfile.ZipFile(path) as archive:
-        return any(Path(name).name == "data.pkl" for name in archive.namelist())
+        entries = archive.infolist()
+    # a model's file that is cut short may end with one of its parts, which looks the same
+    return any(Path(entry.filename).name == "data.pkl" for entry in entries) and entries[0].header_offset == 0

@@ -573,7 +573,7 @@ class PEARLSAC(SamplingSAC):
         if self.verbose > 0:
             epoch, updates = self.epoch_steps, self.gradient_steps
             print(
-                f"Training for {total_timesteps:,} steps in {-(-total_timesteps // epoch):,} epochs: "
+                f"Training for {total_timesteps:,.0f} steps in {-(-total_timesteps // epoch):,.0f} epochs: "
                 f"each has {epoch:,} environment steps, then {updates if updates >= 0 else epoch:,} "
                 "gradient steps"
             )
