@@ -105,13 +105,11 @@ def run_zoo(command: str, arguments: Sequence[str]) -> None:
             print("--resume: go on with the last run of the same algorithm, environment and seed, if it did not finish")
         print()
 
-    check_arguments(command, arguments)
-    given = [*defaults, *arguments]
-    if command == "train" and "--resume" in arguments:
-        continued = resumed(given)
-        if continued is None:
-            return
-        given = continued
+    resumes = command == "train" and "--resume" in arguments
+    given = resumed([*defaults, *arguments]) if resumes else [*defaults, *arguments]
+    if given is None:
+        return
+    check_arguments(command, given)
     # rl_zoo3's programs read the process's own arguments.
     own_arguments = sys.argv
     sys.argv = [f"sb3-poem {command}", *given]

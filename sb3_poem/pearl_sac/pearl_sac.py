@@ -596,5 +596,7 @@ class PEARLSAC(SamplingSAC):
         self: SelfPEARLSAC, callback: MaybeCallback = None, log_interval: int | None = 1, progress_bar: bool = False
     ) -> SelfPEARLSAC:
         """Finish the ``learn`` that a checkpoint interrupted, up to its own ``total_timesteps``."""
-        remaining = max(0, self._total_timesteps - self.num_timesteps)
+        remaining = self._total_timesteps - self.num_timesteps
+        if remaining <= 0:
+            return self
         return self.learn(remaining, callback, log_interval=log_interval, reset_num_timesteps=False, progress_bar=progress_bar)
