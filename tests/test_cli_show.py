@@ -33,7 +33,7 @@ class WatchedEnv(PointGoalEnv):
 def test_enjoy_adapts_then_shows_the_policy_in_a_window(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("sb3_poem.cli.show.has_display", lambda: True)
+    monkeypatch.setenv("DISPLAY", ":0")
     gym.register("Watched-v0", WatchedEnv, max_episode_steps=25)
     try:
         assert show("enjoy", "--model", "PointGoal", "--env", "Watched-v0", "--task", 1.0, *QUICK) == 0
@@ -95,6 +95,7 @@ def test_record_video_films_before_and_after_or_one_policy(tmp_path: Path, capsy
         ),
         (["enjoy", "--no-render", "--model", "PointGoaal"], "Did you mean 'PointGoal'?"),
         (["enjoy", "--algo", "ppo", "--env", "Pendulum-v1"], "add --no-render"),
+        (["enjoy", "--model", "PointGoal", "--no-render", "--device", "gpu"], "--device gpu: there is no such device"),
         (["record-video", "--model", "PointGoal", "--out", "a.avi"], "--out a.avi: the name must end in .mp4 or .gif"),
         (["record-video", "--model", "PointGoal", "--out", "a.gif", "--task", 1, 2], "--task needs 1 numbers"),
     ],

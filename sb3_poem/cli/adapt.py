@@ -27,7 +27,7 @@ from sb3_poem.adaptation import (
 )
 from sb3_poem.adaptation.evaluation import evaluation_seed
 from sb3_poem.cli import DEFAULT_STORE
-from sb3_poem.cli.outputs import check_device, check_output
+from sb3_poem.cli.outputs import check_output
 from sb3_poem.cli.report import Report, row_text
 from sb3_poem.cli.subject import POLICY_SUFFIX, Subject, describe_task, say
 from sb3_poem.label import Store, StoreRecorder
@@ -45,7 +45,6 @@ def run_adapt(arguments: argparse.Namespace) -> int:
     :raises OSError: if the model cannot be read, or a file not be written
     :raises EOFError: if a person should answer and standard input is closed
     """
-    check_device(arguments.device)
     check_output("--json", arguments.json, (".json",))
     check_output("--plot", arguments.plot, (".png", ".pdf", ".svg"))
     check_output("--video", arguments.video, (".mp4", ".gif"))

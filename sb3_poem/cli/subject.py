@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_poem.adaptation import AdaptedPolicy, KnownTaskReturn, Trajectory, known_task_return
 from sb3_poem.adaptation.evaluation import evaluation_seed, held_out_tasks
 from sb3_poem.adaptation.oracles import compute_reward
+from sb3_poem.cli.outputs import check_device
 from sb3_poem.cli.packages import import_packages
 from sb3_poem.common.family import FamilyEnv
 from sb3_poem.common.foreign import environment_of
@@ -76,6 +77,7 @@ class Subject:
     def __init__(self, arguments: argparse.Namespace, console: Console, n_tasks: int, copies: int = COPIES) -> None:
         self.console = console
         self.seed: int = arguments.seed
+        check_device(arguments.device)
         import_packages(arguments.gym_packages)
         th.set_num_threads(arguments.num_threads)
         #: (latent_dim,) of a file that holds a policy, which is adapted already
