@@ -403,9 +403,9 @@ PREDICT = [
     ),
     works(
         "deterministic",
-        lambda _: np.array_equal(*(trained().predict(OBS, deterministic=True)[0] for _ in "12")),
+        lambda _: np.array_equal(*(trained().predict(OBS, np.zeros(5), deterministic=True)[0] for _ in "12")),
     ),
-    works("policy.predict", lambda _: trained().policy.predict(OBS)[0].shape, (6, 2)),
+    works("policy.predict", lambda _: trained().policy.predict(OBS, np.zeros(5))[0].shape, (6, 2)),
     works(
         "obs_to_tensor",
         lambda _: trained().policy(trained().policy.obs_to_tensor(OBS)[0]).shape,

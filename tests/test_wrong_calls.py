@@ -200,7 +200,7 @@ ALGORITHMS = [
     argument(made, "batch_size", 0, "at least 1"),
     argument(made, "batch_size", 2.5),
     argument(made, "batch_size", "big"),
-    argument(made, "gamma", 1.5, r"\[0, 1\]"),
+    argument(made, "gamma", 1.5, "at most 1"),
     argument(made, "ent_coef", "little", "auto"),
     argument(made, "ent_coef", -0.1),
     argument(made, "target_entropy", "low", "auto"),

@@ -131,7 +131,7 @@ class PreferenceAdapter:
         :return: An ``options_class``.
         :raises ValueError: If an option is out of its range.
         """
-        if options.get("noise_model") is None:
+        if options.get("noise_model") is None and not isinstance(oracle, type):
             options["noise_model"] = getattr(oracle, "noise_model", None)
         return cls.options_class(**options)
 

@@ -62,7 +62,7 @@ class AdaptationEvalCallback(EpochCallback):
         if n_tasks < 1 or n_episodes < 1:
             raise ValueError(f"n_tasks and n_episodes must be at least 1, got {n_tasks} and {n_episodes}")
         if not record_at:
-            raise ValueError("record_at must hold at least one number of answers, got none")
+            raise ValueError(f"record_at must hold at least one number of answers, got {record_at!r}")
         self.n_tasks = n_tasks
         self.record_at = tuple(record_at)
         self.n_episodes = n_episodes

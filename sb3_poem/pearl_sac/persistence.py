@@ -98,8 +98,9 @@ class PersistentSAC(SAC):
         if env is None or isinstance(env, gym.Env | VecEnv):
             return env
         if not isinstance(env, str):
+            what = f"the class {env.__name__}" if isinstance(env, type) else f"a {type(env).__name__}"
             raise TypeError(
-                f"env is a {type(env).__name__}, but must be an environment, a vectorised one (DummyVecEnv, "
+                f"env is {what}, but must be an environment, a vectorised one (DummyVecEnv, "
                 "SubprocVecEnv, TaskVecEnv), or a registered id"
             )
         env = plain_id(env)
