@@ -5,6 +5,7 @@ import shlex
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -404,6 +405,14 @@ class CrashError(Exception):
     """Training was cut off."""
 
 
+@pytest.fixture(autouse=True)
+def _keyboard() -> Iterator[None]:
+    """Ctrl-C is heard, which a shell's background jobs ignore, this process among them perhaps."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, th.Tensor]:
     """What training ends with when nothing interrupts it."""
@@ -475,7 +484,6 @@ def test_an_interrupt_of_the_program(tmp_path: Path, whole: dict[str, th.Tensor]
     done = subprocess.run(
         [*command, "-c", str(config), "-f", str(tmp_path), *LONG],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell's background jobs ignore it
         capture_output=True,
         text=True,
     )
