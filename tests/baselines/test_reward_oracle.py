@@ -127,5 +127,5 @@ def test_what_will_not_do(trained):
         action_space = trained.action_space
         compute_reward = property()
 
-    with pytest.raises(ValueError, match="`env` must be a task family"):
+    with pytest.raises(ValueError, match="does not belong to this environment: its task_space"):
         RewardOracleAdapter(trained, DummyVecEnv([NoFamily]))
