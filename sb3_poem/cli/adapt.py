@@ -29,7 +29,7 @@ from sb3_poem.adaptation.evaluation import evaluation_seed
 from sb3_poem.cli import DEFAULT_STORE
 from sb3_poem.cli.outputs import check_output
 from sb3_poem.cli.report import Report, row_text
-from sb3_poem.cli.subject import POLICY_SUFFIX, Subject, describe_task, say
+from sb3_poem.cli.subject import COPIES, COPIES_FOR_ONE_TASK, POLICY_SUFFIX, Subject, describe_task, say
 from sb3_poem.label import Store, StoreRecorder
 from sb3_poem.label.beliefs import belief
 
@@ -52,7 +52,8 @@ def run_adapt(arguments: argparse.Namespace) -> int:
     n_tasks = _check_tasks(arguments)
     if arguments.record and max(arguments.record) > arguments.queries:
         raise ValueError(f"--record {max(arguments.record)} is more than --queries {arguments.queries}")
-    subject = Subject(arguments, Console(), n_tasks)
+    copies = COPIES_FOR_ONE_TASK if arguments.oracle == "human" else COPIES
+    subject = Subject(arguments, Console(), n_tasks, copies)
     if subject.latent is not None:
         raise ValueError(f"--model {arguments.model} is a policy that is adapted already; name the model instead")
     adaptation = Adaptation(arguments, subject)

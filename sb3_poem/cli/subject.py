@@ -74,7 +74,7 @@ class Subject:
     :raises OSError: if the model cannot be read
     """
 
-    def __init__(self, arguments: argparse.Namespace, console: Console, n_tasks: int, copies: int = COPIES) -> None:
+    def __init__(self, arguments: argparse.Namespace, console: Console, n_tasks: int, copies: int) -> None:
         self.console = console
         self.seed: int = arguments.seed
         check_device(arguments.device)
