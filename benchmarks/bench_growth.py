@@ -82,7 +82,7 @@ def returns_matrix(repeats: int) -> list[dict[str, Any]]:
             times = []
             for _ in range(repeats if n_tasks < 1000 else 1):
                 started = time.perf_counter()
-                relabelled_returns(family.compute_reward, tasks, features, mask)
+                relabelled_returns(family.compute_rewards, tasks, features, mask)
                 times.append(time.perf_counter() - started)
             rows.append({"family": env_id, "tasks": n_tasks, "ms": 1000.0 * float(np.median(times))})
     return rows

@@ -144,7 +144,7 @@ def check_set_task(make: MakeFamily, seed: int) -> None:
     env.step(actions[0])
     env.set_task(second)
     _, reward, _, _, info = env.step(actions[1])
-    kept, changed = (float(env.compute_reward(task, info["reward_features"])) for task in (first, second))
+    kept, changed = (float(env.compute_rewards(task, info["reward_features"])) for task in (first, second))
     ok = np.array_equal(env.task, first) and not (reward == changed != kept)
     assert ok, "set_task must take effect at the next reset only, but it changed the episode under way"
     env.reset()
@@ -190,24 +190,24 @@ def check_relabelling(make: MakeFamily, n_steps: int, seed: int) -> None:
     episodes = [_run(env, actions, seed=seed, options={"task": task}) for task in tasks]
     for task, episode in zip(tasks, episodes, strict=True):
         for source, name in ((env, "this"), (other, "another")):
-            rewards = np.array([float(source.compute_reward(task, row)) for row in episode.features])
+            rewards = np.array([float(source.compute_rewards(task, row)) for row in episode.features])
             assert np.array_equal(rewards, episode.rewards), (
-                f"step must return exactly compute_reward(task, info['reward_features']), but {name} environment's gives "
+                f"step must return exactly compute_rewards(task, info['reward_features']), but {name} environment's gives "
                 f"{rewards.tolist()} for the rewards {episode.rewards.tolist()}: compute the reward in _reward alone, from "
                 "its arguments alone, with no state of the environment, and return new arrays of features"
             )
     features = episodes[0].features
     try:
-        together = env.compute_reward(tasks[:, None, :], features[None, :, :])
+        together = env.compute_rewards(tasks[:, None, :], features[None, :, :])
     except Exception as error:
         raise AssertionError(
-            "compute_reward must broadcast tasks (n, 1, task_dim) against features (1, m, reward_feature_dim), but raised "
+            "compute_rewards must broadcast tasks (n, 1, task_dim) against features (1, m, reward_feature_dim), but raised "
             f"{type(error).__name__}: {error}; index the last dimension in _reward by tasks[..., i] and features[..., i]"
         ) from error
-    one_by_one = np.array([[float(env.compute_reward(task, row)) for row in features] for task in tasks])
+    one_by_one = np.array([[float(env.compute_rewards(task, row)) for row in features] for task in tasks])
     assert np.array_equal(together, one_by_one), (
-        "compute_reward must give many rewards at once exactly as one after another, but does not: use elementwise operations "
-        "in _reward, on the last dimension by tasks[..., i] and features[..., i]"
+        "compute_rewards must give many rewards at once exactly as one after another, but does not: "
+        "use elementwise operations in _reward, on the last dimension by tasks[..., i] and features[..., i]"
     )
 
 

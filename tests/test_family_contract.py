@@ -129,7 +129,7 @@ class FeaturesOfAnotherWidth(Walk):
     def _reward(self, tasks, features):
         return np.zeros(np.broadcast_shapes(tasks.shape, features.shape)[:-1])
 
-    compute_reward = _reward  # without the check of the base class
+    compute_rewards = _reward  # without the check of the base class
 
 
 class SuccessAsANumber(Walk):
@@ -250,7 +250,7 @@ class RewardThatRounds(Walk):
 
 
 class RewardWithoutItsCosts(Walk):
-    """What ``step`` takes off is not in ``compute_reward``."""
+    """What ``step`` takes off is not in ``compute_rewards``."""
 
     def step(self, action):
         observation, reward, terminated, truncated, info = super().step(action)
@@ -335,9 +335,9 @@ BROKEN = [
     (TaskInTheObservation, "observations must not depend on the task"),
     (TaskInTheFeatures, "reward features must not depend on the task"),
     (TaskInTheEnd, "end must not depend on the task"),
-    (RewardOfItsOwnState, "must return exactly compute_reward.* with no state of the environment"),
+    (RewardOfItsOwnState, "must return exactly compute_rewards.* with no state of the environment"),
     (FeaturesThatAreReused, "return new arrays of features"),
-    (RewardThatDoesNotBroadcast, "compute_reward must broadcast"),
+    (RewardThatDoesNotBroadcast, "compute_rewards must broadcast"),
     (RewardThatRounds, "exactly as one after another"),
     (PotentialThatDoesNotBroadcast, "compute_potential must broadcast"),
     (PotentialOfItsOwnState, "potentials at once as one after another"),
@@ -345,7 +345,7 @@ BROKEN = [
     (SymmetryOfAnotherWidth, "observations.order must hold each of the indices 0 to 1 once"),
     (SymmetryThatScales, "observations.signs must be 2 of 1 and -1"),
     (SymmetryOfUnevenActions, "actions must leave the bounds of the space as they are"),
-    (RewardWithoutItsCosts, "step must return exactly compute_reward"),
+    (RewardWithoutItsCosts, "step must return exactly compute_rewards"),
     (RenderingThatMoves, "rendering must not change the episode"),
     (RenderingOfTheTask, "images must not show the task unless render_task=True"),
     (RenderingOfNothing, r"render\(\) .* must return a uint8 array"),

@@ -44,7 +44,7 @@ class SpeedEnv(gym.Env):
         self._next_task = np.array(task, dtype=np.float64)
 
     @staticmethod
-    def compute_reward(tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
+    def compute_rewards(tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
         return -STEP_WEIGHT * np.abs(features[..., 0] - tasks[..., 0])
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
@@ -59,7 +59,7 @@ class SpeedEnv(gym.Env):
         self._place += 0.05 * speed
         self._time += 1
         features = np.array([speed])
-        reward = float(self.compute_reward(self.task, features))
+        reward = float(self.compute_rewards(self.task, features))
         truncated = self._time >= HORIZON
         return np.array([self._place, speed]), reward, self._place > self.end_at, truncated, {"reward_features": features}
 
@@ -98,7 +98,7 @@ class SpeedVecEnv(VecEnv):
         observations = np.column_stack([self._places, speeds])
         done = self._time >= HORIZON
         infos = [{"terminal_observation": row} if done else {} for row in observations]
-        rewards = SpeedEnv.compute_reward(self.tasks, self.last_reward_features)
+        rewards = SpeedEnv.compute_rewards(self.tasks, self.last_reward_features)
         return observations, rewards, np.full(self.num_envs, done), infos
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:

@@ -6,10 +6,7 @@ contract.
 
 from __future__ import annotations
 
-import functools
-import sys
 from abc import ABC, ABCMeta, abstractmethod
-from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import gymnasium as gym
@@ -22,23 +19,6 @@ from poem_envs.headless import has_display
 
 # Rounding in float32 policies and files may leave a value just outside its bounds: up to this it is clipped, not refused.
 BOUNDS_TOLERANCE = 1e-6
-
-
-class _NoGoalEnvironment:
-    """A method that SB3's ``check_env`` cannot see.
-
-    It takes every environment with a ``compute_reward`` for a goal-conditioned one, and then refuses observations that are no
-    dictionary. The name is common enough to keep, and the check is worth passing.
-    """
-
-    def __init__(self, function: Callable[..., np.ndarray]) -> None:
-        self._function = function
-        functools.update_wrapper(self, function)  # type: ignore[arg-type]
-
-    def __get__(self, instance: object, owner: type) -> Any:
-        if sys._getframe(1).f_globals.get("__name__") == "stable_baselines3.common.env_checker":
-            raise AttributeError("compute_reward(tasks, features) is not that of a goal-conditioned environment")
-        return self._function.__get__(instance, owner)
 
 
 class SignedPermutation(NamedTuple):
@@ -122,8 +102,7 @@ class TaskDefinition(ABC):
             )
         return np.asarray(rng.permutation(self.all_tasks)[:n], dtype=np.float64)
 
-    @_NoGoalEnvironment
-    def compute_reward(self, tasks: npt.ArrayLike, features: npt.ArrayLike) -> np.ndarray:
+    def compute_rewards(self, tasks: npt.ArrayLike, features: npt.ArrayLike) -> np.ndarray:
         """The rewards that steps with the given features earn in the given tasks.
 
         A pure function: ``step`` returns exactly this for its own task and features, so that a trajectory logged in one
@@ -278,7 +257,7 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray], metaclass=_Fam
     the episode itself, so two tasks see the same start.
 
     **The info** of every step holds ``"reward_features"``, ``(reward_feature_dim,)`` float64: everything that rewards of this
-    family depend on (see :meth:`~TaskDefinition.compute_reward`). A family whose :meth:`_step_info` gives ``"success"``,
+    family depend on (see :meth:`~TaskDefinition.compute_rewards`). A family whose :meth:`_step_info` gives ``"success"``,
     whether the step reached what the task asks for, has ``"is_success"`` there too, as SB3 calls it: whether any step of the
     episode so far did. Training, evaluation and the command line then report success rates.
 
@@ -356,7 +335,7 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray], metaclass=_Fam
         checked = checked_actions(action, self.action_space)
         self._elapsed_steps += 1
         observation, features, terminated = self._simulate(checked)
-        reward = float(self.compute_reward(self._task, features))
+        reward = float(self.compute_rewards(self._task, features))
         if self.render_mode == "human":
             self.render()
         info = {"reward_features": features, **self._step_info()}

@@ -302,7 +302,7 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         checked = checked_actions(actions, self.single_action_space, self.num_envs)
         self._elapsed_steps += 1
         features, terminations = self._advance(checked)
-        rewards = self.compute_reward(self._tasks, features)
+        rewards = self.compute_rewards(self._tasks, features)
         observations = self._observations()
         if self.max_episode_steps is None:
             truncations = np.zeros(self.num_envs, dtype=bool)

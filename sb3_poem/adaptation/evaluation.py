@@ -12,7 +12,7 @@ from sb3_poem.adaptation.environments import Env, model_and_env
 from sb3_poem.adaptation.limits import information_limit
 from sb3_poem.adaptation.lockstep import OracleFactory, TaskAdaptations, adapt_tasks
 from sb3_poem.adaptation.noise import NoiseModel
-from sb3_poem.adaptation.oracles import ReturnOracle, compute_reward
+from sb3_poem.adaptation.oracles import ReturnOracle, compute_rewards
 from sb3_poem.adaptation.preference import Preference
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.rollouts import rollout_features, rollout_outcomes
@@ -99,7 +99,7 @@ def evaluate_episodes(
     rows = np.tile(np.arange(n), n_episodes)
     outcomes = rollout_outcomes(model, vec_env, latents[rows], tasks[rows], seed, deterministic)
     returns = [
-        float(np.sum(compute_reward(vec_env, tasks[row], outcome.reward_features)))
+        float(np.sum(compute_rewards(vec_env, tasks[row], outcome.reward_features)))
         for row, outcome in zip(rows, outcomes, strict=True)
     ]
     successes = None
@@ -373,7 +373,7 @@ def return_matrix(
     some_task = np.repeat(tasks[:1], n_episodes * len(latents), axis=0)
     features = rollout_features(model, vec_env, np.tile(latents, (n_episodes, 1)), some_task, seed, deterministic)
     totals = np.stack(
-        [compute_reward(vec_env, tasks[:, None, :], episode[None, :, :]).sum(axis=1) for episode in features], axis=1
+        [compute_rewards(vec_env, tasks[:, None, :], episode[None, :, :]).sum(axis=1) for episode in features], axis=1
     )
     return totals.reshape(len(tasks), n_episodes, len(latents)).mean(axis=1)
 

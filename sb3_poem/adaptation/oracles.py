@@ -182,7 +182,7 @@ class MistakeOracle(TaskOracle):
         return _better(left, right)
 
 
-def compute_reward(env: gym.Env | VecEnv, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
+def compute_rewards(env: gym.Env | VecEnv, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
     """
     A task family's own reward.
 
@@ -192,7 +192,7 @@ def compute_reward(env: gym.Env | VecEnv, tasks: np.ndarray, features: np.ndarra
     :return: Rewards (...).
     :raises ValueError: If the environment is no task family.
     """
-    return np.asarray(_call(env, "compute_reward", tasks, features), dtype=np.float64)
+    return np.asarray(_call(env, "compute_rewards", tasks, features), dtype=np.float64)
 
 
 def step_rewards(env: gym.Env | VecEnv, task: np.ndarray | None, trajectory: Trajectory) -> np.ndarray:
@@ -207,7 +207,7 @@ def step_rewards(env: gym.Env | VecEnv, task: np.ndarray | None, trajectory: Tra
     """
     if trajectory.reward_features is None:
         raise ValueError('the trajectory has no reward features: its environment gave no info["reward_features"]')
-    return compute_reward(env, _current_task(env) if task is None else task, trajectory.reward_features)
+    return compute_rewards(env, _current_task(env) if task is None else task, trajectory.reward_features)
 
 
 def _current_task(env: gym.Env | VecEnv) -> np.ndarray:

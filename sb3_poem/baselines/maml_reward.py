@@ -212,7 +212,7 @@ def meta_train_reward(
     fragments = replay_fragments(model, n_fragments, length, rng)
     inputs = th.stack([meta.transitions(fragment) for fragment in fragments])
     features = np.stack([np.asarray(fragment.reward_features) for fragment in fragments])
-    returns = model.family.compute_reward(model.train_tasks[:, None, None, :], features[None]).sum(axis=2)
+    returns = model.family.compute_rewards(model.train_tasks[:, None, None, :], features[None]).sum(axis=2)
     parameters = {name: value.requires_grad_() for name, value in meta.parameters.items()}
     optimizer = th.optim.Adam(parameters.values(), lr=learning_rate)
     n_tasks = min(tasks_per_batch, len(returns))

@@ -54,8 +54,8 @@ class RewardOracleOptions:
             )
         if model.context_reward_statistics is None:
             raise ValueError("`model` does not know how its contexts' rewards were standardised; train it for an epoch first")
-        if not vec_env.has_attr("compute_reward"):
-            raise ValueError("`env` must be a task family (poem_envs.TaskFamily): it has no `compute_reward`")
+        if not vec_env.has_attr("compute_rewards"):
+            raise ValueError("`env` must be a task family (poem_envs.TaskFamily): it has no `compute_rewards`")
 
     def make_inference(
         self, model: Any, rng: np.random.Generator, library: Sequence[Trajectory] | None = None

@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_poem.adaptation import AdaptedPolicy, KnownTaskReturn, Trajectory, known_task_return
 from sb3_poem.adaptation.evaluation import evaluation_seed, held_out_tasks
-from sb3_poem.adaptation.oracles import compute_reward
+from sb3_poem.adaptation.oracles import compute_rewards
 from sb3_poem.cli.outputs import check_device
 from sb3_poem.cli.packages import import_packages
 from sb3_poem.common.family import FamilyEnv
@@ -151,7 +151,7 @@ class Subject:
     def true_return(self, episode: Trajectory) -> float:
         """What an episode earns on the first task."""
         assert episode.reward_features is not None
-        return float(compute_reward(self.env, self.tasks[0], episode.reward_features).sum())
+        return float(compute_rewards(self.env, self.tasks[0], episode.reward_features).sum())
 
     def film(self, latents: Sequence[np.ndarray], captions: Sequence[str], path: Path, show_task: bool) -> None:
         """Film one policy on the first task, or two side by side from the same start.

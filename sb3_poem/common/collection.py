@@ -97,14 +97,14 @@ def collect_segment(
 
 
 def relabelled_returns(
-    compute_reward: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    compute_rewards: Callable[[np.ndarray, np.ndarray], np.ndarray],
     tasks: np.ndarray,
     features: np.ndarray,
     mask: np.ndarray,
 ) -> np.ndarray:
     """Returns of trajectories under every task, without another environment step.
 
-    :param compute_reward: The family's reward function
+    :param compute_rewards: The family's reward function
     :param tasks: (tasks, task_dim)
     :param features: (trajectories, steps, feat_dim)
     :param mask: (trajectories, steps), which steps count
@@ -112,5 +112,5 @@ def relabelled_returns(
     """
     returns = np.empty((len(tasks), len(features)))
     for index, task in enumerate(tasks):  # one row at a time bounds the memory at trajectories x steps
-        returns[index] = (compute_reward(task, features) * mask).sum(axis=1)
+        returns[index] = (compute_rewards(task, features) * mask).sum(axis=1)
     return returns

@@ -137,7 +137,7 @@ class FamilyEnv:
         self._experience_is_right = False
 
     def check_experience(self, tasks: np.ndarray, seed: int, segment: "Segment") -> None:
-        """Whether rewards are :meth:`compute_reward`'s, and unknown wrappers leave the family as it is.
+        """Whether rewards are :meth:`compute_rewards`'s, and unknown wrappers leave the family as it is.
         The first call looks, and the others take its word.
 
         :param tasks: (copies, task_dim), those of the segment
@@ -148,10 +148,10 @@ class FamilyEnv:
         if self._experience_is_right:
             return
         wrappers = self._unknown_wrappers
-        expected = self.compute_reward(tasks[:, None, :], segment.features)
+        expected = self.compute_rewards(tasks[:, None, :], segment.features)
         if expected.shape != segment.rewards.shape:
             raise ValueError(
-                f"compute_reward must give tasks {tasks[:, None, :].shape} and features "
+                f"compute_rewards must give tasks {tasks[:, None, :].shape} and features "
                 f"{segment.features.shape} rewards of shape {segment.rewards.shape}, but gave "
                 f"{expected.shape}: in _reward index the last dimension, as in tasks[..., i]"
             )
@@ -160,7 +160,7 @@ class FamilyEnv:
             copy, step = wrong[0]
             what = (
                 f"env paid {segment.rewards[copy, step]:.6g} at step {step} of copy {copy}, but "
-                f'compute_reward(task, info["reward_features"]) is {expected[copy, step]:.6g}'
+                f'compute_rewards(task, info["reward_features"]) is {expected[copy, step]:.6g}'
             )
             if wrappers:
                 raise WrapperError(f"{what}, by one of its wrappers {wrappers}")
@@ -207,9 +207,9 @@ class FamilyEnv:
         """Draw (n, task_dim) tasks from the family's distribution."""
         return np.asarray(self.env.env_method("sample_tasks", n, rng, indices=[0])[0], dtype=np.float64)
 
-    def compute_reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
+    def compute_rewards(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
         """Rewards (...) of reward features (..., feat_dim) under tasks (..., task_dim)."""
-        return np.asarray(self.env.env_method("compute_reward", tasks, features, indices=[0])[0])
+        return np.asarray(self.env.env_method("compute_rewards", tasks, features, indices=[0])[0])
 
     @property
     def has_potential(self) -> bool:

@@ -526,7 +526,7 @@ class PEARLSAC(SamplingSAC):
         generator, device, policy = self.generators.torch, self.device, self.policy
         sources = th.randint(n_tasks, (n_tasks, per_task), generator=generator, device=device)
         data = self.replay_buffer.sample_rows(sources, generator)
-        rewards = self.family.compute_reward(self.train_tasks[:, None, :], data.features.cpu().numpy())
+        rewards = self.family.compute_rewards(self.train_tasks[:, None, :], data.features.cpu().numpy())
         with th.no_grad():
             latents = th.as_tensor(self.task_latents, dtype=th.float32, device=device)
             obs, next_obs = policy.standardise(data.observations), policy.standardise(data.next_observations)

@@ -152,7 +152,7 @@ class SamplingSAC(CollectingSAC):
             return transitions
         assert self.train_tasks is not None
         features = transitions.features[:, -n_foreign:].cpu().numpy()
-        own = self.family.compute_reward(self.train_tasks[chosen][:, None, :], features)
+        own = self.family.compute_rewards(self.train_tasks[chosen][:, None, :], features)
         rewards = transitions.rewards.clone()
         rewards[:, -n_foreign:] = th.as_tensor(own, dtype=th.float32, device=self.device)
         return transitions._replace(rewards=rewards)
@@ -175,7 +175,7 @@ class SamplingSAC(CollectingSAC):
         assert self.context_reward_statistics is not None
         features = self.context.features.view(len(rewards) * steps, -1).index_select(0, rows).view(*shape, -1)
         tasks = self.train_tasks[task_ids.cpu().numpy()][:, None, :]
-        own = th.as_tensor(self.family.compute_reward(tasks, features.cpu().numpy()), dtype=th.float32, device=self.device)
+        own = th.as_tensor(self.family.compute_rewards(tasks, features.cpu().numpy()), dtype=th.float32, device=self.device)
         centre, deviation = self.context_reward_statistics
         context[..., -1] = (own - centre) / deviation
         return context, own

@@ -208,7 +208,7 @@ class POEMSAC(PEARLSAC):
         assert self.train_tasks is not None
         n_tasks = len(self.train_tasks)
         if self._relabels:
-            returns = relabelled_returns(self.family.compute_reward, self.train_tasks, epoch.features, epoch.first_episode)
+            returns = relabelled_returns(self.family.compute_rewards, self.train_tasks, epoch.features, epoch.first_episode)
             return returns.reshape(n_tasks, n_tasks, -1).mean(axis=2)
         own = super()._measure_returns(epoch, callback)
         assert own is not None

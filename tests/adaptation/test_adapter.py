@@ -121,7 +121,7 @@ def test_it_neither_reads_nor_sets_the_task():
         def task(self):
             raise AssertionError("the task was read")
 
-        def compute_reward(self, tasks, features):
+        def compute_rewards(self, tasks, features):
             raise AssertionError("rewards were computed")
 
         def reset(self, *, seed=None, options=None):

@@ -133,7 +133,7 @@ def test_winners_are_measured_on_fresh_episodes():
             return result
 
         @staticmethod
-        def compute_reward(tasks, features):
+        def compute_rewards(tasks, features):
             return features[..., 0] + 0.0 * tasks[..., 0]
 
     known = known_task_return(MODEL, DummyVecEnv([Lucky] * 10), GOALS[:3], n_latents=100, n_episodes=50)

@@ -125,7 +125,7 @@ def test_what_will_not_do(trained):
     class NoFamily(SpeedEnv):
         observation_space = trained.observation_space
         action_space = trained.action_space
-        compute_reward = property()
+        compute_rewards = property()
 
     with pytest.raises(ValueError, match="does not belong to this environment: its task_space"):
         RewardOracleAdapter(trained, DummyVecEnv([NoFamily]))

@@ -142,7 +142,7 @@ def test_relabelled_returns_are_what_the_other_tasks_environments_return(env_id:
     env = TaskVecEnv.from_id(env_id, 3, **kwargs)
     tasks = FamilyEnv(env).sample_tasks(3, np.random.default_rng(0))
     segment, _ = collect(env, tasks, seed=11)
-    relabelled = relabelled_returns(FamilyEnv(env).compute_reward, tasks, segment.features, segment.first_episode)
+    relabelled = relabelled_returns(FamilyEnv(env).compute_rewards, tasks, segment.features, segment.first_episode)
     truth = true_returns(lambda: gym.make(env_id, **kwargs), tasks, unscaled(segment, env), [11, 12, 13])
     assert segment.first_episode.all() == (env_id == POINT_GOAL)  # the others fall
     assert np.ptp(truth, axis=0).min() > 1e-3  # the tasks do differ
@@ -155,6 +155,6 @@ def test_relabelling_counts_the_marked_steps_only() -> None:
     env, tasks = walks(3, steps=8, edge=0.35), np.array([[-1.0], [0.0], [1.0]])
     segment, _ = collect(env, tasks, horizon=8)
     assert (~segment.first_episode).any()
-    relabelled = relabelled_returns(FamilyEnv(env, 8).compute_reward, tasks, segment.features, segment.first_episode)
+    relabelled = relabelled_returns(FamilyEnv(env, 8).compute_rewards, tasks, segment.features, segment.first_episode)
     truth = true_returns(lambda: gym.wrappers.TimeLimit(Walk(edge=0.35), 8), tasks, unscaled(segment, env), [3, 4, 5])
     np.testing.assert_allclose(relabelled, truth, rtol=1e-6)

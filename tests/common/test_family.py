@@ -37,7 +37,7 @@ def test_tasks_reach_the_copies_and_features_come_back(make, wrap) -> None:  # t
     features = family.features_of(infos)
     goals = np.stack([np.cos(tasks[:, 0]), np.sin(tasks[:, 0])], axis=1)
     np.testing.assert_allclose(rewards, -np.linalg.norm(features - goals, axis=1), rtol=1e-6)
-    np.testing.assert_allclose(family.compute_reward(tasks, features), rewards, rtol=1e-6)
+    np.testing.assert_allclose(family.compute_rewards(tasks, features), rewards, rtol=1e-6)
     assert np.array_equal(family.reset(tasks, seed=4), first)
     assert not np.array_equal(family.reset(tasks, seed=5), first)
 

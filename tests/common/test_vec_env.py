@@ -89,9 +89,9 @@ def test_a_copy_looks_like_a_single_environment(env_id):
         env.reset()
         assert np.array_equal(env.get_attr("task"), [other] * 3)
     features = np.random.default_rng(0).normal(size=(4, ours.get_attr("reward_feature_dim")[0]))
-    relabel = functools.partial(TaskVecEnv.env_method, method_name="compute_reward", indices=[0])
+    relabel = functools.partial(TaskVecEnv.env_method, method_name="compute_rewards", indices=[0])
     assert np.array_equal(
-        relabel(ours, tasks=task, features=features)[0], theirs.env_method("compute_reward", task, features, indices=[0])[0]
+        relabel(ours, tasks=task, features=features)[0], theirs.env_method("compute_rewards", task, features, indices=[0])[0]
     )
     ours.env_method("set_physics_state", ours.env_method("get_physics_state", indices=[0])[0], indices=[2])
     states = ours.env_method("get_physics_state")

@@ -50,7 +50,7 @@ def ahead(
         features = segment.features[copy, step].astype(np.float64)
         if symmetry is not None:
             features = symmetry.features(features)
-        total += GAMMA**k * float(model.family.compute_reward(model.train_tasks[task], features))
+        total += GAMMA**k * float(model.family.compute_rewards(model.train_tasks[task], features))
         over, after = segment.terminated[copy, step] > 0, segment.next_observations[copy, step]
         cut = step + 1 == horizon or not (segment.observations[copy, step + 1] == after).all()
         if over or cut or k + 1 == n_steps:

@@ -71,7 +71,7 @@ def test_the_vectorised_and_the_process_family_have_the_potential_of_the_single_
     single = gym.make("poem/AntGoal-v0").unwrapped
     np.testing.assert_allclose(single.compute_potential(tasks, observations), [-3.0, -1.5])
     standing = np.column_stack([observations[:, :2], np.zeros(2)])
-    np.testing.assert_allclose(single.compute_reward(tasks, standing), [-3.0, -1.5])
+    np.testing.assert_allclose(single.compute_rewards(tasks, standing), [-3.0, -1.5])
     vec_env = TaskVecEnv.from_id("poem/AntGoal-v0", 2)
     assert vec_env.get_attr("has_potential") == [True, True]
     np.testing.assert_allclose(vec_env.env_method("compute_potential", tasks, observations, indices=[0])[0], [-3.0, -1.5])

@@ -133,7 +133,7 @@ def test_in_subprocesses(wrap: Wrap, message: str) -> None:
         ("observation", "env's wrappers Own change what is seen or done"),
         ("start", "env's wrappers Own change what is seen or done"),
         ("action", "env's wrappers Own change what is seen or done"),
-        ("reward", r"env paid .* at step 0 of copy 0, but compute_reward.* is .*, by one of its wrappers Own"),
+        ("reward", r"env paid .* at step 0 of copy 0, but compute_rewards.* is .*, by one of its wrappers Own"),
     ],
 )
 @pytest.mark.parametrize("registered", [True, False])
@@ -164,7 +164,7 @@ def test_a_family_that_does_not_pay_what_it_computes() -> None:
             observation, reward, *rest = super().step(action)
             return observation, reward + 1.0, *rest
 
-    with pytest.raises(ValueError, match=r"env paid .*, but compute_reward.* is .*; .*check_task_family"):
+    with pytest.raises(ValueError, match=r"env paid .*, but compute_rewards.* is .*; .*check_task_family"):
         small(POEMSAC, Bribed(), horizon=5).learn(EPOCH)
 
 
@@ -173,7 +173,7 @@ def test_a_reward_that_does_not_broadcast() -> None:
         def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
             return -np.abs(features[0] - tasks[0]) if features.ndim == 1 else np.zeros(3)
 
-    with pytest.raises(ValueError, match=r"compute_reward must give .* rewards of shape \(1, 5\), but gave \(3,\)"):
+    with pytest.raises(ValueError, match=r"compute_rewards must give .* rewards of shape \(1, 5\), but gave \(3,\)"):
         small(POEMSAC, OneByOne(), horizon=5).learn(EPOCH)
 
 

@@ -62,7 +62,7 @@ def test_a_minimal_family_in_sb3s_own_vec_env():
     _, rewards, _, infos = vec_env.step(np.zeros((2, 1), dtype=np.float32))
     assert rewards == pytest.approx(-np.abs(start - tasks)[:, 0])
     features = np.stack([info["reward_features"] for info in infos])
-    assert vec_env.env_method("compute_reward", tasks, features, indices=[0])[0] == pytest.approx(rewards)
+    assert vec_env.env_method("compute_rewards", tasks, features, indices=[0])[0] == pytest.approx(rewards)
 
 
 @pytest.mark.filterwarnings("error", "ignore:.*A Box observation space m.*imum value is")

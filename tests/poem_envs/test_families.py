@@ -158,26 +158,26 @@ def test_wrong_tasks(env_id, wrong):
     assert np.array_equal(env.task, before)
 
 
-def test_compute_reward_broadcasts_to_the_same_bits(env_id, rng):
+def test_compute_rewards_broadcasts_to_the_same_bits(env_id, rng):
     env = make(env_id)
     tasks = np.concatenate([env.sample_tasks(2, rng) for _ in range(20)])
     features = rng.normal(0, 2, size=(7, 5, env.reward_feature_dim))
-    together = env.compute_reward(tasks[:, None, None], features)
+    together = env.compute_rewards(tasks[:, None, None], features)
     assert together.shape == (40, 7, 5)
     assert together.dtype == np.float64
-    one_by_one = [[[float(env.compute_reward(t, f)) for f in row] for row in features] for t in tasks]
+    one_by_one = [[[float(env.compute_rewards(t, f)) for f in row] for row in features] for t in tasks]
     assert np.array_equal(together, one_by_one)
-    strided = env.compute_reward(tasks[::2], np.asfortranarray(features)[0, 0])
+    strided = env.compute_rewards(tasks[::2], np.asfortranarray(features)[0, 0])
     assert np.array_equal(strided, together[::2, 0, 0])
 
 
-def test_compute_reward_refuses_wrong_dimensions(env_id):
+def test_compute_rewards_refuses_wrong_dimensions(env_id):
     env = make(env_id)
     task_dim, feature_dim = env.task_space.shape[0], env.reward_feature_dim
     with pytest.raises(ValueError, match="task_dim"):
-        env.compute_reward(np.zeros(task_dim + 1), np.zeros(feature_dim))
+        env.compute_rewards(np.zeros(task_dim + 1), np.zeros(feature_dim))
     with pytest.raises(ValueError, match="reward_feature_dim"):
-        env.compute_reward(np.zeros(task_dim), np.zeros((3, feature_dim + 1)))
+        env.compute_rewards(np.zeros(task_dim), np.zeros((3, feature_dim + 1)))
 
 
 def test_episodes_are_reproducible(env_id, rng):

@@ -30,7 +30,7 @@ def test_rewards_are_the_environments_own(env_id, own_id, reward_type, rng):
         observation, _, _, _, info = family.step(action)
         own_observation, own_reward, _, _, _ = own.step(action)
         assert np.array_equal(observation, own_observation["observation"])
-        assert family.compute_reward(other, info["reward_features"]) == pytest.approx(float(own_reward), abs=1e-12)
+        assert family.compute_rewards(other, info["reward_features"]) == pytest.approx(float(own_reward), abs=1e-12)
 
 
 def test_the_goal_is_reached_where_the_task_says(rng):
@@ -90,7 +90,7 @@ def test_a_reward_function_for_one_goal_at_a_time_is_called_for_one_after_anothe
     family = GoalFamily(OneRewardAtATime)
     goals, achieved = rng.uniform(-1, 1, (5, 2)), rng.uniform(-1, 1, (4, 2))
     expected = [[-(abs(a[0] - g[0]) + abs(a[1])) for a in achieved] for g in goals]
-    assert family.compute_reward(goals[:, None], achieved[None]) == pytest.approx(np.array(expected))
+    assert family.compute_rewards(goals[:, None], achieved[None]) == pytest.approx(np.array(expected))
 
 
 def test_what_the_observation_holds():

@@ -71,7 +71,7 @@ def test_relabelled_rewards_of_reaching_are_those_of_metaworld_with_the_other_go
         action = np.append(np.clip(10 * (other - env._sawyer.env.tcp_center), -1, 1), 0.0) if step < 50 else np.ones(4)
         _, _, _, _, info = env.step(action)
         _, own_reward, _, _, _ = own.step(action)
-        assert env.compute_reward(other, info["reward_features"]) == pytest.approx(own_reward, rel=1e-13)
+        assert env.compute_rewards(other, info["reward_features"]) == pytest.approx(own_reward, rel=1e-13)
         if step == 49:
             assert own_reward == 10.0
 

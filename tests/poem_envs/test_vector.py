@@ -152,7 +152,7 @@ def test_set_tasks(env_id, rng):
         envs.step(zeros)
         assert np.array_equal(envs.tasks, first)
     _, rewards, *_, infos = envs.step(zeros)
-    assert np.array_equal(rewards, envs.compute_reward(first, infos["reward_features"]))
+    assert np.array_equal(rewards, envs.compute_rewards(first, infos["reward_features"]))
     assert np.array_equal(envs.tasks, second)
     envs.set_tasks(first[1:2], copies=[1])
     envs.reset()
