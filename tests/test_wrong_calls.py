@@ -24,6 +24,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from poem_envs import GoalFamily, TaskFamily
 from poem_envs.point_goal import PointGoalEnv
+from poem_envs.testing import check_task_family
 from sb3_poem import (
     PEARLSAC,
     POEMSAC,
@@ -41,7 +42,6 @@ from sb3_poem import (
 )
 from sb3_poem.adaptation import AdaptedPolicy, evaluate_adaptation
 from sb3_poem.label import LabelWidget
-from sb3_poem.testing import check_task_family
 
 NAN = float("nan")
 OBS = np.zeros((3, 2))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from gymnasium.envs.registration import register
 
-from poem_envs.core import SignedPermutation, Symmetry, TaskDefinition, TaskFamily
+from poem_envs.family import SignedPermutation, Symmetry, TaskDefinition, TaskFamily
 from poem_envs.vector import BatchFamily, BatchTaskFamily, TaskFamilyVector, set_task
 
 if TYPE_CHECKING:

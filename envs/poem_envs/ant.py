@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from poem_envs.core import SignedPermutation, Symmetry
+from poem_envs.family import SignedPermutation, Symmetry
 from poem_envs.mujoco_family import MujocoFamily, MujocoTaskEnv, MujocoTaskVectorEnv
 from poem_envs.mujoco_rendering import arrow, pole
 

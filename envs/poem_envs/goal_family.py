@@ -12,7 +12,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
-from poem_envs.core import BOUNDS_TOLERANCE, TaskFamily
+from poem_envs.family import BOUNDS_TOLERANCE, TaskFamily
 from poem_envs.mujoco_rendering import prepare_to_render
 
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from poem_envs.core import TaskFamily
+from poem_envs.family import TaskFamily
 from poem_envs.mujoco_fast_rendering import renders_fast
 from poem_envs.process_vector import ProcessFamilyVector
 from poem_envs.sawyer import (

@@ -12,11 +12,10 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
-from poem_envs.cores import available_cores
 from poem_envs.mujoco_fast_rendering import FastRenderer, renders_fast
 from poem_envs.mujoco_integrator import Integrator
 from poem_envs.mujoco_rendering import StateRenderer
-from poem_envs.vector import BatchFamily, BatchTaskFamily, TaskFamilyVector
+from poem_envs.vector import BatchFamily, BatchTaskFamily, TaskFamilyVector, available_cores
 
 DEFAULT_SIZE = 480
 RENDER_MODES = ["human", "rgb_array", "depth_array", "rgbd_tuple"]

@@ -23,9 +23,8 @@ from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 
-from poem_envs.core import Symmetry, TaskFamily
-from poem_envs.cores import available_cores
-from poem_envs.vector import TaskFamilyVector
+from poem_envs.family import Symmetry, TaskFamily
+from poem_envs.vector import TaskFamilyVector, available_cores
 
 
 class EpisodeStart(NamedTuple):

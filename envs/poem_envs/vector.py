@@ -5,6 +5,7 @@ Both run the same code, the single one as a batch of one, so their results agree
 
 from __future__ import annotations
 
+import os
 from abc import abstractmethod
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -18,7 +19,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from poem_envs.core import (
+from poem_envs.family import (
     TaskDefinition,
     TaskFamily,
     check_options,
@@ -158,6 +159,13 @@ class BatchTaskFamily(BatchFamily, TaskFamily):
     def close(self) -> None:
         """Free what rendering and simulation hold."""
         self._release()
+
+
+def available_cores() -> int:
+    """The number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):

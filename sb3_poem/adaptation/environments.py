@@ -32,7 +32,7 @@ def model_and_env(model: Any, env: Env, n_copies: int = COPIES, render: bool = F
     """
     from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-    from sb3_poem.common.family import plain_id
+    from poem_envs.registration import plain_id
     from sb3_poem.common.foreign import environment_of
     from sb3_poem.common.vec_env import as_task_vec_env, make_task_vec_env
     from sb3_poem.loading import as_model

@@ -9,6 +9,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from poem_envs.vector import available_cores
+
 CODE = ("sb3_poem", "envs", "zoo_configs", "benchmarks/*.py")
 VERSIONED = ("sb3_poem", "stable_baselines3", "rl_zoo3", "torch", "gymnasium", "mujoco", "numpy")
 COMMIT_VARIABLE = "SB3_POEM_COMMIT"
@@ -54,8 +56,7 @@ def machine() -> str:
     if cpuinfo.exists():
         flags = set(next((line for line in cpuinfo.read_text().splitlines() if line.startswith("flags")), "").split())
     known = [name for name in INSTRUCTION_SETS if name in flags]
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    words = [f"{cores} of {os.cpu_count()} cores", platform.machine(), *known]
+    words = [f"{available_cores()} of {os.cpu_count()} cores", platform.machine(), *known]
     import torch as th
 
     if th.cuda.is_available():

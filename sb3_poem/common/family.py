@@ -1,7 +1,5 @@
 """What an algorithm needs to know of a task family, asked of any SB3 ``VecEnv`` of it."""
 
-import difflib
-import importlib
 from typing import TYPE_CHECKING, Any
 
 import cloudpickle
@@ -10,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from poem_envs import Symmetry
+from poem_envs.family import Symmetry, definition_problem
 from sb3_poem.common.wrappers import WrapperError, unknown_wrappers
 
 if TYPE_CHECKING:
@@ -23,26 +21,6 @@ REQUIRED_ATTRIBUTES = ("task_space", "all_tasks", "shared_dynamics", "reward_fea
 COMPARED_STEPS = 10
 
 
-def plain_id(env_id: str) -> str:
-    """An environment's id as the registry has it.
-
-    :param env_id: As for ``gym.make``: an id, or ``"module:id"``, whose module is imported first
-    :raises ModuleNotFoundError: if there is no such module
-    :raises gymnasium.error.NameNotFound: if there is no such id; the message names one like it
-    """
-    module, _, name = env_id.rpartition(":")
-    if module:
-        importlib.import_module(module)
-    if name not in gym.registry:
-        close = difflib.get_close_matches(name, gym.registry, n=1)
-        hint = f"did you mean {close[0]!r}?" if close else "nor any like it."
-        raise gym.error.NameNotFound(
-            f"No environment {name!r} is registered with Gymnasium, {hint} One of your own is "
-            "registered by an import of its module, as in 'module:id'"
-        )
-    return name
-
-
 def no_family(env: str) -> str:
     """What to say of an environment that is no task family.
 
@@ -52,36 +30,8 @@ def no_family(env: str) -> str:
         f"env {env} is no task family: an environment whose reward depends on a hidden task. "
         "Subclass poem_envs.TaskFamily, or make one of a goal-conditioned environment by "
         "poem_envs.GoalFamily; docs/families.md has both as complete programs, and "
-        "sb3_poem.testing.check_task_family says what is missing"
+        "poem_envs.testing.check_task_family says what is missing"
     )
-
-
-def definition_problem(
-    observation_space: spaces.Space,
-    action_space: spaces.Space,
-    task_space: Any,
-    reward_feature_dim: Any,
-    all_tasks: Any,
-) -> str | None:
-    """What is wrong with a family's attributes, and what would be right; None if nothing is."""
-    for name, space in (("observation_space", observation_space), ("action_space", action_space)):
-        if not isinstance(space, spaces.Box) or len(space.shape) != 1:
-            return f"{name} must be a flat gymnasium.spaces.Box, but is {space}"
-    assert isinstance(action_space, spaces.Box)
-    if not action_space.is_bounded():
-        return f"action_space must be bounded below and above, but is {action_space}"
-    flat = isinstance(task_space, spaces.Box) and len(task_space.shape) == 1
-    if not flat or task_space.dtype != np.float64:
-        return f"task_space must be a Box of shape (task_dim,) and dtype float64, but is {task_space}"
-    if not isinstance(reward_feature_dim, (int, np.integer)) or reward_feature_dim < 1:
-        return f"reward_feature_dim must be a whole number from 1 on, but is {reward_feature_dim!r}"
-    if all_tasks is not None:
-        tasks, size = np.asarray(all_tasks), task_space.shape[0]
-        if tasks.shape[1:] != (size,) or not all(task in task_space for task in tasks):
-            return f"all_tasks must have shape (n, {size}) and lie in task_space {task_space}, but is {all_tasks}"
-        if len(np.unique(tasks, axis=0)) < len(tasks):
-            return f"all_tasks must hold every task once, but is {tasks.tolist()}"
-    return None
 
 
 class FamilyEnv:
@@ -107,10 +57,11 @@ class FamilyEnv:
         attributes: list[Any] = [None if attribute in missing else self._get(attribute) for attribute in REQUIRED_ATTRIBUTES]
         task_space, self.all_tasks, shared_dynamics, feature_dim = attributes
         self._unknown_wrappers = ", ".join(unknown_wrappers(env))
-        problem = definition_problem(env.observation_space, env.action_space, task_space, feature_dim, self.all_tasks)
+        self.observation_space, self.action_space = env.observation_space, env.action_space
+        self.task_space, self.reward_feature_dim = task_space, feature_dim
+        problem = definition_problem(self)
         if problem is not None:
             raise ValueError(f"env {name}: {problem}")
-        self.task_space, self.reward_feature_dim = task_space, int(feature_dim)
         self.shared_dynamics = bool(shared_dynamics)
         self.symmetries: tuple[Symmetry, ...] = self._get("symmetries") if env.has_attr("symmetries") else ()
         spec = self._get("spec") if env.has_attr("spec") else None
@@ -164,7 +115,7 @@ class FamilyEnv:
             )
             if wrappers:
                 raise WrapperError(f"{what}, by one of its wrappers {wrappers}")
-            raise ValueError(f"{what}; sb3_poem.testing.check_task_family says what to change")
+            raise ValueError(f"{what}; poem_envs.testing.check_task_family says what to change")
         if wrappers and not self._lives_through(tasks[0], seed, segment):
             raise WrapperError(f"env's wrappers {wrappers} change what is seen or done")
         self._experience_is_right = True

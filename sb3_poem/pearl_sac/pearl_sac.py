@@ -13,9 +13,10 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import LinearSchedule
 from torch import nn
 
+from poem_envs.registration import plain_id
 from sb3_poem.common.buffers import ContextStore, TaskBatch, TaskReplayBuffer
 from sb3_poem.common.checks import check_number, check_number_or_auto, check_whole
-from sb3_poem.common.family import FamilyEnv, plain_id
+from sb3_poem.common.family import FamilyEnv
 from sb3_poem.common.precision import MixedPrecision, hidden_dtype
 from sb3_poem.common.random import Generators
 from sb3_poem.pearl_sac import losses

@@ -16,8 +16,8 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 
+from poem_envs.registration import plain_id
 from sb3_poem.common.checkpoint import is_checkpoint, read_checkpoint, restore_stores, save_checkpoint
-from sb3_poem.common.family import plain_id
 from sb3_poem.common.files import write_atomically
 from sb3_poem.common.pretrained import from_pretrained, save_pretrained
 from sb3_poem.common.vec_env import as_task_vec_env, make_task_vec_env

@@ -16,8 +16,9 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecMonitor, VecNormalize
 
+from poem_envs.registration import plain_id
 from sb3_poem import set_task
-from sb3_poem.common.family import FamilyEnv, plain_id
+from sb3_poem.common.family import FamilyEnv
 from sb3_poem.common.vec_env import TaskVecEnv, as_task_vec_env, make_task_vec_env
 
 SMALL = {"buffer_size": 500, "batch_size": 16, "policy_kwargs": {"net_arch": [8]}, "device": "cpu"}

@@ -10,7 +10,7 @@ from metaworld.types import Task
 
 import poem_envs  # noqa: F401 (registers)
 from poem_envs import sawyer
-from sb3_poem.testing import check_task_family
+from poem_envs.testing import check_task_family
 
 # The last four have starts that Meta-World computes from data that is out of date.
 MANIPULATIONS = ["reach", "push", "door-open", "box-close", "dial-turn", "lever-pull", "window-close"]

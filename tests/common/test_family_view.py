@@ -69,10 +69,10 @@ def test_observations_must_be_flat(space: spaces.Space) -> None:
 @pytest.mark.parametrize(
     ("space", "message"),
     [
-        (spaces.Discrete(3), r"must be a flat gymnasium\.spaces\.Box, but is Discrete\(3\)"),
-        (spaces.Box(-np.inf, np.inf, (1,)), "must be bounded below and above"),
-        (spaces.Box(0.0, np.inf, (1,)), "must be bounded below and above"),
-        (spaces.Box(-np.inf, 0.0, (1,)), "must be bounded below and above"),
+        (spaces.Discrete(3), r"must be a flat gymnasium\.spaces\.Box, bounded .*, but is Discrete\(3\)"),
+        (spaces.Box(-np.inf, np.inf, (1,)), "must be a flat .*, bounded below and above, but is"),
+        (spaces.Box(0.0, np.inf, (1,)), "must be a flat .*, bounded below and above, but is"),
+        (spaces.Box(-np.inf, 0.0, (1,)), "must be a flat .*, bounded below and above, but is"),
     ],
 )
 def test_actions_must_be_bounded(space: spaces.Space, message: str) -> None:

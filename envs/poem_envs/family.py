@@ -211,6 +211,34 @@ REQUIRED_ATTRIBUTES = {
 }
 
 
+def definition_problem(family: Any) -> str | None:
+    """What is wrong with a family's attributes, and what would be right; None if nothing is."""
+    given: dict[str, Any] = {name: getattr(family, name, None) for name in REQUIRED_ATTRIBUTES}
+    action_space, task_space = given["action_space"], given["task_space"]
+    feature_dim = given["reward_feature_dim"]
+    fits = {
+        "observation_space": _is_flat(given["observation_space"]),
+        "action_space": _is_flat(action_space) and action_space.is_bounded(),
+        "task_space": _is_flat(task_space) and task_space.dtype == np.float64,
+        "reward_feature_dim": isinstance(feature_dim, (int, np.integer)) and feature_dim >= 1,
+    }
+    for name, what in REQUIRED_ATTRIBUTES.items():
+        if not fits[name]:
+            return f"{name} must be {what}, but is {given[name]!r}"
+    all_tasks = getattr(family, "all_tasks", None)
+    if all_tasks is not None:
+        tasks, size = np.asarray(all_tasks), task_space.shape[0]
+        if tasks.shape[1:] != (size,) or not all(task in task_space for task in tasks):
+            return f"all_tasks must have shape (n, {size}) and lie in task_space {task_space}, but is {all_tasks}"
+        if len(np.unique(tasks, axis=0)) < len(tasks):
+            return f"all_tasks must hold every task once, but is {tasks.tolist()}"
+    return None
+
+
+def _is_flat(space: Any) -> bool:
+    return isinstance(space, spaces.Box) and len(space.shape) == 1
+
+
 class _FamilyType(ABCMeta):
     """Looks at a family when it is made, whether or not its constructor called ``super().__init__``."""
 

@@ -11,8 +11,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from poem_envs import TaskFamily, TaskFamilyVector
-from sb3_poem.common.family import definition_problem, plain_id
+from poem_envs.family import TaskFamily, definition_problem
+from poem_envs.registration import plain_id
+from poem_envs.vector import TaskFamilyVector
 
 MakeFamily = Callable[..., Any]
 
@@ -71,10 +72,9 @@ class Episode:
 def check_spaces(make: MakeFamily, seed: int) -> None:
     """Boxes of the right shapes and types, which hold what the environment returns."""
     env = make()
-    dim, task_space = getattr(env, "reward_feature_dim", None), getattr(env, "task_space", None)
-    observation_space, action_space = env.observation_space, env.action_space
-    problem = definition_problem(observation_space, action_space, task_space, dim, env.all_tasks)
+    problem = definition_problem(env)
     assert problem is None, problem
+    dim = env.reward_feature_dim
     observation, _ = env.reset(seed=seed)
     _check_observation(observation, env, "reset")
     observation, reward, _, _, info = env.step(_actions(env, 1, seed)[0])
