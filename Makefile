@@ -20,7 +20,7 @@ help:
 	@echo "make test-all  the default suite and the slow tests"
 	@echo "make lint      ruff and mypy"
 	@echo "make format    let ruff format the code"
-	@echo "make bench     the benchmarks of speed and memory; tables go to benchmarks/results/"
+	@echo "make bench     the benchmarks of speed and memory; tables go to benchmarks/results/speed/"
 	@echo "make bench-gpu the same of what runs on a CUDA device"
 	@echo "make venv      only set up $(VENV)"
 	@echo "make wheel     build the distribution in dist/"

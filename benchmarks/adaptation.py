@@ -4,7 +4,7 @@
 
 For every seed: ``sb3-poem train`` (continued from its checkpoint if it was interrupted, skipped if it is done), then
 ``sb3-poem adapt`` for each rule and source of candidates, on 30 fresh test tasks with 10 episodes each. The result is
-``benchmarks/results/adaptation-<Family>.json`` and a table of the same name in Markdown.
+``benchmarks/results/<Family>/adaptation.json`` and a table of the same name in Markdown.
 """
 
 import argparse
@@ -155,7 +155,7 @@ def main() -> None:
     parser.add_argument("--train-args", nargs=argparse.REMAINDER, default=[], help="further arguments of sb3-poem train")
     arguments = parser.parse_args()
     family = family_of(arguments.env_id)
-    record = RESULTS / f"adaptation-{family}.json"
+    record = RESULTS / family / "adaptation.json"
     by_seed = {run["training"]["seed"]: run for run in json.loads(record.read_text())["runs"]} if record.exists() else {}
     for seed in arguments.seeds:
         folder = arguments.runs / family / f"seed{seed}"
@@ -172,8 +172,8 @@ def main() -> None:
             "order": order_on_test_tasks(arguments.env_id, model, test_seed),
         }
         runs = [by_seed[key] for key in sorted(by_seed)]
-        RESULTS.mkdir(exist_ok=True)
-        record.write_text(json.dumps({"env_id": arguments.env_id, "runs": runs}, indent=1))
+        record.parent.mkdir(parents=True, exist_ok=True)
+        record.write_text(json.dumps({"env_id": arguments.env_id, "runs": runs}))
         record.with_suffix(".md").write_text(table(arguments.env_id, runs))
     print(record.with_suffix(".md").read_text())
 

@@ -15,6 +15,7 @@ from typing import Any
 from sb3_poem.benchmark.provenance import commit, machine
 
 RESULTS = Path(__file__).parent / "results"
+SPEED = RESULTS / "speed"
 
 
 def arguments(description: str | None, add: Callable[[argparse.ArgumentParser], None] | None = None) -> argparse.Namespace:
@@ -24,7 +25,7 @@ def arguments(description: str | None, add: Callable[[argparse.ArgumentParser], 
     :param add: Adds the script's own arguments
     """
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the results")
+    parser.add_argument("--out", type=Path, default=SPEED, help="folder of the results")
     if add is not None:
         add(parser)
     return parser.parse_args()

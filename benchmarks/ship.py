@@ -16,7 +16,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--runs", type=Path, default=Path("logs/benchmark"))
     arguments = parser.parse_args()
-    results = json.loads((REPOSITORY / f"benchmarks/results/adaptation-{arguments.family}.json").read_text())
+    results = json.loads((REPOSITORY / f"benchmarks/results/{arguments.family}/adaptation.json").read_text())
     run = next(run for run in results["runs"] if run["training"]["seed"] == arguments.seed)
     folder = arguments.runs / arguments.family / f"seed{arguments.seed}"
     model = load_model(str(sorted(folder.glob(f"*/*/poem-{arguments.family}-v0.zip"))[-1]))

@@ -2,7 +2,8 @@
 
     python benchmarks/straight_to_goal.py
 
-On the 30 test tasks of ``benchmarks/adaptation.py``, an episode each; writes ``benchmarks/results/straight-to-goal.md``.
+On the 30 test tasks of ``benchmarks/adaptation.py``, an episode each; writes
+``benchmarks/results/MetaWorldML1/straight-to-goal.md``.
 """
 
 import gymnasium as gym
@@ -42,7 +43,7 @@ def main() -> None:
         success = np.mean([succeeded for _, succeeded in outcomes])
         lines.append(f"| {gain:g} | {returns.mean():.1f} | {returns.min():.1f} | {returns.max():.1f} | {success:.2f} |")
     lines += ["", f"By `benchmarks/straight_to_goal.py` at {commit()}. Machine: {machine()}."]
-    (RESULTS / "straight-to-goal.md").write_text("\n".join(lines) + "\n")
+    (RESULTS / "MetaWorldML1" / "straight-to-goal.md").write_text("\n".join(lines) + "\n")
     print("\n".join(lines))
 
 

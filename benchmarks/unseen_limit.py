@@ -4,7 +4,7 @@
 
 The tables' limit takes the 2^k policies that are best for the 30 test tasks. Here they are the 2^k that are best for many
 other tasks of the family; then each test task gets the best of them, as if k answers could tell which that is. Policies,
-episodes and test tasks are those of the benchmark's cells. Writes ``benchmarks/results/unseen-limit-<Family>.md``.
+episodes and test tasks are those of the benchmark's cells. Writes ``benchmarks/results/<Family>/unseen-limit.md``.
 """
 
 import argparse
@@ -76,7 +76,8 @@ def main() -> None:
         f"By `benchmarks/unseen_limit.py {given.family} --seeds {' '.join(map(str, given.seeds))} --others {given.others} "
         f"--models ...` at {commit()}. Machine: {machine()}.",
     ]
-    out = RESULTS / f"unseen-limit-{given.family}.md"
+    out = RESULTS / given.family / "unseen-limit.md"
+    out.parent.mkdir(exist_ok=True)
     out.write_text("\n".join(lines) + "\n")
     print(out.read_text())
 

@@ -2,7 +2,7 @@
 
 python benchmarks/work_queue.py [--device cuda --conf zoo_configs/poem_sac_paper.yml] [--runs logs/benchmark]
 
-A seed is done when `results/adaptation-<Family>.json` holds it. What was interrupted goes on from its last checkpoint in
+A seed is done when `results/<Family>/adaptation.json` holds it. What was interrupted goes on from its last checkpoint in
 `--runs`; an entry that fails is reported at the end, after the others.
 """
 
@@ -21,7 +21,7 @@ HERE = Path(__file__).parent
 
 def missing_seeds(entry: dict[str, Any]) -> list[int]:
     """Seeds of an entry that have no record."""
-    file = RESULTS / f"adaptation-{family_of(entry['env'])}.json"
+    file = RESULTS / family_of(entry["env"]) / "adaptation.json"
     recorded = {run["training"]["seed"] for run in json.loads(file.read_text())["runs"]} if file.exists() else set()
     return [seed for seed in entry["seeds"] if seed not in recorded]
 

@@ -106,3 +106,24 @@ def test_readme_s_commands_run(folder: Path, monkeypatch: pytest.MonkeyPatch, ca
 def test_every_kind_of_command_is_shown() -> None:
     shown = {command.split()[1] for page in PAGES for command in commands(page)}
     assert {"train", "enjoy", "adapt", "label", "benchmark", "record-video", "models"} <= shown
+
+
+LINKED = ("README.md", "docs/*.md", "pretrained/*/README.md", "benchmarks/results/**/*.md")
+
+
+def test_every_relative_link_leads_somewhere() -> None:
+    pages = [page for pattern in LINKED for page in TOP.glob(pattern)]
+    assert len(pages) > 60
+    for page in pages:
+        for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text()):
+            assert "://" in target or (page.parent / target).exists(), f"{page.relative_to(TOP)}: {target}"
+
+
+def test_results_are_small_and_listed() -> None:
+    """Each folder's manifest names its files, pages their data."""
+    results = TOP / "benchmarks/results"
+    files = [file for file in results.rglob("*") if file.is_file() and file.suffix != ".pdf"]
+    assert sum(file.stat().st_size for file in files) < 4e6
+    for file in files:
+        manifest = (file.parent / "manifest.md").read_text()
+        assert file.name == "manifest.md" or f"({file.name})" in manifest, file.relative_to(TOP)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -17,8 +18,22 @@ from sqlalchemy.schema import CreateTable
 
 from sb3_poem import __version__
 
-SCHEMA = "1"
+SCHEMA = "2"
 BUSY_SECONDS = 120
+
+
+class _Packed(sa.types.TypeDecorator[dict[str, Any]]):
+    """JSON, compressed: a record's result is mostly a matrix of returns."""
+
+    impl = sa.LargeBinary
+    cache_ok = True
+
+    def process_bind_param(self, value: Any, dialect: sa.Dialect) -> bytes:
+        return zlib.compress(json.dumps(value, sort_keys=True, allow_nan=False).encode(), 9)
+
+    def process_result_value(self, value: Any, dialect: sa.Dialect) -> dict[str, Any]:
+        return json.loads(zlib.decompress(value))
+
 
 _METADATA = sa.MetaData()
 _ABOUT = sa.Table(
@@ -32,9 +47,9 @@ _CELLS = sa.Table(
     sa.Column("method", sa.String, nullable=False),
     sa.Column("seed", sa.Integer, nullable=False),
     sa.Column("created", sa.String, nullable=False),
-    sa.Column("identity", sa.String, nullable=False),
-    sa.Column("result", sa.String, nullable=False),
-    sa.Column("provenance", sa.String, nullable=False),
+    sa.Column("identity", _Packed, nullable=False),
+    sa.Column("result", _Packed, nullable=False),
+    sa.Column("provenance", _Packed, nullable=False),
 )
 
 
@@ -147,8 +162,6 @@ class Store:
         :return: Whether it is new; if not, what is there stays.
         """
         row = record.to_dict()
-        for name in ("identity", "result", "provenance"):
-            row[name] = json.dumps(row[name], sort_keys=True, allow_nan=False)
         row["created"] = record.created or datetime.now(UTC).isoformat(timespec="seconds")
         with self._engine.begin() as connection:
             return connection.execute(insert(_CELLS).on_conflict_do_nothing(), row).rowcount == 1
@@ -166,5 +179,4 @@ class Store:
             rows = connection.execute(sa.select(_CELLS).order_by(*order)).mappings().all()
         for row in rows:
             if wanted is None or row["key"] in wanted:
-                parsed = {name: json.loads(row[name]) for name in ("identity", "result", "provenance")}
-                yield Record(**{**row, **parsed})
+                yield Record(**row)

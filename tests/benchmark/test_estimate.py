@@ -30,7 +30,7 @@ def pace_of(records: list[Record]) -> Pace:
 
 
 def test_the_estimate_of_the_smoke_suite_is_within_a_factor_of_two() -> None:
-    with Store(RESULTS / "smoke" / "smoke.sqlite", create=False) as store:
+    with Store(RESULTS / "PointGoal" / "benchmark.sqlite", create=False) as store:
         records = {record.key: record for record in store.records()}
     pace = pace_of(list(records.values()))
     cells = SUITES["smoke"].cells(["poem/PointGoal-v0"], range(3))

@@ -57,7 +57,7 @@ def test_another_version_is_refused_by_name(tmp_path: Path) -> None:
     with sqlite3.connect(path) as connection:
         connection.execute("update about set value = '7' where name = 'schema'")
         connection.execute("update about set value = '9.9' where name = 'version'")
-    with pytest.raises(ValueError, match=r"written in schema '7' by sb3_poem '9.9', but this is .* which reads schema '1'"):
+    with pytest.raises(ValueError, match=r"written in schema '7' by sb3_poem '9.9', but this is .* which reads schema '2'"):
         Store(path)
 
 
