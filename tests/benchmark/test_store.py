@@ -1,8 +1,11 @@
 """The store: versions, foreign files, and several processes at once."""
 
+import json
 import sqlite3
 import subprocess
 import sys
+import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +30,18 @@ def test_a_record_comes_back_as_it_was(tmp_path: Path) -> None:
         [read] = store.records()
     assert {**read.to_dict(), "created": ""} == record.to_dict()
     assert read.created.endswith("+00:00")
+
+
+def test_what_is_kept_is_compressed_json(tmp_path: Path) -> None:
+    path, matrix = tmp_path / "store.sqlite", (np.arange(6000.0).reshape(30, 200) / 100).tolist()
+    record = replace(some_record(1), result={"candidate_returns": matrix})
+    with Store(path) as store:
+        store.add(record)
+        assert [read.result for read in store.records()] == [record.result]
+    with sqlite3.connect(path) as connection:
+        [packed] = connection.execute("select result from cells").fetchone()
+    assert json.loads(zlib.decompress(packed)) == record.result
+    assert len(packed) < len(json.dumps(matrix)) / 2
 
 
 def test_what_is_there_stays(tmp_path: Path) -> None:
