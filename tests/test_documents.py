@@ -120,7 +120,7 @@ def test_every_relative_link_leads_somewhere() -> None:
 
 
 def test_results_are_small_and_listed() -> None:
-    """Each folder's manifest names its files, pages their data."""
+    """Each folder has a manifest that names its files: with the command, and the commit that it ran at."""
     results = TOP / "benchmarks/results"
     files = [file for file in results.rglob("*") if file.is_file() and file.suffix != ".pdf"]
     assert sum(file.stat().st_size for file in files) < 4e6
