@@ -32,8 +32,8 @@ STEPS = 200
 def make_model(latent_dim: int) -> POEMSAC:
     model = POEMSAC("MlpPolicy", "poem/HalfCheetahVel-v0", n_train_tasks=2, latent_dim=latent_dim, seed=0, device="cpu")
     model.predicted_rewards_error = 0.05  # a trained model's; an untrained one has measured none
-    model.latent_means = np.random.default_rng(0).standard_normal((120, latent_dim))
-    model.latent_variances = np.full((120, latent_dim), 0.01)
+    means = np.random.default_rng(0).standard_normal((120, latent_dim))
+    model.train_tasks.set_posteriors(means, np.full((120, latent_dim), 0.01))
     return model
 
 

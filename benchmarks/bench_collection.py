@@ -97,13 +97,11 @@ def training(model: POEMSAC) -> Callable[[], None]:
     _, callback = model._setup_learn(10**9, None)
     callback.on_training_start({}, {})
     model.family.horizon = STEPS
-    assert model.train_tasks is not None
-    tasks, ids, latents = model.train_tasks, np.arange(N_TASKS), np.zeros((N_TASKS, model.latent_dim))
+    collector = model.make_collector(callback)
+    ids, latents = np.arange(N_TASKS), np.zeros((N_TASKS, model.latent_dim))
 
     def collect() -> None:
-        segment = model._collect(callback, ids, tasks, latents)
-        assert segment is not None
-        model.replay_buffer.extend(segment)
+        assert collector.roll_out(ids, latents) is not None
 
     return collect
 

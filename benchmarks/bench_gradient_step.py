@@ -80,18 +80,19 @@ def compare_losses(model: POEMSAC, plain: PlainPOEM, size: dict[str, Any]) -> di
 
     :raises AssertionError: if one differs by more than float32 explains
     """
-    batch = model._sample_meta_batches(1, size["batch"])[0]
+    batch = model.make_sampler().sample(1, size["batch"])[0]
     noises = [batch.latent_noise, batch.next_action_noise, batch.action_noise]
     theirs = plain.losses(list(batch.transitions[:5]), batch.context, batch.context_rewards, batch.returns, noises)
     with th.no_grad():
         mean, variance = model.policy.encoder(batch.context)
-        embeddings = model._embed(mean + variance.sqrt() * noises[0])
-        data, alpha = model._standardise(batch.transitions), model._entropy_coefficient()
-        scale = 1.0 / model.policy.reward_std
+        objective = model.make_objective()
+        embeddings = objective.embed(mean + variance.sqrt() * noises[0])
+        data, alpha = objective.standardised(batch.transitions), model.entropy_coefficient.value
+        scale = 1.0 / model.policy.reward_norm.std
         critic = losses.critic_loss(model.policy, data, embeddings, alpha, model.gamma, scale, noises[1])
         actor, log_prob = losses.actor_loss(model.policy, data, embeddings, alpha, noises[2])
-        decoder = model._decoder_loss(batch, data, embeddings)
-        preference = model._embedding_loss(batch, embeddings)[1]["preference_loss"]
+        decoder = objective.decoder_loss(batch, data, embeddings)
+        preference = objective.embedding_loss(batch, embeddings)[1]["preference_loss"]
         ours = [critic, actor, decoder, losses.kl_to_prior(mean, variance).mean(), preference, log_prob]
     names = ("critic", "actor", "decoder", "kl", "preference", "log_prob")
     differences = {
@@ -151,9 +152,9 @@ def products_of_a_step(model: POEMSAC, size: dict[str, Any]) -> Products:
     networks = th.nn.ModuleList([policy.encoder, policy.decoder, policy.actor, policy.critic, policy.critic_target])
     with MixedPrecision(networks, model.hidden_dtype) as precision:
         precision.refresh()
-        batch = model._sample_meta_batches(1, size["batch"])[0]
+        batch = model.make_sampler().sample(1, size["batch"])[0]
         with products:
-            model._losses(batch)[0].backward()
+            model.make_objective().loss(batch, model.entropy_coefficient.value)[0].backward()
     policy.optimizer.zero_grad(set_to_none=True)
     return products
 

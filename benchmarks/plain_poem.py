@@ -23,9 +23,9 @@ class TaskData:
         sources = th.full((1, TRANSITIONS_PER_TASK), task, device=model.device)
         stored = model.replay_buffer.sample_rows(sources, model.generators.torch)
         self.fields = [field[0].cpu().numpy().copy() for field in stored[:5]]
-        assert model.context is not None
-        self.context = model.context.transitions[task].cpu().numpy().copy()
-        self.context_rewards = model.context.rewards[task].cpu().numpy().copy()
+        assert model.epoch_context is not None
+        self.context = model.epoch_context.transitions[task].cpu().numpy().copy()
+        self.context_rewards = model.epoch_context.rewards[task].cpu().numpy().copy()
 
     def sample(self, rng: np.random.Generator, batch_size: int) -> list[th.Tensor]:
         picks = rng.integers(len(self.fields[0]), size=batch_size)
@@ -55,13 +55,13 @@ class PlainPOEM:
         trained = [self.encoder, self.decoder, self.policy_embedding, self.reward_embedding, self.actor, *self.critics]
         self.optimizers = [th.optim.Adam(network.parameters(), lr=rate) for network in trained]
         self.alpha_optimizer = th.optim.Adam([self.log_alpha], lr=rate)
-        assert model.context is not None
-        self.returns = model.context.returns.cpu()
+        assert model.epoch_context is not None
+        self.returns = model.epoch_context.returns.cpu()
         self.data = [TaskData(model, task) for task in range(len(self.returns))]
         self.rng = np.random.default_rng(seed)
-        self.obs_mean, self.obs_std = policy.obs_mean.cpu(), policy.obs_std.cpu()
-        self.reward_mean, self.reward_std = policy.reward_mean.cpu(), policy.reward_std.cpu()
-        self.reward_variance = model.context.rewards.var().cpu()
+        self.obs_mean, self.obs_std = policy.obs_norm.mean.cpu(), policy.obs_norm.std.cpu()
+        self.reward_mean, self.reward_std = policy.reward_norm.mean.cpu(), policy.reward_norm.std.cpu()
+        self.reward_variance = model.epoch_context.rewards.var().cpu()
 
     def step(self, n_tasks: int, batch_size: int) -> None:
         """Sample a meta-batch, and update every network once."""

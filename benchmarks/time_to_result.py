@@ -19,9 +19,9 @@ from rl_zoo3.utils import linear_schedule
 
 from sb3_poem import POEMSAC
 from sb3_poem.adaptation.evaluation import evaluate_adaptation
-from sb3_poem.common.callbacks import EpochCallback
 from sb3_poem.common.family import FamilyEnv
 from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.pearl_sac.callbacks import EpochCallback
 from sb3_poem.resources import zoo_entry
 
 N_TASKS, N_EPISODES, N_QUERIES = 30, 10, 10

@@ -20,8 +20,8 @@ from common import available_device
 from stable_baselines3.common.utils import ConstantSchedule
 
 from sb3_poem import POEMSAC
-from sb3_poem.common.callbacks import EpochCallback
 from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.pearl_sac.callbacks import EpochCallback
 from sb3_poem.resources import zoo_entry
 
 SHOWN = (
@@ -34,8 +34,6 @@ SHOWN = (
     "collection_fps",
     "updates_per_second",
 )
-#: Arguments whose attribute has another name
-ATTRIBUTES = {"n_steps": "target_steps"}
 
 
 class Clock(EpochCallback):
@@ -98,7 +96,7 @@ def make_model(entry: dict[str, Any], env: TaskVecEnv, start: Path | None, seed:
             for parameter in critic.output.parameters():
                 parameter *= (1.0 - model.gamma) / (1.0 - entry.get("gamma", model.gamma))
     for name in entry.keys() - {"policy", "policy_kwargs", "ent_coef"}:  # which belong to the weights
-        setattr(model, ATTRIBUTES.get(name, name), entry[name])
+        setattr(model, name, entry[name])
     return model
 
 

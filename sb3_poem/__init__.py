@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     )
     from sb3_poem.adaptation.callback import AdaptationEvalCallback
     from sb3_poem.baselines import ANOLEAdapter, MAMLRewardAdapter, RewardOracleAdapter
-    from sb3_poem.common.callbacks import TrainingCheckpointCallback
     from sb3_poem.common.vec_env import TaskVecEnv
     from sb3_poem.pearl_sac import PEARLSAC
+    from sb3_poem.pearl_sac.callbacks import TrainingCheckpointCallback
     from sb3_poem.poem_sac import POEMSAC
 
 __version__ = Path(__file__).with_name("version.txt").read_text().strip()
@@ -43,7 +43,7 @@ _HOME = {
     "HumanOracle": "sb3_poem.adaptation",
     "TaskVecEnv": "sb3_poem.common.vec_env",
     "AdaptationEvalCallback": "sb3_poem.adaptation.callback",
-    "TrainingCheckpointCallback": "sb3_poem.common.callbacks",
+    "TrainingCheckpointCallback": "sb3_poem.pearl_sac.callbacks",
 }
 
 __all__ = [

@@ -1,15 +1,12 @@
 """A model from its name: a file, a folder, or one that ships with the package."""
 
-import json
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import torch as th
 
-from sb3_poem.common.checkpoint import is_checkpoint, read_checkpoint
-from sb3_poem.common.pretrained import read_config
 from sb3_poem.pearl_sac import PEARLSAC
+from sb3_poem.pearl_sac.saving import algorithm_of, is_checkpoint, read_checkpoint, read_config
 from sb3_poem.poem_sac import POEMSAC
 from sb3_poem.resources import find_folder, pretrained_names
 
@@ -51,7 +48,8 @@ def load_model(name: str | Path, device: th.device | str = "auto") -> PEARLSAC:
     if archive.is_file():
         if is_checkpoint(archive):
             return _class_named(read_checkpoint(archive)["algorithm"], archive).load_checkpoint(archive, device=device)
-        return _algorithm_of(archive).load(archive, device=device)
+        # where that cannot be told, POEMSAC.load says what is wrong with the file
+        return BY_CLASS_NAME.get(algorithm_of(archive), POEMSAC).load(archive, device=device)
     path = find_folder(path)
     return _class_named(read_config(path)["algorithm"], path).from_pretrained(path, device=device)
 
@@ -60,13 +58,3 @@ def _class_named(name: str, path: Path) -> type[PEARLSAC]:
     if name not in BY_CLASS_NAME:
         raise ValueError(f"{path} holds a {name}, known are {', '.join(BY_CLASS_NAME)}")
     return BY_CLASS_NAME[name]
-
-
-def _algorithm_of(archive: Path) -> type[PEARLSAC]:
-    """Whose model a file holds; where that cannot be told, ``POEMSAC.load`` says what is wrong with the file."""
-    try:
-        with zipfile.ZipFile(archive) as file:
-            data = json.loads(file.read("data"))
-    except (zipfile.BadZipFile, KeyError, ValueError):
-        return POEMSAC
-    return POEMSAC if "preference_coef" in data else PEARLSAC

@@ -70,8 +70,8 @@ def of_model(model: PEARLSAC) -> str:
     arrays += [model.predict(observations, latents, deterministic=True)[0]]
     arrays += [model.sample_latents(9, np.random.default_rng(4), source) for source in ("prior", "aggregate")]
     if isinstance(model, POEMSAC):
-        arrays.append(model.similarity(latents, latents))
-    return digest([*arrays, model.train_tasks, model.task_latents])
+        arrays.append(model.similarities(latents, latents))
+    return digest([*arrays, model.train_tasks.tasks, model.task_latents])
 
 
 def trained(name: str) -> PEARLSAC:

@@ -217,14 +217,14 @@ def point_goal_bounds(tasks: np.ndarray) -> tuple[float, float]:
 def assert_same_model(one: PEARLSAC, two: PEARLSAC) -> None:
     """The same weights, tasks, latents, counters, actions and, of POEM, similarities."""
     assert not differing(parameters(one), parameters(two))
-    for name in ("train_tasks", "latent_means", "latent_variances", "task_latents"):
-        assert np.array_equal(getattr(one, name), getattr(two, name)), name
+    for name, value in vars(one.train_tasks).items():
+        assert np.array_equal(value, getattr(two.train_tasks, name)), name
     for name in ("num_timesteps", "epoch", "env_id", "horizon", "predicted_rewards_error", "seed", "_n_updates"):
         assert getattr(one, name) == getattr(two, name), name
     latents, obs = np.random.default_rng(1).normal(size=(6, 5)), np.random.default_rng(0).normal(size=(6, 2))
     assert np.array_equal(one.predict(obs, latents, deterministic=True)[0], two.predict(obs, latents, deterministic=True)[0])
     if isinstance(one, POEMSAC):
-        assert np.array_equal(one.similarity(latents, latents), two.similarity(latents, latents))
+        assert np.array_equal(one.similarities(latents, latents), two.similarities(latents, latents))
     for source in ("prior", "aggregate"):
         draws = [model.sample_latents(9, np.random.default_rng(4), source) for model in (one, two)]
         assert np.array_equal(*draws)

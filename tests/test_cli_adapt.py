@@ -116,7 +116,7 @@ def test_same_seed_same_result_and_fresh_tasks(model: tuple[POEMSAC, str], tmp_p
     assert results[0]["task_returns"] == results[1]["task_returns"]
     assert results[0]["tasks"] != results[2]["tasks"]
     assert model[0].seed == 3
-    assert not np.isin(np.array(results[0]["tasks"]), model[0].train_tasks).any()
+    assert not np.isin(np.array(results[0]["tasks"]), model[0].train_tasks.tasks).any()
 
 
 def test_pretrained_folder_and_the_other_algorithm(model: tuple[POEMSAC, str], tmp_path: Path) -> None:

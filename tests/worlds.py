@@ -148,7 +148,7 @@ class SpeedModel:
     def speed(latents: np.ndarray) -> np.ndarray:
         return TOP_SPEED * ndtr(np.asarray(latents)[..., 0])
 
-    def similarity(self, task_latents: np.ndarray, policy_latents: np.ndarray) -> np.ndarray:
+    def similarities(self, task_latents: np.ndarray, policy_latents: np.ndarray) -> np.ndarray:
         goal, speed = self.speed(task_latents), self.speed(policy_latents)
         reward_embedding = np.stack([goal, np.ones_like(goal)], axis=1)
         policy_embedding = np.stack([2.0 * speed, -(speed**2)], axis=1)

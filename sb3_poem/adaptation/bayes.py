@@ -134,7 +134,7 @@ class BayesInference(LatentInference):
         library: Sequence[Trajectory] | None = None,
     ) -> None:
         super().__init__(model, n_candidates, epsilon, candidates, query_rule, rng or np.random.default_rng())
-        self.has_similarity = hasattr(model, "similarity")
+        self.has_similarity = hasattr(model, "similarities")
         self.likelihood = _check_likelihood(model, likelihood)
         if decision not in DECISIONS:
             raise ValueError(f"`decision` must be one of {DECISIONS}, but is {decision!r}")
@@ -173,7 +173,7 @@ class BayesInference(LatentInference):
             first, second = draw_random_pair(len(policies), self.rng)
             return policies[first], policies[second]
         particles, weights = self._query_particles()
-        similarities = self.model.similarity(particles, policies)
+        similarities = self.model.similarities(particles, policies)
         if self.query_rule == "worst-case":
             first, second = worst_case_pair(similarities, self.epsilon, weights)
         else:
@@ -237,7 +237,7 @@ class BayesInference(LatentInference):
         """The spread of S's differences, and the unit in which a difference counts as one logistic unit of doubt."""
         if not self.has_similarity:
             return 1.0, 1.0
-        similarities = self.model.similarity(self.particles, self.particles)
+        similarities = self.model.similarities(self.particles, self.particles)
         # Twice the variance within a row is the mean squared difference of two of its entries.
         spread = float(np.sqrt(2.0 * similarities.var(axis=1).mean()))
         return max(spread, 1e-12), max(1.0, SIMILARITY_RESOLUTION * spread / PROBIT_SLOPE)
@@ -275,7 +275,7 @@ class BayesInference(LatentInference):
             if new and self.has_similarity:
                 self._calibrate(latents, shown, values)
         else:
-            values = self.model.similarity(latents, np.stack([latent_of(item) for item in shown]))
+            values = self.model.similarities(latents, np.stack([latent_of(item) for item in shown]))
             difference = values[:, 0::2] - values[:, 1::2]
             error, magnitude = self._unit * PROBIT_SLOPE, 2.0 * self._spread
         probability = self.noise_model.probability_left(difference, error, magnitude)
@@ -295,7 +295,7 @@ class BayesInference(LatentInference):
         return np.array([Thinning()] * (n - len(known)) + known)
 
     def _calibrate(self, latents: np.ndarray, shown: Sequence[Shown], returns: np.ndarray) -> None:
-        similarities = self.model.similarity(latents, np.stack([latent_of(item) for item in shown]))
+        similarities = self.model.similarities(latents, np.stack([latent_of(item) for item in shown]))
         s = similarities[:, 0] - similarities[:, 1]
         magnitude = np.abs(returns).sum(axis=1).mean()
         self._calibration += [s @ (returns[:, 0] - returns[:, 1]), s @ s, magnitude, 1.0]
@@ -377,8 +377,8 @@ def _check_likelihood(model: Any, likelihood: str | None) -> str:
     if likelihood not in LIKELIHOODS:
         raise ValueError(f"`likelihood` must be one of {LIKELIHOODS}, but is {likelihood!r}")
     name = type(model).__name__
-    if likelihood == "similarity" and not hasattr(model, "similarity"):
-        raise ValueError(f'likelihood="similarity" needs a model with `similarity` (POEMSAC); {name} has none')
+    if likelihood == "similarity" and not hasattr(model, "similarities"):
+        raise ValueError(f'likelihood="similarity" needs a model with `similarities` (POEMSAC); {name} has none')
     if likelihood == "decoder" and not decoder_is_known:
         raise ValueError(
             f'likelihood="decoder" needs a model with `predicted_returns` and a finite `predicted_rewards_error`, which is '

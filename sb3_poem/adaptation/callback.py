@@ -12,9 +12,9 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_poem.adaptation.adapter import PreferenceAdapter
 from sb3_poem.adaptation.environments import check_model_fits
 from sb3_poem.adaptation.evaluation import evaluate_adaptation, evaluate_latents, known_task_return, preference_order
-from sb3_poem.common.callbacks import EpochCallback
 from sb3_poem.common.family import FamilyEnv
 from sb3_poem.common.vec_env import make_task_vec_env
+from sb3_poem.pearl_sac.callbacks import EpochCallback
 
 # Options of adapt_tasks that are not the adapter's
 OF_ADAPT_TASKS = {"adapter", "library", "oracle_factory", "progress_bar"}
@@ -111,7 +111,7 @@ class AdaptationEvalCallback(EpochCallback):
     def _on_epoch(self) -> None:
         env, tasks = self._make_env()
         options: dict[str, Any] = {"seed": self.seed, "n_episodes": self.n_episodes}
-        if not hasattr(self.model, "similarity") and "adapter" not in self.adaptation_kwargs:
+        if not hasattr(self.model, "similarities") and "adapter" not in self.adaptation_kwargs:
             self.adaptation_kwargs.setdefault("query_rule", "random")
         result = evaluate_adaptation(self.model, env, tasks, record_at=self.record_at, **options, **self.adaptation_kwargs)
         known = known_task_return(self.model, env, tasks, **options)
@@ -122,7 +122,7 @@ class AdaptationEvalCallback(EpochCallback):
             metrics.update({f"success_rate_after_{k}_queries": rate for k, rate in rates})
             metrics["known_task_success_rate"] = known.success_rate
         metrics["coverage_loss"] = self._coverage_loss(env)
-        if hasattr(self.model, "similarity"):
+        if hasattr(self.model, "similarities"):
             metrics["preference_accuracy"], metrics["kendall_tau"] = preference_order(self.model, known)
         for name, value in metrics.items():
             self.logger.record(f"eval/{name}", value)
@@ -138,11 +138,10 @@ class AdaptationEvalCallback(EpochCallback):
 
     def _coverage_loss(self, env: VecEnv) -> float:
         """How far the prior is from what the policy was trained on, in return."""
-        assert self.model.train_tasks is not None
         rng = np.random.default_rng(self.seed)
         count = min(self.n_tasks, len(self.model.train_tasks))
         chosen = rng.choice(len(self.model.train_tasks), size=count, replace=False)
-        own, tasks = self.model.task_latents[chosen], self.model.train_tasks[chosen]
+        own, tasks = self.model.task_latents[chosen], self.model.train_tasks.tasks[chosen]
         draws = rng.standard_normal((1000, self.model.latent_dim))
         nearest = draws[((own[:, None, :] - draws[None, :, :]) ** 2).sum(axis=2).argmin(axis=1)]
         returns = [evaluate_latents(self.model, env, latents, tasks, 1, self.seed).mean() for latents in (own, nearest)]

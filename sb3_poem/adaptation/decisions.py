@@ -64,8 +64,8 @@ def decide(
     if training_latents is not None:
         options.append(np.asarray(training_latents, dtype=np.float64))
     stacked = np.concatenate(options)
-    unit = model.similarity(particles, reference)
-    scores = standard_scores(model.similarity(particles, stacked), unit)
+    unit = model.similarities(particles, reference)
+    scores = standard_scores(model.similarities(particles, stacked), unit)
     fitness = weights @ scores
     best = int(np.argmax(fitness))
     if not has_holes and fitness[best] <= fitness[len(particles)] + MEAN_ADVANTAGE:
@@ -75,7 +75,7 @@ def decide(
         return stacked[best].copy()
     middle = shares @ particles / shares.sum()
     # What is like the best at either end need not be so in the middle.
-    of_middle = standard_scores(model.similarity(particles, middle[None, :]), unit)
+    of_middle = standard_scores(model.similarities(particles, middle[None, :]), unit)
     return middle if _alike(of_middle, scores[:, best], weights)[0] else stacked[best].copy()
 
 

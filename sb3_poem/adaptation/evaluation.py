@@ -419,7 +419,7 @@ def preference_order(model: Any, known: KnownTaskReturn) -> tuple[float, float]:
     """
     best = np.argmax(known.candidate_returns, axis=1)
     policies = np.unique(best)
-    similarities = model.similarity(known.latents, known.candidate_latents[policies])
+    similarities = model.similarities(known.latents, known.candidate_latents[policies])
     return property_one(similarities, known.candidate_returns[:, policies])
 
 

@@ -258,7 +258,7 @@ class PaperInference(LatentInference):
         if self.query_rule == "random":
             first, second = draw_random_pair(self.n_candidates, self.rng)
         else:
-            similarities = self.model.similarity(self.candidates, self.candidates)
+            similarities = self.model.similarities(self.candidates, self.candidates)
             if self.query_rule == "worst-case":
                 first, second = worst_case_pair(similarities, self.epsilon)
             else:
@@ -302,7 +302,7 @@ class PaperInference(LatentInference):
     def _differences(self, latents: np.ndarray) -> np.ndarray:
         """(m, k) S(z, z_left) - S(z, z_right) of every answered question."""
         shown = np.stack([latent_of(item) for answer in self.answers for item in (answer.left, answer.right)])
-        similarities = self.model.similarity(latents, shown)
+        similarities = self.model.similarities(latents, shown)
         return similarities[:, 0::2] - similarities[:, 1::2]
 
     def _satisfied(self, differences: np.ndarray) -> np.ndarray:

@@ -90,7 +90,7 @@ class AdaptationOptions:
         if self.inference == "paper":
             if library is not None:
                 raise ValueError('a `library` needs inference="bayes": Algorithm 2 compares its own candidates')
-            if not hasattr(model, "similarity"):
+            if not hasattr(model, "similarities"):
                 raise ValueError(f'inference="paper" needs a model with a similarity S; {type(model).__name__} has none')
             return PaperInference(model, self.n_candidates, self.epsilon, candidates, self.query_rule or "worst-case", rng)
         return BayesInference(

@@ -82,7 +82,7 @@ class AdaptedPolicy:
         import torch as th
         from safetensors.torch import save
 
-        from sb3_poem.common.pretrained import config_text, model_contents
+        from sb3_poem.pearl_sac.saving import config_text, model_contents
 
         config, tensors = model_contents(self.model)
         named = {MODEL_PREFIX + name: value for name, value in tensors.items()}
@@ -126,8 +126,8 @@ class AdaptedPolicy:
         from safetensors import SafetensorError
         from safetensors.torch import load
 
-        from sb3_poem.common.pretrained import build_model, parse_config
         from sb3_poem.pearl_sac import PEARLSAC
+        from sb3_poem.pearl_sac.saving import build_model, parse_config
         from sb3_poem.poem_sac import POEMSAC
 
         try:

@@ -80,7 +80,7 @@ def training_rollouts(model: Any, env: Env, n: int, seed: int = 0, deterministic
     """
     model, vec_env = model_and_env(model, env)
     chosen = np.random.default_rng([seed, 4]).integers(len(model.train_tasks), size=n)
-    return rollout_latents(model, vec_env, model.task_latents[chosen], model.train_tasks[chosen], seed, deterministic)
+    return rollout_latents(model, vec_env, model.task_latents[chosen], model.train_tasks.tasks[chosen], seed, deterministic)
 
 
 def rollout_fragments(model: Any, env: Env, n: int, length: int, seed: int = 0) -> list[Trajectory]:

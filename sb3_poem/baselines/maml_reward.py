@@ -24,8 +24,6 @@ from sb3_poem.common.trajectory import Trajectory
 
 FORMAT = "sb3_poem meta reward 1"
 WEIGHTS, CONFIG = "reward.safetensors", "reward.json"
-# The parameters mean something only together with this standardisation of observations.
-STANDARDISATION = ("obs_mean", "obs_std")
 LABELS = {Preference.LEFT: 1.0, Preference.RIGHT: 0.0, Preference.EQUAL: 0.5}
 
 
@@ -35,6 +33,11 @@ class JudgedPair(NamedTuple):
     preference: Preference
     left: Trajectory
     right: Trajectory
+
+
+def _standardisation(policy: Any) -> dict[str, th.Tensor]:
+    """By what observations are standardised; the parameters mean something only together with it."""
+    return {"obs_mean": policy.obs_norm.mean, "obs_std": policy.obs_norm.std}
 
 
 class MetaReward:
@@ -70,7 +73,7 @@ class MetaReward:
     @property
     def digest(self) -> str:
         """Of its numbers, the standardisation's included."""
-        return digest_of({**self.parameters, **{name: getattr(self.policy, name) for name in STANDARDISATION}})
+        return digest_of({**self.parameters, **_standardisation(self.policy)})
 
     def save(self, folder: str | Path) -> None:
         """
@@ -81,7 +84,7 @@ class MetaReward:
         """
         folder = Path(folder)
         tensors = {f"network.{name}": value.detach().cpu().contiguous() for name, value in self.parameters.items()}
-        tensors |= {name: getattr(self.policy, name).detach().cpu().contiguous() for name in STANDARDISATION}
+        tensors |= {name: value.cpu().contiguous() for name, value in _standardisation(self.policy).items()}
         config = {
             "format": FORMAT,
             "net_arch": list(self.net_arch),
@@ -112,8 +115,8 @@ class MetaReward:
             tensors = load_tensors((folder / WEIGHTS).read_bytes())
         except SafetensorError as error:
             raise ValueError(f"{folder / WEIGHTS} is truncated, or no safetensors file: {error}") from error
-        for name in STANDARDISATION:
-            own = getattr(policy, name).cpu()
+        for name, value in _standardisation(policy).items():
+            own = value.cpu()
             if name not in tensors or tensors[name].shape != own.shape or not th.equal(tensors[name], own):
                 raise ValueError(
                     f"`policy` is not the one with which the reward in {folder} was meta-trained: its {name} differs; "
@@ -212,7 +215,7 @@ def meta_train_reward(
     fragments = replay_fragments(model, n_fragments, length, rng)
     inputs = th.stack([meta.transitions(fragment) for fragment in fragments])
     features = np.stack([np.asarray(fragment.reward_features) for fragment in fragments])
-    returns = model.family.compute_rewards(model.train_tasks[:, None, None, :], features[None]).sum(axis=2)
+    returns = model.family.compute_rewards(model.train_tasks.tasks[:, None, None, :], features[None]).sum(axis=2)
     parameters = {name: value.requires_grad_() for name, value in meta.parameters.items()}
     optimizer = th.optim.Adam(parameters.values(), lr=learning_rate)
     n_tasks = min(tasks_per_batch, len(returns))

@@ -138,7 +138,7 @@ def _measure_known(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) -> di
     }
     if known.successes is not None:
         data["task_success_rates"] = _rounded(known.successes.mean(axis=1))
-    if hasattr(model, "similarity"):
+    if hasattr(model, "similarities"):
         accuracy, tau = preference_order(model, known)
         data |= {"preference_accuracy": _number(accuracy), "kendall_tau": _number(tau)}
     return data

@@ -27,11 +27,10 @@ from sb3_poem.benchmark.locks import locked, try_lock
 from sb3_poem.benchmark.methods import META_ITERATIONS, META_ITERATIONS_OF, VARIANTS
 from sb3_poem.benchmark.provenance import provenance
 from sb3_poem.benchmark.suites import ModelKey, family_id, family_label
-from sb3_poem.common.checkpoint import is_checkpoint
-from sb3_poem.common.pretrained import CONFIG, WEIGHTS, read_config
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.loading import ALGORITHMS
 from sb3_poem.pearl_sac import PEARLSAC
+from sb3_poem.pearl_sac.saving import CONFIG, WEIGHTS, is_checkpoint, read_config
 
 CHECKPOINT, MODEL, FINISHED, SESSIONS, LOG, REWARD = (
     "checkpoint.zip",
@@ -390,9 +389,7 @@ def _is_variant(config: dict[str, Any], key: ModelKey) -> bool:
 
 def _check_variant(model: Any, key: ModelKey, path: Path) -> None:
     """Refuse a model that is not the one as which it was handed over."""
-    facts = _distinguishing(
-        getattr(model, "similarity_metric", None), getattr(model, "context_kind", None), int(model.latent_dim)
-    )
+    facts = _distinguishing(getattr(model, "similarity", None), getattr(model, "context", None), int(model.latent_dim))
     found, expected = (model.env_id, model.seed, facts), (key.env_id, key.seed, _expected(key))
     if found != expected:
         names = ("env_id", "seed", "(similarity, context, latent_dim)")

@@ -23,11 +23,11 @@ from sb3_poem.adaptation.callback import AdaptationEvalCallback
 from sb3_poem.cli.hyperparams import check_config, check_keys, check_numbers
 from sb3_poem.cli.hyperparams_opt import entry_params
 from sb3_poem.cli.outputs import check_writable
-from sb3_poem.common.callbacks import TrainingCheckpointCallback
-from sb3_poem.common.checkpoint import is_checkpoint
 from sb3_poem.common.vec_env import TaskVecEnv
 from sb3_poem.loading import ALGORITHMS
 from sb3_poem.pearl_sac import PEARLSAC
+from sb3_poem.pearl_sac.callbacks import TrainingCheckpointCallback
+from sb3_poem.pearl_sac.saving import is_checkpoint
 from sb3_poem.resources import config_file
 
 CHECKPOINT = "checkpoint.zip"
@@ -175,7 +175,6 @@ class PoemExperiment(FamilyExperiment):
     @staticmethod
     def _epochs(model: PEARLSAC, steps: int) -> int:
         """How many epochs take about so many environment steps, at least 1."""
-        assert model.train_tasks is not None
         assert model.horizon is not None
         return max(1, round(steps / (len(model.train_tasks) * model.trajectories_per_task * model.horizon)))
 

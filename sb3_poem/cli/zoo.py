@@ -21,8 +21,8 @@ from sb3_poem.cli.experiment import TrainingInterrupted, make_experiment
 from sb3_poem.cli.outputs import check_device
 from sb3_poem.cli.packages import import_packages
 from sb3_poem.cli.resume import resume_command, resumed
-from sb3_poem.common.checkpoint import is_checkpoint
 from sb3_poem.loading import ALGORITHMS
+from sb3_poem.pearl_sac.saving import is_checkpoint
 
 # Those of our own that differ from rl_zoo3's; what the user gives comes later, and wins.
 DEFAULTS = {

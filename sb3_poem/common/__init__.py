@@ -1,1 +1,1 @@
-"""What the algorithms share: environments in lockstep, trajectories, buffers, encoders, callbacks."""
+"""What the algorithms share: environments in lockstep, trajectories, buffers, networks."""

@@ -9,7 +9,9 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch as th
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from torch import nn
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import linear, softplus
@@ -35,6 +37,48 @@ class Normalised(nn.Module):
     def forward(self, x: th.Tensor) -> th.Tensor:
         """Map (..., width) to (..., width)."""
         return self.activation(nn.functional.layer_norm(x, x.shape[-1:]))
+
+
+class RunningNorm(nn.Module):
+    """Standardises by the mean and deviation of all rows that it was shown.
+
+    :param width: Entries of a row
+    :param clip: Bound on standardised values; None for none
+    """
+
+    #: Deviations below it count as this
+    MIN_STD = 1e-3
+
+    mean: th.Tensor
+    std: th.Tensor
+    count: th.Tensor
+
+    def __init__(self, width: int, clip: float | None = None) -> None:
+        super().__init__()
+        self.clip = clip
+        self.register_buffer("mean", th.zeros(width))
+        self.register_buffer("std", th.ones(width))
+        self.register_buffer("count", th.zeros((), dtype=th.int64))
+
+    def update(self, rows: np.ndarray) -> None:
+        """Take rows (n, width) into the statistics, as SB3's ``VecNormalize`` does."""
+        running = RunningMeanStd(shape=self.mean.shape)
+        running.mean, running.count = self.mean.double().cpu().numpy(), int(self.count)
+        running.var = self.std.double().cpu().numpy() ** 2
+        running.update(rows)
+        with th.no_grad():
+            self.mean.copy_(th.as_tensor(running.mean))
+            self.std.copy_(th.as_tensor(np.maximum(np.sqrt(running.var), self.MIN_STD)))
+            self.count += len(rows)
+
+    def forward(self, rows: th.Tensor) -> th.Tensor:
+        """Map (..., width) to the same, standardised."""
+        standardised = (rows - self.mean) / self.std
+        return standardised if self.clip is None else standardised.clamp(-self.clip, self.clip)
+
+    def inverse(self, standardised: th.Tensor) -> th.Tensor:
+        """What :meth:`forward` mapped to ``standardised``, as far as it was not clipped."""
+        return standardised * self.std + self.mean
 
 
 class MLP(nn.Module):

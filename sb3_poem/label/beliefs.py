@@ -25,7 +25,7 @@ def belief(adapter: Any, env_id: str) -> dict[str, Any]:
     """
     latents, weights = posterior(adapter.inference)
     everything = np.concatenate([latents, adapter.inference.estimate()[None, :]])
-    tasks = np.asarray(adapter.model.train_tasks, dtype=np.float64)
+    tasks = np.asarray(adapter.model.train_tasks.tasks, dtype=np.float64)
     description = describe(env_id, tasks.shape[1])
     picture = description.picture
     if picture == "projection":
@@ -116,7 +116,7 @@ def _direction_sentence(points: np.ndarray, weights: np.ndarray) -> str:
 
 def _points_of(model: Any, latents: np.ndarray, train_points: np.ndarray) -> np.ndarray:
     """(m, 1 or 2) the tasks of latents (m, d): the mean of the nearest training tasks', the nearer the heavier."""
-    means, variances = np.asarray(model.latent_means), np.asarray(model.latent_variances)
+    means, variances = model.train_tasks.latent_means, model.train_tasks.latent_variances
     spread = means.var(axis=0)
     # What training has left unused says nothing of the task; there the prior's spread would drown the rest.
     scale = np.sqrt(spread / np.maximum(spread + variances.mean(axis=0), 1e-12))
@@ -129,7 +129,7 @@ def _points_of(model: Any, latents: np.ndarray, train_points: np.ndarray) -> np.
 
 def _projection(model: Any, latents: np.ndarray) -> tuple[np.ndarray, float]:
     """(m, 2) latents on the plane in which the training tasks' latents differ most, and half the picture's width."""
-    means = np.asarray(model.latent_means)
+    means = model.train_tasks.latent_means
     centre = means.mean(axis=0)
     axes = np.linalg.svd(means - centre, full_matrices=False)[2][:2]
     if len(axes) < 2:

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from sb3_poem.common.foreign import environment_of
-from sb3_poem.common.pretrained import CONFIG, read_config
 from sb3_poem.label.families import Description, describe
+from sb3_poem.pearl_sac.saving import CONFIG, read_config
 from sb3_poem.resources import find_folder, shipped_folder
 
 
@@ -57,7 +57,7 @@ def read_catalogue(
     choices = []
     for one in folders:
         config = read_config(one)
-        own = config.get("env_id"), config.get("env_kwargs", {})
+        own = config["env_id"], config["env_kwargs"]
         chosen, arguments = environment_of(str(one), *own, env_id, env_kwargs)
         choices.append(
             Choice(one.resolve().name, one.resolve(), config["algorithm"], chosen, tuple(sorted(arguments.items())))

@@ -81,10 +81,10 @@ def critic_loss(
         bootstraps = Bootstraps(batch.rewards, batch.next_observations, gamma * (1.0 - batch.terminated))
     with th.no_grad():
         next_obs, z = bootstraps.observations, embeddings.latents
-        next_actions, next_log_prob = policy.actor(next_obs, rows(embeddings.policy, n), noise)  # type: ignore[operator]
-        next_values = policy.critic_target(next_obs, next_actions, rows(z, n)).amin(dim=0) - alpha * next_log_prob  # type: ignore[operator]
+        next_actions, next_log_prob = policy.actor(next_obs, rows(embeddings.policy, n), noise)
+        next_values = policy.critic_target(next_obs, next_actions, rows(z, n)).amin(dim=0) - alpha * next_log_prob
         targets = reward_scale * bootstraps.rewards + bootstraps.discounts * next_values
-    values = policy.critic(batch.observations, batch.actions, rows(embeddings.latents, n))  # type: ignore[operator]
+    values = policy.critic(batch.observations, batch.actions, rows(embeddings.latents, n))
     return 0.5 * len(values) * (values - targets).pow(2).mean()
 
 
@@ -96,10 +96,10 @@ def actor_loss(
     :param noise: (tasks, batch, action_dim) standard normal draws for the actions
     """
     n = batch.rewards.shape[1]
-    actions, log_prob = policy.actor(batch.observations, rows(embeddings.policy, n), noise)  # type: ignore[operator]
+    actions, log_prob = policy.actor(batch.observations, rows(embeddings.policy, n), noise)
     # the latent is a task here, not a decision: the actor must not raise its value by moving it
     z = rows(embeddings.latents.detach(), n)
-    values = policy.critic(batch.observations, actions, z, frozen=True).amin(dim=0)  # type: ignore[operator]
+    values = policy.critic(batch.observations, actions, z, frozen=True).amin(dim=0)
     mean_log_prob = log_prob.mean()
     return alpha * mean_log_prob - values.mean(), mean_log_prob
 

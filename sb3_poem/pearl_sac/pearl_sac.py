@@ -1,37 +1,52 @@
 """Soft actor-critic with a probabilistic task context: what POEM and its baselines share."""
 
+import inspect
+import io
+import pathlib
 import time
 import warnings
-from functools import partial
+from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
-from gymnasium.vector import VectorEnv
+from gymnasium import spaces
+from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import LinearSchedule
-from torch import nn
+from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
+from stable_baselines3.common.utils import LinearSchedule, check_for_correct_spaces, get_device
+from stable_baselines3.common.vec_env import VecEnv
 
 from poem_envs.registration import plain_id
-from sb3_poem.common.buffers import ContextStore, TaskBatch, TaskReplayBuffer
+from sb3_poem.common.buffers import ContextStore, Segment, TaskReplayBuffer
 from sb3_poem.common.checks import check_number, check_number_or_auto, check_whole
+from sb3_poem.common.digest import digest_of
 from sb3_poem.common.family import FamilyEnv
-from sb3_poem.common.precision import MixedPrecision, hidden_dtype
+from sb3_poem.common.files import write_atomically
+from sb3_poem.common.networks import RunningNorm
+from sb3_poem.common.precision import hidden_dtype
 from sb3_poem.common.random import Generators
-from sb3_poem.pearl_sac import losses
-from sb3_poem.pearl_sac.collecting import MIN_STD
-from sb3_poem.pearl_sac.cuda_graph import GraphedStep, Step, prepare_optimizers
-from sb3_poem.pearl_sac.losses import MetaBatch, TaskEmbeddings
-from sb3_poem.pearl_sac.policies import LatentPolicy, MlpPolicy
-from sb3_poem.pearl_sac.sampling import SamplingSAC
+from sb3_poem.common.trajectory import Trajectory
+from sb3_poem.pearl_sac import losses, saving
+from sb3_poem.pearl_sac.collector import EpochCollector, concatenate
+from sb3_poem.pearl_sac.environments import GivenEnv, vectorise
+from sb3_poem.pearl_sac.objective import Objective
+from sb3_poem.pearl_sac.policies import OBSERVATION_CLIP, LatentPolicy, MlpPolicy
+from sb3_poem.pearl_sac.sampler import MetaBatchSampler
+from sb3_poem.pearl_sac.train_tasks import TrainTasks
 from sb3_poem.pearl_sac.unsupported import refuse_unknown, refuse_unsupported
+from sb3_poem.pearl_sac.updater import EntropyCoefficient, Updater
 from sb3_poem.resources import config_file, zoo_entry
 
 SelfPEARLSAC = TypeVar("SelfPEARLSAC", bound="PEARLSAC")
 
+#: Transitions of each task on which the decoder is measured
+MEASURED_PER_TASK = 64
+MIN_STD = RunningNorm.MIN_STD
 
-class PEARLSAC(SamplingSAC):
+
+class PEARLSAC(SAC):
     """Context-based meta-RL on soft actor-critic (PEARL, https://arxiv.org/abs/1903.08254).
 
     Training alternates between an epoch's collection, in which every training task is rolled out under its own latest
@@ -98,18 +113,18 @@ class PEARLSAC(SamplingSAC):
     #: The name of the algorithm on the command line, and of its file in ``zoo_configs/``
     zoo_name: ClassVar[str] = "pearl_sac"
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy}
-    saved_arguments: ClassVar[dict[str, str]] = {
-        **SamplingSAC.saved_arguments,
-        "context_relabel_fraction": "context_relabel_fraction",
-        "n_steps": "target_steps",
-    }
 
-    policy_delay: int = 1  # models of before it
+    policy: LatentPolicy
+    replay_buffer: TaskReplayBuffer
+    observation_space: spaces.Box
+    action_space: spaces.Box
+    task_space: spaces.Box
+    reward_feature_dim: int
 
     def __init__(
         self,
         policy: str | type[LatentPolicy],
-        env: GymEnv | VectorEnv | str,
+        env: GivenEnv | None,
         learning_rate: float | Schedule = 3e-4,
         buffer_size: int = 100_000,
         learning_starts: int = 0,
@@ -199,7 +214,6 @@ class PEARLSAC(SamplingSAC):
         self.relabel_fraction = relabel_fraction
         self.context_relabel_fraction = context_relabel_fraction
         self.reward_scale = reward_scale
-        self.target_steps = n_steps  # SB3's attribute n_steps goes with its own replay buffer
         if shaping_coef > 0 and gamma == 1:
             raise ValueError("shaping_coef must be 0 with gamma=1: staying somewhere has no finite value then")
         self.shaping_coef = shaping_coef
@@ -208,20 +222,25 @@ class PEARLSAC(SamplingSAC):
         self.policy_delay = policy_delay
         self.horizon = horizon
         self.precision = precision
-        self.train_tasks: np.ndarray | None = None
-        self.latent_means: np.ndarray | None = None
-        self.latent_variances: np.ndarray | None = None
-        self.predicted_rewards_error = float("nan")
-        self.context: ContextStore | None = None
-        self.context_reward_statistics: tuple[float, float] | None = None
+        #: Whose zip it is
+        self.algorithm = type(self).__name__
+        self.env_id: str | None = None
+        self.env_kwargs: Mapping[str, Any] = {}
+        self.generators = Generators(seed, get_device(device))
+        #: Drawn with the networks
+        self.train_tasks = TrainTasks.of_prior(np.zeros((0, 0)), latent_dim)
         self.epoch = 0
-        self.obs_count: int | None = 0
-        self._family: FamilyEnv | None = None
-        self._logs_pending = False
+        #: The last epoch's contexts
+        self.epoch_context: ContextStore | None = None
+        #: Mean and deviation by which the rewards in them are standardised; kept with the model
+        self.context_reward_statistics: tuple[float, float] | None = None
+        self.predicted_rewards_error = float("nan")
         self.best_adapted_return = -np.inf  # kept with the model, for AdaptationEvalCallback
         self.n_timesteps: int | None = None  # what learn takes unless told, see from_zoo
+        self._family: FamilyEnv | None = None
+        self._logs_pending = False
         self.policy_class = self._get_policy_from_name(policy)
-        given = self._vectorise(env, n_train_tasks, trajectories_per_task)
+        given = vectorise(env, None, n_train_tasks, trajectories_per_task)
         if _init_setup_model:
             if given is None:
                 raise TypeError(
@@ -240,6 +259,7 @@ class PEARLSAC(SamplingSAC):
             gamma=gamma,
             gradient_steps=gradient_steps,
             replay_buffer_class=TaskReplayBuffer,
+            n_steps=n_steps,
             ent_coef=ent_coef,
             target_update_interval=target_update_interval,
             target_entropy=target_entropy,
@@ -258,16 +278,29 @@ class PEARLSAC(SamplingSAC):
     def _setup_model(self) -> None:
         if self.env is not None:
             self.horizon = self.family.horizon
-        self.generators = getattr(self, "generators", None) or Generators(self.seed, self.device)
         self.generators.to(self.device)
-        if self.train_tasks is None:
+        if not len(self.train_tasks):
             self._draw_tasks()
-        assert self.train_tasks is not None
         self._complete_policy_kwargs()
         self.replay_buffer_kwargs = {"n_tasks": len(self.train_tasks), "feature_dim": self.reward_feature_dim}
         generators = self.generators
-        super()._setup_model()
+        with warnings.catch_warnings():
+            # SB3 says that it ignores n_steps with another replay buffer than its own; our sampler does not
+            warnings.filterwarnings("ignore", "`n_steps=")
+            super()._setup_model()
         self.generators = generators  # a model that is loaded goes on with its own
+
+    def _draw_tasks(self) -> None:
+        family = self.family
+        self.env_id, self.env_kwargs = family.env_id, family.env_kwargs
+        self.task_space, self.reward_feature_dim = family.task_space, family.reward_feature_dim
+        rng = self.generators.child()
+        self.train_tasks = TrainTasks.draw(family, self.n_train_tasks, self.latent_dim, rng)
+
+    def _complete_policy_kwargs(self) -> None:
+        """Give the policy what follows from the model's own arguments."""
+        self.policy_kwargs.pop("use_sde", None)
+        self.policy_kwargs["latent_dim"] = self.latent_dim
 
     def _get_policy_from_name(self, policy_name: str | type[BasePolicy]) -> type[BasePolicy]:
         """As SB3's, and of a class whether it is one of ours."""
@@ -297,7 +330,7 @@ class PEARLSAC(SamplingSAC):
         rate = entry.get("learning_rate")
         if isinstance(rate, str):  # rl_zoo3's syntax
             entry["learning_rate"] = LinearSchedule(float(rate.removeprefix("lin_")), 0.0, 1.0)
-        entry["env"] = cls._vectorise(entry.get("env", env_id), None, 1, n_envs)
+        entry["env"] = vectorise(entry.get("env", env_id), n_envs)
         model = cls(**entry)
         model.n_timesteps = timesteps
         return model
@@ -308,244 +341,112 @@ class PEARLSAC(SamplingSAC):
         if seed is not None:
             self.generators = Generators(seed, self.device)
 
-    def set_parameters(
-        self, load_path_or_dict: str | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"
-    ) -> None:
-        """As SB3's. By what observations and rewards are standardised comes with the policy."""
-        super().set_parameters(load_path_or_dict, exact_match, device)
-        untouched = (self.policy.obs_mean == 0).all() & (self.policy.obs_std == 1).all()
-        if untouched:
-            self.obs_count = 0
-        elif self.obs_count == 0:
-            self.obs_count = None
-
-    def _complete_policy_kwargs(self) -> None:
-        """Give the policy what follows from the model's own arguments."""
-        self.policy_kwargs.pop("use_sde", None)
-        self.policy_kwargs.update(latent_dim=self.latent_dim, context_has_value=self.context_has_value)
-
-    # ------------------------------------------------------------------ learning
-
-    def train(self, gradient_steps: int, batch_size: int = 128) -> None:
-        """Gradient steps on meta-batches, then a refresh of every training task's posterior."""
-        self.policy.set_training_mode(True)
-        optimizers = [self.policy.optimizer]
-        if self.ent_coef_optimizer is not None:
-            optimizers.append(self.ent_coef_optimizer)
-        self._update_learning_rate(optimizers)
-        prepare_optimizers(optimizers, self.device)
-        started = time.perf_counter()
-        history: dict[str, list[th.Tensor]] = {}
-        policy = self.policy
-        networks = nn.ModuleList([policy.encoder, policy.decoder, policy.actor, policy.critic, policy.critic_target])
-        with MixedPrecision(networks, self.hidden_dtype) as precision:
-            # whether everything learns or, in between, critics and encoder only
-            steps: dict[bool, Step] = {whole: partial(self._gradient_step, precision, whole) for whole in (True, False)}
-            if self.device.type == "cuda" and self.target_update_interval == 1:
-                steps = {whole: GraphedStep(step) for whole, step in steps.items()}
-            for block in self._meta_batch_blocks(gradient_steps, batch_size):
-                for batch in block:
-                    step = steps[self._n_updates % self.policy_delay == 0]
-                    for name, value in step(batch).items():
-                        history.setdefault(name, []).append(value)
-                    self._n_updates += 1
-                self._check_finite(history["gradient_norm"][-len(block) :])
-        self._refresh_posteriors()
-        self.logger.record("time/updates_per_second", gradient_steps / max(time.perf_counter() - started, 1e-9))
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        for name, values in history.items():
-            self.logger.record(f"train/{name}", th.stack(values).mean().item())
-        self._record_latent_statistics()
-        self._measure_decoder()
-
-    def _gradient_step(self, precision: MixedPrecision, whole: bool, batch: MetaBatch) -> dict[str, th.Tensor]:
-        """One step on a meta-batch, of all networks or, unless ``whole``, of critics and encoder; returns what to log."""
-        precision.refresh()
-        loss, metrics = self._losses(batch, whole)
-        metrics["gradient_norm"] = self._optimise(loss, precision)
-        if whole:
-            self._update_entropy_coefficient(metrics["entropy"])
-        if self._n_updates % self.target_update_interval == 0:
-            self._update_targets()
-        return {name: value.detach() for name, value in metrics.items()}
+    # ------------------------------------------------------------------ the task family
 
     @property
-    def hidden_dtype(self) -> th.dtype:
-        """Type of the hidden layers' arithmetic in training."""
-        return hidden_dtype(self.precision, self.device.type)
+    def family(self) -> FamilyEnv:
+        """The environment as a task family.
 
-    def _optimise(self, loss: th.Tensor, precision: MixedPrecision) -> th.Tensor:
-        """One step of the optimiser; returns the norm of the gradient, not finite where the loss is not."""
-        optimizer = self.policy.optimizer
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        precision.collect_gradients()
-        gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
-        # the gradient is looked at as well as the loss, because a ReLU may turn NaN to 0 on the way there
-        norm = nn.utils.get_total_norm(gradients, foreach=True) + 0.0 * loss.detach()
-        if self.device.type == "cpu":
-            self._check_finite([norm], done=0)
-        else:  # the device is not waited for: it leaves out the step itself, and the block's end tells
-            optimizer.found_inf = (~th.isfinite(norm)).float()  # type: ignore[attr-defined]
-        optimizer.step()
-        return norm
+        :raises ValueError: if the model was loaded without an environment
+        """
+        if self._family is None:
+            if self.env is None:
+                raise ValueError("the model has no environment; give it one with set_env, or load it with env=...")
+            self._family = self._family_of(self.env)
+        return self._family
 
-    def _check_finite(self, gradient_norms: list[th.Tensor], done: int | None = None) -> None:
+    def _family_of(self, env: VecEnv) -> FamilyEnv:
+        """View of an environment, which must be of the model's own family once the model has one."""
+        family = FamilyEnv(env, self.horizon)
+        self._check_family(family)
+        if len(self.train_tasks):
+            family.check_same_family(self.task_space, self.reward_feature_dim)
+        return family
+
+    def _check_family(self, family: FamilyEnv) -> None:
         """
-        :param gradient_norms: Of the latest updates
-        :param done: How many of them are counted in ``_n_updates``; None: all
-        :raises ValueError: if one is not finite
+        :raises ValueError: if the model's arguments need what the family does not have
         """
-        finite = th.isfinite(th.stack(gradient_norms))
-        if not finite.all():
-            first = self._n_updates - (len(gradient_norms) if done is None else done) + int(finite.int().argmin())
+        for name in ("relabel_fraction", "context_relabel_fraction", "mirror_fraction"):
+            if getattr(self, name) > 0 and not family.shared_dynamics:
+                raise ValueError(f"{name} must be 0: the tasks of {family.env_id} do not share dynamics")
+        if self.shaping_coef > 0 and not family.has_potential:
             raise ValueError(
-                f"the training loss or its gradient is not finite at update {first}; no network was changed by it. "
-                "A lower learning_rate or reward_scale usually helps."
+                f"shaping_coef must be 0: {family.env_id} has no potential; a family defines one by "
+                "_potential(tasks, observations)"
+            )
+        if self.mirror_fraction > 0 and not family.symmetries:
+            raise ValueError(
+                f"mirror_fraction must be 0: {family.env_id} names no symmetries; a family of them sets `symmetries`, "
+                "a tuple of poem_envs.Symmetry"
             )
 
-    def _update_targets(self) -> None:
-        targets: list[th.Tensor] = list(self.policy.critic_target.parameters())
-        sources: list[th.Tensor] = list(self.policy.critic.parameters())
-        with th.no_grad():
-            th._foreach_lerp_(targets, sources, self.tau)
+    def set_env(self, env: GivenEnv, force_reset: bool = True) -> None:
+        """Change the environment, to one of the same family with any number of copies; a registered id
+        gets as many as the model has.
 
-    def _encode(self, context: th.Tensor, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Latents (tasks, d) by reparameterisation, and the KL of their posteriors to N(0, I), (tasks,)."""
-        mean, variance = self.policy.encoder(context)
-        return mean + variance.sqrt() * noise, losses.kl_to_prior(mean, variance)
-
-    def _embed(self, latents: th.Tensor) -> TaskEmbeddings:
-        """What actor and decoder see of the latents. PEARL's encoder learns nothing from the actor."""
-        return TaskEmbeddings(latents, self.policy.policy_embedding(latents.detach()), self.policy.reward_embedding(latents))
-
-    def _losses(self, batch: MetaBatch, whole: bool = True) -> tuple[th.Tensor, dict[str, th.Tensor]]:
-        """Sum of all losses of a meta-batch or, unless ``whole``, of critics' and encoder's; and what to log of them."""
-        latents, kl = self._encode(batch.context, batch.latent_noise)
-        embeddings = self._embed(latents)
-        transitions = self._standardise(batch.transitions)
-        alpha = self._entropy_coefficient()
-        bootstraps = batch.bootstraps
-        if bootstraps is not None:
-            bootstraps = bootstraps._replace(observations=self.policy.standardise(bootstraps.observations))
-        critic_loss = self._critic_loss(transitions, embeddings, alpha, batch.next_action_noise, bootstraps)
-        kl_loss = kl.mean()
-        metrics = {"critic_loss": critic_loss, "kl": kl_loss}
-        if not whole:
-            return critic_loss + self.kl_coef * kl_loss, metrics
-        actor_loss, log_prob = losses.actor_loss(self.policy, transitions, embeddings, alpha, batch.action_noise)
-        decoder_loss = self._decoder_loss(batch, transitions, embeddings)
-        embedding_loss, embedding_metrics = self._embedding_loss(batch, embeddings)
-        loss = (
-            critic_loss
-            + self.policy_coef * actor_loss
-            + self.reward_coef * decoder_loss
-            + self.kl_coef * kl_loss
-            + embedding_loss
-        )
-        metrics |= {
-            "actor_loss": actor_loss,
-            "decoder_loss": decoder_loss,
-            "entropy": -log_prob,
-            "ent_coef": alpha,
-            **embedding_metrics,
-        }
-        return loss, metrics
-
-    def _embedding_loss(self, batch: MetaBatch, embeddings: TaskEmbeddings) -> tuple[th.Tensor | float, dict[str, th.Tensor]]:
-        """A subclass's own demand on the latents (weighted), and what to log of it."""
-        return 0.0, {}
-
-    def _entropy_coefficient(self) -> th.Tensor:
-        if self.log_ent_coef is not None:
-            return self.log_ent_coef.detach().exp().squeeze()
-        return self.ent_coef_tensor
-
-    def _update_entropy_coefficient(self, entropy: th.Tensor) -> None:
-        if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
-            assert isinstance(self.target_entropy, float)
-            # the gradient of log_ent_coef * (entropy - target_entropy)
-            gradient = (entropy.detach() - self.target_entropy).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
-            self.log_ent_coef.grad = gradient.view_as(self.log_ent_coef)
-            self.ent_coef_optimizer.step()
-
-    def _standardise(self, batch: TaskBatch) -> TaskBatch:
-        standardise = self.policy.standardise
-        return batch._replace(
-            observations=standardise(batch.observations), next_observations=standardise(batch.next_observations)
-        )
-
-    def _critic_loss(
-        self,
-        batch: TaskBatch,
-        embeddings: TaskEmbeddings,
-        alpha: th.Tensor,
-        noise: th.Tensor,
-        bootstraps: losses.Bootstraps | None = None,
-    ) -> th.Tensor:
-        scale = 1.0 / self.policy.reward_std if self.reward_scale == "auto" else self.reward_scale
-        return losses.critic_loss(self.policy, batch, embeddings, alpha, self.gamma, scale, noise, bootstraps)  # type: ignore[arg-type]
-
-    def _decoder_loss(self, batch: MetaBatch, transitions: TaskBatch, embeddings: TaskEmbeddings) -> th.Tensor:
-        """On context transitions (eq. 4); with relabelling on the batch of transitions instead, which holds other tasks'
-        policies too: adaptation asks the decoder about trajectories of any policy.
+        :raises ValueError: if the environment is of another family; the model then keeps its own
         """
-        if self.relabel_fraction > 0:
-            obs, actions, next_obs = transitions.observations, transitions.actions, transitions.next_observations
-            rewards = transitions.rewards
-        else:
-            obs_dim, action_dim = transitions.observations.shape[-1], transitions.actions.shape[-1]
-            widths = [obs_dim, action_dim, obs_dim]
-            obs, actions, next_obs = batch.context[..., : sum(widths)].split(widths, dim=-1)
-            rewards = batch.context_rewards
-        variance = self._reward_variance()
-        return losses.decoder_loss(self.policy, obs, actions, next_obs, rewards, embeddings.reward, variance)
+        given = vectorise(env, self.n_envs)
+        if given is None:
+            raise TypeError("env is None, but set_env needs an environment")
+        vec_env = self._wrap_env(given, self.verbose)
+        check_for_correct_spaces(vec_env, self.observation_space, self.action_space)
+        family = self._family_of(vec_env)
+        self.n_envs = vec_env.num_envs  # experience is kept per task, not per copy
+        super().set_env(vec_env, force_reset)
+        self._family = family
 
-    def _reward_variance(self) -> th.Tensor:
-        assert self.context is not None
-        return self.context.rewards.var().clamp(min=MIN_STD**2)
+    @property
+    def epoch_steps(self) -> int:
+        """Environment steps of an epoch's collection."""
+        return self._steps_of(len(self.train_tasks) * self.trajectories_per_task)
 
-    def _refresh_posteriors(self) -> None:
-        """Posterior of every training task from its latest context: next epoch's latents, and the aggregate posterior."""
-        if self.context is None:
-            return
-        self.policy.set_training_mode(False)
-        with th.no_grad():
-            steps = self.context.transitions.shape[1]
-            picks = th.randperm(steps, generator=self.generators.torch, device=self.device)[: self.context_size]
-            mean, variance = self.policy.encoder(self.context.transitions[:, picks])
-        self.latent_means, self.latent_variances = mean.double().cpu().numpy(), variance.double().cpu().numpy()
+    def _steps_of(self, rollouts: int) -> int:
+        """Environment steps of so many rollouts, all copies of the environment at a time."""
+        n_envs = self.family.num_envs
+        return -(-rollouts // n_envs) * n_envs * self.family.horizon
 
-    def _measure_decoder(self) -> None:
-        """Residual deviation of the decoder, per step, on transitions of all training policies, in units of reward. Where
-        tasks do not share their dynamics it stays unknown: the decoder has seen no rewards for what others' policies do.
+    # ------------------------------------------------------------------ what adaptation asks
+
+    @property
+    def task_latents(self) -> np.ndarray:
+        """Posterior means of the training tasks' latents, (n_train_tasks, latent_dim)."""
+        return self.train_tasks.latent_means
+
+    @property
+    def aggregate_to_prior_kl(self) -> float:
+        """How far the training tasks' aggregate posterior is from N(0, I), nats."""
+        return self.train_tasks.aggregate_to_prior_kl
+
+    def sample_latents(self, n: int, rng: np.random.Generator, source: str = "prior") -> np.ndarray:
+        """Draw latents (n, latent_dim), see :meth:`TrainTasks.sample_latents`."""
+        return self.train_tasks.sample_latents(n, rng, source)
+
+    def predicted_returns(
+        self, latents: np.ndarray, trajectories: Iterable[Trajectory], max_steps: int | None = None
+    ) -> np.ndarray:
+        """Returns that the reward decoder predicts for trajectories, if each latent were the task's.
+
+        :param latents: (m, latent_dim)
+        :param max_steps: Of a longer trajectory only so many steps are decoded, evenly spaced, and the sum
+            is scaled up; None decodes all
+        :return: (m, number of trajectories)
         """
-        assert self.train_tasks is not None
-        if not self.family.shared_dynamics:
-            return
-        n_tasks, per_task = len(self.train_tasks), 64
-        generator, device, policy = self.generators.torch, self.device, self.policy
-        sources = th.randint(n_tasks, (n_tasks, per_task), generator=generator, device=device)
-        data = self.replay_buffer.sample_rows(sources, generator)
-        rewards = self.family.compute_rewards(self.train_tasks[:, None, :], data.features.cpu().numpy())
-        with th.no_grad():
-            latents = th.as_tensor(self.task_latents, dtype=th.float32, device=device)
-            obs, next_obs = policy.standardise(data.observations), policy.standardise(data.next_observations)
-            embedding = losses.rows(policy.reward_embedding(latents), per_task)
-            predicted = policy.decode_rewards(obs, data.actions, next_obs, embedding).cpu().numpy()
-        self.predicted_rewards_error = float(np.sqrt(np.mean((predicted - rewards) ** 2)))
-        self.logger.record("train/decoder_error", self.predicted_rewards_error)
+        return self.policy.predicted_returns(latents, trajectories, max_steps, self.hidden_dtype)
 
-    def _record_latent_statistics(self) -> None:
-        """Log the information in the latents, and how far their aggregate is from the prior."""
-        assert self.latent_means is not None
-        assert self.latent_variances is not None
-        self.logger.record("train/kl_ideal", float(np.log(len(self.latent_means))))
-        self.logger.record("train/aggregate_to_prior_kl", self.aggregate_to_prior_kl)
+    @property
+    def digest(self) -> str:
+        """Of what adaptation uses: all networks but the critics, and the training tasks' latents."""
+        state = self.policy.state_dict().items()
+        used = {name: value for name, value in state if not name.startswith("critic")}
+        used["latent_means"] = th.as_tensor(self.train_tasks.latent_means)
+        used["latent_variances"] = th.as_tensor(self.train_tasks.latent_variances)
+        return digest_of(used)
 
-    # ------------------------------------------------------------------ SB3's interface
+    # ------------------------------------------------------------------ learning: Algorithm 1
 
-    def learn(  # type: ignore[override]
+    def learn(
         self: SelfPEARLSAC,
         total_timesteps: int | None = None,
         callback: MaybeCallback = None,
@@ -562,6 +463,19 @@ class PEARLSAC(SamplingSAC):
         :param tb_log_name: None is the algorithm's name
         :raises ValueError: if the number of steps is not known
         """
+        total_timesteps = self._checked_steps(total_timesteps, callback)
+        total_timesteps, callback = self._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
+        )
+        callback.on_training_start(locals(), globals())
+        while self.num_timesteps < total_timesteps and self._run_epoch(callback, log_interval):
+            pass
+        callback.on_training_end()
+        self._dump_pending_logs(log_interval)
+        return self
+
+    def _checked_steps(self, total_timesteps: int | None, callback: MaybeCallback) -> int:
+        """How many steps to train for, said aloud where ``verbose``."""
         total_timesteps = self.n_timesteps if total_timesteps is None else total_timesteps
         if total_timesteps is None:
             raise ValueError(
@@ -578,16 +492,244 @@ class PEARLSAC(SamplingSAC):
                 f"each has {epoch:,} environment steps, then {updates if updates >= 0 else epoch:,} "
                 "gradient steps"
             )
-        super().learn(
-            total_timesteps=total_timesteps,
-            callback=callback,
-            log_interval=log_interval,  # type: ignore[arg-type]
-            tb_log_name=tb_log_name or type(self).__name__,
-            reset_num_timesteps=reset_num_timesteps,
-            progress_bar=progress_bar,
-        )
+        return total_timesteps
+
+    def _run_epoch(self, callback: BaseCallback, log_interval: int | None) -> bool:
+        """One epoch; False if a callback ended training in it."""
+        self.policy.set_training_mode(False)
+        callback.on_rollout_start()  # between two epochs: evaluations and checkpoints belong here
         self._dump_pending_logs(log_interval)
-        return self
+        steps_before = self.num_timesteps
+        if not self._collect_epoch(callback):
+            return False
+        callback.on_rollout_end()
+        if self.num_timesteps > self.learning_starts:
+            collected = self.num_timesteps - steps_before
+            gradient_steps = self.gradient_steps if self.gradient_steps >= 0 else collected
+            if gradient_steps > 0:
+                self.train(gradient_steps=gradient_steps, batch_size=self.batch_size)
+        return True
+
+    def _collect_epoch(self, callback: BaseCallback) -> bool:
+        """Roll out every training task under a latent of its own, and replace the contexts (Algorithm 1,
+        lines 4 to 8); False if a callback ended it.
+        """
+        started, steps_before = time.perf_counter(), self.num_timesteps
+        collector = self.make_collector(callback)
+        waves = collector.collect()
+        if waves is None:
+            return False
+        epoch = concatenate(waves, len(self.train_tasks) * self.trajectories_per_task)
+        returns = self.measure_returns(epoch, collector)
+        if returns is None:
+            return False
+        # after the returns, which the policies that collected the epoch must earn
+        self.policy.update_statistics(waves)
+        self._replace_context(epoch, returns)
+        self.epoch += 1
+        collected = self.num_timesteps - steps_before
+        self.logger.record("time/collection_fps", collected / (time.perf_counter() - started))
+        self.logger.record("rollout/train_task_return", np.nanmean(np.diagonal(returns)))
+        self._logs_pending = True
+        return True
+
+    def train(self, gradient_steps: int, batch_size: int = 128) -> None:
+        """Gradient steps on meta-batches, then a refresh of every training task's posterior (Algorithm 1,
+        lines 9 to 14).
+        """
+        self.policy.set_training_mode(True)
+        coefficient = self.entropy_coefficient
+        self._update_learning_rate([self.policy.optimizer, *coefficient.optimizers])
+        started = time.perf_counter()
+        history: dict[str, list[th.Tensor]] = {}
+        with self.make_updater() as updater:
+            for block in self.make_sampler().blocks(gradient_steps, batch_size):
+                for batch in block:
+                    for name, value in updater.step(batch).items():
+                        history.setdefault(name, []).append(value)
+                    self._n_updates = updater.n_updates
+                updater.check_finite(history["gradient_norm"][-len(block) :], updater.n_updates - len(block))
+        self._refresh_posteriors()
+        self.logger.record("time/updates_per_second", gradient_steps / max(time.perf_counter() - started, 1e-9))
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        for name, values in history.items():
+            self.logger.record(f"train/{name}", th.stack(values).mean().item())
+        self.logger.record("train/kl_ideal", float(np.log(len(self.train_tasks))))
+        self.logger.record("train/aggregate_to_prior_kl", self.aggregate_to_prior_kl)
+        self._measure_decoder()
+
+    # ------------------------------------------------------------------ the parts
+
+    def make_collector(self, callback: BaseCallback) -> EpochCollector:
+        """What collects an epoch.
+
+        :param callback: Told of every step
+        """
+
+        def on_step(step_locals: dict[str, Any]) -> bool:
+            self.num_timesteps += self.family.num_envs
+            callback.update_locals(step_locals)
+            if not callback.on_step():
+                return False
+            if step_locals["dones"].any():  # what it looks for comes with an episode's end
+                self._update_info_buffer(step_locals["infos"], step_locals["dones"])
+            self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+            self._episode_num += int(step_locals["dones"].sum())
+            return True
+
+        return EpochCollector(
+            self.family,
+            self.policy,
+            self.train_tasks,
+            self.replay_buffer,
+            self.generators,
+            self.trajectories_per_task,
+            self.noise_color,
+            explores=lambda: self.num_timesteps < self.learning_starts,
+            episode_count=lambda: self._episode_num,
+            on_step=on_step,
+        )
+
+    def make_sampler(self) -> MetaBatchSampler:
+        """What draws meta-batches."""
+        return MetaBatchSampler(
+            self.family,
+            self.train_tasks.tasks,
+            self.replay_buffer,
+            self._known_context,
+            self.generators,
+            self.latent_dim,
+            self.meta_batch_size,
+            self.context_size,
+            self.gamma,
+            self.n_steps,
+            self.relabel_fraction,
+            self.context_relabel_fraction,
+            self.shaping_coef,
+            self.mirror_fraction,
+        )
+
+    def make_objective(self) -> Objective:
+        """What gradient steps minimise."""
+        rewards = self._known_context.rewards
+        return Objective(
+            self.policy,
+            self.gamma,
+            1.0 / self.policy.reward_norm.std if self.reward_scale == "auto" else float(self.reward_scale),
+            rewards.var().clamp(min=MIN_STD**2),
+            self.relabel_fraction > 0,
+            self.kl_coef,
+            self.reward_coef,
+            self.policy_coef,
+        )
+
+    def make_updater(self) -> Updater:
+        """What takes gradient steps."""
+        return Updater(
+            self.policy,
+            self.make_objective(),
+            self.entropy_coefficient,
+            self.hidden_dtype,
+            self.tau,
+            self.target_update_interval,
+            self.policy_delay,
+            self._n_updates,
+        )
+
+    @property
+    def entropy_coefficient(self) -> EntropyCoefficient:
+        """SAC's entropy coefficient."""
+        tensor = self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef
+        return EntropyCoefficient(tensor, self.ent_coef_optimizer, float(self.target_entropy))
+
+    @property
+    def hidden_dtype(self) -> th.dtype:
+        """Type of the hidden layers' arithmetic in training."""
+        return hidden_dtype(self.precision, self.device.type)
+
+    @property
+    def _known_context(self) -> ContextStore:
+        if self.epoch_context is None:
+            raise ValueError("the model has no contexts before it has collected an epoch: call learn")
+        return self.epoch_context
+
+    # ------------------------------------------------------------------ an epoch's steps
+
+    def measure_returns(self, epoch: Segment, collector: EpochCollector) -> np.ndarray | None:
+        """J[i, j]: the return of task j's policy on task i, (n_train_tasks, n_train_tasks); NaN where unknown.
+
+        :param epoch: Rollouts of the tasks under their own policies
+        :param collector: For further rollouts
+        :return: None if a callback ended these
+        """
+        n_tasks = len(self.train_tasks)
+        own = (epoch.rewards * epoch.first_episode).sum(axis=1).reshape(n_tasks, -1).mean(axis=1)
+        returns = np.full((n_tasks, n_tasks), np.nan)
+        np.fill_diagonal(returns, own)
+        return returns
+
+    def _replace_context(self, epoch: Segment, returns: np.ndarray) -> None:
+        n_tasks, policy = len(returns), self.policy
+        with th.no_grad():
+            obs, next_obs = (
+                policy.standardise(th.as_tensor(values, device=self.device))
+                for values in (epoch.observations, epoch.next_observations)
+            )
+            beyond = (obs.abs() == OBSERVATION_CLIP).any(dim=-1).float().mean()
+            self.logger.record("train/clipped_observations", beyond.item())
+            actions = th.as_tensor(epoch.actions, device=self.device)
+            rewards = th.as_tensor(epoch.rewards, dtype=th.float32, device=self.device)
+            self.context_reward_statistics = (float(rewards.mean()), max(float(rewards.std()), MIN_STD))
+            parts = [obs, actions, next_obs, _standardised(rewards)[..., None]]
+            if policy.context_has_value:  # eq. 8; 0 before the first update (Algorithm 1, line 2)
+                known = self._n_updates > 0
+                values = policy.action_values(obs, actions, epoch.latents) if known else th.zeros_like(rewards)
+                parts.append(_standardised(values)[..., None])
+            transitions = th.cat(parts, dim=-1)
+        features = None
+        if self.context_relabel_fraction > 0:
+            features = th.as_tensor(epoch.features, device=self.device)
+            features = features.reshape(n_tasks, -1, features.shape[-1])
+        self.epoch_context = ContextStore(
+            transitions.reshape(n_tasks, -1, transitions.shape[-1]),
+            rewards.reshape(n_tasks, -1),
+            th.as_tensor(returns, dtype=th.float32, device=self.device),
+            features,
+        )
+
+    def _refresh_posteriors(self) -> None:
+        """Posterior of every training task from its latest context: next epoch's latents, and the aggregate."""
+        self.policy.set_training_mode(False)
+        transitions = self._known_context.transitions
+        with th.no_grad():
+            steps = transitions.shape[1]
+            picks = th.randperm(steps, generator=self.generators.torch, device=self.device)[: self.context_size]
+            mean, variance = self.policy.encoder(transitions[:, picks])
+        self.train_tasks.set_posteriors(mean.double().cpu().numpy(), variance.double().cpu().numpy())
+
+    def _measure_decoder(self) -> None:
+        """Residual deviation of the decoder, per step, on transitions of all training policies, in units of reward. Where
+        tasks do not share their dynamics it stays unknown: the decoder has seen no rewards for what others' policies do.
+        """
+        if not self.family.shared_dynamics:
+            return
+        tasks, policy, device = self.train_tasks.tasks, self.policy, self.device
+        shape = (len(tasks), MEASURED_PER_TASK)
+        sources = th.randint(len(tasks), shape, generator=self.generators.torch, device=device)
+        data = self.replay_buffer.sample_rows(sources, self.generators.torch)
+        rewards = self.family.compute_rewards(tasks[:, None, :], data.features.cpu().numpy())
+        with th.no_grad():
+            latents = th.as_tensor(self.task_latents, dtype=th.float32, device=device)
+            obs, next_obs = policy.standardise(data.observations), policy.standardise(data.next_observations)
+            embedding = losses.rows(policy.reward_embedding(latents), MEASURED_PER_TASK)
+            predicted = policy.decode_rewards(obs, data.actions, next_obs, embedding).cpu().numpy()
+        self.predicted_rewards_error = float(np.sqrt(np.mean((predicted - rewards) ** 2)))
+        self.logger.record("train/decoder_error", self.predicted_rewards_error)
+
+    def _dump_pending_logs(self, log_interval: int | None) -> None:
+        if self._logs_pending and log_interval and self.epoch % log_interval == 0:
+            self.dump_logs()
+            self._logs_pending = False
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         """The last epoch may overshoot the total; a schedule must not turn negative there."""
@@ -601,3 +743,111 @@ class PEARLSAC(SamplingSAC):
         if remaining <= 0:
             return self
         return self.learn(remaining, callback, log_interval=log_interval, reset_num_timesteps=False, progress_bar=progress_bar)
+
+    # ------------------------------------------------------------------ files
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """As SB3's, but a file is written completely or not at all."""
+        if isinstance(path, io.BufferedIOBase):
+            super().save(path, exclude, include)
+            return
+        archive = io.BytesIO()
+        super().save(archive, exclude, include)
+        path = pathlib.Path(path)
+        write_atomically(path if path.suffix else path.with_suffix(".zip"), archive.getbuffer())
+
+    @classmethod
+    def load(
+        cls: type[SelfPEARLSAC],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GivenEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfPEARLSAC:
+        """As SB3's. ``env`` may be a registered id too: it becomes as many copies as the model was trained with. Further
+        arguments are the constructor's; a ``seed`` begins new random streams.
+
+        :raises ValueError: if it is a folder, the file is truncated or holds another algorithm's model, env is of another
+            family, or an argument would change what the networks are
+        """
+        refuse_unknown(kwargs.keys() - inspect.signature(cls).parameters.keys(), cls)
+        data = saving.read_archive(path, cls, kwargs)
+        if env is not None:
+            env = vectorise(env, data["n_envs"])
+        model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        if kwargs.get("seed") is not None:
+            model.set_random_seed(kwargs["seed"])
+        return model
+
+    def save_checkpoint(self, path: str | pathlib.Path) -> None:
+        """Write everything to one file, from which :meth:`load_checkpoint` continues bit for bit. Between two epochs only.
+
+        :raises OSError: if it cannot be written; a previous checkpoint stays whole
+        """
+        archive = io.BytesIO()
+        self.save(archive)
+        saving.write_checkpoint(path, self.algorithm, archive.getvalue(), self.replay_buffer, self.epoch_context)
+
+    @classmethod
+    def load_checkpoint(
+        cls: type[SelfPEARLSAC],
+        path: str | pathlib.Path,
+        env: GivenEnv | None = None,
+        device: th.device | str = "auto",
+    ) -> SelfPEARLSAC:
+        """Read a checkpoint; :meth:`resume` then continues the run.
+
+        :param path: A file that :meth:`save_checkpoint` or :class:`TrainingCheckpointCallback` wrote
+        :param env: An environment like the run's own: the same family and number of copies
+        :param device: "auto", "cpu", "cuda"
+        :raises ValueError: if the file is truncated or holds another algorithm's run, or env is of another family
+        """
+        state = saving.read_checkpoint(path, cls.__name__)
+        model = cls.load(io.BytesIO(state["model"].numpy().tobytes()), env, device)
+        model.replay_buffer.load_state(state["replay_buffer"])
+        if state["context"] is not None:
+            stored = {name: value.to(model.device) for name, value in state["context"].items()}
+            model.epoch_context = ContextStore(**stored)
+        return model
+
+    def save_pretrained(self, folder: str | pathlib.Path, card: dict[str, Any] | None = None) -> None:
+        """Write safetensors, JSON and a model card; see :func:`sb3_poem.pearl_sac.saving.save_pretrained`."""
+        saving.save_pretrained(self, folder, card)
+
+    @classmethod
+    def from_pretrained(
+        cls: type[SelfPEARLSAC],
+        folder: str | pathlib.Path,
+        env: GivenEnv | None = None,
+        device: th.device | str = "auto",
+    ) -> SelfPEARLSAC:
+        """Read what :meth:`save_pretrained` wrote, or a shipped model by its name.
+
+        :param env: An environment of the model's family, if it shall be trained on
+        :raises FileNotFoundError: if the folder does not hold a model
+        :raises ValueError: if a file is truncated or foreign, the model is of another algorithm, or env of another family
+        """
+        model = saving.from_pretrained(cls, folder, device)
+        if env is not None:
+            model.set_env(env)
+        return model
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_family", "epoch_context", "_logs_pending"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, variables = super()._get_torch_save_params()
+        kept = [name for name in state_dicts if name not in ("actor.optimizer", "critic.optimizer")]
+        return [*kept, "policy.optimizer"], variables
+
+
+def _standardised(values: th.Tensor) -> th.Tensor:
+    return (values - values.mean()) / values.std().clamp(min=MIN_STD)

@@ -1,7 +1,7 @@
 """Policy of PEARLSAC: an actor, critics, a context encoder and a reward decoder that share one latent."""
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,16 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
-from sb3_poem.common.networks import ContextEncoder, LatentActor, LatentCritic, RewardDecoder
+from sb3_poem.common.buffers import Segment
+from sb3_poem.common.decoding import decoded_sums
+from sb3_poem.common.networks import (
+    ContextEncoder,
+    LatentActor,
+    LatentCritic,
+    RewardDecoder,
+    RunningNorm,
+)
+from sb3_poem.common.trajectory import Trajectory
 
 OBSERVATION_CLIP = 10.0
 
@@ -38,12 +47,12 @@ class LatentPolicy(SACPolicy):
     :param optimizer_kwargs: Its arguments
     """
 
-    encoder: ContextEncoder
-    decoder: RewardDecoder
-    obs_mean: th.Tensor
-    obs_std: th.Tensor
-    reward_mean: th.Tensor
-    reward_std: th.Tensor
+    observation_space: spaces.Box
+    action_space: spaces.Box
+    net_arch: dict[str, list[int]]
+    actor: LatentActor  # type: ignore[assignment]
+    critic: LatentCritic  # type: ignore[assignment]
+    critic_target: LatentCritic  # type: ignore[assignment]
 
     def __init__(
         self,
@@ -71,7 +80,7 @@ class LatentPolicy(SACPolicy):
             else optimizer_kwargs,
             squash_output=True,
         )
-        self.net_arch = self._complete_net_arch(net_arch)  # type: ignore[assignment]
+        self.net_arch = self._complete_net_arch(net_arch)
         self.activation_fn = activation_fn
         self.layer_norm = layer_norm
         self.latent_dim = latent_dim
@@ -101,24 +110,19 @@ class LatentPolicy(SACPolicy):
         return {key: list(given.get(key, default)) for key, default in defaults.items()}
 
     def _build(self, lr_schedule: Schedule) -> None:
-        arch: dict[str, list[int]] = self.net_arch  # type: ignore[assignment]
-        obs_dim, action_dim = int(self.observation_space.shape[0]), int(self.action_space.shape[0])  # type: ignore[index]
-        for name, shape, value in (
-            ("obs_mean", obs_dim, 0.0),
-            ("obs_std", obs_dim, 1.0),
-            ("reward_mean", 1, 0.0),
-            ("reward_std", 1, 1.0),
-        ):
-            self.register_buffer(name, th.full((shape,), value))
+        arch = self.net_arch
+        obs_dim, action_dim = int(self.observation_space.shape[0]), int(self.action_space.shape[0])
+        self.obs_norm = RunningNorm(obs_dim, clip=OBSERVATION_CLIP)
+        self.reward_norm = RunningNorm(1)  # of the first epoch, in whose units the critics learn
         context_dim = 2 * obs_dim + action_dim + 1 + int(self.context_has_value)
         self.encoder = ContextEncoder(context_dim, self.latent_dim, arch["encoder"])
         self._build_embeddings(arch["embedding"])
         activation_fn, layer_norm = self.activation_fn, self.layer_norm
         self.decoder = RewardDecoder(obs_dim, action_dim, self.latent_dim, arch["decoder"], activation_fn, layer_norm)
-        self.actor = LatentActor(obs_dim, self.latent_dim, action_dim, arch["pi"], activation_fn, layer_norm)  # type: ignore[assignment]
+        self.actor = LatentActor(obs_dim, self.latent_dim, action_dim, arch["pi"], activation_fn, layer_norm)
         critic_args = (obs_dim, action_dim, self.latent_dim, arch["qf"], activation_fn, layer_norm, self.n_critics)
-        self.critic = LatentCritic(*critic_args)  # type: ignore[assignment]
-        self.critic_target = LatentCritic(*critic_args)  # type: ignore[assignment]
+        self.critic = LatentCritic(*critic_args)
+        self.critic_target = LatentCritic(*critic_args)
         self.critic_target.load_state_dict(self.critic.state_dict())
         self.critic_target.requires_grad_(False)
         trained = [parameter for parameter in self.parameters() if parameter.requires_grad]
@@ -137,12 +141,71 @@ class LatentPolicy(SACPolicy):
 
     def standardise(self, obs: th.Tensor) -> th.Tensor:
         """Standardised observations, bounded so that a fall does not saturate the networks."""
-        return ((obs - self.obs_mean) / self.obs_std).clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP)
+        return self.obs_norm(obs)
+
+    def update_statistics(self, segments: Sequence[Segment]) -> None:
+        """Standardise by the mean and deviation of all observations so far: a robot that has learned to run
+        is far from what the first epoch's random actions showed. Rewards keep the first epoch's, in whose
+        units the critics learn.
+        """
+        obs = [segment.observations.reshape(-1, segment.observations.shape[-1]) for segment in segments]
+        self.obs_norm.update(np.concatenate(obs))
+        if self.reward_norm.count == 0:
+            rewards = [segment.rewards.reshape(-1, 1) for segment in segments]
+            self.reward_norm.update(np.concatenate(rewards))
+
+    def action_values(self, obs: th.Tensor, actions: th.Tensor, latents: np.ndarray) -> th.Tensor:
+        """Q(s, a) of the more doubtful critic, (copies, steps).
+
+        :param obs: (copies, steps, obs_dim), standardised
+        :param actions: (copies, steps, action_dim) in [-1, 1]
+        :param latents: (copies, latent_dim)
+        """
+        z = th.as_tensor(latents, dtype=th.float32, device=self.device)
+        values = [
+            self.critic(o, a, own.expand(o.shape[0], -1)).min(dim=0).values for o, a, own in zip(obs, actions, z, strict=True)
+        ]
+        return th.stack(values)
+
+    @th.no_grad()
+    def predicted_returns(
+        self,
+        latents: np.ndarray,
+        trajectories: Iterable[Trajectory],
+        max_steps: int | None,
+        dtype: th.dtype,
+    ) -> np.ndarray:
+        """Returns (m, trajectories) that the decoder predicts under latents (m, latent_dim).
+
+        :param max_steps: Steps that are decoded of each trajectory, see :meth:`PEARLSAC.predicted_returns`
+        :param dtype: Of the hidden layers' arithmetic
+        """
+        device = self.device
+        rows: list[th.Tensor] = []
+        lengths: list[int] = []
+        shares: list[float] = []  # of a trajectory's steps, one over
+        for trajectory in trajectories:
+            total = len(trajectory.actions)
+            steps = _evenly_spaced(total, max_steps)
+            obs, next_obs = (
+                self.standardise(th.as_tensor(trajectory.observations[at], dtype=th.float32, device=device))
+                for at in (steps, steps + 1)
+            )
+            actions = th.as_tensor(trajectory.actions[steps], dtype=th.float32, device=device)
+            rows.append(th.cat([obs, self.scale_action_batch(actions), next_obs], dim=1))
+            lengths.append(len(steps))
+            shares.append(total / max(len(steps), 1))
+        latent_tensor = th.as_tensor(np.atleast_2d(latents), dtype=th.float32, device=device)
+        embeddings = self.reward_embedding(latent_tensor)
+        sums = decoded_sums(self.decoder.mlp, th.cat(rows), lengths, embeddings, dtype).double()
+        norm = self.reward_norm
+        sums = sums * norm.std + norm.mean * sums.new_tensor(lengths)
+        return (sums * sums.new_tensor(shares)).cpu().numpy()
 
     def scale_action_batch(self, actions: th.Tensor) -> th.Tensor:
         """Actions in the environment's units -> [-1, 1]."""
-        low = th.as_tensor(self.action_space.low, device=actions.device)  # type: ignore[attr-defined]
-        high = th.as_tensor(self.action_space.high, device=actions.device)  # type: ignore[attr-defined]
+        low = th.as_tensor(self.action_space.low, device=actions.device)
+        high = th.as_tensor(self.action_space.high, device=actions.device)
         return 2.0 * (actions - low) / (high - low) - 1.0
 
     def decode_rewards(
@@ -155,7 +218,7 @@ class LatentPolicy(SACPolicy):
         :param next_obs: (..., obs_dim), standardised
         :param reward_embedding: (..., latent_dim)
         """
-        return self.decoder(obs, actions, next_obs, reward_embedding) * self.reward_std + self.reward_mean
+        return self.reward_norm.inverse(self.decoder(obs, actions, next_obs, reward_embedding))
 
     def act(self, obs: np.ndarray, latents: np.ndarray, noise: th.Tensor | None = None) -> np.ndarray:
         """Actions in [-1, 1] for a batch.
@@ -172,14 +235,14 @@ class LatentPolicy(SACPolicy):
         :param latents: (n, latent_dim)
         :return: A function of ``obs`` and ``noise``
         """
-        device = self.obs_mean.device
+        device = self.device
         with th.no_grad():
             embedding = self.policy_embedding(th.as_tensor(latents, dtype=th.float32, device=device))
 
         def act(obs: np.ndarray, noise: th.Tensor | None) -> np.ndarray:
             with th.no_grad():
                 standardised = self.standardise(th.as_tensor(obs, dtype=th.float32, device=device))
-                mean, log_std = self.actor.distribution(standardised, embedding)  # type: ignore[operator]
+                mean, log_std = self.actor.distribution(standardised, embedding)
                 actions = mean if noise is None else th.addcmul(mean, log_std.exp(), noise)
                 return actions.tanh_().cpu().numpy()
 
@@ -191,7 +254,7 @@ class LatentPolicy(SACPolicy):
         state: tuple[np.ndarray, ...] | np.ndarray | None = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+    ) -> tuple[np.ndarray, Any]:
         """Actions for observations under task latents.
 
         :param observation: (obs_dim,) or (n, obs_dim)
@@ -230,15 +293,15 @@ class LatentPolicy(SACPolicy):
         latents = np.array(np.broadcast_to(latents, (obs.shape[0], self.latent_dim)))
         noise = None
         if not deterministic:
-            noise = th.randn(obs.shape[0], int(np.prod(self.action_space.shape)), device=self.device)  # type: ignore[arg-type]
+            noise = th.randn(obs.shape[0], int(np.prod(self.action_space.shape)), device=self.device)
         actions = self.unscale_action(self.act(obs, latents, noise))
-        actions = np.clip(actions, self.action_space.low, self.action_space.high)  # type: ignore[attr-defined]
-        return (actions[0] if single else actions), latents  # type: ignore[return-value]
+        actions = np.clip(actions, self.action_space.low, self.action_space.high)
+        return (actions[0] if single else actions), latents
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         assert isinstance(observation, th.Tensor)
         latents = np.zeros((observation.shape[0], self.latent_dim))
-        noise = None if deterministic else th.randn(observation.shape[0], *self.action_space.shape, device=self.device)  # type: ignore[misc]
+        noise = None if deterministic else th.randn(observation.shape[0], *self.action_space.shape, device=self.device)
         return th.as_tensor(self.act(observation.cpu().numpy(), latents, noise), device=self.device)
 
     def set_training_mode(self, mode: bool) -> None:
@@ -259,6 +322,15 @@ class LatentPolicy(SACPolicy):
             "optimizer_class": self.optimizer_class,
             "optimizer_kwargs": self.optimizer_kwargs,
         }
+
+
+def _evenly_spaced(total: int, count: int | None) -> np.ndarray:
+    """At most ``count`` of ``total`` indices, at one distance, with what is left over at both ends."""
+    if count is None or total <= count:
+        return np.arange(total)
+    distance = -(-total // count)
+    chosen = np.arange(0, total, distance)
+    return chosen + (total - 1 - chosen[-1]) // 2
 
 
 MlpPolicy = LatentPolicy

@@ -4,20 +4,19 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
-from gymnasium.vector import VectorEnv
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_poem.common.buffers import Segment
 from sb3_poem.common.collection import relabelled_returns
 from sb3_poem.common.family import FamilyEnv
-from sb3_poem.pearl_sac.losses import MetaBatch, TaskEmbeddings
+from sb3_poem.pearl_sac.collector import EpochCollector, in_waves
+from sb3_poem.pearl_sac.environments import GivenEnv
 from sb3_poem.pearl_sac.pearl_sac import PEARLSAC
-from sb3_poem.pearl_sac.sampling import SamplingSAC
 from sb3_poem.pearl_sac.unsupported import refuse_unknown
-from sb3_poem.poem_sac.losses import preference_loss
+from sb3_poem.poem_sac.objective import POEMObjective
 from sb3_poem.poem_sac.policies import MlpPolicy, POEMPolicy
+from sb3_poem.poem_sac.sampler import GroupSampler
 
 SIMILARITIES = ("two-encoder", "inner")
 CONTEXTS = ("optimal", "pearl")
@@ -49,20 +48,11 @@ class POEMSAC(PEARLSAC):
     zoo_name: ClassVar[str] = "poem_sac"
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy}
     policy: POEMPolicy
-    saved_arguments: ClassVar[dict[str, str]] = {
-        **SamplingSAC.saved_arguments,
-        "n_steps": "target_steps",
-        "preference_coef": "preference_coef",
-        "similarity": "similarity_metric",
-        "context": "context_kind",
-        "preference_source": "preference_source",
-        "preference_group_size": "preference_group_size",
-    }
 
     def __init__(
         self,
         policy: str | type[POEMPolicy],
-        env: GymEnv | VectorEnv | str,
+        env: GivenEnv | None,
         learning_rate: float | Schedule = 3e-4,
         buffer_size: int = 100_000,
         learning_starts: int = 0,
@@ -117,12 +107,12 @@ class POEMSAC(PEARLSAC):
         if preference_group_size < 2:
             raise ValueError(f"preference_group_size must be at least 2, got {preference_group_size}")
         self.preference_coef = preference_coef
-        self.similarity_metric = similarity
-        self.context_kind = context
+        self.similarity = similarity
+        self.context = context
         self.preference_source = preference_source
         self.preference_group_size = preference_group_size
-        self.context_has_value = context == "optimal"
-        self._groups: list[np.ndarray] | None = None
+        #: Tasks whose policies were run on each other's in the last epoch, with returns by rollouts
+        self.groups: list[np.ndarray] = []
         super().__init__(
             policy,
             env,
@@ -164,7 +154,8 @@ class POEMSAC(PEARLSAC):
 
     def _complete_policy_kwargs(self) -> None:
         super()._complete_policy_kwargs()
-        self.policy_kwargs["two_encoder"] = self.similarity_metric == "two-encoder"
+        self.policy_kwargs["two_encoder"] = self.similarity == "two-encoder"
+        self.policy_kwargs["context_has_value"] = self.context == "optimal"
 
     def _check_family(self, family: FamilyEnv) -> None:
         super()._check_family(family)
@@ -174,7 +165,7 @@ class POEMSAC(PEARLSAC):
                 "so a trajectory of one cannot be relabelled for another"
             )
 
-    def similarity(self, task_latents: np.ndarray, policy_latents: np.ndarray) -> np.ndarray:
+    def similarities(self, task_latents: np.ndarray, policy_latents: np.ndarray) -> np.ndarray:
         """S(z_i, z_j) = <f_r(z_i), f_pi(z_j)> (eq. 3): how well policy j fits task i.
 
         :param task_latents: (m, latent_dim)
@@ -189,61 +180,50 @@ class POEMSAC(PEARLSAC):
             return self.policy.similarity(tasks, policies).double().cpu().numpy()
 
     @property
-    def _relabels(self) -> bool:
+    def relabels(self) -> bool:
+        """Whether J[i, j] comes from relabelling, rather than from rollouts."""
         return self.preference_source == "relabel" or (self.preference_source == "auto" and self.family.shared_dynamics)
 
     @property
     def epoch_steps(self) -> int:
         """Environment steps of an epoch's collection, those that compare policies included."""
-        if self._relabels:
+        if self.relabels:
             return super().epoch_steps
-        sizes = [len(group) for group in self._split(np.arange(len(self.task_latents)))]
+        sizes = [len(group) for group in self._split(np.arange(len(self.train_tasks)))]
         return super().epoch_steps + self._steps_of(sum(size * (size - 1) for size in sizes))
 
     def _split(self, tasks: np.ndarray) -> list[np.ndarray]:
         """Groups of tasks, whose policies are run on each other's."""
         return np.array_split(tasks, max(1, len(tasks) // self.preference_group_size))
 
-    def _measure_returns(self, epoch: Segment, callback: BaseCallback) -> np.ndarray | None:
-        assert self.train_tasks is not None
-        n_tasks = len(self.train_tasks)
-        if self._relabels:
-            returns = relabelled_returns(self.family.compute_rewards, self.train_tasks, epoch.features, epoch.first_episode)
-            return returns.reshape(n_tasks, n_tasks, -1).mean(axis=2)
-        own = super()._measure_returns(epoch, callback)
-        assert own is not None
-        return self._measure_by_rollouts(own, epoch, callback)
+    def measure_returns(self, epoch: Segment, collector: EpochCollector) -> np.ndarray | None:
+        """J[i, j] by relabelling or, within groups of tasks, by rollouts; see :meth:`PEARLSAC.measure_returns`."""
+        if not self.relabels:
+            return self._measure_by_rollouts(epoch, collector)
+        tasks = self.train_tasks.tasks
+        returns = relabelled_returns(self.family.compute_rewards, tasks, epoch.features, epoch.first_episode)
+        return returns.reshape(len(tasks), len(tasks), -1).mean(axis=2)
 
-    def _measure_by_rollouts(self, returns: np.ndarray, epoch: Segment, callback: BaseCallback) -> np.ndarray | None:
-        """Run the policies of random groups of tasks on each other's tasks; the transitions go to the tasks' buffers."""
-        assert self.train_tasks is not None
-        n_tasks, n_envs = len(returns), self.family.num_envs
-        self._groups = self._split(self.generators.numpy.permutation(n_tasks))
-        pairs = np.array([(i, j) for group in self._groups for i in group for j in group if i != j], dtype=np.int64)
+    def _measure_by_rollouts(self, epoch: Segment, collector: EpochCollector) -> np.ndarray | None:
+        """Run the policies of random groups of tasks on each other's tasks."""
+        returns = super().measure_returns(epoch, collector)
+        n_tasks = len(self.train_tasks)
+        self.groups = self._split(self.generators.numpy.permutation(n_tasks))
+        pairs = [(i, j) for group in self.groups for i in group for j in group if i != j]
         own_latents = epoch.latents.reshape(n_tasks, -1, self.latent_dim)[:, 0]
-        slots = np.resize(np.arange(len(pairs)), -(-len(pairs) // n_envs) * n_envs)
-        for wave in slots.reshape(-1, n_envs):
-            task_ids, policy_ids = pairs[wave].T
-            segment = self._collect(callback, task_ids, self.train_tasks[task_ids], own_latents[policy_ids])
-            if segment is None:
+        for wave in in_waves(np.array(pairs, dtype=np.int64).reshape(-1, 2), self.family.num_envs):
+            task_ids, policy_ids = wave.T
+            segment = collector.roll_out(task_ids, own_latents[policy_ids])
+            if segment is None or returns is None:
                 return None
-            self.replay_buffer.extend(segment)
             returns[task_ids, policy_ids] = (segment.rewards * segment.first_episode).sum(axis=1)
         return returns
 
-    def _choose_tasks(self) -> np.ndarray:
-        if self._groups is None:
-            return super()._choose_tasks()
-        # returns are known within groups only, so a meta-batch is made of whole groups
-        count = max(1, min(self.meta_batch_size // self.preference_group_size, len(self._groups)))
-        chosen = self.generators.numpy.choice(len(self._groups), size=count, replace=False)
-        return np.concatenate([self._groups[index] for index in chosen])
+    def make_sampler(self) -> GroupSampler:
+        """What draws meta-batches."""
+        parts = vars(super().make_sampler())
+        return GroupSampler(**parts, groups=self.groups, group_size=self.preference_group_size)
 
-    def _embed(self, latents: th.Tensor) -> TaskEmbeddings:
-        """L_policy trains f_pi and the encoder (section 5.3)."""
-        return TaskEmbeddings(latents, self.policy.policy_embedding(latents), self.policy.reward_embedding(latents))
-
-    def _embedding_loss(self, batch: MetaBatch, embeddings: TaskEmbeddings) -> tuple[th.Tensor, dict[str, th.Tensor]]:
-        similarity = embeddings.reward @ embeddings.policy.T  # eq. 3
-        loss, accuracy = preference_loss(similarity, batch.returns)
-        return self.preference_coef * loss, {"preference_loss": loss, "preference_accuracy": accuracy}
+    def make_objective(self) -> POEMObjective:
+        """What gradient steps minimise."""
+        return POEMObjective(**vars(super().make_objective()), preference_coef=self.preference_coef)

@@ -1,5 +1,7 @@
 """Policy of POEMSAC: PEARLSAC's, with a reward and a policy embedding of the latent."""
 
+from typing import Any
+
 import torch as th
 
 from sb3_poem.common.networks import MLP
@@ -12,7 +14,7 @@ class POEMPolicy(LatentPolicy):
     :param two_encoder: False leaves both embeddings out: the ablation ``similarity="inner"``
     """
 
-    def __init__(self, *args, two_encoder: bool = True, **kwargs) -> None:  # type: ignore[no-untyped-def]
+    def __init__(self, *args: Any, two_encoder: bool = True, **kwargs: Any) -> None:
         self.two_encoder = two_encoder
         super().__init__(*args, **kwargs)
 
@@ -33,7 +35,7 @@ class POEMPolicy(LatentPolicy):
         """S(z_i, z_j) = <f_r(z_i), f_pi(z_j)> (eq. 3): (m, d), (n, d) -> (m, n)."""
         return self.reward_embedding(task_latents) @ self.policy_embedding(policy_latents).T
 
-    def _get_constructor_parameters(self) -> dict:
+    def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), "two_encoder": self.two_encoder}
 
 

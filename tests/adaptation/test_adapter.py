@@ -239,7 +239,11 @@ def test_the_same_weights_go_on_and_others_are_refused(point_goal, tmp_path):
         with torch.no_grad():
             again.policy.critic.members[0].output.bias += 1.0  # which adaptation does not use
         assert again.digest == point_goal.digest
-        for tensor in (again.policy.actor.mlp.output.bias, again.policy.obs_mean, again.policy.reward_mapping.output.weight):
+        for tensor in (
+            again.policy.actor.mlp.output.bias,
+            again.policy.obs_norm.mean,
+            again.policy.reward_mapping.output.weight,
+        ):
             with torch.no_grad():
                 tensor += 0.01
             with pytest.raises(ValueError, match="saved with a model of other weights than this POEMSAC on poem/PointGoal-v0"):
@@ -247,7 +251,7 @@ def test_the_same_weights_go_on_and_others_are_refused(point_goal, tmp_path):
             with torch.no_grad():
                 tensor -= 0.01
     other = POEMSAC.load(tmp_path / "m.zip", device="cpu")
-    other.latent_means = other.latent_means + 0.1
+    other.train_tasks.latent_means += 0.1
     begun.save(tmp_path / "state.json")
     with pytest.raises(ValueError, match="other weights"):
         PreferenceAdapter.load(tmp_path / "state.json", other, env)

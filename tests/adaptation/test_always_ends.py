@@ -30,7 +30,7 @@ class RandomModel(SpeedModel):
         self.scale = scale
         self.similarity_rows = self.decoder_steps = 0
 
-    def similarity(self, task_latents, policy_latents):
+    def similarities(self, task_latents, policy_latents):
         self.similarity_rows += len(task_latents) + len(policy_latents)
         embeddings = [np.tanh(z @ w) for z, w in zip((task_latents, policy_latents), self.weights, strict=True)]
         return self.scale * embeddings[0] @ embeddings[1].T

@@ -75,12 +75,12 @@ def test_the_likelihood_from_s_is_the_direct_formula():
     model = SpeedModel()
     inference = make(model, likelihood="similarity", n_candidates=50)
     particles = inference.particles.copy()
-    s = model.similarity(particles, particles)
+    s = model.similarities(particles, particles)
     spread = math.sqrt(np.mean([(row[i] - row[j]) ** 2 for row in s for i in range(50) for j in range(50)]))
     unit = max(1.0, SIMILARITY_RESOLUTION * spread / 1.702)
     left, right = np.full(5, 0.4), np.full(5, -0.7)
     expected = np.log(
-        LAPSE / 2 + (1 - LAPSE) * logistic((model.similarity(particles, np.stack([left, right])) @ [1, -1]) / unit)
+        LAPSE / 2 + (1 - LAPSE) * logistic((model.similarities(particles, np.stack([left, right])) @ [1, -1]) / unit)
     )
     inference._rejuvenate = lambda: None
     inference.tell(LEFT, left, right)
@@ -196,28 +196,28 @@ def test_many_answers_in_many_dimensions_do_not_thin_the_particles_out(likelihoo
 class SignOf:
     """Forwards or backwards: the middle fits neither."""
 
-    def similarity(self, tasks, policies):
+    def similarities(self, tasks, policies):
         return np.sign(tasks[:, :1]) * np.where(np.abs(policies[:, 0]) > 0.5, np.sign(policies[:, 0]), 0.0)
 
 
 class ProductOf:
     """A policy looks the fitter the more extreme it is."""
 
-    def similarity(self, tasks, policies):
+    def similarities(self, tasks, policies):
         return tasks[:, :1] * policies[:, 0]
 
 
 class EitherOf:
     """Two kinds of policy are as good as each other, and what lies between them is not."""
 
-    def similarity(self, tasks, policies):
+    def similarities(self, tasks, policies):
         return np.repeat(-np.abs(np.abs(policies[:, 0]) - 2.0)[None, :], len(tasks), axis=0)
 
 
 class NearestTo:
     """A policy that lies between all others looks best by far."""
 
-    def similarity(self, tasks, policies):
+    def similarities(self, tasks, policies):
         return np.repeat(-np.abs(policies[:, 0] - 0.8)[None, :], len(tasks), axis=0)
 
 

@@ -25,7 +25,7 @@ def differences(inference, latents):
     model = inference.model
     columns = []
     for answer in inference.answers:
-        left, right = model.similarity(latents, np.stack([answer.left, answer.right])).T
+        left, right = model.similarities(latents, np.stack([answer.left, answer.right])).T
         columns.append(left - right if answer.preference is LEFT else right - left)
     return np.stack(columns, axis=1)
 
@@ -108,7 +108,7 @@ def test_the_query_is_eq_10s():
             )
             odds = 1 / (1 + np.exp(-difference))
             best = min(best, max(np.sum(odds >= 0.4), np.sum(1 - odds >= 0.4)))
-    s = model.similarity(z, np.stack([left, right]))
+    s = model.similarities(z, np.stack([left, right]))
     odds = 1 / (1 + np.exp(s[:, 1] - s[:, 0]))
     assert max(np.sum(odds >= 0.4), np.sum(1 - odds >= 0.4)) == best
 

@@ -41,7 +41,7 @@ class SphereModel:
         direction = self.reward_embedding(latents)
         return RADIUS * direction / np.linalg.norm(direction, axis=1, keepdims=True)
 
-    def similarity(self, task_latents, policy_latents):
+    def similarities(self, task_latents, policy_latents):
         return self.reward_embedding(task_latents) @ self.policy_embedding(policy_latents).T
 
 
@@ -53,7 +53,7 @@ def surviving_mass(model, inference, epsilon, draws):
     """P_k by Monte Carlo: eq. 9 written out, independent of the code under test."""
     alive = np.ones(len(draws), dtype=bool)
     for answer in inference.answers:
-        s = model.similarity(draws, np.stack([answer.left, answer.right]))
+        s = model.similarities(draws, np.stack([answer.left, answer.right]))
         better, worse = (s[:, 0], s[:, 1]) if answer.preference is Preference.LEFT else (s[:, 1], s[:, 0])
         with np.errstate(over="ignore"):
             alive &= 1.0 / (1.0 + np.exp(worse - better)) >= 0.5 - epsilon
@@ -69,7 +69,7 @@ def run(epsilon, seed):
     masses, alive, distances = [1.0], True, []
     for _ in range(K):
         left, right = inference.ask_latents()
-        difference = np.subtract(*model.similarity(truth, np.stack([left, right]))[0])
+        difference = np.subtract(*model.similarities(truth, np.stack([left, right]))[0])
         # Assumption 2: it errs only where eq. 9 still holds for the truth. There it always errs.
         errs = abs(difference) <= slack(epsilon) * (1 - 1e-9)
         inference.tell(Preference.LEFT if (difference > 0) != errs else Preference.RIGHT, left, right)
@@ -133,7 +133,7 @@ def test_it_can_fail_with_random_questions():
         inference = PaperInference(model, N_CANDIDATES, 0.0, query_rule="random", rng=rng)
         for _ in range(K):
             left, right = inference.ask_latents()
-            s = model.similarity(truth, np.stack([left, right]))[0]
+            s = model.similarities(truth, np.stack([left, right]))[0]
             inference.tell(Preference.LEFT if s[0] > s[1] else Preference.RIGHT, left, right)
         masses.append(surviving_mass(model, inference, 0.0, draws))
     assert max(masses) > bound(0.0)[K]
@@ -151,7 +151,7 @@ def test_candidates_converge_to_the_truth():
             left, right = inference.ask_latents()
             cosine = model.policy_embedding(inference.candidates) @ model.policy_embedding(truth)[0] / RADIUS**2
             angles.append(np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean())
-            s = model.similarity(truth, np.stack([left, right]))[0]
+            s = model.similarities(truth, np.stack([left, right]))[0]
             inference.tell(Preference.LEFT if s[0] > s[1] else Preference.RIGHT, left, right)
         assert angles[0] > 60
         assert angles[10] < 12

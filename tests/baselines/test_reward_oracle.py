@@ -26,13 +26,13 @@ def test_contexts_are_those_of_training(trained):
     rows = adapter.inference.transitions
     assert rows.shape == (20, 6)
     centre, deviation = trained.context_reward_statistics
-    rewards = trained.context.rewards.numpy()
+    rewards = trained.epoch_context.rewards.numpy()
     assert (centre, deviation) == pytest.approx((rewards.mean(), rewards.std(ddof=1)), rel=1e-5)
-    np.testing.assert_allclose(trained.context.transitions[..., -1].numpy(), (rewards - centre) / deviation, atol=1e-5)
+    np.testing.assert_allclose(trained.epoch_context.transitions[..., -1].numpy(), (rewards - centre) / deviation, atol=1e-5)
     features = query.left.reward_features
     true_rewards = -np.abs(features[:, 0] - 0.3) - 0.01 * features[:, 1] ** 2
     np.testing.assert_allclose(rows[:10, -1], (true_rewards - centre) / deviation, atol=1e-5)
-    mean, std = trained.policy.obs_mean.numpy(), trained.policy.obs_std.numpy()
+    mean, std = trained.policy.obs_norm.mean.numpy(), trained.policy.obs_norm.std.numpy()
     np.testing.assert_allclose(rows[:10, :2], (query.left.observations[:-1] - mean) / std, atol=1e-4)
     np.testing.assert_allclose(rows[:10, 2], (query.left.actions[:, 0] - 1.0) / 3.0, atol=1e-5)  # from [-2, 4] to [-1, 1]
     with th.no_grad():

@@ -27,7 +27,7 @@ from sb3_poem.label.catalogue import read_catalogue
 from sb3_poem.loading import load_model
 
 ADAPT = ["--queries", "1", "--tasks", "1", "--episodes", "1", "--record", "0"]
-FORMAT = "sb3_poem pretrained 1"
+FORMAT = "sb3_poem pretrained 2"
 NAN = float("nan")
 
 
@@ -269,7 +269,7 @@ REFUSED_NUMBERS: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     ({"algorithm": ["POEMSAC"]}, {}, "names no algorithm"),
     ({"algorithm": "SAC"}, {}, "holds a SAC"),
     ({"arguments": {}, "card": [1]}, {}, "card must be an object"),
-    ({"format": "sb3_poem pretrained 2"}, {}, f"its format is 'sb3_poem pretrained 2', expected '{FORMAT}'"),
+    ({"format": "sb3_poem pretrained 1"}, {}, f"its format is 'sb3_poem pretrained 1', expected '{FORMAT}'"),
 ]
 
 

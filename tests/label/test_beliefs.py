@@ -13,6 +13,7 @@ import pytest
 from sb3_poem.label.beliefs import belief, posterior, sentence, weighted_quantiles
 from sb3_poem.label.families import as_points, describe
 from sb3_poem.label.videos import HEIGHT, WIDTH, fit, pair
+from sb3_poem.pearl_sac.train_tasks import TrainTasks
 
 
 def adapter(latents: np.ndarray, weights: np.ndarray, tasks: np.ndarray, means: np.ndarray) -> Any:
@@ -22,7 +23,7 @@ def adapter(latents: np.ndarray, weights: np.ndarray, tasks: np.ndarray, means: 
     variances[:, 1:] = 1.0  # what training has left unused keeps the prior's variance
     return SimpleNamespace(
         inference=inference,
-        model=SimpleNamespace(train_tasks=tasks, latent_means=means, latent_variances=variances),
+        model=SimpleNamespace(train_tasks=TrainTasks(tasks, means, variances)),
     )
 
 

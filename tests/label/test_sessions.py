@@ -109,7 +109,7 @@ def test_a_session_does_not_go_on_with_a_model_of_other_weights(
 
     token = with_conversations(first_half)
     model = load_choice(point_goal)
-    model.latent_means = model.latent_means + 0.1
+    model.train_tasks.latent_means += 0.1
     model.save_pretrained(tmp_path / "PointGoal")
 
     async def second_half() -> str:

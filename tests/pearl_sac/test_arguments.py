@@ -29,9 +29,9 @@ def test_a_seed_determines_everything(algorithm: type[PEARLSAC]) -> None:
     np.random.seed(99)  # noqa: NPY002 (to show that it does not matter)
     second = small(algorithm).learn(2 * EPOCH)
     assert_same_model(first, second)
-    assert th.equal(first.context.transitions, second.context.transitions)
+    assert th.equal(first.epoch_context.transitions, second.epoch_context.transitions)
     third = small(algorithm, seed=1).learn(2 * EPOCH)
-    assert not np.array_equal(first.train_tasks, third.train_tasks)
+    assert not np.array_equal(first.train_tasks.tasks, third.train_tasks.tasks)
     different = differing(parameters(first), parameters(third))
     assert sum(name.startswith("policy.") for name in different) > 20
 
@@ -52,13 +52,13 @@ def test_the_kind_of_environment_does_not_matter(algorithm: type[PEARLSAC]) -> N
 
 
 def test_tasks_come_from_the_family_and_the_seed(algorithm: type[PEARLSAC]) -> None:
-    tasks = small(algorithm, n_train_tasks=200).train_tasks
+    tasks = small(algorithm, n_train_tasks=200).train_tasks.tasks
     assert tasks.shape == (200, 1)
     assert np.unique(tasks).size == 200
     # uniform on [0, pi]: Kolmogorov-Smirnov at 1 %
     deviation = np.abs(np.sort(tasks[:, 0]) / np.pi - (np.arange(200) + 0.5) / 200).max()
     assert deviation < 1.63 / np.sqrt(200)
-    assert small(algorithm, walks(1), horizon=10, n_train_tasks=None).train_tasks.shape == (120, 1)
+    assert small(algorithm, walks(1), horizon=10, n_train_tasks=None).train_tasks.tasks.shape == (120, 1)
 
 
 def test_the_callers_policy_kwargs_stay_as_they_are(algorithm: type[PEARLSAC]) -> None:
@@ -140,13 +140,13 @@ def test_a_schedule_never_turns_negative(algorithm: type[PEARLSAC]) -> None:
 def test_entropy_coefficient(algorithm: type[PEARLSAC]) -> None:
     fixed = small(algorithm, ent_coef=0.3).learn(EPOCH)
     assert fixed.ent_coef_optimizer is None
-    assert fixed._entropy_coefficient().item() == pytest.approx(0.3)
+    assert fixed.entropy_coefficient.value.item() == pytest.approx(0.3)
     learned = small(algorithm, ent_coef="auto_0.1")
-    assert learned._entropy_coefficient().item() == pytest.approx(0.1)
+    assert learned.entropy_coefficient.value.item() == pytest.approx(0.1)
     learned.learn(2 * EPOCH)
-    assert learned._entropy_coefficient().item() != pytest.approx(0.1, abs=1e-5)
+    assert learned.entropy_coefficient.value.item() != pytest.approx(0.1, abs=1e-5)
     # ten Adam steps of 3e-4 on the logarithm
-    assert abs(np.log(learned._entropy_coefficient().item() / 0.1)) <= 10 * 3e-4 * 1.01
+    assert abs(np.log(learned.entropy_coefficient.value.item() / 0.1)) <= 10 * 3e-4 * 1.01
     with pytest.raises(ValueError, match=r'`ent_coef` must be a number or "auto", but is .little'):
         small(algorithm, ent_coef="little")
 
@@ -156,8 +156,8 @@ def test_target_entropy(algorithm: type[PEARLSAC]) -> None:
     assert small(algorithm).target_entropy == -2.0
     assert small(algorithm, target_entropy=-0.5).target_entropy == -0.5
     # far below the policy's entropy alpha falls, far above it rises
-    falling = small(algorithm, target_entropy=-50.0).learn(EPOCH)._entropy_coefficient().item()
-    rising = small(algorithm, target_entropy=50.0).learn(EPOCH)._entropy_coefficient().item()
+    falling = small(algorithm, target_entropy=-50.0).learn(EPOCH).entropy_coefficient.value.item()
+    rising = small(algorithm, target_entropy=50.0).learn(EPOCH).entropy_coefficient.value.item()
     assert falling < 1.0 < rising
 
 
@@ -181,17 +181,12 @@ def test_target_critics_follow_slowly(algorithm: type[PEARLSAC]) -> None:
 @one_is_enough
 def test_target_update_interval(algorithm: type[PEARLSAC]) -> None:
     """Updates at gradient steps 0, 3, 6, ... with tau = 1 copy the critics."""
-    model, seen = small(algorithm, gradient_steps=7, target_update_interval=3, tau=1.0), []
-    update = model._update_targets
-
-    def spy() -> None:
-        update()
-        seen.append(model._n_updates)
-        assert th.equal(target_networks(model), critic_networks(model))
-
-    model._update_targets = spy  # type: ignore[method-assign]
-    model.learn(1)
-    assert seen == [0, 3, 6]
+    model, copied = small(algorithm, gradient_steps=0, target_update_interval=3, tau=1.0).learn(1), []
+    with model.make_updater() as updater:
+        for batch in model.make_sampler().sample(7, 16):
+            updater.step(batch)
+            copied.append(th.equal(target_networks(model), critic_networks(model)))
+    assert copied == [True, False, False, True, False, False, True]
 
 
 @one_is_enough
@@ -210,11 +205,11 @@ def test_gradient_steps_and_learning_starts(algorithm: type[PEARLSAC]) -> None:
 def test_horizons_per_task_and_epoch(algorithm: type[PEARLSAC]) -> None:
     model = small(algorithm, trajectories_per_task=3).learn(1)
     assert model.num_timesteps == 3 * EPOCH
-    assert model.context.transitions.shape[:2] == (N_TASKS, 75)
+    assert model.epoch_context.transitions.shape[:2] == (N_TASKS, 75)
     assert (model.replay_buffer.counts == 75).all()
     # contexts are the tasks' own
     raw = model.replay_buffer.transitions(4).rewards[0]
-    assert sorted(model.context.rewards[4].tolist()) == pytest.approx(sorted(raw.tolist()), abs=1e-5)
+    assert sorted(model.epoch_context.rewards[4].tolist()) == pytest.approx(sorted(raw.tolist()), abs=1e-5)
 
 
 @one_is_enough

@@ -212,7 +212,7 @@ def test_more_tasks_than_a_finite_family_has(algorithm: type[PEARLSAC]) -> None:
     with pytest.raises(ValueError, match=message):
         small(algorithm, "poem/HalfCheetahFwdBack-v0", n_train_tasks=3)
     model = small(algorithm, walks(2, TwoWalks), horizon=10, n_train_tasks=None)
-    assert sorted(model.train_tasks.ravel()) == [-1.0, 1.0]
+    assert sorted(model.train_tasks.tasks.ravel()) == [-1.0, 1.0]
 
 
 def test_vec_normalize(algorithm: type[PEARLSAC]) -> None:
@@ -281,7 +281,7 @@ def test_poison_stops_training_before_the_weights(algorithm: type[PEARLSAC], wha
 def test_a_loss_that_is_not_finite_changes_no_weight(algorithm: type[PEARLSAC]) -> None:
     model = small(algorithm).learn(300)
     before = parameters(model)
-    model.context.transitions[:] = float("nan")  # latents, and with them all losses
+    model.epoch_context.transitions[:] = float("nan")  # latents, and with them all losses
     with pytest.raises(ValueError, match=r"loss or its gradient is not finite at update 5; no network was changed by it"):
         model.train(3, 16)
     assert not differing(before, parameters(model))

@@ -6,7 +6,7 @@ import torch as th
 from meta_toys import POINT_GOAL, small, walks
 
 from sb3_poem import PEARLSAC
-from sb3_poem.common.pretrained import read_config
+from sb3_poem.pearl_sac.saving import read_config
 
 
 def trained(fraction: float) -> PEARLSAC:
@@ -16,13 +16,13 @@ def trained(fraction: float) -> PEARLSAC:
 def sampled(model: PEARLSAC, n: int = 600) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Task numbers (n,), contexts (n, size, 6) and rewards (n, size)."""
     tasks = th.as_tensor(np.resize(np.arange(6), n))
-    context, rewards = model._sample_contexts(tasks)
+    context, rewards = model.make_sampler().contexts(tasks)
     return tasks.numpy(), context.numpy(), rewards.numpy()
 
 
 def own_transitions(model: PEARLSAC, tasks: np.ndarray, context: np.ndarray) -> np.ndarray:
     """(n, size), whether a transition, its reward aside, was collected by the task itself."""
-    stored = model.context.transitions.numpy()[..., :-1]
+    stored = model.epoch_context.transitions.numpy()[..., :-1]
     return np.array(
         [[(stored[i] == row[:-1]).all(axis=1).any() for row in rows] for i, rows in zip(tasks, context, strict=True)]
     )
@@ -33,9 +33,9 @@ def test_rewards_are_the_tasks_own_whoever_acted(fraction: float) -> None:
     model = trained(fraction)
     tasks, context, rewards = sampled(model)
     policy = model.policy
-    obs, next_obs = (context[..., i : i + 2] * policy.obs_std.numpy() + policy.obs_mean.numpy() for i in (0, 3))
+    obs, next_obs = (context[..., i : i + 2] * policy.obs_norm.std.numpy() + policy.obs_norm.mean.numpy() for i in (0, 3))
     actions = 3.0 * context[..., 2] + 1.0  # from [-1, 1] to [-2, 4]
-    goals = model.train_tasks[tasks]
+    goals = model.train_tasks.tasks[tasks]
     np.testing.assert_allclose(rewards, -np.abs(next_obs[..., 0] - goals) - 0.01 * actions**2, atol=1e-4)
     centre, deviation = model.context_reward_statistics
     np.testing.assert_allclose(context[..., -1], (rewards - centre) / deviation, atol=1e-4)
@@ -46,7 +46,7 @@ def test_rewards_are_the_tasks_own_whoever_acted(fraction: float) -> None:
 def test_the_share_of_contexts_that_are_others() -> None:
     model = trained(0.0)
     assert own_transitions(model, *sampled(model)[:2]).all()
-    assert model.context.features is None
+    assert model.epoch_context.features is None
     model = trained(0.5)
     tasks, context, _ = sampled(model)
     own = own_transitions(model, tasks, context).all(axis=1)

@@ -52,7 +52,7 @@ def test_any_number_of_environments(algorithm: type[PEARLSAC], make_env: Any) ->
     # the stored transitions are the tasks' own
     for task in range(N_TASKS):
         stored = model.replay_buffer.transitions(task)
-        expected = model.family.compute_rewards(model.train_tasks[task], stored.features.numpy())
+        expected = model.family.compute_rewards(model.train_tasks.tasks[task], stored.features.numpy())
         np.testing.assert_allclose(stored.rewards.numpy(), expected, atol=1e-5)
 
 

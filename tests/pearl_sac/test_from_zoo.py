@@ -15,14 +15,15 @@ from meta_toys import EPOCH, POINT_GOAL, Walk, differing, parameters, small
 from sb3_poem import PEARLSAC, POEMSAC
 from sb3_poem.common.vec_env import TaskVecEnv
 from sb3_poem.loading import ALGORITHMS
+from sb3_poem.pearl_sac.saving import kept_arguments
 from sb3_poem.resources import config_file
 
 
 def test_arguments_are_those_of_the_entry(algorithm: type[PEARLSAC]) -> None:
     entry = yaml.safe_load(config_file(algorithm.zoo_name).read_text())[POINT_GOAL]
     model = algorithm.from_zoo(POINT_GOAL, seed=3, device="cpu", gamma=0.8)
-    for name in entry.keys() & model.saved_arguments.keys() - {"gamma"}:
-        assert getattr(model, model.saved_arguments[name]) == entry[name], name
+    for name in entry.keys() & set(kept_arguments(algorithm)) - {"gamma"}:
+        assert getattr(model, name) == entry[name], name
     assert (model.gamma, model.seed) == (0.8, 3)
     assert (model.n_envs, model.n_timesteps) == (entry["n_envs"], int(entry["n_timesteps"]))
     assert model.policy.net_arch["pi"] == [64, 64]

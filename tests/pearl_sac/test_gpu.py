@@ -11,7 +11,8 @@ import torch as th
 from meta_toys import EPOCH, POINT_GOAL, small
 
 from sb3_poem import PEARLSAC, POEMSAC, PreferenceAdapter, ReturnOracle
-from sb3_poem.pearl_sac import pearl_sac
+from sb3_poem.pearl_sac import updater
+from sb3_poem.pearl_sac.losses import MetaBatch
 
 pytestmark = [pytest.mark.gpu, pytest.mark.parametrize("algorithm", [PEARLSAC, POEMSAC])]
 
@@ -30,7 +31,7 @@ def test_replayed_steps_are_the_eager_ones(
 ) -> None:
     arguments = {"precision": "fp32", "gradient_steps": 20, "policy_delay": policy_delay}
     graphed = on_gpu(algorithm, **arguments).learn(EPOCH)
-    monkeypatch.setattr(pearl_sac, "GraphedStep", lambda step: step)
+    monkeypatch.setattr(updater, "GraphedStep", lambda step: step)
     eager = on_gpu(algorithm, **arguments).learn(EPOCH)
     assert graphed._n_updates == eager._n_updates == 20
     for name, value in weights(eager).items():
@@ -49,22 +50,22 @@ def test_everything_is_trained(algorithm: type[PEARLSAC], precision: str) -> Non
 
 
 def test_a_step_waits_for_nothing(algorithm: type[PEARLSAC], monkeypatch: pytest.MonkeyPatch) -> None:
-    step = PEARLSAC._gradient_step
+    step = updater.Updater.step
 
-    def watched(self: PEARLSAC, *arguments: Any) -> dict[str, th.Tensor]:
+    def watched(self: updater.Updater, batch: MetaBatch) -> dict[str, th.Tensor]:
         th.cuda.set_sync_debug_mode("error")
         try:
-            return step(self, *arguments)
+            return step(self, batch)
         finally:
             th.cuda.set_sync_debug_mode("default")
 
-    monkeypatch.setattr(PEARLSAC, "_gradient_step", watched)
+    monkeypatch.setattr(updater.Updater, "step", watched)
     on_gpu(algorithm).learn(EPOCH)
 
 
 def test_a_loss_that_is_not_finite_changes_no_weight(algorithm: type[PEARLSAC]) -> None:
     model = on_gpu(algorithm).learn(EPOCH)
-    model.context.transitions[:] = float("nan")
+    model.epoch_context.transitions[:] = float("nan")
     before = weights(model)
     with pytest.raises(ValueError, match="loss or its gradient is not finite at update 5"):
         model.train(6, 16)

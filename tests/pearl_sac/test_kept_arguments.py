@@ -22,5 +22,5 @@ def test_arguments_come_back(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
         algorithm.from_pretrained(tmp_path, ANT_GOAL),
         algorithm.load(tmp_path / "model.zip", env=ANT_GOAL),
     ):
-        kept = {name: getattr(loaded, loaded.saved_arguments[name]) for name in arguments}
+        kept = {name: getattr(loaded, name) for name in arguments}
         assert kept == arguments

@@ -50,7 +50,7 @@ def ahead(
         features = segment.features[copy, step].astype(np.float64)
         if symmetry is not None:
             features = symmetry.features(features)
-        total += GAMMA**k * float(model.family.compute_rewards(model.train_tasks[task], features))
+        total += GAMMA**k * float(model.family.compute_rewards(model.train_tasks.tasks[task], features))
         over, after = segment.terminated[copy, step] > 0, segment.next_observations[copy, step]
         cut = step + 1 == horizon or not (segment.observations[copy, step + 1] == after).all()
         if over or cut or k + 1 == n_steps:
@@ -65,7 +65,7 @@ def ahead(
 def test_rewards_values_and_discounts(monkeypatch: pytest.MonkeyPatch, n_steps: int, relabel_fraction: float) -> None:
     model, segments = collected(monkeypatch, n_steps=n_steps, relabel_fraction=relabel_fraction)
     assert model.replay_buffer.full
-    [batch] = model._sample_meta_batches(1, 60)
+    [batch] = model.make_sampler().sample(1, 60)
     assert batch.bootstraps is not None
     rewards, observations, discounts = (part.numpy() for part in batch.bootstraps)
     lengths = set()
@@ -86,7 +86,7 @@ def test_mirror_images_have_the_rewards_of_what_is_seen(
     monkeypatch: pytest.MonkeyPatch, n_steps: int, relabel_fraction: float
 ) -> None:
     model, segments = collected(monkeypatch, EvenWalk, n_steps=n_steps, relabel_fraction=relabel_fraction, mirror_fraction=0.3)
-    [batch] = model._sample_meta_batches(1, 60)
+    [batch] = model.make_sampler().sample(1, 60)
     transitions, n_mirrored = batch.transitions, 0
     rewards, observations, discounts = batch.bootstraps or (
         transitions.rewards,
@@ -121,18 +121,18 @@ def test_mirroring_needs_symmetries_and_shared_dynamics(family: type[Walk], mess
 
 def test_one_step_is_what_it_was() -> None:
     model = small(PEARLSAC).learn(300)
-    [batch] = model._sample_meta_batches(1, 16)
+    [batch] = model.make_sampler().sample(1, 16)
     assert batch.bootstraps is None
 
 
 def test_the_critics_learn_from_what_lies_ahead() -> None:
     model = small(PEARLSAC, n_steps=3).learn(300)
-    [batch] = model._sample_meta_batches(1, 16)
+    [batch] = model.make_sampler().sample(1, 16)
     assert batch.bootstraps is not None
-    _, metrics = model._losses(batch)
+    _, metrics = model.make_objective().loss(batch, model.entropy_coefficient.value)
     richer = batch._replace(bootstraps=batch.bootstraps._replace(rewards=batch.bootstraps.rewards + 100.0))
-    _, other = model._losses(richer)
-    scale = 1.0 / model.policy.reward_std.item()
+    _, other = model.make_objective().loss(richer, model.entropy_coefficient.value)
+    scale = 1.0 / model.policy.reward_norm.std.item()
     # Half the squared error of two critics: raising targets by c adds about c^2 once c is large.
     assert other["critic_loss"].item() == pytest.approx((100.0 * scale) ** 2, rel=0.2)
     assert metrics["critic_loss"].item() < 0.1 * other["critic_loss"].item()

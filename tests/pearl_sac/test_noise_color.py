@@ -5,6 +5,7 @@ from itertools import islice
 import numpy as np
 import pytest
 from meta_toys import small, walks
+from stable_baselines3.common.callbacks import CallbackList
 
 from sb3_poem import PEARLSAC
 from sb3_poem.common.buffers import Segment
@@ -13,7 +14,8 @@ from sb3_poem.common.buffers import Segment
 def noises(color: float, steps: int = 400) -> np.ndarray:
     """(steps, copies, action_dim) of one collection."""
     model = small(PEARLSAC, walks(6), horizon=steps, n_train_tasks=6, noise_color=color)
-    return np.stack([noise.numpy() for noise in islice(model._action_noises((500, 2)), steps)])
+    noises = model.make_collector(CallbackList([])).action_noises((500, 2))
+    return np.stack([noise.numpy() for noise in islice(noises, steps)])
 
 
 @pytest.mark.parametrize("color", [0.0, 1.0, 2.0])

@@ -15,7 +15,7 @@ def test_pearl_learns_point_goal() -> None:
     latents begin to tell depends on the seed; another had come 12 % of the way by then.
     """
     model = PEARLSAC("MlpPolicy", POINT_GOAL, **LEARN).learn(2 * LEARN_STEPS)
-    tasks, latents = model.train_tasks, model.task_latents
+    tasks, latents = model.train_tasks.tasks, model.task_latents
     env = TaskVecEnv.from_id(POINT_GOAL, len(tasks))
     own = evaluate_latents(model, env, latents, tasks, n_episodes=2, seed=5).mean()
     blind, known = point_goal_bounds(tasks)

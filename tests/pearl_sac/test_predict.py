@@ -74,7 +74,7 @@ def test_predict_is_the_actor(trained: PEARLSAC) -> None:
     """Against the networks put together by hand."""
     latents = np.random.default_rng(1).normal(size=(6, 5))
     policy = trained.policy
-    obs = ((th.as_tensor(OBS).float() - policy.obs_mean) / policy.obs_std).clamp(-10, 10)
+    obs = ((th.as_tensor(OBS).float() - policy.obs_norm.mean) / policy.obs_norm.std).clamp(-10, 10)
     embedding = th.as_tensor(latents).float()
     if isinstance(policy, POEMPolicy):
         embedding = policy.policy_mapping(embedding)

@@ -37,15 +37,14 @@ def targets(shaping_coef: float, n_steps: int) -> tuple[PEARLSAC, Any]:
         relabel_fraction=0.5,
         shaping_coef=shaping_coef,
     ).learn(5 * 60)
-    return model, model._sample_meta_batches(1, 60)[0]
+    return model, model.make_sampler().sample(1, 60)[0]
 
 
 @pytest.mark.parametrize("n_steps", [1, 3, 20])
 def test_targets_are_the_plain_ones_and_the_difference_of_potentials(n_steps: int) -> None:
     model, batch = targets(0.5, n_steps)
     plain_model, plain = targets(0.0, n_steps)
-    assert model.train_tasks is not None
-    np.testing.assert_array_equal(model.train_tasks, plain_model.train_tasks)
+    np.testing.assert_array_equal(model.train_tasks.tasks, plain_model.train_tasks.tasks)
     for name in ("observations", "actions", "rewards"):  # the decoder learns rewards as they are
         th.testing.assert_close(getattr(batch.transitions, name), getattr(plain.transitions, name), rtol=0, atol=0)
     if n_steps == 1:
@@ -54,7 +53,7 @@ def test_targets_are_the_plain_ones_and_the_difference_of_potentials(n_steps: in
     else:
         rewards, after, discounts = plain.bootstraps
     assert (discounts == 0).any()  # an early end was seen
-    task = model.train_tasks[batch.task_ids.numpy()][:, None, 0]
+    task = model.train_tasks.tasks[batch.task_ids.numpy()][:, None, 0]
 
     def worth(observations: th.Tensor) -> np.ndarray:
         return 0.5 / (1.0 - GAMMA) * (3.0 * np.sin(observations[..., 0].numpy()) * task + 1.0)

@@ -5,6 +5,7 @@ import pytest
 
 from sb3_poem import POEMSAC, TaskVecEnv
 from sb3_poem.adaptation import evaluate_episodes
+from sb3_poem.pearl_sac.collector import EpochCollector
 
 HORIZON = 8
 SMALL = {"net_arch": {"pi": [16], "qf": [16], "encoder": [16], "decoder": [16], "embedding": [8]}}
@@ -21,18 +22,18 @@ def test_preferences_are_relabelled_where_dynamics_are_shared(env_id):
     model = make_model(env_id).learn(2 * 4 * HORIZON)
     assert model.num_timesteps == 2 * 4 * HORIZON
     assert model._n_updates > 0
-    assert np.isfinite(model.context.returns.numpy()).all()
+    assert np.isfinite(model.epoch_context.returns.numpy()).all()
 
 
-def test_preferences_of_ml10_are_measured_by_rollouts_that_count():
+def test_preferences_of_ml10_are_measured_by_rollouts_that_count(monkeypatch):
     """An epoch runs four tasks, and the twelve pairs of the one group, each once; its returns are theirs."""
     model = make_model("poem/MetaWorldML10-v0")
     returns: dict[tuple[int, int], float] = {}
-    collected = model._collect
+    collected = EpochCollector.roll_out
     latents: list[np.ndarray] = []
 
-    def record(callback, task_ids, tasks, given_latents):
-        segment = collected(callback, task_ids, tasks, given_latents)
+    def record(self, task_ids, given_latents):
+        segment = collected(self, task_ids, given_latents)
         if not latents:
             latents.extend(given_latents)  # the epoch's own, one a task
         for row, task in enumerate(task_ids):
@@ -41,11 +42,11 @@ def test_preferences_of_ml10_are_measured_by_rollouts_that_count():
             returns[int(task), policy] = segment.rewards[row].sum()
         return segment
 
-    model._collect = record
+    monkeypatch.setattr(EpochCollector, "roll_out", record)
     model.learn(16 * HORIZON)
     assert model.num_timesteps == 16 * HORIZON
     expected = np.array([[returns[i, j] for j in range(4)] for i in range(4)])
-    assert model.context.returns.numpy() == pytest.approx(expected, rel=1e-5)
+    assert model.epoch_context.returns.numpy() == pytest.approx(expected, rel=1e-5)
     with pytest.raises(ValueError, match='preference_source must be "rollout" or "auto"'):
         POEMSAC("MlpPolicy", model.env, n_train_tasks=4, preference_source="relabel")
 
@@ -55,7 +56,7 @@ def test_what_a_deterministic_rollout_measures_is_what_a_single_environment_give
     import gymnasium as gym
 
     model = make_model("poem/MetaWorldML10-v0")
-    tasks = model.train_tasks[:3]
+    tasks = model.train_tasks.tasks[:3]
     latents = np.random.default_rng(0).standard_normal((3, model.latent_dim))
     outcomes = evaluate_episodes(model, model.env, latents, tasks, n_episodes=1, seed=5)
     env = gym.make("poem/MetaWorldML10-v0", max_episode_steps=HORIZON)

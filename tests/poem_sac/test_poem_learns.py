@@ -13,8 +13,8 @@ from sb3_poem.common.vec_env import TaskVecEnv
 
 def preference_accuracy(model: POEMSAC, env: TaskVecEnv) -> float:
     """Share of all (i, j, k) of the training tasks that S puts in the order of fresh episodes' returns."""
-    returns = return_matrix(model, env, model.train_tasks, model.task_latents, n_episodes=2, seed=9)
-    similarity = model.similarity(model.task_latents, model.task_latents)
+    returns = return_matrix(model, env, model.train_tasks.tasks, model.task_latents, n_episodes=2, seed=9)
+    similarity = model.similarities(model.task_latents, model.task_latents)
     truth = np.sign(returns[:, :, None] - returns[:, None, :])
     guess = np.sign(similarity[:, :, None] - similarity[:, None, :])
     return float((truth == guess)[truth != 0].mean())
@@ -24,8 +24,8 @@ def test_poem_learns_point_goal() -> None:
     """Thresholds against figures measured with several seeds and numerics: 0.84 to 0.95, and 36 to 78 % of the way."""
     model = POEMSAC("MlpPolicy", POINT_GOAL, **LEARN).learn(LEARN_STEPS)
     env = TaskVecEnv.from_id(POINT_GOAL, 20)
-    own = evaluate_latents(model, env, model.task_latents, model.train_tasks, n_episodes=2, seed=5).mean()
-    blind, known = point_goal_bounds(model.train_tasks)
+    own = evaluate_latents(model, env, model.task_latents, model.train_tasks.tasks, n_episodes=2, seed=5).mean()
+    blind, known = point_goal_bounds(model.train_tasks.tasks)
     assert own > blind + 0.35 * (known - blind)
     assert preference_accuracy(model, env) > 0.8
     # on tasks that it never saw, too (Property 1)

@@ -13,9 +13,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_poem import PEARLSAC, POEMSAC
 from sb3_poem.adaptation.bayes import BayesInference
-from sb3_poem.common.buffers import TaskBatch
+from sb3_poem.common.buffers import Segment, TaskBatch
 from sb3_poem.common.vec_env import TaskVecEnv
-from sb3_poem.pearl_sac.losses import TaskEmbeddings, actor_loss
+from sb3_poem.pearl_sac.collector import EpochCollector
+from sb3_poem.pearl_sac.losses import TaskEmbeddings, actor_loss, kl_to_prior
+from sb3_poem.poem_sac.objective import POEMObjective
 
 
 def transitions_of(model: PEARLSAC, start: int, stop: int) -> TaskBatch:
@@ -30,7 +32,7 @@ def nearly_deterministic(model: PEARLSAC) -> PEARLSAC:
         actions = model.action_space.shape[0]
         model.policy.actor.mlp.output.weight[actions:] = 0.0
         model.policy.actor.mlp.output.bias[actions:] = -20.0
-    model.obs_count = None
+    model.policy.obs_norm.update = lambda rows: None  # type: ignore[method-assign]
     return model
 
 
@@ -40,7 +42,7 @@ def nearly_deterministic(model: PEARLSAC) -> PEARLSAC:
 def policy_returns(model: PEARLSAC, env: gym.Env, latents: np.ndarray) -> np.ndarray:
     """(tasks, policies): returns of the mean actions, by stepping one environment in each task."""
     returns = np.zeros((len(model.train_tasks), len(latents)))
-    for i, task in enumerate(model.train_tasks):
+    for i, task in enumerate(model.train_tasks.tasks):
         for j, latent in enumerate(latents):
             obs, _ = env.reset(seed=0, options={"task": task})
             done = False
@@ -58,13 +60,15 @@ class Spy:
     def __init__(self, model: PEARLSAC) -> None:
         self.latents: list[np.ndarray] = []
         self.returns: list[np.ndarray] = []
-        self._replace = model._replace_context
-        model._replace_context = self._note  # type: ignore[method-assign]
+        self._measure = model.measure_returns
+        model.measure_returns = self._note  # type: ignore[method-assign]
 
-    def _note(self, epoch: Any, returns: np.ndarray) -> None:
+    def _note(self, epoch: Segment, collector: EpochCollector) -> np.ndarray | None:
+        returns = self._measure(epoch, collector)
+        assert returns is not None
         self.latents.append(epoch.latents)
         self.returns.append(returns.copy())
-        self._replace(epoch, returns)
+        return returns
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +104,7 @@ def test_measured_returns_equal_relabelled_ones(sources: dict) -> None:
 
 def test_returns_are_measured_within_groups_and_counted(sources: dict) -> None:
     model, spy = sources["rollout"]
-    groups = model._groups
+    groups = model.groups
     assert sorted(np.concatenate(groups)) == list(range(6))  # every task in one group
     assert [len(group) for group in groups] == [3, 3]
     expected = np.zeros((6, 6), dtype=bool)
@@ -116,40 +120,39 @@ def test_returns_are_measured_within_groups_and_counted(sources: dict) -> None:
 
 def test_meta_batches_are_whole_groups() -> None:
     model = small(POEMSAC, preference_source="rollout", n_train_tasks=14, meta_batch_size=9, preference_group_size=4).learn(1)
-    assert [len(group) for group in model._groups] == [5, 5, 4]
+    assert [len(group) for group in model.groups] == [5, 5, 4]
     for _ in range(5):
-        batch = model._sample_meta_batches(1, 8)[0]
+        batch = model.make_sampler().sample(1, 8)[0]
         chosen = set(batch.task_ids.tolist())
-        inside = [group for group in model._groups if chosen & set(group)]
+        inside = [group for group in model.groups if chosen & set(group)]
         assert len(inside) == 2
         assert chosen == {task for group in inside for task in group}
         # all that is known of these tasks is in the batch: 5 or 4 policies for each
         known = batch.returns.isfinite()
         assert set(known.sum(dim=1).tolist()) <= {4, 5}
         th.testing.assert_close(
-            batch.returns, model.context.returns[batch.task_ids][:, batch.task_ids], equal_nan=True, rtol=0, atol=0
+            batch.returns, model.epoch_context.returns[batch.task_ids][:, batch.task_ids], equal_nan=True, rtol=0, atol=0
         )
-    assert small(POEMSAC, preference_source="rollout", meta_batch_size=2)._choose_tasks().size == 2  # before any epoch
 
 
 def test_measured_groups_change_every_epoch() -> None:
     model = small(POEMSAC, preference_source="rollout").learn(1)
-    first = [set(group) for group in model._groups]
+    first = [set(group) for group in model.groups]
     model.learn(1, reset_num_timesteps=False)
     assert model.epoch == 2
-    assert [set(group) for group in model._groups] != first
+    assert [set(group) for group in model.groups] != first
 
 
 def test_auto_relabels_where_it_can() -> None:
-    assert small(POEMSAC)._relabels
+    assert small(POEMSAC).relabels
     windy = small(POEMSAC, walks(4, WindyWalk), horizon=10)
-    assert not windy._relabels
+    assert not windy.relabels
     windy.learn(1)
-    assert not windy.context.returns.isfinite().all()
+    assert not windy.epoch_context.returns.isfinite().all()
     # The decoder knows no rewards for what others' policies do, so adaptation goes by S.
     assert np.isnan(windy.predicted_rewards_error)
     assert BayesInference(windy).likelihood == "similarity"
-    assert small(POEMSAC, walks(4), horizon=10, preference_source="rollout")._relabels is False
+    assert small(POEMSAC, walks(4), horizon=10, preference_source="rollout").relabels is False
 
 
 def test_returns_of_tasks_with_their_own_dynamics() -> None:
@@ -188,36 +191,30 @@ def test_trajectories_of_a_task_are_averaged() -> None:
 
 def test_contexts_are_standardised_transitions_with_the_critics_values() -> None:
     model = small(POEMSAC, gradient_steps=3).learn(EPOCH)
-    latents: list[np.ndarray] = []
-    replace, before = model._replace_context, {}
-
-    def spy(epoch: Any, returns: np.ndarray) -> None:
-        latents.append(epoch.latents)
-        before.update({name: value.clone() for name, value in model.policy.critic.state_dict().items()})
-        replace(epoch, returns)
-
-    model._replace_context = spy
+    spy = Spy(model)
+    before = {name: value.clone() for name, value in model.policy.critic.state_dict().items()}
     model.learn(EPOCH, reset_num_timesteps=False)
     policy, stored = model.policy, transitions_of(model, 25, 50)  # the second epoch's
-    transitions = model.context.transitions
+    transitions = model.epoch_context.transitions
     assert transitions.shape == (N_TASKS, 25, 2 + 2 + 2 + 1 + 1)
     standardised = [
-        ((obs - policy.obs_mean) / policy.obs_std).clamp(-10, 10) for obs in (stored.observations, stored.next_observations)
+        ((obs - policy.obs_norm.mean) / policy.obs_norm.std).clamp(-10, 10)
+        for obs in (stored.observations, stored.next_observations)
     ]
     th.testing.assert_close(transitions[..., :2], standardised[0])
     th.testing.assert_close(transitions[..., 2:4], stored.actions, atol=1.6e-5, rtol=0)  # the buffer's actions have 16 bits
     th.testing.assert_close(transitions[..., 4:6], standardised[1])
     rewards = stored.rewards
-    th.testing.assert_close(model.context.rewards, rewards)
+    th.testing.assert_close(model.epoch_context.rewards, rewards)
     th.testing.assert_close(transitions[..., 6], (rewards - rewards.mean()) / rewards.std(), atol=1e-5, rtol=0)
     # Q of the critics before this epoch's updates, the smaller of two, each task under the latent that acted
     policy.critic.load_state_dict(before)
     with th.no_grad():
         values = th.stack(
             [
-                policy.critic(standardised[0][i], transitions[i, :, 2:4], th.tensor(latents[0][i]).float().expand(25, -1)).min(
-                    dim=0
-                )[0]
+                policy.critic(
+                    standardised[0][i], transitions[i, :, 2:4], th.tensor(spy.latents[0][i]).float().expand(25, -1)
+                ).min(dim=0)[0]
                 for i in range(N_TASKS)
             ]
         )
@@ -226,7 +223,7 @@ def test_contexts_are_standardised_transitions_with_the_critics_values() -> None
 
 def test_values_are_zero_before_the_first_update() -> None:
     model = small(POEMSAC, gradient_steps=0).learn(1)
-    assert (model.context.transitions[..., 7] == 0).all()
+    assert (model.epoch_context.transitions[..., 7] == 0).all()
 
 
 def test_observations_are_standardised_by_all_so_far_and_rewards_by_the_first_epoch() -> None:
@@ -234,28 +231,28 @@ def test_observations_are_standardised_by_all_so_far_and_rewards_by_the_first_ep
     rewards = transitions_of(model, 0, 25).rewards.numpy()
     model.learn(3 * EPOCH, reset_num_timesteps=False)
     obs = transitions_of(model, 0, 100).observations.reshape(-1, 2).numpy()
-    assert model.obs_count == len(obs) == 4 * EPOCH
-    np.testing.assert_allclose(model.policy.obs_mean.numpy(), obs.mean(axis=0), atol=1e-5)
-    np.testing.assert_allclose(model.policy.obs_std.numpy(), obs.std(axis=0), rtol=1e-4)
-    assert model.policy.reward_mean.item() == pytest.approx(rewards.mean(), abs=1e-5)
-    assert model.policy.reward_std.item() == pytest.approx(rewards.std(), rel=1e-4)
+    assert model.policy.obs_norm.count == len(obs) == 4 * EPOCH
+    np.testing.assert_allclose(model.policy.obs_norm.mean.numpy(), obs.mean(axis=0), atol=1e-5)
+    np.testing.assert_allclose(model.policy.obs_norm.std.numpy(), obs.std(axis=0), rtol=1e-4)
+    assert model.policy.reward_norm.mean.item() == pytest.approx(rewards.mean(), abs=1e-5)
+    assert model.policy.reward_norm.std.item() == pytest.approx(rewards.std(), rel=1e-4)
 
 
 def test_the_context_is_the_last_epochs_only() -> None:
     model = small(POEMSAC).learn(3 * EPOCH)
     latest = transitions_of(model, 50, 75).rewards
-    th.testing.assert_close(model.context.rewards, latest)
+    th.testing.assert_close(model.epoch_context.rewards, latest)
     own = latest.double().sum(dim=1)
-    np.testing.assert_allclose(np.diagonal(model.context.returns.numpy()), own.numpy(), rtol=1e-5)
+    np.testing.assert_allclose(np.diagonal(model.epoch_context.returns.numpy()), own.numpy(), rtol=1e-5)
 
 
 def test_posteriors_are_the_encoders_of_the_context() -> None:
     model = small(POEMSAC, context_size=25).learn(EPOCH)
     with th.no_grad():
-        mean, variance = model.policy.encoder(model.context.transitions)
-    np.testing.assert_allclose(model.latent_means, mean.numpy(), atol=1e-5)
-    np.testing.assert_allclose(model.latent_variances, variance.numpy(), rtol=1e-4)
-    assert np.array_equal(model.task_latents, model.latent_means)
+        mean, variance = model.policy.encoder(model.epoch_context.transitions)
+    np.testing.assert_allclose(model.train_tasks.latent_means, mean.numpy(), atol=1e-5)
+    np.testing.assert_allclose(model.train_tasks.latent_variances, variance.numpy(), rtol=1e-4)
+    assert np.array_equal(model.task_latents, model.train_tasks.latent_means)
 
 
 # ---------------------------------------------------------------- relabelled batches
@@ -264,8 +261,8 @@ def test_posteriors_are_the_encoders_of_the_context() -> None:
 @pytest.mark.parametrize(("fraction", "n_foreign"), [(0.0, 0), (0.25, 4), (1.0, 16)])
 def test_a_share_of_every_batch_is_relabelled(fraction: float, n_foreign: int) -> None:
     model = small(POEMSAC, walks(4), horizon=10, relabel_fraction=fraction).learn(1)
-    batch = model._sample_meta_batches(1, 16)[0]
-    tasks = model.train_tasks[batch.task_ids.numpy()]
+    batch = model.make_sampler().sample(1, 16)[0]
+    tasks = model.train_tasks.tasks[batch.task_ids.numpy()]
     features = batch.transitions.features.numpy()
     truth = -np.abs(features[..., 0] - tasks) - 0.01 * features[..., 1] ** 2
     np.testing.assert_allclose(batch.transitions.rewards.numpy(), truth, atol=1e-5)  # own or relabelled, all fit the task
@@ -284,7 +281,7 @@ def test_a_share_of_every_batch_is_relabelled(fraction: float, n_foreign: int) -
 def test_similarity_is_the_inner_product_of_the_two_embeddings() -> None:
     model = small(POEMSAC)
     tasks, policies = np.random.default_rng(0).normal(size=(4, 5)), np.random.default_rng(1).normal(size=(7, 5))
-    similarity = model.similarity(tasks, policies)
+    similarity = model.similarities(tasks, policies)
     assert similarity.shape == (4, 7)
     assert similarity.dtype == np.float64
     for i in range(4):
@@ -292,7 +289,7 @@ def test_similarity_is_the_inner_product_of_the_two_embeddings() -> None:
             z_r = model.policy.reward_mapping(th.tensor(tasks[i]).float())
             z_pi = model.policy.policy_mapping(th.tensor(policies[j]).float())
             assert similarity[i, j] == pytest.approx((z_r @ z_pi).item(), abs=1e-5)
-    assert model.similarity(tasks[0], policies[0]).shape == (1, 1)
+    assert model.similarities(tasks[0], policies[0]).shape == (1, 1)
 
 
 def test_the_inner_product_has_one_embedding() -> None:
@@ -301,7 +298,7 @@ def test_the_inner_product_has_one_embedding() -> None:
     z = th.tensor(latents).float()
     assert model.policy.policy_embedding(z) is z
     assert model.policy.reward_embedding(z) is z
-    np.testing.assert_allclose(model.similarity(latents, latents), latents @ latents.T, rtol=1e-5)
+    np.testing.assert_allclose(model.similarities(latents, latents), latents @ latents.T, rtol=1e-5)
     names = model.policy.state_dict().keys()
     assert not any("mapping" in name for name in names)
     assert any("mapping" in name for name in small(POEMSAC).policy.state_dict())
@@ -309,18 +306,18 @@ def test_the_inner_product_has_one_embedding() -> None:
 
 def test_contexts_without_values() -> None:
     model = small(POEMSAC, context="pearl").learn(EPOCH)
-    assert model.context.transitions.shape[-1] == 2 + 2 + 2 + 1
+    assert model.epoch_context.transitions.shape[-1] == 2 + 2 + 2 + 1
     assert model.policy.encoder.mlp.hidden[0].in_features == 7
     assert small(POEMSAC).policy.encoder.mlp.hidden[0].in_features == 8
 
 
-def test_without_its_parts_poem_is_pearl() -> None:
+def test_without_its_parts_poem_is_pearl(monkeypatch: pytest.MonkeyPatch) -> None:
     """The ablations leave PEARLSAC's networks, and the same losses but for the actor's gradient to the encoder."""
     arguments = {"kl_coef": 0.3, "reward_coef": 0.7, "policy_coef": 1.0}
     pearl = small(PEARLSAC, **arguments)
     poem = small(POEMSAC, similarity="inner", context="pearl", preference_coef=0.0, **arguments)
     assert parameters(pearl).keys() == parameters(poem).keys()
-    poem._embed = lambda latents: TaskEmbeddings(latents, latents.detach(), latents)
+    monkeypatch.setattr(POEMObjective, "embed", lambda self, latents: TaskEmbeddings(latents, latents.detach(), latents))
     pearl.learn(2 * EPOCH)
     poem.learn(2 * EPOCH)
     assert all(th.equal(value, parameters(pearl)[name]) for name, value in parameters(poem).items())
@@ -334,7 +331,8 @@ def gradients(model: PEARLSAC, **weights: float) -> set[str]:
     for name in ("kl_coef", "reward_coef", "policy_coef", "preference_coef"):
         if hasattr(model, name):
             setattr(model, name, weights.get(name, 0.0))
-    loss, _ = model._losses(model._sample_meta_batches(1, 16)[0])
+    batch = model.make_sampler().sample(1, 16)[0]
+    loss, _ = model.make_objective().loss(batch, model.entropy_coefficient.value)
     model.policy.zero_grad()
     loss.backward()
     return {
@@ -358,14 +356,15 @@ def test_each_loss_trains_what_the_paper_says() -> None:
 
 
 def encoder_gradient(model: PEARLSAC, batch: Any, name: str) -> float:
-    latents, kl = model._encode(batch.context, batch.latent_noise)
-    embeddings, transitions = model._embed(latents), model._standardise(batch.transitions)
+    objective, alpha = model.make_objective(), th.ones(())
+    latents, kl = objective.encode(batch)
+    embeddings, transitions = objective.embed(latents), objective.standardised(batch.transitions)
     losses = {
-        "actor": lambda: actor_loss(model.policy, transitions, embeddings, th.ones(()), batch.action_noise)[0],
-        "decoder": lambda: model._decoder_loss(batch, transitions, embeddings),
-        "preference": lambda: model._embedding_loss(batch, embeddings)[0],
-        "critic": lambda: model._critic_loss(transitions, embeddings, th.ones(()), batch.next_action_noise),
-        "kl": lambda: kl.mean(),
+        "actor": lambda: actor_loss(model.policy, transitions, embeddings, alpha, batch.action_noise)[0],
+        "decoder": lambda: objective.decoder_loss(batch, transitions, embeddings),
+        "preference": lambda: objective.embedding_loss(batch, embeddings)[0],
+        "critic": lambda: objective.critic_loss(batch, transitions, embeddings, alpha),
+        "kl": lambda: kl,
     }
     model.policy.zero_grad()
     losses[name]().backward()
@@ -376,7 +375,7 @@ def encoder_gradient(model: PEARLSAC, batch: Any, name: str) -> float:
 
 def test_which_losses_reach_the_encoder() -> None:
     poem, pearl = small(POEMSAC).learn(EPOCH), small(PEARLSAC).learn(EPOCH)
-    batch, other = poem._sample_meta_batches(1, 16)[0], pearl._sample_meta_batches(1, 16)[0]
+    batch, other = poem.make_sampler().sample(1, 16)[0], pearl.make_sampler().sample(1, 16)[0]
     for name in ("actor", "decoder", "preference", "critic", "kl"):
         assert encoder_gradient(poem, batch, name) > 0, name
     for name in ("decoder", "critic", "kl"):
@@ -386,10 +385,11 @@ def test_which_losses_reach_the_encoder() -> None:
 
 def test_the_actors_loss_does_not_train_the_critics() -> None:
     model = small(POEMSAC).learn(EPOCH)
-    batch = model._sample_meta_batches(1, 16)[0]
-    latents, _ = model._encode(batch.context, batch.latent_noise)
+    batch = model.make_sampler().sample(1, 16)[0]
+    objective = model.make_objective()
+    latents, _ = objective.encode(batch)
     model.policy.zero_grad()
-    transitions, embeddings = model._standardise(batch.transitions), model._embed(latents)
+    transitions, embeddings = objective.standardised(batch.transitions), objective.embed(latents)
     actor_loss(model.policy, transitions, embeddings, th.ones(()), batch.action_noise)[0].backward()
     assert all(parameter.grad is None for parameter in model.policy.critic.parameters())
     assert all(parameter.grad is None for parameter in model.policy.critic_target.parameters())
@@ -399,10 +399,10 @@ def test_kl_is_that_of_two_normals() -> None:
     from torch.distributions import Normal, kl_divergence
 
     model = small(POEMSAC).learn(EPOCH)
-    context = model.context.transitions
+    context = model.epoch_context.transitions
     with th.no_grad():
         mean, variance = model.policy.encoder(context)
-        _, kl = model._encode(context, th.zeros(len(context), model.latent_dim))
+        kl = kl_to_prior(mean, variance)
     expected = kl_divergence(Normal(mean, variance.sqrt()), Normal(th.zeros(5), th.ones(5))).sum(dim=1)
     th.testing.assert_close(kl, expected, rtol=1e-4, atol=1e-5)
 
@@ -410,23 +410,24 @@ def test_kl_is_that_of_two_normals() -> None:
 def test_targets_are_bootstrapped_except_at_an_early_end() -> None:
     """The critics' loss against soft Bellman targets computed here, with gamma and alpha far from trivial."""
     model = small(POEMSAC, walks(4, edge=0.4), horizon=10, gamma=0.9, ent_coef=0.3).learn(120)
-    meta_batch = model._sample_meta_batches(1, 16)[0]
+    meta_batch = model.make_sampler().sample(1, 16)[0]
     batch, noise = meta_batch.transitions, meta_batch.next_action_noise
     assert 0 < batch.terminated.sum() < batch.terminated.numel()
     policy, latents = model.policy, th.randn(6, 5)
-    alpha = model._entropy_coefficient()
-    loss = model._critic_loss(model._standardise(batch), model._embed(latents), alpha, noise)
+    alpha = model.entropy_coefficient.value
+    objective = model.make_objective()
+    loss = objective.critic_loss(meta_batch, objective.standardised(batch), objective.embed(latents), alpha)
     total = 0.0
     with th.no_grad():
         for i in range(6):
             z = latents[i].expand(16, 5)
             obs, next_obs = (
-                ((x - policy.obs_mean) / policy.obs_std).clamp(-10, 10)
+                ((x - policy.obs_norm.mean) / policy.obs_norm.std).clamp(-10, 10)
                 for x in (batch.observations[i], batch.next_observations[i])
             )
             next_actions, log_prob = policy.actor(next_obs, policy.policy_mapping(z), noise[i])
             next_values = policy.critic_target(next_obs, next_actions, z).min(dim=0).values - 0.3 * log_prob
-            target = batch.rewards[i] / policy.reward_std + 0.9 * (1 - batch.terminated[i]) * next_values
+            target = batch.rewards[i] / policy.reward_norm.std + 0.9 * (1 - batch.terminated[i]) * next_values
             for value in policy.critic(obs, batch.actions[i], z):
                 total += 0.5 * (value - target).pow(2).mean().item() / 6
     assert alpha.item() == pytest.approx(0.3)
@@ -454,7 +455,7 @@ def test_predicted_returns_are_sums_of_decoded_rewards(layer_norm: bool) -> None
                 obs, next_obs = (policy.standardise(th.tensor(trajectory.observations[t + k]).float()) for k in (0, 1))
                 action = th.tensor(2.0 * (trajectory.actions[t] + 2.0) / 6.0 - 1.0).float()
                 value = policy.decoder(obs, action, next_obs, z_r)
-                total += (value * policy.reward_std + policy.reward_mean).item()
+                total += (value * policy.reward_norm.std + policy.reward_norm.mean).item()
             assert returns[i, j] == pytest.approx(total, abs=1e-4)
 
 
@@ -466,8 +467,8 @@ def test_a_family_of_two_tasks_trains_without_nan(arguments: dict[str, Any]) -> 
     model = small(POEMSAC, walks(2, TwoWalks), horizon=10, n_train_tasks=None, **arguments).learn(100)
     assert model._n_updates == 25 or arguments.get("preference_source") == "rollout"
     assert all(value.isfinite().all() for value in parameters(model).values())
-    assert np.isfinite(model.latent_means).all()
-    assert np.isfinite(model.similarity(model.task_latents, model.task_latents)).all()
+    assert np.isfinite(model.train_tasks.latent_means).all()
+    assert np.isfinite(model.similarities(model.task_latents, model.task_latents)).all()
 
 
 def test_one_task_is_a_family_too() -> None:
@@ -481,10 +482,10 @@ def test_half_cheetah_forwards_and_backwards(algorithm: type[PEARLSAC]) -> None:
     """Two tasks on the real simulator, from the id alone."""
     env = TaskVecEnv.from_id("poem/HalfCheetahFwdBack-v0", 2, max_episode_steps=20)
     model = small(algorithm, env, n_train_tasks=None).learn(80)
-    assert sorted(model.train_tasks.ravel()) == [-1.0, 1.0]
+    assert sorted(model.train_tasks.tasks.ravel()) == [-1.0, 1.0]
     assert all(value.isfinite().all() for value in parameters(model).values())
     if isinstance(model, POEMSAC):  # what forwards earns, backwards pays for, but for the control cost
-        assert model.context.returns.isfinite().all()
+        assert model.epoch_context.returns.isfinite().all()
 
 
 def test_environments_of_one_copy_and_many_tasks() -> None:

@@ -29,15 +29,15 @@ def assert_same_run(one: PEARLSAC, two: PEARLSAC) -> None:
     for name in ("num_timesteps", "epoch", "_n_updates", "_episode_num", "_total_timesteps"):
         assert getattr(one, name) == getattr(two, name), name
     assert np.array_equal(one.predicted_rewards_error, two.predicted_rewards_error, equal_nan=True)
-    for name in ("train_tasks", "latent_means", "latent_variances"):
-        assert np.array_equal(getattr(one, name), getattr(two, name)), name
+    for name, value in vars(one.train_tasks).items():
+        assert np.array_equal(value, getattr(two.train_tasks, name)), name
     first, second = one.generators.__getstate__(), two.generators.__getstate__()
     assert first["numpy"] == second["numpy"]
     assert np.array_equal(first["torch"], second["torch"])
     first, second = one.replay_buffer.state(), two.replay_buffer.state()
     assert first.keys() == second.keys()
     assert all(np.array_equal(first[name], second[name]) for name in first)
-    first, second = ({k: v for k, v in vars(model.context).items() if v is not None} for model in (one, two))
+    first, second = ({k: v for k, v in vars(model.epoch_context).items() if v is not None} for model in (one, two))
     assert not differing(first, second)
     assert [episode["r"] for episode in one.ep_info_buffer] == [episode["r"] for episode in two.ep_info_buffer]
 
@@ -109,6 +109,7 @@ import errno, os, signal, sys, time
 from stable_baselines3.common.callbacks import BaseCallback
 from meta_toys import EPOCH, small
 from sb3_poem import POEMSAC, TrainingCheckpointCallback
+from sb3_poem.pearl_sac.updater import Updater
 
 folder, moments = sys.argv[1], sys.argv[2:]
 
@@ -137,7 +138,7 @@ def run(kind, number, path):
     if kind == "collecting":
         callbacks.append(KillAt(number))
     elif kind == "learning":
-        POEMSAC._update_targets = count_down(POEMSAC._update_targets, number)
+        Updater.step = count_down(Updater.step, number)
     elif kind == "writing":  # the temporary file is there, the checkpoint not yet replaced
         os.fsync = count_down(os.fsync, number)
     elif kind == "replacing":
@@ -198,7 +199,7 @@ def test_a_checkpoint_is_a_model_with_its_experience(tmp_path: Path) -> None:
 def test_a_checkpoint_before_training(tmp_path: Path) -> None:
     small(PEARLSAC).save_checkpoint(tmp_path / "checkpoint.pt")
     loaded = PEARLSAC.load_checkpoint(tmp_path / "checkpoint.pt", POINT_GOAL)
-    assert loaded.context is None
+    assert loaded.epoch_context is None
     assert not differing(parameters(loaded.learn(EPOCH)), parameters(small(PEARLSAC).learn(EPOCH)))
 
 

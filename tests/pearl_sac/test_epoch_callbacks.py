@@ -22,7 +22,7 @@ from sb3_poem import (
     RewardOracleAdapter,
     TrainingCheckpointCallback,
 )
-from sb3_poem.common.callbacks import EpochCallback
+from sb3_poem.pearl_sac.callbacks import EpochCallback
 
 
 class Note(EpochCallback):

@@ -3,12 +3,10 @@
 import time
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from stable_baselines3.common.callbacks import BaseCallback
 
-if TYPE_CHECKING:
-    from sb3_poem.pearl_sac.pearl_sac import PEARLSAC
+from sb3_poem.pearl_sac.pearl_sac import PEARLSAC
 
 
 class EpochCallback(BaseCallback):
@@ -19,7 +17,7 @@ class EpochCallback(BaseCallback):
     :raises ValueError: if ``every`` is below 1
     """
 
-    model: "PEARLSAC"
+    model: PEARLSAC
 
     def __init__(self, every: int = 1, verbose: int = 0) -> None:
         super().__init__(verbose)
@@ -29,7 +27,7 @@ class EpochCallback(BaseCallback):
         self._last_epoch = 0
 
     def _init_callback(self) -> None:
-        if not hasattr(self.model, "epoch"):
+        if not isinstance(self.model, PEARLSAC):
             raise TypeError(
                 f"{type(self).__name__} is for POEMSAC and PEARLSAC, which train in epochs, not for "
                 f"{type(self.model).__name__}"

@@ -16,6 +16,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_poem import PEARLSAC, POEMSAC
 from sb3_poem.common.trajectory import Trajectory
+from sb3_poem.pearl_sac.train_tasks import TrainTasks
 
 FILES = ["README.md", "config.json", "model.safetensors"]
 CARD = {
@@ -53,12 +54,12 @@ def assert_same_predictions(one: PEARLSAC, two: PEARLSAC) -> None:
     if one.observation_space.shape == (2,) and one.action_space.shape == (2,):
         assert np.array_equal(one.predicted_returns(latents, trajectories()), two.predicted_returns(latents, trajectories()))
     if isinstance(one, POEMSAC):
-        assert np.array_equal(one.similarity(latents, latents[:3]), two.similarity(latents, latents[:3]))
+        assert np.array_equal(one.similarities(latents, latents[:3]), two.similarities(latents, latents[:3]))
     for source in ("prior", "aggregate"):
         draws = [model.sample_latents(9, np.random.default_rng(4), source) for model in (one, two)]
         assert np.array_equal(*draws)
     assert np.array_equal(one.task_latents, two.task_latents)
-    assert np.array_equal(one.train_tasks, two.train_tasks)
+    assert np.array_equal(one.train_tasks.tasks, two.train_tasks.tasks)
     for name in ("observation_space", "action_space", "task_space", "env_id", "horizon"):
         assert getattr(one, name) == getattr(two, name), name
     assert one.predicted_rewards_error == pytest.approx(two.predicted_rewards_error, rel=0, abs=0, nan_ok=True)
@@ -95,7 +96,7 @@ def test_the_folder_holds_nothing_that_can_run(trained: PEARLSAC, folder: Path) 
 def test_a_model_of_the_default_size_is_below_three_megabytes(tmp_path: Path) -> None:
     model = POEMSAC("MlpPolicy", "poem/HalfCheetahVel-v0", n_train_tasks=2, device="cpu")
     model.env.close()
-    model.train_tasks = np.linspace(0.0, 3.0, 120)[:, None]
+    model.train_tasks = TrainTasks.of_prior(np.linspace(0.0, 3.0, 120)[:, None], model.latent_dim)
     model.save_pretrained(tmp_path / "m")
     assert sum(path.stat().st_size for path in (tmp_path / "m").iterdir()) < 3_000_000
 
@@ -130,15 +131,15 @@ def test_continues_training(trained: PEARLSAC, folder: Path) -> None:
         assert_same_predictions(trained, loaded)
         # it goes on at the rate and the entropy at which it stopped
         assert loaded.lr_schedule(1.0) == 2e-3
-        assert loaded._entropy_coefficient().item() == pytest.approx(trained._entropy_coefficient().item(), rel=1e-4)
+        assert loaded.entropy_coefficient.value.item() == pytest.approx(trained.entropy_coefficient.value.item(), rel=1e-4)
         assert loaded.target_entropy == trained.target_entropy
         before = parameters(loaded)
         loaded.learn(EPOCH, reset_num_timesteps=False)
         assert loaded.num_timesteps >= 3 * EPOCH
         changed = differing(before, parameters(loaded))
         assert {"policy.actor.mlp.output.weight", "policy.decoder.mlp.output.weight", "log_ent_coef"} <= set(changed)
-        assert "policy.obs_mean" in changed
-        assert loaded.obs_count == trained.obs_count + loaded.num_timesteps - trained.num_timesteps
+        assert "policy.obs_norm.mean" in changed
+        assert loaded.policy.obs_norm.count == trained.policy.obs_norm.count + loaded.num_timesteps - trained.num_timesteps
 
 
 VARIANTS = {
@@ -160,13 +161,13 @@ def test_every_kind_of_model(variant: str, tmp_path: Path) -> None:
     json.loads((tmp_path / "m" / "config.json").read_text(), parse_constant=pytest.fail)  # NaN, which only Python reads
     loaded = POEMSAC.from_pretrained(tmp_path / "m", env=env() if callable(env) else env)
     assert_same_predictions(model, loaded)
-    for name in ("similarity_metric", "context_kind", "preference_group_size", "target_update_interval", "gamma", "tau"):
+    for name in ("similarity", "context", "preference_group_size", "target_update_interval", "gamma", "tau"):
         assert getattr(loaded, name) == getattr(model, name)
     assert loaded.policy.layer_norm == model.policy.layer_norm == (variant == "layer-norm")
     assert len(loaded.policy.critic.members) == len(model.policy.critic.members)
     if variant == "fixed-entropy":
         assert loaded.ent_coef_optimizer is None
-        assert loaded._entropy_coefficient().item() == pytest.approx(0.3)
+        assert loaded.entropy_coefficient.value.item() == pytest.approx(0.3)
     loaded.learn(1)
 
 
@@ -236,7 +237,7 @@ def test_incomplete_configurations(trained: PEARLSAC, folder: Path, key: str) ->
     config = json.loads((folder / "config.json").read_text())
     del config[key]
     (folder / "config.json").write_text(json.dumps(config))
-    with pytest.raises(ValueError, match=rf"folder .*{key}"):
+    with pytest.raises(ValueError, match=rf"folder.*{key}"):
         type(trained).from_pretrained(folder)
 
 

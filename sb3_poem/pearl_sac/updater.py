@@ -1,0 +1,144 @@
+"""One optimiser step, in mixed precision, with a look at the gradient; on a GPU as one graph."""
+
+from dataclasses import dataclass
+from functools import partial
+from types import TracebackType
+from typing import Any
+
+import torch as th
+from torch import nn
+
+from sb3_poem.common.precision import MixedPrecision
+from sb3_poem.pearl_sac.cuda_graph import GraphedStep, Step, prepare_optimizers
+from sb3_poem.pearl_sac.losses import MetaBatch
+from sb3_poem.pearl_sac.objective import Metrics, Objective
+from sb3_poem.pearl_sac.policies import LatentPolicy
+
+
+@dataclass
+class EntropyCoefficient:
+    """SAC's entropy coefficient, learned or fixed.
+
+    :param tensor: The coefficient; its logarithm, (1,), where it is learned
+    :param optimizer: Of the logarithm; None where the coefficient is fixed
+    :param target: The entropy that it is to bring about
+    """
+
+    tensor: th.Tensor
+    optimizer: th.optim.Optimizer | None
+    target: float
+
+    @property
+    def optimizers(self) -> list[th.optim.Optimizer]:
+        """The optimizer, if there is one."""
+        return [] if self.optimizer is None else [self.optimizer]
+
+    @property
+    def value(self) -> th.Tensor:
+        """The coefficient, a scalar without a graph."""
+        return self.tensor if self.optimizer is None else self.tensor.detach().exp().squeeze()
+
+    def update(self, entropy: th.Tensor) -> None:
+        """Learn from the entropy of a meta-batch: a step along the gradient of log * (entropy - target)."""
+        if self.optimizer is not None:
+            gradient = (entropy.detach() - self.target).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
+            self.tensor.grad = gradient.view_as(self.tensor)
+            self.optimizer.step()
+
+
+class Updater:
+    """Changes the networks, one meta-batch at a time. Use it as a context, in which hidden layers compute
+    in ``dtype``.
+
+    :param policy: The networks
+    :param objective: What is minimised
+    :param entropy: The entropy coefficient
+    :param dtype: Of the hidden layers' arithmetic
+    :param tau: Soft update coefficient of the target critics
+    :param target_update_interval: Steps between updates of the target critics
+    :param policy_delay: Steps of critics and encoder for each of everything else
+    :param n_updates: Steps that the networks have had
+    """
+
+    def __init__(
+        self,
+        policy: LatentPolicy,
+        objective: Objective,
+        entropy: EntropyCoefficient,
+        dtype: th.dtype,
+        tau: float,
+        target_update_interval: int,
+        policy_delay: int,
+        n_updates: int,
+    ) -> None:
+        self.policy, self.objective, self.entropy = policy, objective, entropy
+        self.tau, self.target_update_interval, self.policy_delay = tau, target_update_interval, policy_delay
+        self.n_updates = n_updates
+        prepare_optimizers([policy.optimizer, *entropy.optimizers], policy.device)
+        learning = [policy.encoder, policy.decoder, policy.actor, policy.critic, policy.critic_target]
+        self._precision = MixedPrecision(nn.ModuleList(learning), dtype)
+        self._steps: dict[bool, Step] = {whole: partial(self._step, whole) for whole in (True, False)}
+        if policy.device.type == "cuda" and target_update_interval == 1:
+            self._steps = {whole: GraphedStep(step) for whole, step in self._steps.items()}
+
+    def __enter__(self) -> "Updater":
+        self._precision.__enter__()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None) -> None:
+        self._precision.__exit__(kind, error, where)
+
+    def step(self, batch: MetaBatch) -> Metrics:
+        """One step on a meta-batch: of everything or, in between, of critics and encoder. Returns what to log.
+
+        :raises ValueError: on a processor, if loss or gradient is not finite; see :meth:`check_finite`
+        """
+        metrics = self._steps[self.n_updates % self.policy_delay == 0](batch)
+        self.n_updates += 1
+        return metrics
+
+    def _step(self, whole: bool, batch: MetaBatch) -> Metrics:
+        self._precision.refresh()
+        loss, metrics = self.objective.loss(batch, self.entropy.value, whole)
+        metrics["gradient_norm"] = self._descend(loss)
+        if whole:
+            self.entropy.update(metrics["entropy"])
+        if self.n_updates % self.target_update_interval == 0:
+            self._update_targets()
+        return {name: value.detach() for name, value in metrics.items()}
+
+    def _descend(self, loss: th.Tensor) -> th.Tensor:
+        """Step along the gradient; returns its norm, not finite where the loss is not."""
+        optimizer: Any = self.policy.optimizer
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        self._precision.collect_gradients()
+        groups = optimizer.param_groups
+        gradients = [p.grad for group in groups for p in group["params"] if p.grad is not None]
+        # the loss is looked at as well, because a ReLU may turn NaN to 0 on the way to the gradient
+        norm = nn.utils.get_total_norm(gradients, foreach=True) + 0.0 * loss.detach()
+        if self.policy.device.type == "cpu":
+            self.check_finite([norm], self.n_updates)
+        else:  # nobody waits for the device: it leaves out the step itself, and the block's end tells
+            optimizer.found_inf = (~th.isfinite(norm)).float()
+        optimizer.step()
+        return norm
+
+    def check_finite(self, gradient_norms: list[th.Tensor], first: int) -> None:
+        """
+        :param gradient_norms: Of successive steps
+        :param first: The number of the first of them
+        :raises ValueError: if one is not finite
+        """
+        finite = th.isfinite(th.stack(gradient_norms))
+        if not finite.all():
+            raise ValueError(
+                "the training loss or its gradient is not finite at update "
+                f"{first + int(finite.int().argmin())}; no network was changed by it. "
+                "A lower learning_rate or reward_scale usually helps."
+            )
+
+    def _update_targets(self) -> None:
+        targets = tuple(self.policy.critic_target.parameters())
+        with th.no_grad():
+            th._foreach_lerp_(targets, tuple(self.policy.critic.parameters()), self.tau)
