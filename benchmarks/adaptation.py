@@ -69,13 +69,13 @@ def adapt(env_id: str, model: Path, rule: str, candidates: str, test_seed: int, 
 def order_on_test_tasks(env_id: str, model_file: Path, test_seed: int) -> dict[str, float]:
     """Property 1 on test tasks: preference accuracy and Kendall's tau."""
     from sb3_poem.adaptation.evaluation import known_task_return, preference_order
-    from sb3_poem.common.family import FamilyEnv
+    from sb3_poem.common.family_view import FamilyView
     from sb3_poem.common.vec_env import TaskVecEnv
     from sb3_poem.loading import load_model
 
     model = load_model(str(model_file))
     env = TaskVecEnv.from_id(env_id, 60)
-    family = FamilyEnv(env)
+    family = FamilyView(env)
     tasks = family.all_tasks
     if tasks is None:
         tasks = family.sample_tasks(30, np.random.default_rng([test_seed, 77]))

@@ -16,7 +16,7 @@ import torch as th
 
 from sb3_poem import POEMSAC, TaskVecEnv
 from sb3_poem.common.collection import relabelled_returns
-from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.family_view import FamilyView
 
 COPIES = (1, 4, 16, 64, 256, 1024)
 BATCH_TASKS, TASKS = (2, 4, 8, 16, 32, 64), (120, 300, 1000)
@@ -74,7 +74,7 @@ def returns_matrix(repeats: int) -> list[dict[str, Any]]:
     """Milliseconds of J[i, j] for N tasks with a trajectory of 200 steps each."""
     rng, rows = np.random.default_rng(0), []
     for env_id in IDS:
-        family = FamilyEnv(TaskVecEnv.from_id(env_id, 1))
+        family = FamilyView(TaskVecEnv.from_id(env_id, 1))
         for n_tasks in TASKS:
             tasks = family.sample_tasks(n_tasks, rng)
             features = rng.standard_normal((n_tasks, 200, family.reward_feature_dim))

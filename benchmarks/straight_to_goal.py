@@ -11,9 +11,8 @@ import numpy as np
 from common import RESULTS
 
 import sb3_poem  # noqa: F401  registers the families
-from sb3_poem.adaptation.evaluation import held_out_tasks
 from sb3_poem.benchmark.provenance import commit, machine
-from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.vec_env import TaskVecEnv
 
 ENV_ID = "poem/MetaWorldML1-v0"
@@ -33,7 +32,7 @@ def episode(env: gym.Env, goal: np.ndarray, gain: float) -> tuple[float, bool]:
 
 def main() -> None:
     """Measure and write."""
-    tasks = held_out_tasks(FamilyEnv(TaskVecEnv.from_id(ENV_ID, 1)), 30, 100)
+    tasks = FamilyView(TaskVecEnv.from_id(ENV_ID, 1)).test_tasks(30, 100)
     env = gym.make(ENV_ID)
     lines = ["# MetaWorldML1 (reach): straight to the goal", "", "`action = gain (goal - hand)`, clipped; 30 test tasks.", ""]
     lines += ["| gain | mean return | least | most | success |", "|---|---|---|---|---|"]

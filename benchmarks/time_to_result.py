@@ -19,7 +19,7 @@ from rl_zoo3.utils import linear_schedule
 
 from sb3_poem import POEMSAC
 from sb3_poem.adaptation.evaluation import evaluate_adaptation
-from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.vec_env import TaskVecEnv
 from sb3_poem.pearl_sac.callbacks import EpochCallback
 from sb3_poem.resources import zoo_entry
@@ -42,7 +42,7 @@ class Clock(EpochCallback):
         super().__init__(every)
         self.target, self.rules, self.test_seed, self.from_step = target, rules, test_seed, from_step
         self.env = TaskVecEnv.from_id(env_id, 2 * N_TASKS)
-        self.tasks = FamilyEnv(self.env).sample_tasks(N_TASKS, np.random.default_rng([test_seed, 77]))
+        self.tasks = FamilyView(self.env).sample_tasks(N_TASKS, np.random.default_rng([test_seed, 77]))
         self.seconds, self.started = 0.0, time.perf_counter()
         self.evaluations: list[dict[str, Any]] = []
         self.reached = False

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 from common import RESULTS
 
-from sb3_poem.adaptation.evaluation import evaluation_seed, held_out_tasks, known_task_return, return_matrix
+from sb3_poem.adaptation.evaluation import evaluation_seed, known_task_return, return_matrix
 from sb3_poem.adaptation.limits import best_codebook
 from sb3_poem.benchmark.cells import SEED_STRIDE, SELECTION_EPISODES
 from sb3_poem.benchmark.provenance import commit, machine
 from sb3_poem.benchmark.suites import Budget
-from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.vec_env import TaskVecEnv
 from sb3_poem.loading import load_model
 
@@ -28,8 +28,8 @@ COLUMNS = (0, 1, 2, 3, 5)
 def limits(env_id: str, model_file: Path, seed: int, n_others: int) -> tuple[list[float], list[float]]:
     """The limits with the test tasks in sight, and without, after :data:`COLUMNS` answers."""
     model, env, budget = load_model(str(model_file)), TaskVecEnv.from_id(env_id, 120), Budget()
-    family = FamilyEnv(env)
-    tasks = held_out_tasks(family, budget.tasks, budget.task_seed)
+    family = FamilyView(env)
+    tasks = family.test_tasks(budget.tasks, budget.task_seed)
     others = family.sample_tasks(n_others, np.random.default_rng([budget.task_seed, seed, 1]))
     stream = budget.task_seed + SEED_STRIDE * seed
     known = known_task_return(model, env, tasks, n_episodes=1, seed=stream, selection_episodes=SELECTION_EPISODES)

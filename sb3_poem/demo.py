@@ -11,7 +11,7 @@ import sys
 import time
 from pathlib import Path
 
-from sb3_poem.cli import can_draw
+from poem_envs.headless import can_draw
 from sb3_poem.cli.outputs import check_writable
 
 ADAPTATION = ["--oracle", "return", "--queries", "10", "--tasks", "30", "--record", "0", "1", "2", "5", "10"]

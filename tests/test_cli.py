@@ -1,5 +1,6 @@
 """The command line, run as a user runs it, or in this process where that is slow."""
 
+import contextlib
 import os
 import resource
 import shlex
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from poem_envs import headless
 from sb3_poem import cli, resources
 
 
@@ -180,16 +182,18 @@ def test_rendering_without_a_display(monkeypatch: pytest.MonkeyPatch, libraries:
     monkeypatch.setattr("ctypes.util.find_library", lambda name: f"lib{name}.so" if name in libraries else None)
     monkeypatch.setenv("MUJOCO_GL", "")  # so that monkeypatch restores it afterwards
     monkeypatch.delenv("MUJOCO_GL")
-    cli.use_offscreen_rendering()
+    assert headless.can_draw() == (expected is not None)
+    with contextlib.nullcontext() if expected else pytest.raises(RuntimeError, match="install libegl1"):
+        headless.choose_headless_backend()
     assert os.environ.get("MUJOCO_GL") == expected
 
 
 def test_the_users_choice_of_rendering_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     without_display(monkeypatch)
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
-    cli.use_offscreen_rendering()
+    headless.choose_headless_backend()
     assert os.environ["MUJOCO_GL"] == "osmesa"
     monkeypatch.delenv("MUJOCO_GL")
     monkeypatch.setenv("DISPLAY", ":0")
-    cli.use_offscreen_rendering()
+    headless.choose_headless_backend()
     assert "MUJOCO_GL" not in os.environ

@@ -13,18 +13,31 @@ def has_display() -> bool:
     return sys.platform != "linux" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
+def can_draw() -> bool:
+    """Whether images can be made here, as far as can be told without trying."""
+    return has_display() or _offscreen_backend() is not None
+
+
+def _offscreen_backend() -> str | None:
+    backends = (("egl", "EGL"), ("osmesa", "OSMesa"))
+    return next((name for name, library in backends if ctypes.util.find_library(library)), None)
+
+
 def choose_headless_backend() -> None:
-    """On a Linux machine without a display, let MuJoCo render through EGL or OSMesa, unless the user chose already.
+    """On a Linux machine without a display, let MuJoCo render through EGL or OSMesa, unless the
+    user chose already. To be called before MuJoCo is imported.
 
     Left to itself, Gymnasium's renderer tries a window first, and goes on as if it had got one.
+
+    :raises RuntimeError: if there is neither
     """
     if has_display() or "MUJOCO_GL" in os.environ:
         return
-    for backend, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
-        if ctypes.util.find_library(library):
-            os.environ["MUJOCO_GL"] = backend
-            _logger.info("no display: rendering with MUJOCO_GL=%s", backend)
-            return
+    backend = _offscreen_backend()
+    if backend is not None:
+        os.environ["MUJOCO_GL"] = backend
+        _logger.info("no display: rendering with MUJOCO_GL=%s", backend)
+        return
     raise RuntimeError("rendering on a machine without a display needs libEGL or libOSMesa: install libegl1 or libosmesa6")
 
 

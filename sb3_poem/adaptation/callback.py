@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_poem.adaptation.adapter import PreferenceAdapter
 from sb3_poem.adaptation.environments import check_model_fits
 from sb3_poem.adaptation.evaluation import evaluate_adaptation, evaluate_latents, known_task_return, preference_order
-from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.pearl_sac.callbacks import EpochCallback
 
@@ -91,8 +91,7 @@ class AdaptationEvalCallback(EpochCallback):
 
     def _make_env(self) -> tuple[VecEnv, np.ndarray]:
         if self._env is None:
-            training_env = self.model.family.env
-            spec = training_env.get_attr("spec", indices=[0])[0]
+            spec = self.model.family.spec
             if spec is None:
                 raise ValueError(
                     "AdaptationEvalCallback makes copies of the environment, which must be registered with Gymnasium; "
@@ -102,7 +101,7 @@ class AdaptationEvalCallback(EpochCallback):
             arguments = {**spec.kwargs, **self.env_kwargs}
             self._env = make_task_vec_env(spec.id, 2 * self.n_tasks, max_episode_steps=limit, **arguments)
             check_model_fits(self.model, self._env)
-        family = FamilyEnv(self._env, self.model.horizon)
+        family = FamilyView(self._env)
         family.check_same_family(self.model.task_space, self.model.reward_feature_dim)
         if family.all_tasks is not None and len(family.all_tasks) <= self.n_tasks:
             return self._env, family.all_tasks

@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias, Union
 
 import gymnasium as gym
 
+from poem_envs.registration import plain_id
+from sb3_poem.common.family_view import FamilyView, vectorised
+
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
@@ -30,9 +33,8 @@ def model_and_env(model: Any, env: Env, n_copies: int = COPIES, render: bool = F
     :raises ValueError: If the model's file asks for what it may not, see
         :func:`sb3_poem.common.foreign.environment_of`.
     """
-    from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+    from stable_baselines3.common.vec_env import VecEnv
 
-    from poem_envs.registration import plain_id
     from sb3_poem.common.foreign import environment_of
     from sb3_poem.common.vec_env import as_task_vec_env, make_task_vec_env
     from sb3_poem.loading import as_model
@@ -47,7 +49,7 @@ def model_and_env(model: Any, env: Env, n_copies: int = COPIES, render: bool = F
             arguments["render_mode"] = "rgb_array"
         return model, make_task_vec_env(env, n_copies, **arguments)
     if isinstance(env, gym.Env):
-        return model, DummyVecEnv([lambda: env])
+        return model, vectorised(env)
     if isinstance(env, gym.vector.VectorEnv):
         return model, as_task_vec_env(env)
     raise TypeError(f"`env` must be a gymnasium.Env, an id, a Gymnasium VectorEnv or an SB3 VecEnv, but is {env!r}")
@@ -62,11 +64,11 @@ def check_model_fits(model: Any, vec_env: VecEnv) -> None:
     :raises ValueError: If a space differs.
     """
     names = ["observation_space", "action_space"]
-    if hasattr(model, "task_space") and vec_env.has_attr("task_space"):
+    family = FamilyView.of(vec_env)
+    if hasattr(model, "task_space") and family is not None:
         names.append("task_space")
     for name in names:
-        expected = getattr(model, name)
-        given = vec_env.get_attr(name, indices=[0])[0] if name == "task_space" else getattr(vec_env, name)
+        expected, given = getattr(model, name), getattr(vec_env if family is None else family, name)
         if expected != given:
             raise ValueError(
                 f"the model does not belong to this environment: its {name} is {expected} ({describe_model(model)}), but "

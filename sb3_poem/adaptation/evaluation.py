@@ -12,22 +12,19 @@ from sb3_poem.adaptation.environments import Env, model_and_env
 from sb3_poem.adaptation.limits import information_limit
 from sb3_poem.adaptation.lockstep import OracleFactory, TaskAdaptations, adapt_tasks
 from sb3_poem.adaptation.noise import NoiseModel
-from sb3_poem.adaptation.oracles import ReturnOracle, compute_rewards
+from sb3_poem.adaptation.oracles import ReturnOracle
 from sb3_poem.adaptation.preference import Preference
 from sb3_poem.common.checks import check_whole
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.rollouts import rollout_features, rollout_outcomes
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
-    from sb3_poem.common.family import FamilyEnv
-
 
 # Latents to try for each task, where every one must be rolled out in every task, and where one rollout serves all of them.
 LATENTS_WITH_OWN_DYNAMICS, LATENTS_WITH_SHARED_DYNAMICS = 30, 300
 
-# Test tasks come from a stream of their own, so that no seed gives the tasks that a model was trained on.
-TEST_TASK_STREAM = 0x7E57
 N_TEST_TASKS = 30
 
 
@@ -98,8 +95,9 @@ def evaluate_episodes(
     n = len(latents)
     rows = np.tile(np.arange(n), n_episodes)
     outcomes = rollout_outcomes(model, vec_env, latents[rows], tasks[rows], seed, deterministic)
+    family = FamilyView(vec_env)
     returns = [
-        float(np.sum(compute_rewards(vec_env, tasks[row], outcome.reward_features)))
+        float(np.sum(family.compute_rewards(tasks[row], outcome.reward_features)))
         for row, outcome in zip(rows, outcomes, strict=True)
     ]
     successes = None
@@ -217,7 +215,7 @@ def evaluate_adaptation(
         check_whole("record_at", k, 0)
     check_whole("n_episodes", n_episodes, 1)
     model, vec_env = model_and_env(model, env)
-    tasks = _test_tasks(model, vec_env, tasks, seed)
+    tasks = _test_tasks(vec_env, tasks, seed)
     start, deterministic = evaluation_seed(seed), options.get("deterministic", True)
     outcomes: list[EpisodeOutcomes] = []
 
@@ -330,9 +328,9 @@ def known_task_return(
     :raises ValueError: If an argument is out of its range.
     """
     model, vec_env = model_and_env(model, env)
-    tasks = _test_tasks(model, vec_env, tasks, seed)
+    tasks = _test_tasks(vec_env, tasks, seed)
     if n_latents is None:
-        n_latents = LATENTS_WITH_SHARED_DYNAMICS if _dynamics_are_shared(vec_env) else LATENTS_WITH_OWN_DYNAMICS
+        n_latents = LATENTS_WITH_SHARED_DYNAMICS if FamilyView(vec_env).shared_dynamics else LATENTS_WITH_OWN_DYNAMICS
     check_whole("n_latents", n_latents, 1)
     candidates = _draw_latents(model, n_latents, source, np.random.default_rng([seed, 2]))
     returns = return_matrix(model, vec_env, tasks, candidates, selection_episodes, evaluation_seed(seed, 1), deterministic)
@@ -365,7 +363,8 @@ def return_matrix(
     :raises ValueError: If shapes do not fit or an episode is not finite.
     """
     tasks, latents = np.asarray(tasks, dtype=np.float64), np.asarray(latents, dtype=np.float64)
-    if not _dynamics_are_shared(vec_env):
+    family = FamilyView(vec_env)
+    if not family.shared_dynamics:
         rows = np.repeat(tasks, len(latents), axis=0)
         returns = evaluate_latents(model, vec_env, np.tile(latents, (len(tasks), 1)), rows, n_episodes, seed, deterministic)
         return returns.mean(axis=1).reshape(len(tasks), len(latents))
@@ -373,7 +372,7 @@ def return_matrix(
     some_task = np.repeat(tasks[:1], n_episodes * len(latents), axis=0)
     features = rollout_features(model, vec_env, np.tile(latents, (n_episodes, 1)), some_task, seed, deterministic)
     totals = np.stack(
-        [compute_rewards(vec_env, tasks[:, None, :], episode[None, :, :]).sum(axis=1) for episode in features], axis=1
+        [family.compute_rewards(tasks[:, None, :], episode[None, :, :]).sum(axis=1) for episode in features], axis=1
     )
     return totals.reshape(len(tasks), n_episodes, len(latents)).mean(axis=1)
 
@@ -423,27 +422,10 @@ def preference_order(model: Any, known: KnownTaskReturn) -> tuple[float, float]:
     return property_one(similarities, known.candidate_returns[:, policies])
 
 
-def held_out_tasks(family: FamilyEnv, n: int, seed: int) -> np.ndarray:
-    """
-    Test tasks. Those of a finite family are repeated in turn: each is one adaptation more.
-
-    :param family: The family.
-    :param n: How many.
-    :param seed: Draws them; no seed gives the tasks that a model was trained on.
-    :return: (n, task_dim).
-    """
-    rng = np.random.default_rng([TEST_TASK_STREAM, seed])
-    if family.all_tasks is None:
-        return family.sample_tasks(n, rng)
-    return np.resize(family.sample_tasks(len(family.all_tasks), rng), (n, family.task_dim))
-
-
-def _test_tasks(model: Any, vec_env: VecEnv, tasks: np.ndarray | int | None, seed: int) -> np.ndarray:
+def _test_tasks(vec_env: VecEnv, tasks: np.ndarray | int | None, seed: int) -> np.ndarray:
     if tasks is None or isinstance(tasks, (int, np.integer)):
-        from sb3_poem.common.family import FamilyEnv
-
         n_tasks = N_TEST_TASKS if tasks is None else int(tasks)
-        return held_out_tasks(FamilyEnv(vec_env, model.horizon), n_tasks, seed)
+        return FamilyView(vec_env).test_tasks(n_tasks, seed)
     return np.asarray(tasks, dtype=np.float64)
 
 
@@ -456,10 +438,6 @@ def evaluation_seed(seed: int, stream: int = 0) -> int:
     :return: A non-negative 30-bit integer.
     """
     return int(np.random.SeedSequence([seed, 3, stream]).generate_state(1)[0] >> 2)
-
-
-def _dynamics_are_shared(vec_env: VecEnv) -> bool:
-    return bool(vec_env.get_attr("shared_dynamics", indices=[0])[0])
 
 
 def _draw_latents(model: Any, n: int, source: str, rng: np.random.Generator) -> np.ndarray:

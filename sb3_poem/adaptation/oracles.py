@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING
 
 import gymnasium as gym
 import numpy as np
 
 from sb3_poem.adaptation.noise import BoltzmannNoise, ExactNoise, MistakeNoise, NoiseModel
 from sb3_poem.adaptation.preference import Preference
+from sb3_poem.common.family_view import FamilyView, vectorised
 from sb3_poem.common.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -182,19 +183,6 @@ class MistakeOracle(TaskOracle):
         return _better(left, right)
 
 
-def compute_rewards(env: gym.Env | VecEnv, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
-    """
-    A task family's own reward.
-
-    :param env: A ``gym.Env`` or an SB3 ``VecEnv``.
-    :param tasks: (..., task_dim).
-    :param features: (..., feat_dim), broadcasts against the tasks.
-    :return: Rewards (...).
-    :raises ValueError: If the environment is no task family.
-    """
-    return np.asarray(_call(env, "compute_rewards", tasks, features), dtype=np.float64)
-
-
 def step_rewards(env: gym.Env | VecEnv, task: np.ndarray | None, trajectory: Trajectory) -> np.ndarray:
     """
     The true rewards of a trajectory.
@@ -207,23 +195,8 @@ def step_rewards(env: gym.Env | VecEnv, task: np.ndarray | None, trajectory: Tra
     """
     if trajectory.reward_features is None:
         raise ValueError('the trajectory has no reward features: its environment gave no info["reward_features"]')
-    return compute_rewards(env, _current_task(env) if task is None else task, trajectory.reward_features)
-
-
-def _current_task(env: gym.Env | VecEnv) -> np.ndarray:
-    task = env.get_wrapper_attr("task") if isinstance(env, gym.Env) else env.get_attr("task", indices=[0])[0]
-    if task is None:
-        raise RuntimeError("the environment has no task before its first reset(): reset it, or give the oracle its `task`")
-    return np.asarray(task, dtype=np.float64)
-
-
-def _call(env: gym.Env | VecEnv, method: str, *args: Any) -> Any:
-    try:
-        if isinstance(env, gym.Env):
-            return env.get_wrapper_attr(method)(*args)
-        return cast(Any, env).env_method(method, *args, indices=[0])[0]
-    except AttributeError as error:
-        raise ValueError(f"the environment is no task family: it has no `{method}` ({error})") from error
+    family = FamilyView(vectorised(env))
+    return family.compute_rewards(family.task if task is None else task, trajectory.reward_features)
 
 
 def _better(left: float, right: float) -> Preference:

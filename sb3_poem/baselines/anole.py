@@ -19,6 +19,7 @@ from sb3_poem.adaptation.state import plain
 from sb3_poem.baselines.berlekamp import n_distinguishable, worst_case_volumes
 from sb3_poem.baselines.fragments import default_fragment_length, replay_fragments
 from sb3_poem.common.checks import check_whole
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -96,7 +97,8 @@ class ANOLEOptions:
                 "call load_replay_buffer, or pass "
                 "library=sb3_poem.baselines.training_rollouts(model, env, 200), of another copy of the environment"
             )
-        if vec_env.has_attr("shared_dynamics") and not vec_env.get_attr("shared_dynamics", indices=[0])[0]:
+        family = FamilyView.of(vec_env)
+        if family is not None and not family.shared_dynamics:
             raise ValueError(
                 "`env` must be of a family whose tasks share their dynamics: ANOLE asks which fragment of the training "
                 "tasks is better on the new task, and here these show another world; pass a `library` from the new task"

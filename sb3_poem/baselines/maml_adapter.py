@@ -21,6 +21,7 @@ from sb3_poem.adaptation.preference import Preference
 from sb3_poem.adaptation.state import plain
 from sb3_poem.baselines.maml_reward import JudgedPair, MetaReward
 from sb3_poem.common.checks import check_whole
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -125,7 +126,8 @@ class MAMLRewardOptions:
         check_model_fits(model, vec_env)
         if library is not None:
             raise ValueError("`library` must be None: SAC learns from rollouts on the new task")
-        if vec_env.has_attr("shared_dynamics") and not vec_env.get_attr("shared_dynamics", indices=[0])[0]:
+        family = FamilyView.of(vec_env)
+        if family is not None and not family.shared_dynamics:
             raise ValueError(
                 "`env` must be of a family whose tasks share their dynamics: MAML-reward's network was trained on what "
                 "tasks say of each other's fragments"

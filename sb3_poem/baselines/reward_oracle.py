@@ -17,6 +17,7 @@ from sb3_poem.adaptation.oracles import step_rewards
 from sb3_poem.adaptation.preference import Preference
 from sb3_poem.adaptation.state import plain
 from sb3_poem.common.checks import check_whole
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -54,8 +55,7 @@ class RewardOracleOptions:
             )
         if model.context_reward_statistics is None:
             raise ValueError("`model` does not know how its contexts' rewards were standardised; train it for an epoch first")
-        if not vec_env.has_attr("compute_rewards"):
-            raise ValueError("`env` must be a task family (poem_envs.TaskFamily): it has no `compute_rewards`")
+        FamilyView(vec_env)  # which refuses what is no family
 
     def make_inference(
         self, model: Any, rng: np.random.Generator, library: Sequence[Trajectory] | None = None

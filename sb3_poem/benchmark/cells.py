@@ -12,14 +12,14 @@ import torch as th
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.adaptation import BoltzmannOracle, MistakeOracle, PreferenceAdapter, ReturnOracle, TaskOracle
-from sb3_poem.adaptation.evaluation import evaluate_adaptation, held_out_tasks, known_task_return, preference_order
+from sb3_poem.adaptation.evaluation import evaluate_adaptation, known_task_return, preference_order
 from sb3_poem.baselines import ANOLEAdapter, MAMLRewardAdapter, RewardOracleAdapter, rollout_fragments
 from sb3_poem.baselines.fragments import default_fragment_length
 from sb3_poem.benchmark.models import ModelLibrary, Say
 from sb3_poem.benchmark.provenance import provenance
 from sb3_poem.benchmark.store import Record
 from sb3_poem.benchmark.suites import Cell, OracleSpec
-from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.vec_env import make_task_vec_env
 
 ADAPTERS: dict[str, type[PreferenceAdapter]] = {
@@ -49,7 +49,7 @@ def run_cell(cell: Cell, library: ModelLibrary, say: Say = print) -> Record:
     env = make_task_vec_env(cell.env_id, 2 * cell.budget.tasks)
     try:
         model = library.load(cell.model_key, env, cell.snapshot)
-        tasks = held_out_tasks(FamilyEnv(env), cell.budget.tasks, cell.budget.task_seed)
+        tasks = FamilyView(env).test_tasks(cell.budget.tasks, cell.budget.task_seed)
         started = time.perf_counter()
         measure = _measure_known if cell.definition.kind == "known" else _measure_adaptation
         result = measure(cell, model, env, tasks)

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from functools import cache
 
 import gymnasium as gym
-import numpy as np
 
-import poem_envs  # noqa: F401  registers the environments
 from sb3_poem.benchmark.suites import family_id
-from sb3_poem.common.family import REQUIRED_ATTRIBUTES
+from sb3_poem.common.family_view import FamilyView
+from sb3_poem.common.vec_env import make_task_vec_env
 
 
 @dataclass(frozen=True)
@@ -42,18 +41,14 @@ def family_facts(name: str) -> FamilyFacts:
     """
     env_id = family_id(name)
     try:
-        env = gym.make(env_id)
+        env = make_task_vec_env(env_id, 1)
     except gym.error.Error as error:
         known = ", ".join(sorted(family.split("/")[1].split("-")[0] for family in gym.registry if family.startswith("poem/")))
         raise ValueError(f"--families {name}: {error} The package's own families are: {known}") from error
     with contextlib.closing(env):
-        missing = [attribute for attribute in REQUIRED_ATTRIBUTES if not hasattr(env.unwrapped, attribute)]
-        if missing:
-            raise ValueError(f"--families {name} is no task family (a poem_envs.TaskFamily): it has no {', '.join(missing)}")
-        family = env.unwrapped
-        limit = None if env.spec is None else env.spec.max_episode_steps
-        if limit is None:
-            raise ValueError(f"--families {name}: register {env_id} with max_episode_steps")
-        tasks: np.ndarray | None = family.all_tasks  # type: ignore[attr-defined]
-        shared = bool(family.shared_dynamics)  # type: ignore[attr-defined]
-        return FamilyFacts(env_id, int(limit), None if tasks is None else len(tasks), shared)
+        try:
+            family = FamilyView.for_training(env)
+        except ValueError as error:
+            raise ValueError(f"--families {name}: {error}") from error
+    n_tasks = None if family.all_tasks is None else len(family.all_tasks)
+    return FamilyFacts(env_id, family.horizon, n_tasks, family.shared_dynamics)

@@ -12,7 +12,6 @@ from sb3_poem.benchmark.methods import VARIANTS
 from sb3_poem.benchmark.suites import ModelKey
 from sb3_poem.resources import config_file
 
-DEFAULT_TRAIN_TASKS = 120
 #: Models are saved, for curves and against interruptions, this many times in a training.
 SAVES = 10
 
@@ -76,6 +75,8 @@ def training_plan(key: ModelKey) -> TrainingPlan:
 
 
 def _epoch_steps(facts: FamilyFacts, hyperparameters: dict[str, Any]) -> int:
+    from sb3_poem.pearl_sac.train_tasks import DEFAULT_TRAIN_TASKS
+
     tasks = hyperparameters.get("n_train_tasks")
     if tasks is None:
         tasks = DEFAULT_TRAIN_TASKS if facts.n_tasks is None else min(DEFAULT_TRAIN_TASKS, facts.n_tasks)

@@ -14,7 +14,7 @@ from typing import Any
 
 import gymnasium
 
-from poem_envs.headless import has_display
+from poem_envs.headless import can_draw, choose_headless_backend
 from sb3_poem import __version__
 from sb3_poem.cli.benchmark_arguments import add_benchmark
 
@@ -294,27 +294,6 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def offscreen_backend() -> str | None:
-    """What MuJoCo could draw with where there is no display: ``"egl"``, ``"osmesa"``, or None."""
-    from ctypes.util import find_library
-
-    backends = (("egl", "EGL"), ("osmesa", "OSMesa"))
-    return next((backend for backend, library in backends if find_library(library)), None)
-
-
-def use_offscreen_rendering() -> None:
-    """Where there is no display, let MuJoCo draw off screen, unless the user chose. Call before importing it."""
-    if not has_display() and "MUJOCO_GL" not in os.environ:
-        backend = offscreen_backend()
-        if backend is not None:
-            os.environ["MUJOCO_GL"] = backend
-
-
-def can_draw() -> bool:
-    """Whether videos can be made here, as far as can be told without trying."""
-    return has_display() or offscreen_backend() is not None
-
-
 def _is_zoo(given: Sequence[str]) -> bool:
     """Whether the command is rl_zoo3's, which reads its own arguments."""
     if given[:1] != ["enjoy"]:
@@ -327,7 +306,8 @@ def _is_zoo(given: Sequence[str]) -> bool:
 def _run(arguments: argparse.Namespace) -> int:
     from rich.console import Console
 
-    use_offscreen_rendering()
+    if can_draw():
+        choose_headless_backend()  # before anything imports MuJoCo
     command, is_zoo = arguments.command, _is_zoo(arguments.given)
     name = "zoo" if is_zoo else MODULES.get(command, command)
     # PyTorch and its company take seconds.

@@ -23,6 +23,7 @@ from sb3_poem.adaptation.callback import AdaptationEvalCallback
 from sb3_poem.cli.hyperparams import check_config, check_keys, check_numbers
 from sb3_poem.cli.hyperparams_opt import entry_params
 from sb3_poem.cli.outputs import check_writable
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.vec_env import TaskVecEnv
 from sb3_poem.loading import ALGORITHMS
 from sb3_poem.pearl_sac import PEARLSAC
@@ -237,7 +238,7 @@ class PoemExperiment(FamilyExperiment):
         arguments = {"entry": self._hyperparams}
         sampled = self._preprocess_schedules(HYPERPARAMS_SAMPLER[self.algo](trial, self.n_actions, self.n_envs, arguments))
         env = self.create_envs(self.n_envs, no_log=True)
-        if not env.get_attr("shared_dynamics", indices=[0])[0]:
+        if not FamilyView(env).shared_dynamics:
             sampled["relabel_fraction"] = 0.0  # a reward of another task needs a transition that could be of it
         try:
             model = ALGORITHMS[self.algo](env=env, device=self.device, **{**self._hyperparams, **sampled})

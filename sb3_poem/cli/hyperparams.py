@@ -13,12 +13,6 @@ from sb3_poem.pearl_sac.unsupported import UNSUPPORTED
 
 # What rl_zoo3 takes out of an entry for itself before the rest goes to the algorithm.
 ZOO_KEYS = frozenset({"callback", "env_kwargs", "monitor_kwargs", "n_envs", "n_timesteps"})
-_WRAPPED = "it changes what is seen or paid, and rewards are computed for other tasks from what the family itself gives; "
-# What rl_zoo3 takes too, but no task family can have.
-REFUSED = {
-    **{key: f"{_WRAPPED}write it into the family" for key in ("env_wrapper", "vec_env_wrapper", "frame_stack")},
-    "normalize": f"{_WRAPPED}observations and rewards are standardised by the algorithm",
-}
 # What rl_zoo3 gives to the algorithm itself; the same in an entry would be given twice.
 FLAG_OF_KEY = {
     "device": "--device",
@@ -43,9 +37,8 @@ def check_keys(keys: Sequence[str], algorithm: str, source: str) -> None:
     for key in keys:
         if key in FLAG_OF_KEY:
             raise ValueError(f"{key!r} in {source} belongs on the command line: {FLAG_OF_KEY[key]}")
-        reason = REFUSED.get(key) or UNSUPPORTED.get(key)
-        if reason is not None:
-            raise ValueError(f"{key!r} in {source} is not for {algorithm}: {reason}")
+        if key in UNSUPPORTED:
+            raise ValueError(f"{key!r} in {source} is not for {algorithm}: {UNSUPPORTED[key]}")
         if key not in known:
             close = difflib.get_close_matches(key, known - set(FLAG_OF_KEY), n=3)
             hint = f"did you mean {' or '.join(map(repr, close))}?" if close else "nor anything like it."

@@ -1,10 +1,8 @@
 """What ``sb3-poem adapt`` says: the table, the JSON and the plot."""
 
-import platform
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +12,10 @@ from rich.table import Table
 
 from sb3_poem.adaptation import AdaptationEvaluation, KnownTaskReturn
 from sb3_poem.adaptation.state import write_json_atomically
+from sb3_poem.benchmark.provenance import versions
 from sb3_poem.plotting import plot_returns
 
 TABLE_WIDTH = 76
-VERSIONED = ("sb3_poem", "stable_baselines3", "torch", "gymnasium", "mujoco", "numpy")
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,7 @@ class Report:
         """JSON-ready: every task's return after every answer, the limit, the known-task return, and how it came about."""
         return {
             "command": " ".join(sys.orig_argv),
-            "versions": {"python": platform.python_version(), **{name: version(name) for name in VERSIONED}},
+            "versions": versions(),
             **self.settings,
             **self.evaluation.to_dict(),
             **self._known_to_dict(),

@@ -18,11 +18,10 @@ from rich.console import Console
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_poem.adaptation import AdaptedPolicy, KnownTaskReturn, Trajectory, known_task_return
-from sb3_poem.adaptation.evaluation import evaluation_seed, held_out_tasks
-from sb3_poem.adaptation.oracles import compute_rewards
+from sb3_poem.adaptation.evaluation import evaluation_seed
 from sb3_poem.cli.outputs import check_device
 from sb3_poem.cli.packages import import_packages
-from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.foreign import environment_of
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.vec_env import make_task_vec_env
@@ -93,21 +92,21 @@ class Subject:
             arguments.model, self.model.env_id, self.model.env_kwargs, arguments.env, given
         )
         self.env = make_task_vec_env(self.env_id, copies, **self.env_kwargs)
-        family = FamilyEnv(self.env)
+        self.family = FamilyView(self.env)
         try:
-            family.check_same_family(self.model.task_space, self.model.reward_feature_dim)
+            self.family.check_same_family(self.model.task_space, self.model.reward_feature_dim)
         except ValueError as error:
             raise ValueError(
                 f"--env {self.env_id}, but {arguments.model} was trained on {self.model.env_id}: {error}"
             ) from error
         #: (n_tasks, task_dim)
-        self.tasks = self._choose_tasks(arguments.task, family, n_tasks)
+        self.tasks = self._choose_tasks(arguments.task, n_tasks)
 
-    def _choose_tasks(self, task: list[float] | None, family: FamilyEnv, n_tasks: int) -> np.ndarray:
+    def _choose_tasks(self, task: list[float] | None, n_tasks: int) -> np.ndarray:
         if task is None:
-            return held_out_tasks(family, n_tasks, self.seed)
-        if len(task) != family.task_dim:
-            raise ValueError(f"--task needs {family.task_dim} numbers for {self.env_id}, got {len(task)}")
+            return self.family.test_tasks(n_tasks, self.seed)
+        if len(task) != self.family.task_dim:
+            raise ValueError(f"--task needs {self.family.task_dim} numbers for {self.env_id}, got {len(task)}")
         return np.array([task], dtype=np.float64)
 
     def known_task_return(self, n_episodes: int) -> KnownTaskReturn:
@@ -128,7 +127,7 @@ class Subject:
         :raises ValueError: if the environment cannot render so
         """
         env = DummyVecEnv([partial(self._make_env, render_mode, {"render_task": True} if show_task else {})])
-        env.env_method("set_task", self.tasks[0])
+        FamilyView(env).set_tasks(self.tasks[:1])
         return env
 
     def _make_env(self, render_mode: str | None, options: dict[str, Any]) -> gym.Env:
@@ -151,7 +150,7 @@ class Subject:
     def true_return(self, episode: Trajectory) -> float:
         """What an episode earns on the first task."""
         assert episode.reward_features is not None
-        return float(compute_rewards(self.env, self.tasks[0], episode.reward_features).sum())
+        return float(self.family.compute_rewards(self.tasks[0], episode.reward_features).sum())
 
     def film(self, latents: Sequence[np.ndarray], captions: Sequence[str], path: Path, show_task: bool) -> None:
         """Film one policy on the first task, or two side by side from the same start.
@@ -169,6 +168,6 @@ class Subject:
                 earned = [f": {self.true_return(clip):.1f}" if show_task else "" for clip in clips]
                 left, right = (caption + words for caption, words in zip(captions, earned, strict=True))
                 frames = side_by_side(frames, clips[1].frames or [], (left, right))
-            write_video(frames, path, float(env.get_attr("metadata")[0].get("render_fps", 20)))
+            write_video(frames, path, float(FamilyView(env).render_fps))
         env.close()
         say(f"Wrote {path}" + (f" (task {describe_task(self.tasks[0])})" if show_task else ""))

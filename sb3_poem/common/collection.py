@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from sb3_poem.common.buffers import Segment
-from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.family_view import FamilyView
 
 OnStep = Callable[[dict[str, Any]], bool]
 
@@ -27,7 +27,7 @@ def check_finite(name: str, values: np.ndarray, task_ids: np.ndarray, episodes: 
 
 
 def collect_segment(
-    family: FamilyEnv,
+    family: FamilyView,
     act: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
     task_ids: np.ndarray,
     tasks: np.ndarray,
@@ -48,7 +48,7 @@ def collect_segment(
     :param on_step: Given the local variables of a step; False ends the collection
     :return: The experience, or None if ``on_step`` ended the collection
     :raises ValueError: if the environment returns NaN or infinity, or what
-        :meth:`FamilyEnv.check_experience` refuses
+        :meth:`FamilyView.check_experience` refuses
     """
     obs = family.reset(tasks, seed)
     check_finite("observations", obs, task_ids, episode_counts, 0)

@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import load_env_creator
 
-from sb3_poem.common.family import DRAWING_ARGUMENTS
+from sb3_poem.common.family_view import DRAWING_ARGUMENTS
 
 PLAIN_ID = re.compile(r"\w[\w.-]{0,99}(/\w[\w.-]{0,99})?", re.ASCII)
 WORD = re.compile(r"[\w-]{0,100}", re.ASCII)

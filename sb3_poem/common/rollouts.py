@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -228,7 +229,7 @@ def _wave(
     if tasks is None:
         seed_episodes(vec_env, copy_seeds)
     else:
-        set_tasks(vec_env, tasks[padded])
+        FamilyView(vec_env).set_tasks(tasks[padded])
         seed_copies(vec_env, copy_seeds)
     latents = latents[padded]
     observations = _finite(_flat_observations(vec_env.reset()), np.arange(copies) < n, first, 0, "an observation")
@@ -283,20 +284,6 @@ def _wave(
             frames=images[row] if frames else None,
             success=successes[row],
         )
-
-
-def set_tasks(vec_env: VecEnv, tasks: np.ndarray) -> None:
-    """
-    Give every copy its task, from its next reset on.
-
-    :param vec_env: A vector environment of task families.
-    :param tasks: (num_envs, task_dim).
-    """
-    if hasattr(vec_env, "set_tasks"):
-        vec_env.set_tasks(tasks)
-        return
-    for copy, task in enumerate(tasks):
-        vec_env.env_method("set_task", task, indices=[copy])
 
 
 def seed_copies(vec_env: VecEnv, seeds: Sequence[int]) -> None:

@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices,
 from poem_envs.family import TaskFamily
 from poem_envs.registration import plain_id
 from poem_envs.vector import TaskFamilyVector
-from sb3_poem.common.family import no_family
+from sb3_poem.common.family_view import no_family
 
 # What these do, the vectorised environment or TaskVecEnv does itself.
 ABSORBED_WRAPPERS: tuple[type[gym.Wrapper], ...] = (TimeLimit, OrderEnforcing, PassiveEnvChecker, Monitor)

@@ -20,7 +20,7 @@ from sb3_poem.adaptation.adapter import PreferenceAdapter
 from sb3_poem.adaptation.noise import MistakeNoise
 from sb3_poem.adaptation.options import rollout_seed
 from sb3_poem.adaptation.preference import Preference
-from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.label.beliefs import belief
@@ -133,7 +133,7 @@ class Bench:
         self.model = model
         self.env = env
         self.env_id = env_id
-        self.fps = float(env.get_attr("metadata", indices=[0])[0].get("render_fps", 20))
+        self.fps = FamilyView(env).render_fps
 
     def turn(self, request: Request) -> Turn:
         """
@@ -218,8 +218,8 @@ def make_turn(request: Request) -> Turn:
     """
     bench = bench_of(request.choice)
     bench.env.env_method("render_while", request.marker if request.marker.exists() else None)
-    family = FamilyEnv(bench.env)
-    bench.env.env_method("set_task", family.sample_tasks(1, np.random.default_rng([TASK_STREAM, request.seed]))[0])
+    family = FamilyView(bench.env)
+    family.set_tasks(family.sample_tasks(1, np.random.default_rng([TASK_STREAM, request.seed])))
     return bench.turn(request)
 
 

@@ -9,7 +9,7 @@ from colorednoise import powerlaw_psd_gaussian
 
 from sb3_poem.common.buffers import Segment, TaskReplayBuffer
 from sb3_poem.common.collection import OnStep, collect_segment
-from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.random import Generators
 from sb3_poem.pearl_sac.policies import LatentPolicy
 from sb3_poem.pearl_sac.train_tasks import TrainTasks
@@ -31,7 +31,7 @@ class EpochCollector:
     :param on_step: See :func:`collect_segment`
     """
 
-    family: FamilyEnv
+    family: FamilyView
     policy: LatentPolicy
     tasks: TrainTasks
     buffer: TaskReplayBuffer

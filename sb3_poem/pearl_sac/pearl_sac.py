@@ -22,7 +22,7 @@ from poem_envs.registration import plain_id
 from sb3_poem.common.buffers import ContextStore, Segment, TaskReplayBuffer
 from sb3_poem.common.checks import check_number, check_number_or_auto, check_whole
 from sb3_poem.common.digest import digest_of
-from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.files import write_atomically
 from sb3_poem.common.networks import RunningNorm
 from sb3_poem.common.precision import hidden_dtype
@@ -237,7 +237,7 @@ class PEARLSAC(SAC):
         self.predicted_rewards_error = float("nan")
         self.best_adapted_return = -np.inf  # kept with the model, for AdaptationEvalCallback
         self.n_timesteps: int | None = None  # what learn takes unless told, see from_zoo
-        self._family: FamilyEnv | None = None
+        self._family: FamilyView | None = None
         self._logs_pending = False
         self.policy_class = self._get_policy_from_name(policy)
         given = vectorise(env, None, n_train_tasks, trajectories_per_task)
@@ -344,7 +344,7 @@ class PEARLSAC(SAC):
     # ------------------------------------------------------------------ the task family
 
     @property
-    def family(self) -> FamilyEnv:
+    def family(self) -> FamilyView:
         """The environment as a task family.
 
         :raises ValueError: if the model was loaded without an environment
@@ -355,15 +355,15 @@ class PEARLSAC(SAC):
             self._family = self._family_of(self.env)
         return self._family
 
-    def _family_of(self, env: VecEnv) -> FamilyEnv:
+    def _family_of(self, env: VecEnv) -> FamilyView:
         """View of an environment, which must be of the model's own family once the model has one."""
-        family = FamilyEnv(env, self.horizon)
+        family = FamilyView.for_training(env, self.horizon)
         self._check_family(family)
         if len(self.train_tasks):
             family.check_same_family(self.task_space, self.reward_feature_dim)
         return family
 
-    def _check_family(self, family: FamilyEnv) -> None:
+    def _check_family(self, family: FamilyView) -> None:
         """
         :raises ValueError: if the model's arguments need what the family does not have
         """

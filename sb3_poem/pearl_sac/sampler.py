@@ -9,7 +9,7 @@ import torch as th
 
 from poem_envs import SignedPermutation
 from sb3_poem.common.buffers import ContextStore, TaskBatch, TaskReplayBuffer
-from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.networks import RunningNorm
 from sb3_poem.common.random import Generators
 from sb3_poem.pearl_sac.losses import Bootstraps, MetaBatch
@@ -44,7 +44,7 @@ class MetaBatchSampler:
     :param mirror_fraction: Share of a task's batch that is seen in a symmetry
     """
 
-    family: FamilyEnv
+    family: FamilyView
     tasks: np.ndarray
     buffer: TaskReplayBuffer
     context: ContextStore

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.family_view import FamilyView
 
 DEFAULT_TRAIN_TASKS = 120
 AGGREGATE_NEIGHBOURS = 5
@@ -35,7 +35,7 @@ class TrainTasks:
         return cls(tasks, np.zeros(shape), np.ones(shape))
 
     @classmethod
-    def draw(cls, family: FamilyEnv, n: int | None, latent_dim: int, rng: np.random.Generator) -> "TrainTasks":
+    def draw(cls, family: FamilyView, n: int | None, latent_dim: int, rng: np.random.Generator) -> "TrainTasks":
         """Draw tasks from a family.
 
         :param n: How many; None takes :func:`default_train_tasks`

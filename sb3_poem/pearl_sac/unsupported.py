@@ -11,6 +11,7 @@ _BUFFER = (
     "environments"
 )
 _FEATURES = "networks read flat observations; see net_arch, and put features into the observation"
+_WRAPPED = "it changes what is seen or paid, and rewards are computed for other tasks from what the family itself gives; "
 _DEVIATION = "the policy's deviation is learned, from 1 on; see ent_coef and target_entropy"
 
 #: Argument of SAC or of its policies, or key of rl_zoo3's files: why not, and what to do instead
@@ -24,6 +25,8 @@ UNSUPPORTED = {
     **dict.fromkeys(("replay_buffer_class", "replay_buffer_kwargs"), _BUFFER),
     **dict.fromkeys(("features_extractor_class", "features_extractor_kwargs"), _FEATURES),
     **dict.fromkeys(("share_features_extractor", "normalize_images"), _FEATURES),
+    **dict.fromkeys(("env_wrapper", "vec_env_wrapper", "frame_stack"), f"{_WRAPPED}write it into the family"),
+    "normalize": f"{_WRAPPED}observations and rewards are standardised by the algorithm",
     **dict.fromkeys(("log_std_init", "use_expln", "clip_mean"), _DEVIATION),
 }
 #: Arguments of the policy, which people give to the algorithm

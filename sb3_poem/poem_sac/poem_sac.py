@@ -9,7 +9,7 @@ from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_poem.common.buffers import Segment
 from sb3_poem.common.collection import relabelled_returns
-from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.pearl_sac.collector import EpochCollector, in_waves
 from sb3_poem.pearl_sac.environments import GivenEnv
 from sb3_poem.pearl_sac.pearl_sac import PEARLSAC
@@ -157,7 +157,7 @@ class POEMSAC(PEARLSAC):
         self.policy_kwargs["two_encoder"] = self.similarity == "two-encoder"
         self.policy_kwargs["context_has_value"] = self.context == "optimal"
 
-    def _check_family(self, family: FamilyEnv) -> None:
+    def _check_family(self, family: FamilyView) -> None:
         super()._check_family(family)
         if self.preference_source == "relabel" and not family.shared_dynamics:
             raise ValueError(

@@ -20,8 +20,8 @@ from sb3_poem.adaptation import (
     known_task_return,
     property_one,
 )
-from sb3_poem.adaptation.evaluation import evaluation_seed, held_out_tasks, preference_order, return_matrix
-from sb3_poem.common.family import FamilyEnv
+from sb3_poem.adaptation.evaluation import evaluation_seed, preference_order, return_matrix
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.vec_env import TaskVecEnv
 from sb3_poem.loading import load_model
 
@@ -64,7 +64,7 @@ def test_names_and_numbers_of_tasks_will_do():
     """Held-out tasks, which the seed draws: those of the command line, and the same for both functions."""
     result = evaluate_adaptation("PointGoal", "poem/PointGoal-v0", 3, record_at=(0, 2), n_episodes=1, seed=4)
     env = TaskVecEnv.from_id("poem/PointGoal-v0", 4)
-    np.testing.assert_array_equal(result.tasks, held_out_tasks(FamilyEnv(env), 3, 4))
+    np.testing.assert_array_equal(result.tasks, FamilyView(env).test_tasks(3, 4))
     model = load_model("PointGoal", "cpu")
     again = evaluate_adaptation(model, env, result.tasks, record_at=(0, 2), n_episodes=1, seed=4)
     np.testing.assert_allclose(again.returns, result.returns, atol=1e-4)

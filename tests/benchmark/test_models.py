@@ -105,7 +105,7 @@ def test_a_method_that_cannot_run_on_a_family_says_so_before_training(tmp_path: 
     assert re.search(r"MetaWorldML10 poem seed 0: missing, [\d,]+ steps", lines)
     for families, message in (
         (["HalfCheetahFly"], "--families HalfCheetahFly: .* The package's own families are: AntDir2D"),
-        (["CartPole-v1"], "--families CartPole-v1 is no task family"),
+        (["CartPole-v1"], "--families CartPole-v1: .* is no task family"),
     ):
         with pytest.raises(ValueError, match=message):
             plan_for(library, "table3", families)

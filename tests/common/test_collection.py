@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_poem.common.buffers import Segment
 from sb3_poem.common.collection import collect_segment, relabelled_returns
-from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.vec_env import TaskVecEnv
 
 
@@ -26,7 +26,7 @@ def random_policy(env: VecEnv, seed: int = 0):  # type: ignore[no-untyped-def]
 
 
 def collect(env: VecEnv, tasks: np.ndarray, horizon: int | None = None, seed: int = 3, on_step=lambda _: True):  # type: ignore[no-untyped-def]
-    family, n = FamilyEnv(env, horizon), env.num_envs
+    family, n = FamilyView.for_training(env, horizon), env.num_envs
     counts = np.zeros(n, dtype=int)
     latents = np.arange(2.0 * n).reshape(n, 2)
     return collect_segment(family, random_policy(env), np.arange(n), tasks, latents, seed, counts, on_step), counts
@@ -105,7 +105,7 @@ def test_poison_is_named(what: str) -> None:
 
 def test_actions_that_are_not_finite_do_not_reach_the_environment() -> None:
     env = walks(2)
-    family = FamilyEnv(env, 10)
+    family = FamilyView.for_training(env, 10)
 
     def act(obs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         bad = np.array([[0.0], [np.nan]], dtype=np.float32)
@@ -140,9 +140,9 @@ def true_returns(make_env, tasks: np.ndarray, actions: np.ndarray, seeds: list[i
 def test_relabelled_returns_are_what_the_other_tasks_environments_return(env_id: str, steps: int) -> None:
     kwargs = {"max_episode_steps": steps}
     env = TaskVecEnv.from_id(env_id, 3, **kwargs)
-    tasks = FamilyEnv(env).sample_tasks(3, np.random.default_rng(0))
+    tasks = FamilyView(env).sample_tasks(3, np.random.default_rng(0))
     segment, _ = collect(env, tasks, seed=11)
-    relabelled = relabelled_returns(FamilyEnv(env).compute_rewards, tasks, segment.features, segment.first_episode)
+    relabelled = relabelled_returns(FamilyView(env).compute_rewards, tasks, segment.features, segment.first_episode)
     truth = true_returns(lambda: gym.make(env_id, **kwargs), tasks, unscaled(segment, env), [11, 12, 13])
     assert segment.first_episode.all() == (env_id == POINT_GOAL)  # the others fall
     assert np.ptp(truth, axis=0).min() > 1e-3  # the tasks do differ
@@ -155,6 +155,7 @@ def test_relabelling_counts_the_marked_steps_only() -> None:
     env, tasks = walks(3, steps=8, edge=0.35), np.array([[-1.0], [0.0], [1.0]])
     segment, _ = collect(env, tasks, horizon=8)
     assert (~segment.first_episode).any()
-    relabelled = relabelled_returns(FamilyEnv(env, 8).compute_rewards, tasks, segment.features, segment.first_episode)
+    rewards_of = FamilyView(env).compute_rewards
+    relabelled = relabelled_returns(rewards_of, tasks, segment.features, segment.first_episode)
     truth = true_returns(lambda: gym.wrappers.TimeLimit(Walk(edge=0.35), 8), tasks, unscaled(segment, env), [3, 4, 5])
     np.testing.assert_allclose(relabelled, truth, rtol=1e-6)

@@ -13,24 +13,24 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 
 from poem_envs import GoalFamily
-from sb3_poem.common.family import FamilyEnv
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.vec_env import TaskVecEnv
 
 
 def test_reads_a_family() -> None:
-    family = FamilyEnv(make_vec_env(POINT_GOAL, 2))
+    family = FamilyView.for_training(make_vec_env(POINT_GOAL, 2))
     assert (family.env_id, family.horizon, family.num_envs) == (POINT_GOAL, 25, 2)
     assert (family.task_dim, family.reward_feature_dim, family.shared_dynamics) == (1, 2, True)
     assert family.all_tasks is None
-    assert FamilyEnv(walks(1, TwoWalks), 10).all_tasks.tolist() == [[-1.0], [1.0]]
-    assert not FamilyEnv(walks(1, WindyWalk), 10).shared_dynamics
+    assert FamilyView.for_training(walks(1, TwoWalks), 10).all_tasks.tolist() == [[-1.0], [1.0]]
+    assert not FamilyView.for_training(walks(1, WindyWalk), 10).shared_dynamics
 
 
 @pytest.mark.parametrize("wrap", [lambda env: env, VecMonitor, lambda env: VecMonitor(VecMonitor(env))])
 @pytest.mark.parametrize("make", [lambda: make_vec_env(POINT_GOAL, 3), lambda: TaskVecEnv.from_id(POINT_GOAL, 3)])
 def test_tasks_reach_the_copies_and_features_come_back(make, wrap) -> None:  # type: ignore[no-untyped-def]
     env = wrap(make())
-    family, tasks = FamilyEnv(env), np.array([[0.5], [1.0], [3.0]])
+    family, tasks = FamilyView.for_training(env), np.array([[0.5], [1.0], [3.0]])
     first = family.reset(tasks, seed=4)
     assert np.array_equal(env.get_attr("task"), tasks)
     _, rewards, _, infos = env.step(np.ones((3, 2), dtype=np.float32))
@@ -43,7 +43,7 @@ def test_tasks_reach_the_copies_and_features_come_back(make, wrap) -> None:  # t
 
 
 def test_sampling_leaves_the_environments_generator_alone() -> None:
-    family = FamilyEnv(make_vec_env(POINT_GOAL, 1))
+    family = FamilyView.for_training(make_vec_env(POINT_GOAL, 1))
     assert np.array_equal(family.sample_tasks(4, np.random.default_rng(0)), family.sample_tasks(4, np.random.default_rng(0)))
 
 
@@ -55,7 +55,7 @@ def test_an_environment_that_is_no_family(vec_env_class) -> None:  # type: ignor
     env = vec_env_class([functools.partial(gym.make, "Pendulum-v1")])
     try:
         with pytest.raises(ValueError, match=r"env <.*<Pendulum-v1>.*> is no task family.*TaskFamily.*GoalFamily"):
-            FamilyEnv(env)
+            FamilyView.for_training(env)
     finally:
         env.close()
 
@@ -63,7 +63,7 @@ def test_an_environment_that_is_no_family(vec_env_class) -> None:  # type: ignor
 @pytest.mark.parametrize("space", [spaces.Box(0, 1, (2, 2)), spaces.Discrete(3), spaces.Dict(a=spaces.Box(0, 1, (1,)))])
 def test_observations_must_be_flat(space: spaces.Space) -> None:
     with pytest.raises(ValueError, match=r"observation_space must be a flat gymnasium\.spaces\.Box, but is "):
-        FamilyEnv(walks(1, type("Changed", (Walk,), {"observation_space": space})), 10)
+        FamilyView.for_training(walks(1, type("Changed", (Walk,), {"observation_space": space})), 10)
 
 
 @pytest.mark.parametrize(
@@ -77,31 +77,31 @@ def test_observations_must_be_flat(space: spaces.Space) -> None:
 )
 def test_actions_must_be_bounded(space: spaces.Space, message: str) -> None:
     with pytest.raises(ValueError, match=f"action_space {message}"):
-        FamilyEnv(walks(1, type("Changed", (Walk,), {"action_space": space})), 10)
+        FamilyView.for_training(walks(1, type("Changed", (Walk,), {"action_space": space})), 10)
 
 
 def test_the_horizon_must_be_known_and_agree() -> None:
     with pytest.raises(ValueError, match=r"horizon is unknown: .*max_episode_steps, or pass horizon"):
-        FamilyEnv(walks(1))
-    assert FamilyEnv(walks(1), 10).horizon == 10
+        FamilyView.for_training(walks(1))
+    assert FamilyView.for_training(walks(1), 10).horizon == 10
     with pytest.raises(ValueError, match="horizon is 30, but the environment ends episodes after 25 steps; they must agree"):
-        FamilyEnv(make_vec_env(POINT_GOAL, 1), 30)
-    assert FamilyEnv(make_vec_env(POINT_GOAL, 1), 25).horizon == 25
+        FamilyView.for_training(make_vec_env(POINT_GOAL, 1), 30)
+    assert FamilyView.for_training(make_vec_env(POINT_GOAL, 1), 25).horizon == 25
 
 
 def test_the_horizon_of_a_goal_family_is_that_of_its_environment() -> None:
     family = GoalFamily("gymnasium_robotics:FetchReach-v4")
-    assert FamilyEnv(DummyVecEnv([lambda: family])).horizon == 50
+    assert FamilyView.for_training(DummyVecEnv([lambda: family])).horizon == 50
 
 
 @pytest.mark.parametrize("horizon", [0, -5])
 def test_the_horizon_must_be_positive(horizon: int) -> None:
     with pytest.raises(ValueError, match=rf"horizon must be at least 1.*{horizon}"):
-        FamilyEnv(walks(1), horizon)
+        FamilyView.for_training(walks(1), horizon)
 
 
 def test_another_family_is_told_apart() -> None:
-    family = FamilyEnv(walks(1), 10)
+    family = FamilyView.for_training(walks(1), 10)
     family.check_same_family(Walk.task_space, 2)
     with pytest.raises(ValueError, match=r"trained for tasks in .*Pass an environment of the model's own family"):
         family.check_same_family(OtherWalk.task_space, 2)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import poem_envs  # noqa: F401
-from sb3_poem.cli import can_draw
+from poem_envs.headless import can_draw
 
 
 @pytest.mark.skipif(not can_draw(), reason="no off-screen OpenGL")

@@ -1,22 +1,27 @@
 """What an algorithm needs to know of a task family, asked of any SB3 ``VecEnv`` of it."""
 
+from __future__ import annotations
+
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import cloudpickle
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv
+from gymnasium.envs.registration import EnvSpec
 
 from poem_envs.family import Symmetry, definition_problem
-from sb3_poem.common.wrappers import WrapperError, unknown_wrappers
 
 if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
+
     from sb3_poem.common.buffers import Segment
 
 # Arguments that change how an environment is drawn, not what it is.
 DRAWING_ARGUMENTS = {"render_mode", "render_task"}
-REQUIRED_ATTRIBUTES = ("task_space", "all_tasks", "shared_dynamics", "reward_feature_dim")
+#: Test tasks come from a stream of their own, so that no seed gives the tasks that a model was trained on
+TEST_TASK_STREAM = 0x7E57
 #: Steps by which it is seen whether a wrapper changes a family
 COMPARED_STEPS = 10
 
@@ -34,48 +39,59 @@ def no_family(env: str) -> str:
     )
 
 
-class FamilyEnv:
-    """View of a vectorised environment as a task family.
+class FamilyView:
+    """What a vectorised environment is as a task family: the one way to ask it.
 
-    :param env: Vectorised environment whose copies are :class:`poem_envs.TaskFamily` environments.
-        Wrappers that change what is seen, done or paid are refused: those of Gymnasium and SB3 by
-        name, others by the first experience, see :meth:`check_experience`
-    :param horizon: Steps of an episode; None reads the time limit of the environment's registration
-    :raises ValueError: if the environment is no task family, a wrapper changes it, or no horizon is
-        known
+    :param env: Vectorised environment whose copies are :class:`poem_envs.TaskFamily` environments
+    :raises ValueError: if it is of no task family
     """
 
-    task_space: spaces.Box
-    reward_feature_dim: int
+    #: Steps of an episode, of a family that training can use (:meth:`for_training`)
+    horizon: int
 
-    def __init__(self, env: VecEnv, horizon: int | None = None) -> None:
+    def __init__(self, env: VecEnv) -> None:
+        if not env.has_attr("shared_dynamics"):  # which a subclass of TaskFamily has without a word
+            raise ValueError(no_family(str(env.env_method("__str__", indices=[0])[0])))
         self.env = env
-        name = str(env.env_method("__str__", indices=[0])[0])
-        missing = [attribute for attribute in REQUIRED_ATTRIBUTES if not env.has_attr(attribute)]
-        if "shared_dynamics" in missing:  # which a subclass of TaskFamily has without a word
-            raise ValueError(no_family(name))
-        attributes: list[Any] = [None if attribute in missing else self._get(attribute) for attribute in REQUIRED_ATTRIBUTES]
-        task_space, self.all_tasks, shared_dynamics, feature_dim = attributes
-        self._unknown_wrappers = ", ".join(unknown_wrappers(env))
         self.observation_space, self.action_space = env.observation_space, env.action_space
-        self.task_space, self.reward_feature_dim = task_space, feature_dim
-        problem = definition_problem(self)
+        self.task_space: spaces.Box = self._get("task_space")
+        self.reward_feature_dim: int = self._get("reward_feature_dim")
+        self.all_tasks: np.ndarray | None = self._get("all_tasks")
+        self.shared_dynamics = bool(self._get("shared_dynamics"))
+        self.symmetries: tuple[Symmetry, ...] = self._get("symmetries", ())
+        self.spec: EnvSpec | None = self._get("spec")
+        self._unknown_wrappers = ""
+        self._experience_is_right = False
+
+    @classmethod
+    def of(cls, env: VecEnv) -> FamilyView | None:
+        """The family of an environment; None if it is of none."""
+        return cls(env) if env.has_attr("shared_dynamics") else None
+
+    @classmethod
+    def for_training(cls, env: VecEnv, horizon: int | None = None) -> FamilyView:
+        """The same of what can be trained on: spaces fit, no wrapper changes it, an episode's length is known.
+
+        Wrappers that change what is seen, done or paid are refused: those of Gymnasium and SB3 by
+        name, others by the first experience, see :meth:`check_experience`.
+
+        :param env: As for the class
+        :param horizon: Steps of an episode; None reads the time limit of the environment's registration
+        :raises ValueError: if not
+        """
+        from sb3_poem.common.wrappers import unknown_wrappers
+
+        family = cls(env)
+        family._unknown_wrappers = ", ".join(unknown_wrappers(env))
+        problem = definition_problem(family)
         if problem is not None:
-            raise ValueError(f"env {name}: {problem}")
-        self.shared_dynamics = bool(shared_dynamics)
-        self.symmetries: tuple[Symmetry, ...] = self._get("symmetries") if env.has_attr("symmetries") else ()
-        spec = self._get("spec") if env.has_attr("spec") else None
-        self.env_id: str | None = None if spec is None else spec.id
-        given: dict[str, Any] = {} if spec is None else spec.kwargs
-        registered = gym.registry[spec.id].kwargs if spec is not None and spec.id in gym.registry else {}
-        #: What it was made with beyond its registration
-        self.env_kwargs = {
-            name: value
-            for name, value in given.items()
-            if name not in DRAWING_ARGUMENTS and not (name in registered and _equal(registered[name], value))
-        }
-        limit = None if spec is None else spec.max_episode_steps
-        if limit is None and env.has_attr("max_episode_steps"):  # of a GoalFamily that was not made by gym.make
+            raise ValueError(f"env {env.env_method('__str__', indices=[0])[0]}: {problem}")
+        family.horizon = family._horizon(horizon)
+        return family
+
+    def _horizon(self, horizon: int | None) -> int:
+        limit = None if self.spec is None else self.spec.max_episode_steps
+        if limit is None:  # a GoalFamily that was not made by gym.make
             limit = self._get("max_episode_steps")
         steps = horizon if limit is None else limit
         if steps is None:
@@ -84,10 +100,26 @@ class FamilyEnv:
             raise ValueError(f"horizon is {horizon}, but the environment ends episodes after {limit} steps; they must agree")
         if steps < 1:
             raise ValueError(f"horizon must be at least 1 step, got {steps}")
-        self.horizon = int(steps)
-        self._experience_is_right = False
+        return int(steps)
 
-    def check_experience(self, tasks: np.ndarray, seed: int, segment: "Segment") -> None:
+    @property
+    def env_id(self) -> str | None:
+        """Of its registration."""
+        return None if self.spec is None else self.spec.id
+
+    @cached_property
+    def env_kwargs(self) -> dict[str, Any]:
+        """What it was made with beyond its registration, and beyond how it is drawn."""
+        if self.spec is None:
+            return {}
+        registered = gym.registry[self.spec.id].kwargs if self.spec.id in gym.registry else {}
+        return {
+            name: value
+            for name, value in self.spec.kwargs.items()
+            if name not in DRAWING_ARGUMENTS and not (name in registered and _equal(registered[name], value))
+        }
+
+    def check_experience(self, tasks: np.ndarray, seed: int, segment: Segment) -> None:
         """Whether rewards are :meth:`compute_rewards`'s, and unknown wrappers leave the family as it is.
         The first call looks, and the others take its word.
 
@@ -98,6 +130,8 @@ class FamilyEnv:
         """
         if self._experience_is_right:
             return
+        from sb3_poem.common.wrappers import WrapperError
+
         wrappers = self._unknown_wrappers
         expected = self.compute_rewards(tasks[:, None, :], segment.features)
         if expected.shape != segment.rewards.shape:
@@ -120,8 +154,10 @@ class FamilyEnv:
             raise WrapperError(f"env's wrappers {wrappers} change what is seen or done")
         self._experience_is_right = True
 
-    def _lives_through(self, task: np.ndarray, seed: int, segment: "Segment") -> bool:
+    def _lives_through(self, task: np.ndarray, seed: int, segment: Segment) -> bool:
         """Whether the family without its wrappers repeats the first copy's experience."""
+        from sb3_poem.common.wrappers import WrapperError
+
         if self.env_id is None:
             try:
                 twin = cloudpickle.loads(cloudpickle.dumps(self._get("unwrapped")))
@@ -151,21 +187,43 @@ class FamilyEnv:
     def task_dim(self) -> int:
         return int(self.task_space.shape[0])
 
-    def _get(self, name: str) -> Any:
-        return self.env.get_attr(name, indices=[0])[0]
+    @property
+    def task(self) -> np.ndarray:
+        """(task_dim,), the one in effect in the first copy."""
+        task = self._get("task")
+        if task is None:
+            raise RuntimeError("the environment has no task before its first reset(): reset it, or give the oracle its `task`")
+        return np.asarray(task, dtype=np.float64)
+
+    @property
+    def render_fps(self) -> float:
+        """Frames of a second of its films."""
+        return float(self._get("metadata").get("render_fps", 20))
+
+    def _get(self, name: str, default: Any = None) -> Any:
+        return self.env.get_attr(name, indices=[0])[0] if self.env.has_attr(name) else default
 
     def sample_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draw (n, task_dim) tasks from the family's distribution."""
         return np.asarray(self.env.env_method("sample_tasks", n, rng, indices=[0])[0], dtype=np.float64)
 
+    def test_tasks(self, n: int, seed: int) -> np.ndarray:
+        """(n, task_dim) tasks that no seed gives a model to train on. Those of a finite family are
+        repeated in turn: each is one adaptation more.
+        """
+        rng = np.random.default_rng([TEST_TASK_STREAM, seed])
+        if self.all_tasks is None:
+            return self.sample_tasks(n, rng)
+        return np.resize(self.sample_tasks(len(self.all_tasks), rng), (n, self.task_dim))
+
     def compute_rewards(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
         """Rewards (...) of reward features (..., feat_dim) under tasks (..., task_dim)."""
-        return np.asarray(self.env.env_method("compute_rewards", tasks, features, indices=[0])[0])
+        return np.asarray(self.env.env_method("compute_rewards", tasks, features, indices=[0])[0], dtype=np.float64)
 
     @property
     def has_potential(self) -> bool:
         """Whether the family has :meth:`compute_potential`."""
-        return self.env.has_attr("has_potential") and bool(self._get("has_potential"))
+        return bool(self._get("has_potential", False))
 
     def compute_potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
         """Potentials (...) of observations (..., obs_dim) under tasks (..., task_dim)."""
@@ -173,14 +231,12 @@ class FamilyEnv:
 
     def set_tasks(self, tasks: np.ndarray) -> None:
         """Give copy i the task ``tasks[i]``, from its next reset on."""
-        inner: Any = self.env
-        while not hasattr(inner, "set_tasks") and hasattr(inner, "venv"):
-            inner = inner.venv
-        if hasattr(inner, "set_tasks"):
-            inner.set_tasks(tasks)
-        else:
-            for index, task in enumerate(tasks):
-                self.env.env_method("set_task", task, indices=[index])
+        env: Any = self.env
+        if hasattr(env, "set_tasks"):  # which SB3's wrappers pass on
+            env.set_tasks(tasks)
+            return
+        for index, task in enumerate(tasks):
+            env.env_method("set_task", task, indices=[index])
 
     def reset(self, tasks: np.ndarray, seed: int) -> np.ndarray:
         """Start an episode of ``tasks[i]`` in each copy i, reproducibly; returns observations (num_envs, obs_dim)."""
@@ -192,11 +248,9 @@ class FamilyEnv:
 
     def features_of(self, infos: list[dict[str, Any]]) -> np.ndarray:
         """Reward features (num_envs, feat_dim) of the last step."""
-        inner: Any = self.env
-        while not hasattr(inner, "last_reward_features") and hasattr(inner, "venv"):
-            inner = inner.venv
-        if hasattr(inner, "last_reward_features"):
-            return inner.last_reward_features
+        fast: np.ndarray | None = getattr(self.env, "last_reward_features", None)
+        if fast is not None:
+            return fast
         return np.stack([info["reward_features"] for info in infos])
 
     def check_same_family(self, task_space: spaces.Box, reward_feature_dim: int) -> None:
@@ -209,6 +263,13 @@ class FamilyEnv:
                 f"env ({self.env_id}) has tasks in {self.task_space} with {self.reward_feature_dim}. "
                 "Pass an environment of the model's own family."
             )
+
+
+def vectorised(env: gym.Env | VecEnv) -> VecEnv:
+    """The same environment as a vectorised one, of one copy if it is not one."""
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    return DummyVecEnv([lambda: env]) if isinstance(env, gym.Env) else env
 
 
 def _equal(one: Any, other: Any) -> bool:
