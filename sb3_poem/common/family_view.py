@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -238,6 +239,31 @@ class FamilyView:
         for index, task in enumerate(tasks):
             env.env_method("set_task", task, indices=[index])
 
+    def seed_episodes(self, seeds: Sequence[int]) -> None:
+        """Seed every copy's next episode without touching its task.
+
+        A task family that was never given a task draws one whenever it is reset with a seed; a reset
+        without a seed keeps the task. So a family's generators are replaced, and its next reset needs
+        no seed: the episode is the same as after a seeded reset, and the task stays. Nobody looks at
+        the task for that, except where copies have no generators to replace (``TaskVecEnv``): it is
+        told to keep them. A task that was chosen for the next reset is the one that stays, and seeds
+        that are pending are used up first.
+
+        :param seeds: One a copy
+        """
+        env: Any = self.env
+        if any(seed is not None for seed in env.unwrapped._seeds):
+            env.reset()  # who seeded it, as make_vec_env always does, chose its tasks, not these episodes
+        if not hasattr(env, "keep_tasks"):
+            for copy, seed in enumerate(seeds):
+                env.set_attr("np_random", np.random.default_rng(seed), indices=[copy])
+            return
+        if env.tasks is None:  # nobody has chosen yet, so that the first seeds do
+            seed_copies(env, seeds)
+            env.reset()
+        env.keep_tasks()
+        seed_copies(env, seeds)
+
     def reset(self, tasks: np.ndarray, seed: int) -> np.ndarray:
         """Start an episode of ``tasks[i]`` in each copy i, reproducibly; returns observations (num_envs, obs_dim)."""
         self.set_tasks(tasks)
@@ -263,6 +289,19 @@ class FamilyView:
                 f"env ({self.env_id}) has tasks in {self.task_space} with {self.reward_feature_dim}. "
                 "Pass an environment of the model's own family."
             )
+
+
+def seed_copies(vec_env: VecEnv, seeds: Sequence[int]) -> None:
+    """
+    Seed every copy's next reset by itself. ``VecEnv.seed(s)`` can only give copy i the seed s + i, and two rollouts that
+    are compared should start alike.
+
+    :param vec_env: Any SB3 vector environment.
+    :param seeds: One a copy.
+    """
+    base = vec_env.unwrapped
+    base.seed(seeds[0])
+    base._seeds = list(seeds)  # SB3's own list of "seeds to be used in the next call to env.reset()"
 
 
 def vectorised(env: gym.Env | VecEnv) -> VecEnv:

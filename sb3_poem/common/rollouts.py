@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sb3_poem.common.family_view import FamilyView
+from sb3_poem.common.family_view import FamilyView, seed_copies
 from sb3_poem.common.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -226,10 +226,12 @@ def _wave(
     n, copies = len(latents), vec_env.num_envs
     padded = np.minimum(np.arange(copies), n - 1)
     copy_seeds = [seeds[i] for i in padded]
-    if tasks is None:
-        seed_episodes(vec_env, copy_seeds)
-    else:
+    if tasks is not None:
         FamilyView(vec_env).set_tasks(tasks[padded])
+        seed_copies(vec_env, copy_seeds)
+    elif (family := FamilyView.of(vec_env)) is not None:
+        family.seed_episodes(copy_seeds)
+    else:
         seed_copies(vec_env, copy_seeds)
     latents = latents[padded]
     observations = _finite(_flat_observations(vec_env.reset()), np.arange(copies) < n, first, 0, "an observation")
@@ -284,50 +286,6 @@ def _wave(
             frames=images[row] if frames else None,
             success=successes[row],
         )
-
-
-def seed_copies(vec_env: VecEnv, seeds: Sequence[int]) -> None:
-    """
-    Seed every copy's next reset by itself. ``VecEnv.seed(s)`` can only give copy i the seed s + i, and two rollouts that
-    are compared should start alike.
-
-    :param vec_env: Any SB3 vector environment.
-    :param seeds: One a copy.
-    """
-    base = vec_env.unwrapped
-    base.seed(seeds[0])
-    base._seeds = list(seeds)  # SB3's own list of "seeds to be used in the next call to env.reset()"
-
-
-def seed_episodes(vec_env: VecEnv, seeds: Sequence[int]) -> None:
-    """
-    Seed every copy's next episode without touching its task.
-
-    A task family that was never given a task draws one whenever it is reset with a seed; a reset without a seed keeps the
-    task. So a family's generators are replaced, and its next reset needs no seed: the episode is the same as after a seeded
-    reset, and the task stays. Nobody looks at the task for that, except where copies have no generators to replace
-    (``TaskVecEnv``): it is told to keep them. A task that was chosen for the next reset is the one that stays, and seeds that
-    are pending are used up first. Any other environment is seeded as usual.
-
-    :param vec_env: Any SB3 vector environment.
-    :param seeds: One a copy.
-    """
-    keeps_tasks = hasattr(vec_env, "keep_tasks")
-    is_family = keeps_tasks or vec_env.has_attr("set_task")
-    if is_family and any(seed is not None for seed in vec_env.unwrapped._seeds):
-        vec_env.reset()  # whoever seeded the environment, as make_vec_env always does, chose its tasks, not these episodes
-    if keeps_tasks:
-        family: Any = vec_env
-        if family.tasks is None:  # nobody has chosen yet, so that the first seeds do
-            seed_copies(vec_env, seeds)
-            vec_env.reset()
-        family.keep_tasks()
-        seed_copies(vec_env, seeds)
-    elif is_family:
-        for copy, seed in enumerate(seeds):
-            vec_env.set_attr("np_random", np.random.default_rng(seed), indices=[copy])
-    else:
-        seed_copies(vec_env, seeds)
 
 
 def _flat_observations(observations: Any) -> np.ndarray:
