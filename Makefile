@@ -18,7 +18,7 @@ help:
 	@echo "make label     the page on which a person answers, on this machine"
 	@echo "make test      the default test suite"
 	@echo "make test-all  the default suite and the slow tests"
-	@echo "make lint      ruff and mypy"
+	@echo "make lint      ruff, mypy and import-linter"
 	@echo "make format    let ruff format the code"
 	@echo "make bench     the benchmarks of speed and memory; tables go to benchmarks/results/speed/"
 	@echo "make bench-gpu the same of what runs on a CUDA device"
@@ -43,6 +43,7 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	PYTHONPATH=envs:. $(BIN)/lint-imports
 
 bench: $(STAMP)
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[bench]'
@@ -95,4 +96,4 @@ wheel: $(STAMP)
 	$(BIN)/python -m build --outdir dist .
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist *.egg-info .import_linter_cache .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -7,6 +7,7 @@ It ends with its parent: a benchmark that was killed leaves no training behind.
 import contextlib
 import ctypes
 import os
+import runpy
 import signal
 import sys
 
@@ -28,6 +29,5 @@ def end_with_parent(parent: int) -> None:
 
 if __name__ == "__main__":
     end_with_parent(int(sys.argv[1]))
-    from sb3_poem.cli import main
-
-    sys.exit(main(sys.argv[2:]))
+    del sys.argv[1]
+    runpy.run_module("sb3_poem.cli", run_name="__main__")
