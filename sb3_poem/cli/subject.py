@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
 # A model that rl_zoo3 trained may hold its schedules.
@@ -24,7 +23,7 @@ from sb3_poem.cli.packages import import_packages
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.foreign import environment_of
 from sb3_poem.common.rollouts import rollout_latents
-from sb3_poem.common.vec_env import make_task_vec_env
+from sb3_poem.common.vec_env import make_shown_env, make_task_vec_env
 from sb3_poem.common.video import side_by_side, write_video
 from sb3_poem.loading import load_model
 
@@ -126,14 +125,9 @@ class Subject:
         :param show_task: Whether the hidden task is drawn
         :raises ValueError: if the environment cannot render so
         """
-        env = DummyVecEnv([partial(self._make_env, render_mode, {"render_task": True} if show_task else {})])
+        options = {**self.env_kwargs, "render_task": True} if show_task else self.env_kwargs
+        env = DummyVecEnv([partial(make_shown_env, self.env_id, render_mode, **options)])
         FamilyView(env).set_tasks(self.tasks[:1])
-        return env
-
-    def _make_env(self, render_mode: str | None, options: dict[str, Any]) -> gym.Env:
-        env = gym.make(self.env_id, render_mode=render_mode, **self.env_kwargs, **options)
-        if render_mode is not None and render_mode not in env.metadata.get("render_modes", ()):
-            raise ValueError(f"{self.env_id} cannot be shown: it has no render mode {render_mode!r}")
         return env
 
     def roll_out(self, env: DummyVecEnv, latent: np.ndarray, episode: int = 0, frames: bool = False) -> Trajectory:

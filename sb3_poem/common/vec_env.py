@@ -257,6 +257,21 @@ def make_task_vec_env(env_id: str, n_envs: int, max_sequential: int = 8, **env_k
     return DummyVecEnv([lambda: Monitor(gym.make(env_id, **env_kwargs))] * min(n_envs, max_sequential))
 
 
+def make_shown_env(env_id: str, render_mode: str | None, **env_kwargs: Any) -> gym.Env:
+    """
+    A single environment, to be looked at.
+
+    :param env_id: As for ``gym.make``
+    :param render_mode: None draws nothing
+    :param env_kwargs: Arguments of the environment
+    :raises ValueError: If it cannot be drawn so
+    """
+    env = gym.make(env_id, render_mode=render_mode, **env_kwargs)
+    if render_mode is not None and render_mode not in env.metadata.get("render_modes", ()):
+        raise ValueError(f"{env_id} cannot be shown: it has no render mode {render_mode!r}")
+    return env
+
+
 class _CopyView:
     """One copy of a vectorised task family, with the attributes and methods of a single one."""
 

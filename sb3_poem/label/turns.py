@@ -7,6 +7,7 @@ time or again; the same input always gives the same turn, bit for bit.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -280,15 +281,10 @@ def make_env(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env:
     :return: The environment.
     :raises ValueError: If it cannot render RGB images.
     """
+    from sb3_poem.common.vec_env import make_shown_env
+
     small = {"width": WIDTH, "height": HEIGHT}
     for extra in ({**small, "render_quality": "fast"}, small):
-        try:
-            env = gym.make(env_id, render_mode="rgb_array", **{**extra, **env_kwargs})
-            break
-        except TypeError:  # it does not take these; what the user gave is tried last, alone, and may raise
-            continue
-    else:
-        env = gym.make(env_id, render_mode="rgb_array", **env_kwargs)
-    if "rgb_array" not in env.metadata.get("render_modes", ()):
-        raise ValueError(f"{env_id} cannot be shown: it has no render mode 'rgb_array'")
-    return env
+        with contextlib.suppress(TypeError):  # it does not take these
+            return make_shown_env(env_id, "rgb_array", **{**extra, **env_kwargs})
+    return make_shown_env(env_id, "rgb_array", **env_kwargs)
