@@ -9,8 +9,7 @@ from functools import cache
 import gymnasium as gym
 
 from sb3_poem.benchmark.suites import family_id
-from sb3_poem.common.family_view import FamilyView
-from sb3_poem.common.vec_env import make_task_vec_env
+from sb3_poem.common.family_view import FamilyView, vectorised
 
 
 @dataclass(frozen=True)
@@ -41,14 +40,12 @@ def family_facts(name: str) -> FamilyFacts:
     """
     env_id = family_id(name)
     try:
-        env = make_task_vec_env(env_id, 1)
-    except gym.error.Error as error:
-        known = ", ".join(sorted(family.split("/")[1].split("-")[0] for family in gym.registry if family.startswith("poem/")))
-        raise ValueError(f"--families {name}: {error} The package's own families are: {known}") from error
-    with contextlib.closing(env):
-        try:
+        with contextlib.closing(vectorised(gym.make(env_id))) as env:
             family = FamilyView.for_training(env)
-        except ValueError as error:
-            raise ValueError(f"--families {name}: {error}") from error
+    except gym.error.Error as error:
+        known = ", ".join(sorted(each.split("/")[1].split("-")[0] for each in gym.registry if each.startswith("poem/")))
+        raise ValueError(f"--families {name}: {error} The package's own families are: {known}") from error
+    except ValueError as error:
+        raise ValueError(f"--families {name}: {error}") from error
     n_tasks = None if family.all_tasks is None else len(family.all_tasks)
     return FamilyFacts(env_id, family.horizon, n_tasks, family.shared_dynamics)
