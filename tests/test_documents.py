@@ -117,6 +117,8 @@ def test_every_relative_link_leads_somewhere() -> None:
     for page in pages:
         for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text()):
             assert "://" in target or (page.parent / target).exists(), f"{page.relative_to(TOP)}: {target}"
+        for target in re.findall(r"benchmarks/results/[\w*/.-]*[\w/]", page.read_text()):
+            assert list(TOP.glob(target)), f"{page.relative_to(TOP)}: {target}"
 
 
 def test_results_are_small_and_listed() -> None:
