@@ -215,7 +215,7 @@ def evaluate_adaptation(
         check_whole("record_at", k, 0)
     check_whole("n_episodes", n_episodes, 1)
     model, vec_env = model_and_env(model, env)
-    tasks = _test_tasks(vec_env, tasks, seed)
+    tasks = _test_tasks(model, vec_env, tasks, seed)
     start, deterministic = evaluation_seed(seed), options.get("deterministic", True)
     outcomes: list[EpisodeOutcomes] = []
 
@@ -328,7 +328,7 @@ def known_task_return(
     :raises ValueError: If an argument is out of its range.
     """
     model, vec_env = model_and_env(model, env)
-    tasks = _test_tasks(vec_env, tasks, seed)
+    tasks = _test_tasks(model, vec_env, tasks, seed)
     if n_latents is None:
         n_latents = LATENTS_WITH_SHARED_DYNAMICS if FamilyView(vec_env).shared_dynamics else LATENTS_WITH_OWN_DYNAMICS
     check_whole("n_latents", n_latents, 1)
@@ -422,10 +422,10 @@ def preference_order(model: Any, known: KnownTaskReturn) -> tuple[float, float]:
     return property_one(similarities, known.candidate_returns[:, policies])
 
 
-def _test_tasks(vec_env: VecEnv, tasks: np.ndarray | int | None, seed: int) -> np.ndarray:
+def _test_tasks(model: Any, vec_env: VecEnv, tasks: np.ndarray | int | None, seed: int) -> np.ndarray:
     if tasks is None or isinstance(tasks, (int, np.integer)):
         n_tasks = N_TEST_TASKS if tasks is None else int(tasks)
-        return FamilyView(vec_env).test_tasks(n_tasks, seed)
+        return FamilyView.for_training(vec_env, model.horizon).test_tasks(n_tasks, seed)
     return np.asarray(tasks, dtype=np.float64)
 
 
