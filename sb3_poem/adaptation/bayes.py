@@ -290,7 +290,7 @@ class BayesInference(LatentInference):
         return Thinning.fit(thin[some, 0] - thin[some, 1], full[:, 0] - full[:, 1])
 
     def _thinning_of(self, n: int) -> np.ndarray:
-        """(n, 3), of the last n answers; none where it was not measured, as in states of before it."""
+        """(n, 3), of the last n answers; none where it was not measured."""
         known = self._thinning[-n:]
         return np.array([Thinning()] * (n - len(known)) + known)
 
