@@ -313,7 +313,7 @@ def test_a_task_of_what_is_no_family():
 def test_gymnasiums_vector_environments_are_taken_as_they_are(mode):
     vector_env = gym.make_vec(POINT, 2, vectorization_mode=mode, step_length=0.1)
     env = as_task_vec_env(vector_env)
-    family = FamilyView(env)
+    family = FamilyView.for_training(env)
     assert (family.num_envs, family.horizon, family.env_id, family.env_kwargs) == (2, 25, POINT, {"step_length": 0.1})
     family.reset(np.array([[0.5], [2.0]]), seed=0)
     set_task(vector_env, [1.0])  # the same copies
