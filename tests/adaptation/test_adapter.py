@@ -643,3 +643,18 @@ def test_lockstep_with_a_library():
     for i, task in enumerate(tasks):
         alone = PreferenceAdapter(model, make_env(task), oracle=ReturnOracle(task=task), seed=i, n_queries=4, library=library)
         np.testing.assert_array_equal(together.latents[i, -1], alone.adapt().latent)
+
+
+@pytest.mark.parametrize(
+    "wrapper",
+    [
+        gym.wrappers.NormalizeObservation,
+        gym.wrappers.NormalizeReward,
+        lambda env: gym.wrappers.TransformReward(env, np.negative),
+    ],
+)
+def test_wrappers_that_change_what_is_seen_or_paid_are_refused(wrapper):
+    # HalfCheetah's observations have no bounds, so that their space alone does not tell.
+    env = wrapper(gym.make("poem/HalfCheetahVel-v0"))
+    with pytest.raises(ValueError, match=r"env must not be wrapped in (Normalize|Transform)"):
+        PreferenceAdapter("HalfCheetahVel", env)
