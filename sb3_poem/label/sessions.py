@@ -294,8 +294,8 @@ class Conversations:
         """Of a turn that is kept already, the video takes the place of one that somebody deleted; else it is not needed."""
         turn = self.store.turn(session.id, wanted, answered)
         if turn is not None and not (self.store.videos / turn["video"]).is_file():
+            self.store.note_film(turn["id"], made.fps, made.frames)  # first: whoever finds the film finds what it is
             video.replace(self.store.videos / turn["video"])
-            self.store.note_film(turn["id"], made.fps, made.frames)
         else:
             video.unlink(missing_ok=True)
 
