@@ -1,7 +1,9 @@
-"""Milliseconds of ``ask`` and ``tell`` without rollouts: latent dimensions, answers, candidates, rules, and 30 tasks at once.
+"""Milliseconds of ``ask`` and ``tell`` without rollouts: latent dimensions, answers, candidates,
+rules, and 30 tasks at once.
 
-The model is untrained, of POEMSAC's default size; trajectories of 200 steps are random. Neither changes the work, but for
-how often particles thin out. Figures are the means over the first k questions.
+The model is untrained, of POEMSAC's default size; trajectories of 200 steps are random. Neither
+changes the work, but for how often particles thin out. Figures are the means over the first k
+questions.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from sb3_poem.common.trajectory import Trajectory
 
 # The paper's candidates, what Bayesian inference takes unless told otherwise, and many.
 DIMENSIONS, CANDIDATES = (5, 16, 32), (100, 400, 1000)
-# With so many candidates a question of Algorithm 2 weighs up to half a million pairs: there ten have to do.
+# With so many candidates a question of Algorithm 2 weighs up to half a million pairs: there ten
+# have to do.
 ANSWERS = {100: (1, 10, 50), 400: (1, 10), 1000: (1, 10)}
 RULES: dict[str, dict[str, Any]] = {
     "bayes, decoder": {"inference": "bayes", "likelihood": "decoder"},
@@ -30,7 +33,14 @@ STEPS = 200
 
 
 def make_model(latent_dim: int) -> POEMSAC:
-    model = POEMSAC("MlpPolicy", "poem/HalfCheetahVel-v0", n_train_tasks=2, latent_dim=latent_dim, seed=0, device="cpu")
+    model = POEMSAC(
+        "MlpPolicy",
+        "poem/HalfCheetahVel-v0",
+        n_train_tasks=2,
+        latent_dim=latent_dim,
+        seed=0,
+        device="cpu",
+    )
     model.predicted_rewards_error = 0.05  # a trained model's; an untrained one has measured none
     means = np.random.default_rng(0).standard_normal((120, latent_dim))
     model.train_tasks.set_posteriors(means, np.full((120, latent_dim), 0.01))
@@ -38,10 +48,14 @@ def make_model(latent_dim: int) -> POEMSAC:
 
 
 def trajectory(latent: np.ndarray, rng: np.random.Generator) -> Trajectory:
-    return Trajectory(rng.standard_normal((STEPS + 1, 17)), rng.uniform(-1.0, 1.0, (STEPS, 6)), latent)
+    return Trajectory(
+        rng.standard_normal((STEPS + 1, 17)), rng.uniform(-1.0, 1.0, (STEPS, 6)), latent
+    )
 
 
-def milliseconds(model: POEMSAC, n_answers: int, n_tasks: int, seed: int, **options: Any) -> np.ndarray:
+def milliseconds(
+    model: POEMSAC, n_answers: int, n_tasks: int, seed: int, **options: Any
+) -> np.ndarray:
     """Of ``ask`` and ``tell``, for all tasks together, (n_answers, 2)."""
     settings = AdaptationOptions(n_queries=n_answers, **options)
     inferences = [settings.make_inference(model, inference_rng(seed + i)) for i in range(n_tasks)]
@@ -62,7 +76,9 @@ def milliseconds(model: POEMSAC, n_answers: int, n_tasks: int, seed: int, **opti
 
 def main() -> None:
     """Measure and write."""
-    options = common.arguments(__doc__, lambda parser: parser.add_argument("--repeats", type=int, default=3))
+    options = common.arguments(
+        __doc__, lambda parser: parser.add_argument("--repeats", type=int, default=3)
+    )
     th.set_num_threads(1)
     results: list[dict[str, Any]] = []
     for dim in DIMENSIONS:
@@ -72,11 +88,23 @@ def main() -> None:
             for repeat in range(options.repeats if n_candidates == CANDIDATES[0] else 1):
                 for rule, arguments in RULES.items():  # in turns
                     runs[rule].append(
-                        milliseconds(model, max(ANSWERS[n_candidates]), 1, repeat, n_candidates=n_candidates, **arguments)
+                        milliseconds(
+                            model,
+                            max(ANSWERS[n_candidates]),
+                            1,
+                            repeat,
+                            n_candidates=n_candidates,
+                            **arguments,
+                        )
                     )
             for rule, taken in runs.items():
                 of_run = np.median(taken, axis=0)
-                result = {"rule": rule, "d": dim, "candidates": n_candidates, "worst": float(of_run.sum(axis=1).max())}
+                result = {
+                    "rule": rule,
+                    "d": dim,
+                    "candidates": n_candidates,
+                    "worst": float(of_run.sum(axis=1).max()),
+                }
                 for k in ANSWERS[n_candidates]:
                     result[f"k = {k}"] = float(of_run[:k].sum(axis=1).mean())
                 results.append(result)
@@ -87,18 +115,39 @@ def main() -> None:
     }
     header = ["rule", "d", "candidates", *(f"k = {k}" for k in ANSWERS[100]), "worst question"]
     rows = [
-        [r["rule"], r["d"], r["candidates"], *(r.get(f"k = {k}", "not run") for k in ANSWERS[100]), r["worst"]]
+        [
+            r["rule"],
+            r["d"],
+            r["candidates"],
+            *(r.get(f"k = {k}", "not run") for k in ANSWERS[100]),
+            r["worst"],
+        ]
         for r in results
     ]
     sections = [
         "Milliseconds of `ask` + `tell`, mean over the first k questions.",
         common.table(header, rows),
         "30 tasks at once, d = 5, 100 candidates, k = 10: milliseconds a question for all of them.",
-        common.table(["rule", "30 tasks", "each"], [[rule, float(ms), float(ms) / 30] for rule, ms in many.items()]),
+        common.table(
+            ["rule", "30 tasks", "each"],
+            [[rule, float(ms), float(ms) / 30] for rule, ms in many.items()],
+        ),
     ]
-    settings = {"threads of torch": 1, "steps of a trajectory": STEPS, "runs": options.repeats, "precision": "auto"}
+    settings = {
+        "threads of torch": 1,
+        "steps of a trajectory": STEPS,
+        "runs": options.repeats,
+        "precision": "auto",
+    }
     data = {"one task": results, "30 tasks": {rule: float(value) for rule, value in many.items()}}
-    common.write("adaptation-speed", "Adaptation: time without rollouts", sections, data, options.out, settings)
+    common.write(
+        "adaptation-speed",
+        "Adaptation: time without rollouts",
+        sections,
+        data,
+        options.out,
+        settings,
+    )
 
 
 if __name__ == "__main__":

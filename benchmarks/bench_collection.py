@@ -1,9 +1,10 @@
 """Environment steps per second with the policy in the loop, 120 tasks.
 
-Every contender is stepped by the same loop with the same untrained policy (one call for all copies). "training" is what
-``learn`` does: the same with relabelling features, checks, episode infos, callbacks and storage. The limit is bare
-``mujoco.rollout`` on the very states and controls of "TaskVecEnv", with as many threads and nothing else.
-EnvPool (``pip install sb3_poem[bench]``) steps its own versions of these robots.
+Every contender is stepped by the same loop with the same untrained policy (one call for all
+copies). "training" is what ``learn`` does: the same with relabelling features, checks, episode
+infos, callbacks and storage. The limit is bare ``mujoco.rollout`` on the very states and controls
+of "TaskVecEnv", with as many threads and nothing else. EnvPool (``pip install sb3_poem[bench]``)
+steps its own versions of these robots.
 
     python benchmarks/bench_collection.py --env poem/AntVel-v0 poem/MetaWorldML1-v0
 """
@@ -32,7 +33,12 @@ N_TASKS, STEPS = 120, 25
 # 24 GB of memory did not hold 120 Meta-World environments of each kind.
 OTHERS = {"MetaWorld": 16}
 ENVPOOL = {"HalfCheetah": "HalfCheetah-v4", "Ant": "Ant-v4", "Humanoid": "Humanoid-v4"}
-DEFAULT_IDS = ("poem/HalfCheetahVel-v0", "poem/AntVel-v0", "poem/HumanoidDir2D-v0", "poem/MetaWorldML1-v0")
+DEFAULT_IDS = (
+    "poem/HalfCheetahVel-v0",
+    "poem/AntVel-v0",
+    "poem/HumanoidDir2D-v0",
+    "poem/MetaWorldML1-v0",
+)
 
 
 class Loop:
@@ -43,10 +49,17 @@ class Loop:
     :param model: Whose policy acts
     """
 
-    def __init__(self, reset: Callable[[], np.ndarray], step: Callable[[np.ndarray], np.ndarray], model: POEMSAC) -> None:
+    def __init__(
+        self,
+        reset: Callable[[], np.ndarray],
+        step: Callable[[np.ndarray], np.ndarray],
+        model: POEMSAC,
+    ) -> None:
         self.observations, self.step, self.model = reset(), step, model
         self.copies = len(self.observations)
-        self.act = model.policy.acting_on(np.zeros((self.copies, model.latent_dim)))  # as collection does
+        self.act = model.policy.acting_on(
+            np.zeros((self.copies, model.latent_dim))
+        )  # as collection does
         self.noise_shape = (len(self.observations), int(model.action_space.shape[0]))
 
     def __call__(self) -> None:
@@ -111,7 +124,11 @@ def sb3_loop(env: Any, model: POEMSAC) -> Loop:
 
 
 def gymnasium_loop(env: Any, model: POEMSAC, obs_dim: int) -> Loop:
-    return Loop(lambda: env.reset()[0][:, :obs_dim], lambda actions: env.step(actions)[0][:, :obs_dim], model)
+    return Loop(
+        lambda: env.reset()[0][:, :obs_dim],
+        lambda actions: env.step(actions)[0][:, :obs_dim],
+        model,
+    )
 
 
 def others_of(env_id: str) -> int:
@@ -127,7 +144,15 @@ def measure(env_id: str, nthread: int, repeats: int) -> dict[str, Any]:
     others = others_of(env_id)
     processes = SubprocVecEnv([make] * others, start_method="fork")
     env = TaskVecEnv.from_id(env_id, N_TASKS, nthread=nthread)
-    model = POEMSAC("MlpPolicy", env, n_train_tasks=N_TASKS, seed=0, buffer_size=1000, learning_starts=0, device="cpu")
+    model = POEMSAC(
+        "MlpPolicy",
+        env,
+        n_train_tasks=N_TASKS,
+        seed=0,
+        buffer_size=1000,
+        learning_starts=0,
+        device="cpu",
+    )
     contenders: dict[str, Callable[[], Any]] = {"TaskVecEnv": sb3_loop(env, model)}
     own = POEMSAC(
         "MlpPolicy",
@@ -142,20 +167,36 @@ def measure(env_id: str, nthread: int, repeats: int) -> dict[str, Any]:
     if hasattr(env.vector_env, "_integrator"):
         contenders["limit: bare mujoco.rollout"] = Limit(env, nthread)
     contenders["SB3 DummyVecEnv"] = sb3_loop(DummyVecEnv([make] * others), model)
-    contenders["Gymnasium SyncVectorEnv"] = gymnasium_loop(gym.vector.SyncVectorEnv([make] * others), model, 10**6)
+    contenders["Gymnasium SyncVectorEnv"] = gymnasium_loop(
+        gym.vector.SyncVectorEnv([make] * others), model, 10**6
+    )
     robot = next((name for name in ENVPOOL if f"/{name}" in env_id), None)
     if robot is not None and importlib.util.find_spec("envpool") is not None:
         import envpool
 
-        pool = envpool.make(ENVPOOL[robot], env_type="gymnasium", num_envs=N_TASKS, num_threads=nthread, seed=0)
-        contenders[f"EnvPool {ENVPOOL[robot]}"] = gymnasium_loop(pool, model, env.observation_space.shape[0])
+        pool = envpool.make(
+            ENVPOOL[robot], env_type="gymnasium", num_envs=N_TASKS, num_threads=nthread, seed=0
+        )
+        contenders[f"EnvPool {ENVPOOL[robot]}"] = gymnasium_loop(
+            pool, model, env.observation_space.shape[0]
+        )
     contenders["SB3 SubprocVecEnv"] = sb3_loop(processes, model)
     seconds = common.seconds_in_turns(contenders, repeats)
     processes.close()
     copies = {name: getattr(contender, "copies", N_TASKS) for name, contender in contenders.items()}
-    rates = {name: STEPS * copies[name] / float(np.median(values)) for name, values in seconds.items()}
-    shares = {name: common.ratio(seconds["TaskVecEnv"], values) * copies[name] / N_TASKS for name, values in seconds.items()}
-    return {"env_id": env_id, "seconds": seconds, "steps_per_second": rates, "seconds_of_TaskVecEnv_over_own": shares}
+    rates = {
+        name: STEPS * copies[name] / float(np.median(values)) for name, values in seconds.items()
+    }
+    shares = {
+        name: common.ratio(seconds["TaskVecEnv"], values) * copies[name] / N_TASKS
+        for name, values in seconds.items()
+    }
+    return {
+        "env_id": env_id,
+        "seconds": seconds,
+        "steps_per_second": rates,
+        "seconds_of_TaskVecEnv_over_own": shares,
+    }
 
 
 def main() -> None:
@@ -184,7 +225,11 @@ def main() -> None:
             result = fresh.submit(measure, env_id, options.threads, options.repeats).result()
         mine = result["seconds_of_TaskVecEnv_over_own"]
         rows = [[name, rate, 1.0 / mine[name]] for name, rate in result["steps_per_second"].items()]
-        header = ["contender", "environment steps per second", "TaskVecEnv is so many times as fast"]
+        header = [
+            "contender",
+            "environment steps per second",
+            "TaskVecEnv is so many times as fast",
+        ]
         family = env_id.split("/")[-1].split("-")[0]
         common.write(
             f"collection-{family}",

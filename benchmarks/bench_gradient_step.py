@@ -1,13 +1,16 @@
-"""One gradient step of POEM with all its losses: ours, a plain implementation's, SB3's SAC, and the matrix products alone.
+"""One gradient step of POEM with all its losses: ours, a plain implementation's, SB3's SAC, and the
+matrix products alone.
 
 python benchmarks/bench_gradient_step.py [--sizes small paper] [--threads 2] [--device cpu]
 
-Contenders take turns within one run; a figure is the median of their turns. *plain* is the same mathematics in eager float32
-(`plain_poem.py`; its losses are compared with ours first). *SAC* is Stable-Baselines3's own on as many transitions: it has no
-encoder, decoder, embeddings or preferences. *products* is the time of `torch.mm` for every matrix product of our step, on
-operands of the same shapes, strides and type. What happens once an epoch (posteriors, the decoder's error) is timed on its own
-and subtracted. On a GPU, *on the processor* is our step on that machine's processor, with the given number of threads, and the
-matrix products are replayed as one CUDA graph, as our step is.
+Contenders take turns within one run; a figure is the median of their turns. *plain* is the same
+mathematics in eager float32 (`plain_poem.py`; its losses are compared with ours first). *SAC* is
+Stable-Baselines3's own on as many transitions: it has no encoder, decoder, embeddings or
+preferences. *products* is the time of `torch.mm` for every matrix product of our step, on operands
+of the same shapes, strides and type. What happens once an epoch (posteriors, the decoder's error)
+is timed on its own and subtracted. On a GPU, *on the processor* is our step on that machine's
+processor, with the given number of threads, and the matrix products are replayed as one CUDA graph,
+as our step is.
 """
 
 import argparse
@@ -34,7 +37,8 @@ SIZES: dict[str, dict[str, Any]] = {
     "paper": {"tasks": 32, "batch": 256, "widths": [300, 300, 300], "steps": 4},
 }
 CONTEXT_SIZE, N_TRAIN_TASKS, HORIZON = 128, 120, 200
-#: A GPU's first steps of a call are not captured yet; there should be many more of them, as there are in training
+#: A GPU's first steps of a call are not captured yet; there should be many more of them, as there
+#: are in training
 STEPS_ON_GPU = {"ours": 1000, "ours, float32": 1000, "SAC": 100}
 
 
@@ -71,32 +75,47 @@ def sac(size: dict[str, Any], device: str) -> SAC:
     rng = np.random.default_rng(0)
     for _ in range(N_TRAIN_TASKS * HORIZON):
         obs, next_obs = rng.normal(size=(2, 1, 17))
-        model.replay_buffer.add(obs, next_obs, rng.uniform(-1, 1, (1, 6)), rng.normal(size=1), np.zeros(1), [{}])
+        model.replay_buffer.add(
+            obs, next_obs, rng.uniform(-1, 1, (1, 6)), rng.normal(size=1), np.zeros(1), [{}]
+        )
     return model
 
 
 def compare_losses(model: POEMSAC, plain: PlainPOEM, size: dict[str, Any]) -> dict[str, float]:
-    """The plain implementation's losses against ours on the same batch and noise; returns the relative differences.
+    """The plain implementation's losses against ours on the same batch and noise; returns the
+    relative differences.
 
     :raises AssertionError: if one differs by more than float32 explains
     """
     batch = model.make_sampler().sample(1, size["batch"])[0]
     noises = [batch.latent_noise, batch.next_action_noise, batch.action_noise]
-    theirs = plain.losses(list(batch.transitions[:5]), batch.context, batch.context_rewards, batch.returns, noises)
+    theirs = plain.losses(
+        list(batch.transitions[:5]), batch.context, batch.context_rewards, batch.returns, noises
+    )
     with th.no_grad():
         mean, variance = model.policy.encoder(batch.context)
         objective = model.make_objective()
         embeddings = objective.embed(mean + variance.sqrt() * noises[0])
         data, alpha = objective.standardised(batch.transitions), model.entropy_coefficient.value
         scale = 1.0 / model.policy.reward_norm.std
-        critic = losses.critic_loss(model.policy, data, embeddings, alpha, model.gamma, scale, noises[1])
+        critic = losses.critic_loss(
+            model.policy, data, embeddings, alpha, model.gamma, scale, noises[1]
+        )
         actor, log_prob = losses.actor_loss(model.policy, data, embeddings, alpha, noises[2])
         decoder = objective.decoder_loss(batch, data, embeddings)
         preference = objective.embedding_loss(batch, embeddings)[1]["preference_loss"]
-        ours = [critic, actor, decoder, losses.kl_to_prior(mean, variance).mean(), preference, log_prob]
+        ours = [
+            critic,
+            actor,
+            decoder,
+            losses.kl_to_prior(mean, variance).mean(),
+            preference,
+            log_prob,
+        ]
     names = ("critic", "actor", "decoder", "kl", "preference", "log_prob")
     differences = {
-        name: abs(a.item() - b.item()) / max(abs(b.item()), 1e-3) for name, a, b in zip(names, ours, theirs, strict=True)
+        name: abs(a.item() - b.item()) / max(abs(b.item()), 1e-3)
+        for name, a, b in zip(names, ours, theirs, strict=True)
     }
     assert max(differences.values()) < 1e-3, differences
     return differences
@@ -118,14 +137,23 @@ class Products(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
     def _note(self, left: th.Tensor, right: th.Tensor) -> None:
-        self.operands[tuple((tuple(x.shape), x.stride(), x.dtype, x.device.type) for x in (left, right))] += 1
+        self.operands[
+            tuple((tuple(x.shape), x.stride(), x.dtype, x.device.type) for x in (left, right))
+        ] += 1
 
     def contender(self) -> Callable[[], None]:
         """All of the products by ``torch.mm``, one after another."""
         pairs = []
         for (left, right), count in self.operands.items():
             one, two = (strided(*operand) for operand in (left, right))
-            pairs.append((one, two, th.empty(one.shape[0], two.shape[1], dtype=one.dtype, device=one.device), count))
+            pairs.append(
+                (
+                    one,
+                    two,
+                    th.empty(one.shape[0], two.shape[1], dtype=one.dtype, device=one.device),
+                    count,
+                )
+            )
 
         def run() -> None:
             for one, two, out, count in pairs:
@@ -137,10 +165,15 @@ class Products(TorchDispatchMode):
     @property
     def operations(self) -> float:
         """Floating-point operations."""
-        return sum(2.0 * left[0][0] * left[0][1] * right[0][1] * count for (left, right), count in self.operands.items())
+        return sum(
+            2.0 * left[0][0] * left[0][1] * right[0][1] * count
+            for (left, right), count in self.operands.items()
+        )
 
 
-def strided(shape: tuple[int, ...], stride: tuple[int, ...], dtype: th.dtype, device: str) -> th.Tensor:
+def strided(
+    shape: tuple[int, ...], stride: tuple[int, ...], dtype: th.dtype, device: str
+) -> th.Tensor:
     """Random numbers in a tensor of the same layout."""
     x = th.empty_strided(shape, stride, dtype=dtype, device=device)
     return x.copy_(th.randn(shape, device=device))
@@ -149,7 +182,9 @@ def strided(shape: tuple[int, ...], stride: tuple[int, ...], dtype: th.dtype, de
 def products_of_a_step(model: POEMSAC, size: dict[str, Any]) -> Products:
     """The matrix products of one gradient step."""
     policy, products = model.policy, Products()
-    networks = th.nn.ModuleList([policy.encoder, policy.decoder, policy.actor, policy.critic, policy.critic_target])
+    networks = th.nn.ModuleList(
+        [policy.encoder, policy.decoder, policy.actor, policy.critic, policy.critic_target]
+    )
     with MixedPrecision(networks, model.hidden_dtype) as precision:
         precision.refresh()
         batch = model.make_sampler().sample(1, size["batch"])[0]
@@ -194,11 +229,17 @@ def measure(name: str, device: str, turns: int) -> dict[str, Any]:
 
     contenders = {
         "ours": (lambda: fast.train(n_steps["ours"], size["batch"]), n_steps["ours"]),
-        "ours, float32": (lambda: exact.train(n_steps["ours, float32"], size["batch"]), n_steps["ours, float32"]),
+        "ours, float32": (
+            lambda: exact.train(n_steps["ours, float32"], size["batch"]),
+            n_steps["ours, float32"],
+        ),
         "end of an epoch": (lambda: fast.train(0, size["batch"]), 1),
         "end of an epoch, float32": (lambda: exact.train(0, size["batch"]), 1),
         "SAC": (lambda: plain_sac.train(n_steps["SAC"], n), n_steps["SAC"]),
-        "products": (products.contender() if device == "cpu" else captured(products.contender()), 1),
+        "products": (
+            products.contender() if device == "cpu" else captured(products.contender()),
+            1,
+        ),
     }
     pairs = [("ours", "end of an epoch"), ("ours, float32", "end of an epoch, float32")]
     if device == "cpu":
@@ -208,17 +249,23 @@ def measure(name: str, device: str, turns: int) -> dict[str, Any]:
         contenders["on the processor"] = (lambda: near.train(steps, size["batch"]), steps)
         contenders["end of an epoch, processor"] = (lambda: near.train(0, size["batch"]), 1)
         pairs.append(("on the processor", "end of an epoch, processor"))
-    turns_taken = seconds_in_turns({key: synchronised(run) for key, (run, _) in contenders.items()}, turns)
+    turns_taken = seconds_in_turns(
+        {key: synchronised(run) for key, (run, _) in contenders.items()}, turns
+    )
     seconds = {key: statistics.median(values) for key, values in turns_taken.items()}
     for key, end in pairs:
-        seconds[key] -= seconds[end]  # posteriors and decoder are measured once an epoch, not in a step
+        seconds[key] -= seconds[
+            end
+        ]  # posteriors and decoder are measured once an epoch, not in a step
     milliseconds = {key: 1e3 * seconds[key] / contenders[key][1] for key in contenders}
     return {
-        "size": {key: value for key, value in size.items() if key != "steps"} | {"context": CONTEXT_SIZE},
+        "size": {key: value for key, value in size.items() if key != "steps"}
+        | {"context": CONTEXT_SIZE},
         "arithmetic of hidden layers": str(fast.hidden_dtype),
         "milliseconds": milliseconds,
         "faster than plain": milliseconds.get("plain", float("nan")) / milliseconds["ours"],
-        "faster than the processor": milliseconds.get("on the processor", float("nan")) / milliseconds["ours"],
+        "faster than the processor": milliseconds.get("on the processor", float("nan"))
+        / milliseconds["ours"],
         "faster than SAC": milliseconds["SAC"] / milliseconds["ours"],
         "share of the products rate": milliseconds["products"] / milliseconds["ours"],
         "gigaflop a step": products.operations / 1e9,
@@ -238,7 +285,9 @@ def main() -> None:
     """Measure, print, write."""
     given = arguments(__doc__, add_arguments)
     rows, results = [], []
-    reference, rival = ("plain", "plain") if given.device == "cpu" else ("on the processor", "the processor")
+    reference, rival = (
+        ("plain", "plain") if given.device == "cpu" else ("on the processor", "the processor")
+    )
     columns = ["ours", "ours, float32", reference, "SAC", "products"]
     for threads in given.threads:
         th.set_num_threads(threads)
@@ -248,12 +297,33 @@ def main() -> None:
             shown = result["milliseconds"]
             cells = [f"{shown[key]:.3g}" for key in columns]
             ratios = [f"{result[key]:.1f}x" for key in (f"faster than {rival}", "faster than SAC")]
-            rows.append([name, threads, *cells, *ratios, f"{100 * result['share of the products rate']:.0f} %"])
+            rows.append(
+                [
+                    name,
+                    threads,
+                    *cells,
+                    *ratios,
+                    f"{100 * result['share of the products rate']:.0f} %",
+                ]
+            )
     ratios_of = [f"ours to {rival}", "ours to SAC", "share of the products' rate"]
     text = table(["size", "threads", *(f"{key}, ms" for key in columns), *ratios_of], rows)
     suffix = "" if given.device == "cpu" else f"-{given.device}"
-    settings = {"turns": given.turns, "device": given.device, "context": CONTEXT_SIZE, "tasks": N_TRAIN_TASKS}
-    write(f"gradient-step{suffix}", "Gradient step", [DESCRIPTION, text], results, given.out, settings, max(given.threads))
+    settings = {
+        "turns": given.turns,
+        "device": given.device,
+        "context": CONTEXT_SIZE,
+        "tasks": N_TRAIN_TASKS,
+    }
+    write(
+        f"gradient-step{suffix}",
+        "Gradient step",
+        [DESCRIPTION, text],
+        results,
+        given.out,
+        settings,
+        max(given.threads),
+    )
 
 
 DESCRIPTION = (__doc__ or "").split("\n\n")[-1].strip()

@@ -1,4 +1,5 @@
-"""How time grows: steps against copies and threads, an update against tasks in its batch, the matrix J against tasks.
+"""How time grows: steps against copies and threads, an update against tasks in its batch, the
+matrix J against tasks.
 
 Writes ``growth.png`` beside the table.
 """
@@ -32,7 +33,9 @@ def copies_and_threads(env_id: str, thread_counts: list[int], repeats: int) -> l
             env = TaskVecEnv.from_id(env_id, copies, nthread=threads)
             env.seed(0)
             env.reset()
-            actions = rng.uniform(-1.0, 1.0, (max(1, 1000 // copies), copies, *env.action_space.shape)).astype(np.float32)
+            actions = rng.uniform(
+                -1.0, 1.0, (max(1, 1000 // copies), copies, *env.action_space.shape)
+            ).astype(np.float32)
 
             def steps(env: TaskVecEnv = env, actions: np.ndarray = actions) -> None:
                 for row in actions:
@@ -41,13 +44,18 @@ def copies_and_threads(env_id: str, thread_counts: list[int], repeats: int) -> l
             contenders[str(threads)] = steps
         seconds = common.seconds_in_turns(contenders, repeats)
         n_steps = max(1, 1000 // copies) * copies
-        row = {f"{threads} threads": n_steps / float(np.median(values)) for threads, values in seconds.items()}
+        row = {
+            f"{threads} threads": n_steps / float(np.median(values))
+            for threads, values in seconds.items()
+        }
         rows.append({"family": env_id, "copies": copies, **row})
     return rows
 
 
 def update_against_tasks(repeats: int, steps: int = 10) -> list[dict[str, Any]]:
-    """Milliseconds of one gradient step, 128 transitions a task, by ``model.train`` after one epoch of ``learn``."""
+    """Milliseconds of one gradient step, 128 transitions a task, by ``model.train`` after one epoch
+    of ``learn``.
+    """
     contenders, models = {}, []
     for tasks in BATCH_TASKS:
         model = POEMSAC(
@@ -61,11 +69,18 @@ def update_against_tasks(repeats: int, steps: int = 10) -> list[dict[str, Any]]:
         )
         model.learn(1)
         models.append(model)
-        contenders[str(tasks)] = lambda model=model: model.train(gradient_steps=steps, batch_size=128)
+        contenders[str(tasks)] = lambda model=model: model.train(
+            gradient_steps=steps, batch_size=128
+        )
     seconds = common.seconds_in_turns(contenders, repeats)
-    nothing = common.seconds_in_turns({"0": lambda: models[0].train(gradient_steps=0, batch_size=128)}, repeats)["0"]
+    nothing = common.seconds_in_turns(
+        {"0": lambda: models[0].train(gradient_steps=0, batch_size=128)}, repeats
+    )["0"]
     return [
-        {"tasks": int(tasks), "ms": 1000.0 * (float(np.median(values)) - float(np.median(nothing))) / steps}
+        {
+            "tasks": int(tasks),
+            "ms": 1000.0 * (float(np.median(values)) - float(np.median(nothing))) / steps,
+        }
         for tasks, values in seconds.items()
     ]
 
@@ -84,11 +99,18 @@ def returns_matrix(repeats: int) -> list[dict[str, Any]]:
                 started = time.perf_counter()
                 relabelled_returns(family.compute_rewards, tasks, features, mask)
                 times.append(time.perf_counter() - started)
-            rows.append({"family": env_id, "tasks": n_tasks, "ms": 1000.0 * float(np.median(times))})
+            rows.append(
+                {"family": env_id, "tasks": n_tasks, "ms": 1000.0 * float(np.median(times))}
+            )
     return rows
 
 
-def plot(copies: list[dict[str, Any]], updates: list[dict[str, Any]], returns: list[dict[str, Any]], path: Path) -> None:
+def plot(
+    copies: list[dict[str, Any]],
+    updates: list[dict[str, Any]],
+    returns: list[dict[str, Any]],
+    path: Path,
+) -> None:
     """Three panels, one for each question."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -100,14 +122,34 @@ def plot(copies: list[dict[str, Any]], updates: list[dict[str, Any]], returns: l
         name, rows = family.split("/")[1], [row for row in copies if row["family"] == family]
         for threads in [int(key.split()[0]) for key in copies[0] if key.endswith(" threads")]:
             left.plot(
-                [r["copies"] for r in rows], [r[f"{threads} threads"] for r in rows], marker="o", label=f"{name}, {threads}"
+                [r["copies"] for r in rows],
+                [r[f"{threads} threads"] for r in rows],
+                marker="o",
+                label=f"{name}, {threads}",
             )
         rows = [row for row in returns if row["family"] == family]
         right.plot([r["tasks"] for r in rows], [r["ms"] for r in rows], marker="o", label=name)
-    left.set(xscale="log", yscale="log", xlabel="copies", ylabel="environment steps / s", title="Stepping, by threads")
+    left.set(
+        xscale="log",
+        yscale="log",
+        xlabel="copies",
+        ylabel="environment steps / s",
+        title="Stepping, by threads",
+    )
     middle.plot([r["tasks"] for r in updates], [r["ms"] for r in updates], marker="o")
-    middle.set(xlabel="tasks in a batch (128 transitions each)", ylabel="ms", title="A gradient step", ylim=(0, None))
-    right.set(xscale="log", yscale="log", xlabel="tasks N", ylabel="ms", title="The N x N returns, relabelled")
+    middle.set(
+        xlabel="tasks in a batch (128 transitions each)",
+        ylabel="ms",
+        title="A gradient step",
+        ylim=(0, None),
+    )
+    right.set(
+        xscale="log",
+        yscale="log",
+        xlabel="tasks N",
+        ylabel="ms",
+        title="The N x N returns, relabelled",
+    )
     right.set_xticks(TASKS, labels=[str(n) for n in TASKS], minor=False)
     right.set_xticks([], minor=True)
     for axes in (left, right):
@@ -123,11 +165,17 @@ def main() -> None:
 
     def add(parser: argparse.ArgumentParser) -> None:
         parser.add_argument("--repeats", type=int, default=3)
-        parser.add_argument("--threads", type=int, nargs="+", default=[n for n in (1, 2) if n <= common.cores()])
+        parser.add_argument(
+            "--threads", type=int, nargs="+", default=[n for n in (1, 2) if n <= common.cores()]
+        )
 
     options = common.arguments(__doc__, add)
     th.set_num_threads(1)
-    copies = [row for env_id in IDS for row in copies_and_threads(env_id, options.threads, options.repeats)]
+    copies = [
+        row
+        for env_id in IDS
+        for row in copies_and_threads(env_id, options.threads, options.repeats)
+    ]
     updates, returns = update_against_tasks(options.repeats), returns_matrix(options.repeats)
     plot(copies, updates, returns, options.out / "growth.png")
     sections = [
@@ -138,7 +186,9 @@ def main() -> None:
                 "copies",
                 *(
                     f"steps / s, {threads} threads"
-                    for threads in [int(key.split()[0]) for key in copies[0] if key.endswith(" threads")]
+                    for threads in [
+                        int(key.split()[0]) for key in copies[0] if key.endswith(" threads")
+                    ]
                 ),
             ],
             [
@@ -147,14 +197,22 @@ def main() -> None:
                     r["copies"],
                     *(
                         r[f"{threads} threads"]
-                        for threads in [int(key.split()[0]) for key in copies[0] if key.endswith(" threads")]
+                        for threads in [
+                            int(key.split()[0]) for key in copies[0] if key.endswith(" threads")
+                        ]
                     ),
                 ]
                 for r in copies
             ],
         ),
-        common.table(["tasks in a batch of 128 each", "ms of a gradient step"], [[r["tasks"], r["ms"]] for r in updates]),
-        common.table(["family", "tasks N", "ms of J, N x N"], [[r["family"], r["tasks"], r["ms"]] for r in returns]),
+        common.table(
+            ["tasks in a batch of 128 each", "ms of a gradient step"],
+            [[r["tasks"], r["ms"]] for r in updates],
+        ),
+        common.table(
+            ["family", "tasks N", "ms of J, N x N"],
+            [[r["family"], r["tasks"], r["ms"]] for r in returns],
+        ),
     ]
     data = {"copies": copies, "updates": updates, "returns": returns}
     settings = {"threads of torch": 1, "turns": options.repeats, "steps of a trajectory": 200}

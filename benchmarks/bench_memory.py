@@ -1,8 +1,10 @@
-"""Bytes of a stored transition, and what sampling costs, against a plain float32 store of (s, a, s', r).
+"""Bytes of a stored transition, and what sampling costs, against a plain float32 store of (s, a,
+s', r).
 
-Fills the replay buffer of 120 tasks with episodes of Ant's shape (200 steps, a third of them end early) and reads the
-process's own memory. A plain store holds (27 + 8 + 27 + 1) x 4 = 252 bytes a transition, and neither the flags nor the reward
-features that training needs; it samples with one gather, as the buffer does.
+Fills the replay buffer of 120 tasks with episodes of Ant's shape (200 steps, a third of them end
+early) and reads the process's own memory. A plain store holds (27 + 8 + 27 + 1) x 4 = 252 bytes a
+transition, and neither the flags nor the reward features that training needs; it samples with one
+gather, as the buffer does.
 """
 
 from __future__ import annotations
@@ -30,7 +32,9 @@ def resident_bytes() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def make_segment(obs_dim: int, action_dim: int, feature_dim: int, rng: np.random.Generator) -> Segment:
+def make_segment(
+    obs_dim: int, action_dim: int, feature_dim: int, rng: np.random.Generator
+) -> Segment:
     """One horizon of every task."""
     states = rng.standard_normal((N_TASKS, STEPS + 1, obs_dim), dtype=np.float32)
     next_observations = states[:, 1:].copy()
@@ -68,7 +72,9 @@ def filling(size: int, marks: tuple[float, ...] = (0.1, 0.25, 0.5, 1.0)) -> list
         buffer.extend(segments[epoch % len(segments)])
         if buffer.counts[0] in [int(mark * size) // STEPS * STEPS for mark in marks]:
             taken = resident_bytes() - before
-            rows.append({"stored": buffer.size(), "resident": taken, "bytes each": taken / buffer.size()})
+            rows.append(
+                {"stored": buffer.size(), "resident": taken, "bytes each": taken / buffer.size()}
+            )
     return rows
 
 
@@ -88,9 +94,14 @@ def sampling(name: str, size: int, repeats: int) -> list[dict[str, Any]]:
         def sample_plain(sources: th.Tensor = sources) -> None:
             slots = (th.rand(sources.shape, generator=generator) * size).long()
             flat = (sources * size + slots).view(-1)
-            plain.view(-1, plain.shape[2]).index_select(0, flat).view(*sources.shape, -1).split(widths, dim=-1)
+            plain.view(-1, plain.shape[2]).index_select(0, flat).view(*sources.shape, -1).split(
+                widths, dim=-1
+            )
 
-        contenders = {"buffer": lambda s=sources: buffer.sample_rows(s, generator), "plain": sample_plain}
+        contenders = {
+            "buffer": lambda s=sources: buffer.sample_rows(s, generator),
+            "plain": sample_plain,
+        }
         seconds = common.seconds_in_turns(contenders, repeats, warm_up=20)
         microseconds = {key: 1e6 * statistics.median(values) for key, values in seconds.items()}
         rows.append({"family": name, "batch": f"{tasks} x {batch}", **microseconds,
@@ -108,23 +119,39 @@ def main() -> None:
     options = common.arguments(__doc__, add)
     th.set_num_threads(1)
     filled = filling(options.size)
-    sampled = [row for name in SHAPES for row in sampling(name, min(options.size, 20_000), options.repeats)]
+    sampled = [
+        row for name in SHAPES for row in sampling(name, min(options.size, 20_000), options.repeats)
+    ]
     plain = 4 * (2 * 27 + 8 + 1)
     sections = [
         f"Ant, {N_TASKS} tasks, room for {options.size:,} transitions each; a plain store takes {plain} bytes a transition.",
         common.table(
             ["transitions stored", "resident, MB", "bytes a transition", "share of a plain store"],
-            [[r["stored"], r["resident"] / 1e6, r["bytes each"], r["bytes each"] / plain] for r in filled],
+            [
+                [r["stored"], r["resident"] / 1e6, r["bytes each"], r["bytes each"] / plain]
+                for r in filled
+            ],
         ),
         "Microseconds of a batch, 20,000 transitions a task.",
         common.table(
-            ["family", "tasks x batch", "replay buffer", "plain store, flags and features missing", "ratio"],
+            [
+                "family",
+                "tasks x batch",
+                "replay buffer",
+                "plain store, flags and features missing",
+                "ratio",
+            ],
             [[r["family"], r["batch"], r["buffer"], r["plain"], r["ratio"]] for r in sampled],
         ),
     ]
     settings = {"threads of torch": 1, "steps of a segment": STEPS, "turns": options.repeats}
     common.write(
-        "memory", "Memory of the replay buffer", sections, {"filling": filled, "sampling": sampled}, options.out, settings
+        "memory",
+        "Memory of the replay buffer",
+        sections,
+        {"filling": filled, "sampling": sampled},
+        options.out,
+        settings,
     )
 
 

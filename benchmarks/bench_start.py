@@ -1,4 +1,6 @@
-"""Seconds of imports, of the command line's help, and until the first environment step of ``learn``, in fresh processes."""
+"""Seconds of imports, of the command line's help, and until the first environment step of
+``learn``, in fresh processes.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ COMMANDS: dict[str, list[str]] = {
 
 def main() -> None:
     """Measure and write."""
-    options = common.arguments(__doc__, lambda parser: parser.add_argument("--repeats", type=int, default=5))
+    options = common.arguments(
+        __doc__, lambda parser: parser.add_argument("--repeats", type=int, default=5)
+    )
 
     def runner(arguments: list[str]) -> Any:
         return lambda: subprocess.run([sys.executable, *arguments], check=True, capture_output=True)
@@ -40,7 +44,14 @@ def main() -> None:
     seconds = common.seconds_in_turns(contenders, options.repeats)
     rows = [[name, statistics.median(values), min(values)] for name, values in seconds.items()]
     sections = [common.table(["what", "seconds, median", "fastest"], rows)]
-    common.write("start", "Import and start", sections, seconds, options.out, {"turns": options.repeats, "caches": "warm"})
+    common.write(
+        "start",
+        "Import and start",
+        sections,
+        seconds,
+        options.out,
+        {"turns": options.repeats, "caches": "warm"},
+    )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""What all benchmarks share: timing in turns, a description of the machine, and the files that results are written to."""
+"""What all benchmarks share: timing in turns, a description of the machine, and the files that
+results are written to.
+"""
 
 from __future__ import annotations
 
@@ -18,13 +20,17 @@ RESULTS = Path(__file__).parent / "results"
 SPEED = RESULTS / "speed"
 
 
-def arguments(description: str | None, add: Callable[[argparse.ArgumentParser], None] | None = None) -> argparse.Namespace:
+def arguments(
+    description: str | None, add: Callable[[argparse.ArgumentParser], None] | None = None
+) -> argparse.Namespace:
     """Parse the command line.
 
     :param description: The script's docstring
     :param add: Adds the script's own arguments
     """
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--out", type=Path, default=SPEED, help="folder of the results")
     if add is not None:
         add(parser)
@@ -32,14 +38,17 @@ def arguments(description: str | None, add: Callable[[argparse.ArgumentParser], 
 
 
 def available_device(name: str) -> str:
-    """The type of an argument that names a device: one that is there, since results are filed under its name.
+    """The type of an argument that names a device: one that is there, since results are filed under
+    its name.
 
     :raises argparse.ArgumentTypeError: if it is not
     """
     import torch
 
     if name.startswith("cuda") and not torch.cuda.is_available():
-        raise argparse.ArgumentTypeError(f"{name}: torch {torch.__version__} sees no CUDA device here")
+        raise argparse.ArgumentTypeError(
+            f"{name}: torch {torch.__version__} sees no CUDA device here"
+        )
     return name
 
 
@@ -48,8 +57,11 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def seconds_in_turns(contenders: dict[str, Callable[[], Any]], repeats: int, warm_up: int = 1) -> dict[str, list[float]]:
-    """Time contenders one after the other, again and again, so that a slow minute of the machine hits all of them.
+def seconds_in_turns(
+    contenders: dict[str, Callable[[], Any]], repeats: int, warm_up: int = 1
+) -> dict[str, list[float]]:
+    """Time contenders one after the other, again and again, so that a slow minute of the machine
+    hits all of them.
 
     :param contenders: Functions of the same amount of work
     :param repeats: Timed calls of each
@@ -80,7 +92,13 @@ def table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
 
 
 def write(
-    name: str, title: str, sections: Sequence[str], data: Any, out: Path, settings: dict[str, Any], threads: int = 1
+    name: str,
+    title: str,
+    sections: Sequence[str],
+    data: Any,
+    out: Path,
+    settings: dict[str, Any],
+    threads: int = 1,
 ) -> None:
     """Write ``<out>/<name>.md`` and ``.json``, and print the former.
 
@@ -91,7 +109,8 @@ def write(
     :param out: Folder
     :param settings: Of this run, printed below
     :param threads: The most that any contender used
-    :raises RuntimeError: if the process has fewer cores than that, as when it was pinned after it began
+    :raises RuntimeError: if the process has fewer cores than that, as when it was pinned after it
+        began
     """
     if cores() < threads:
         raise RuntimeError(
@@ -100,13 +119,16 @@ def write(
             "Free the cores, or ask for fewer threads."
         )
     origin = {
-        "command": " ".join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *_without_out(sys.argv[1:])]),
+        "command": " ".join(
+            ["python", f"benchmarks/{Path(sys.argv[0]).name}", *_without_out(sys.argv[1:])]
+        ),
         "commit": commit(),
         "machine": machine(),
         "settings": settings,
     }
-    footer = f"`{origin['command']}` at {origin['commit']}, on {origin['machine']}. Settings: " + ", ".join(
-        f"{key} {value}" for key, value in settings.items()
+    footer = (
+        f"`{origin['command']}` at {origin['commit']}, on {origin['machine']}. Settings: "
+        + ", ".join(f"{key} {value}" for key, value in settings.items())
     )
     text = "\n\n".join([f"# {title}", *sections, footer]) + "\n"
     out.mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,8 @@
-"""
-Several people at once on the page: the time to the next question, answers per second, memory, and whether an answer is lost.
+"""Several people at once on the page: the time to the next question, answers per second, memory,
+and whether an answer is lost.
 
-``sb3-poem label`` runs on loopback; each person is a thread that watches for a while, answers, and waits for what comes next.
+``sb3-poem label`` runs on loopback; each person is a thread that watches for a while, answers, and
+waits for what comes next.
 
     python benchmarks/label_load.py --people 8 --seconds 90 --watch 8
 """
@@ -58,7 +59,10 @@ class Person(threading.Thread):
             time.sleep(self.random.uniform(0.5, 1.5) * self.watch)
             preference = self.random.choice(("left", "right", "equal"))
             asked = time.monotonic()
-            self._send(f"/s/{self.token}/answer", {"question": view["turn"]["id"], "preference": preference})
+            self._send(
+                f"/s/{self.token}/answer",
+                {"question": view["turn"]["id"], "preference": preference},
+            )
             self.given.append(preference)
             view = self._settled()
             # The film itself is part of what a person waits for.
@@ -77,7 +81,9 @@ class Person(threading.Thread):
     def _start(self) -> str:
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
         body = urllib.parse.urlencode({"model": self.model})
-        connection.request("POST", "/start", body, {"Content-Type": "application/x-www-form-urlencoded"})
+        connection.request(
+            "POST", "/start", body, {"Content-Type": "application/x-www-form-urlencoded"}
+        )
         location = connection.getresponse().headers["Location"]
         connection.close()
         return location.rpartition("/")[2]
@@ -111,7 +117,11 @@ def _wait_until_warm(port: int, model: str) -> None:
 
 def memory_of(pid: int) -> float:
     """Resident memory of a process, MB."""
-    line = next(line for line in Path(f"/proc/{pid}/status").read_text().splitlines() if line.startswith("VmRSS"))
+    line = next(
+        line
+        for line in Path(f"/proc/{pid}/status").read_text().splitlines()
+        if line.startswith("VmRSS")
+    )
     return int(line.split()[1]) / 1024
 
 
@@ -123,7 +133,9 @@ def busy_share(seconds: float = 2.0) -> float:
     """How much of all processors other programs use, before the measurement."""
 
     def read() -> tuple[int, int]:
-        values = [int(value) for value in Path("/proc/stat").read_text().splitlines()[0].split()[1:]]
+        values = [
+            int(value) for value in Path("/proc/stat").read_text().splitlines()[0].split()[1:]
+        ]
         return sum(values), values[3] + values[4]
 
     total, idle = read()
@@ -133,11 +145,18 @@ def busy_share(seconds: float = 2.0) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--model", default="HalfCheetahVel")
     parser.add_argument("--people", type=int, default=8, choices=range(1, 33), metavar="1..32")
     parser.add_argument("--seconds", type=float, default=90.0, help="at most 600")
-    parser.add_argument("--watch", type=float, default=8.0, help="mean seconds for which a person watches a question's films")
+    parser.add_argument(
+        "--watch",
+        type=float,
+        default=8.0,
+        help="mean seconds for which a person watches a question's films",
+    )
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--out", type=Path, help="write the figures as JSON")
     arguments = parser.parse_args()
@@ -148,9 +167,29 @@ def main() -> None:
 
     others = busy_share()
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "sb3_poem.cli", "label", "--model", arguments.model, "--port", "0", "--store", folder]
-        command += ["--queries", "1000", "--max-sessions", str(arguments.people + 1), "--workers", str(arguments.workers)]
-        server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        command = [
+            sys.executable,
+            "-m",
+            "sb3_poem.cli",
+            "label",
+            "--model",
+            arguments.model,
+            "--port",
+            "0",
+            "--store",
+            folder,
+        ]
+        command += [
+            "--queries",
+            "1000",
+            "--max-sessions",
+            str(arguments.people + 1),
+            "--workers",
+            str(arguments.workers),
+        ]
+        server = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        )
         assert server.stdout is not None
         match = re.search(r":(\d+)", server.stdout.readline().partition("127.0.0.1")[2])
         assert match is not None, "the server did not start"
@@ -159,7 +198,10 @@ def main() -> None:
             _wait_until_warm(port, arguments.model)
             memory_before = memory_of(server.pid)
             until = time.monotonic() + arguments.seconds
-            people = [Person(port, arguments.model, arguments.watch, until, seed) for seed in range(arguments.people)]
+            people = [
+                Person(port, arguments.model, arguments.watch, until, seed)
+                for seed in range(arguments.people)
+            ]
             begun = time.monotonic()
             for person in people:
                 person.start()
@@ -175,7 +217,9 @@ def main() -> None:
         lost = 0
         for person in people:
             session = store.find(person.token)
-            kept = [] if session is None else [row["preference"] for row in store.answers(session.id)]
+            kept = (
+                [] if session is None else [row["preference"] for row in store.answers(session.id)]
+            )
             lost += kept != person.given
         store.close()
     waits = sorted(wait for person in people for wait in person.waits)
@@ -196,7 +240,9 @@ def main() -> None:
     }
     print(json.dumps(result, indent=1))
     if arguments.out is not None:
-        arguments.out.write_text(json.dumps({"command": " ".join(sys.argv), **result}, indent=1) + "\n")
+        arguments.out.write_text(
+            json.dumps({"command": " ".join(sys.argv), **result}, indent=1) + "\n"
+        )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,9 @@
-"""A plain implementation of POEM's gradient step, to measure against: the same mathematics in eager float32.
+"""A plain implementation of POEM's gradient step, to measure against: the same mathematics in eager
+float32.
 
-It is written as public code of context-based meta-RL is organised: a numpy buffer for each task and a Python loop that samples
-from them, a module for each critic, a loss and an optimiser for each network, one after another.
+It is written as public code of context-based meta-RL is organised: a numpy buffer for each task and
+a Python loop that samples from them, a module for each critic, a loss and an optimiser for each
+network, one after another.
 """
 
 import copy
@@ -45,14 +47,25 @@ class PlainPOEM:
     def __init__(self, model: POEMSAC, seed: int = 0) -> None:
         policy = model.policy
         self.settings = model
-        self.encoder, self.decoder, self.actor = map(perceptron, (policy.encoder.mlp, policy.decoder.mlp, policy.actor.mlp))
-        self.policy_embedding, self.reward_embedding = map(perceptron, (policy.policy_mapping, policy.reward_mapping))
+        self.encoder, self.decoder, self.actor = map(
+            perceptron, (policy.encoder.mlp, policy.decoder.mlp, policy.actor.mlp)
+        )
+        self.policy_embedding, self.reward_embedding = map(
+            perceptron, (policy.policy_mapping, policy.reward_mapping)
+        )
         self.critics = [perceptron(member) for member in policy.critic.members]
         self.targets = copy.deepcopy(self.critics)
         assert model.log_ent_coef is not None
         self.log_alpha = model.log_ent_coef.detach().clone().requires_grad_()
         rate = model.policy.optimizer.param_groups[0]["lr"]
-        trained = [self.encoder, self.decoder, self.policy_embedding, self.reward_embedding, self.actor, *self.critics]
+        trained = [
+            self.encoder,
+            self.decoder,
+            self.policy_embedding,
+            self.reward_embedding,
+            self.actor,
+            *self.critics,
+        ]
         self.optimizers = [th.optim.Adam(network.parameters(), lr=rate) for network in trained]
         self.alpha_optimizer = th.optim.Adam([self.log_alpha], lr=rate)
         assert model.epoch_context is not None
@@ -60,17 +73,25 @@ class PlainPOEM:
         self.data = [TaskData(model, task) for task in range(len(self.returns))]
         self.rng = np.random.default_rng(seed)
         self.obs_mean, self.obs_std = policy.obs_norm.mean.cpu(), policy.obs_norm.std.cpu()
-        self.reward_mean, self.reward_std = policy.reward_norm.mean.cpu(), policy.reward_norm.std.cpu()
+        self.reward_mean, self.reward_std = (
+            policy.reward_norm.mean.cpu(),
+            policy.reward_norm.std.cpu(),
+        )
         self.reward_variance = model.epoch_context.rewards.var().cpu()
 
     def step(self, n_tasks: int, batch_size: int) -> None:
         """Sample a meta-batch, and update every network once."""
         tasks = self.rng.choice(len(self.data), size=n_tasks, replace=False)
         batches = [self.data[task].sample(self.rng, batch_size) for task in tasks]
-        contexts = [self.data[task].sample_context(self.rng, self.settings.context_size) for task in tasks]
+        contexts = [
+            self.data[task].sample_context(self.rng, self.settings.context_size) for task in tasks
+        ]
         batch = [th.stack(field) for field in zip(*batches, strict=True)]
         context, context_rewards = (th.stack(field) for field in zip(*contexts, strict=True))
-        noises = [th.randn(n_tasks, self.settings.latent_dim), *(th.randn(batch[1].shape) for _ in range(2))]
+        noises = [
+            th.randn(n_tasks, self.settings.latent_dim),
+            *(th.randn(batch[1].shape) for _ in range(2)),
+        ]
         self.update(batch, context, context_rewards, self.returns[tasks][:, tasks], noises)
 
     def losses(
@@ -81,7 +102,9 @@ class PlainPOEM:
         returns: th.Tensor,
         noises: list[th.Tensor],
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor, th.Tensor, th.Tensor]:
-        """Losses of the critics, actor, decoder, KL and preferences, and the actions' mean log-probability."""
+        """Losses of the critics, actor, decoder, KL and preferences, and the actions' mean
+        log-probability.
+        """
         observations, actions, next_observations, rewards, terminated = batch
         n_tasks, batch_size = rewards.shape
         alpha = self.log_alpha.detach().exp()
@@ -93,24 +116,36 @@ class PlainPOEM:
         kl = 0.5 * (mean**2 + variance - 1.0 - variance.log()).sum(dim=-1).mean()
         z = mean + variance.sqrt() * noises[0]
         z_rows = z.repeat_interleave(batch_size, dim=0)
-        obs, next_obs = (self.standardise(values).flatten(0, 1) for values in (observations, next_observations))
+        obs, next_obs = (
+            self.standardise(values).flatten(0, 1) for values in (observations, next_observations)
+        )
         acts, rews, ends = actions.flatten(0, 1), rewards.flatten(), terminated.flatten()
         # critics
         with th.no_grad():
-            next_actions, next_log_prob = self.act(next_obs, self.policy_embedding(z_rows), noises[1].flatten(0, 1))
-            next_values = [target(th.cat([next_obs, next_actions, z_rows], dim=1)) for target in self.targets]
+            next_actions, next_log_prob = self.act(
+                next_obs, self.policy_embedding(z_rows), noises[1].flatten(0, 1)
+            )
+            next_values = [
+                target(th.cat([next_obs, next_actions, z_rows], dim=1)) for target in self.targets
+            ]
             next_value = th.min(*next_values).squeeze(1) - alpha * next_log_prob
             wanted = rews / self.reward_std + self.settings.gamma * (1.0 - ends) * next_value
         values = [critic(th.cat([obs, acts, z_rows], dim=1)).squeeze(1) for critic in self.critics]
         critic_loss = sum((0.5 * mse_loss(value, wanted) for value in values), th.zeros(()))
         # actor
-        new_actions, log_prob = self.act(obs, self.policy_embedding(z_rows), noises[2].flatten(0, 1))
-        new_values = [critic(th.cat([obs, new_actions, z_rows.detach()], dim=1)) for critic in self.critics]
+        new_actions, log_prob = self.act(
+            obs, self.policy_embedding(z_rows), noises[2].flatten(0, 1)
+        )
+        new_values = [
+            critic(th.cat([obs, new_actions, z_rows.detach()], dim=1)) for critic in self.critics
+        ]
         actor_loss = (alpha * log_prob - th.min(*new_values).squeeze(1)).mean()
         # decoder, on the context (eq. 4)
         obs_dim, action_dim = obs.shape[1], acts.shape[1]
         z_context = self.reward_embedding(z)[:, None].expand(-1, context.shape[1], -1)
-        decoded = self.decoder(th.cat([context[..., : 2 * obs_dim + action_dim], z_context], dim=-1)).squeeze(-1)
+        decoded = self.decoder(
+            th.cat([context[..., : 2 * obs_dim + action_dim], z_context], dim=-1)
+        ).squeeze(-1)
         decoded = decoded * self.reward_std + self.reward_mean
         decoder_loss = mse_loss(decoded, context_rewards) / self.reward_variance
         # preferences (eqs. 6 and 7), task by task
@@ -123,7 +158,11 @@ class PlainPOEM:
             label = (earned[first] > earned[second]).float()
             distinct = earned[first] != earned[second]
             margin = scores[first] - scores[second]
-            terms.append(binary_cross_entropy_with_logits(margin[distinct], label[distinct], reduction="none"))
+            terms.append(
+                binary_cross_entropy_with_logits(
+                    margin[distinct], label[distinct], reduction="none"
+                )
+            )
         return critic_loss, actor_loss, decoder_loss, kl, th.cat(terms).mean(), log_prob.mean()
 
     def update(
@@ -136,7 +175,9 @@ class PlainPOEM:
     ) -> None:
         """One loss after another, one optimiser after another."""
         settings = self.settings
-        critic, actor, decoder, kl, preference, log_prob = self.losses(batch, context, context_rewards, returns, noises)
+        critic, actor, decoder, kl, preference, log_prob = self.losses(
+            batch, context, context_rewards, returns, noises
+        )
         for optimizer in self.optimizers:
             optimizer.zero_grad()
         (settings.policy_coef * actor).backward(retain_graph=True)

@@ -34,13 +34,20 @@ def main() -> None:
     """Measure and write."""
     tasks = FamilyView(TaskVecEnv.from_id(ENV_ID, 1)).test_tasks(30, 100)
     env = gym.make(ENV_ID)
-    lines = ["# MetaWorldML1 (reach): straight to the goal", "", "`action = gain (goal - hand)`, clipped; 30 test tasks.", ""]
+    lines = [
+        "# MetaWorldML1 (reach): straight to the goal",
+        "",
+        "`action = gain (goal - hand)`, clipped; 30 test tasks.",
+        "",
+    ]
     lines += ["| gain | mean return | least | most | success |", "|---|---|---|---|---|"]
     for gain in GAINS:
         outcomes = [episode(env, goal, gain) for goal in tasks]
         returns = np.array([total for total, _ in outcomes])
         success = np.mean([succeeded for _, succeeded in outcomes])
-        lines.append(f"| {gain:g} | {returns.mean():.1f} | {returns.min():.1f} | {returns.max():.1f} | {success:.2f} |")
+        lines.append(
+            f"| {gain:g} | {returns.mean():.1f} | {returns.min():.1f} | {returns.max():.1f} | {success:.2f} |"
+        )
     lines += ["", f"By `benchmarks/straight_to_goal.py` at {commit()}. Machine: {machine()}."]
     (RESULTS / "MetaWorldML1" / "straight-to-goal.md").write_text("\n".join(lines) + "\n")
     print("\n".join(lines))

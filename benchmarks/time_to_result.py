@@ -2,9 +2,9 @@
 
 python benchmarks/time_to_result.py [--env poem/HalfCheetahVel-v0] [--target -46] [--seeds 0 1 2]
 
-Trains with the hyperparameters of `zoo_configs/poem_sac.yml` (or `--conf`). After the epochs that `--from-step` and `--every`
-name, the model is adapted to 30 test tasks by ten error-free answers each; training ends when their mean return reaches the
-target.
+Trains with the hyperparameters of `zoo_configs/poem_sac.yml` (or `--conf`). After the epochs that
+`--from-step` and `--every` name, the model is adapted to 30 test tasks by ten error-free answers
+each; training ends when their mean return reaches the target.
 """
 
 import argparse
@@ -38,11 +38,26 @@ class Clock(EpochCallback):
     :param every: Epochs between two evaluations
     """
 
-    def __init__(self, env_id: str, target: float, rules: list[str], test_seed: int, from_step: int, every: int) -> None:
+    def __init__(
+        self,
+        env_id: str,
+        target: float,
+        rules: list[str],
+        test_seed: int,
+        from_step: int,
+        every: int,
+    ) -> None:
         super().__init__(every)
-        self.target, self.rules, self.test_seed, self.from_step = target, rules, test_seed, from_step
+        self.target, self.rules, self.test_seed, self.from_step = (
+            target,
+            rules,
+            test_seed,
+            from_step,
+        )
         self.env = TaskVecEnv.from_id(env_id, 2 * N_TASKS)
-        self.tasks = FamilyView(self.env).sample_tasks(N_TASKS, np.random.default_rng([test_seed, 77]))
+        self.tasks = FamilyView(self.env).sample_tasks(
+            N_TASKS, np.random.default_rng([test_seed, 77])
+        )
         self.seconds, self.started = 0.0, time.perf_counter()
         self.evaluations: list[dict[str, Any]] = []
         self.reached = False
@@ -51,7 +66,11 @@ class Clock(EpochCallback):
         if self.reached or self.num_timesteps < self.from_step:
             return
         self.seconds += time.perf_counter() - self.started
-        found = {"seconds": self.seconds, "env_steps": self.model.num_timesteps, "updates": self.model._n_updates}
+        found = {
+            "seconds": self.seconds,
+            "env_steps": self.model.num_timesteps,
+            "updates": self.model._n_updates,
+        }
         for rule in self.rules:
             result = evaluate_adaptation(
                 self.model,
@@ -75,7 +94,11 @@ class Clock(EpochCallback):
 def train(env_id: str, entry: dict[str, Any], seed: int, clock: Clock, device: str) -> POEMSAC:
     """Train with an entry of hyperparameters until the clock ends it; returns the model."""
     entry = dict(entry)
-    n_timesteps, policy, n_envs = int(entry.pop("n_timesteps")), entry.pop("policy"), entry.pop("n_envs")
+    n_timesteps, policy, n_envs = (
+        int(entry.pop("n_timesteps")),
+        entry.pop("policy"),
+        entry.pop("n_envs"),
+    )
     rate = entry.get("learning_rate")
     if isinstance(rate, str):
         entry["learning_rate"] = linear_schedule(rate.removeprefix("lin_"))
@@ -95,7 +118,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--device", type=available_device, default="cpu")
     parser.add_argument("--save", type=Path, help="folder for the models")
-    parser.add_argument("--conf", type=Path, default=Path(__file__).parents[1] / "zoo_configs" / "poem_sac.yml")
+    parser.add_argument(
+        "--conf", type=Path, default=Path(__file__).parents[1] / "zoo_configs" / "poem_sac.yml"
+    )
 
 
 def main() -> None:
@@ -104,27 +129,60 @@ def main() -> None:
     th.set_num_threads(given.threads)
     entry = zoo_entry(given.conf, given.env)
     if given.from_step > entry["n_timesteps"]:
-        raise SystemExit(f"--from-step {given.from_step}: training ends after {entry['n_timesteps']:.0f} steps")
+        raise SystemExit(
+            f"--from-step {given.from_step}: training ends after {entry['n_timesteps']:.0f} steps"
+        )
     results, rows = [], []
     for seed in given.seeds:
-        clock = Clock(given.env, given.target, given.rules, 300 + seed, given.from_step, given.every)
+        clock = Clock(
+            given.env, given.target, given.rules, 300 + seed, given.from_step, given.every
+        )
         model = train(given.env, entry, seed, clock, given.device)
         if given.save:
             model.save(given.save / f"seed{seed}.zip")
         last = clock.evaluations[-1]
-        results.append({"seed": seed, "reached": clock.reached, "evaluations": clock.evaluations, "entry": entry})
+        results.append(
+            {
+                "seed": seed,
+                "reached": clock.reached,
+                "evaluations": clock.evaluations,
+                "entry": entry,
+            }
+        )
         returns = [f"{last[rule]:.1f}" for rule in given.rules]
         reached = "yes" if clock.reached else "no"
-        rows.append([seed, reached, round(last["seconds"]), last["env_steps"], last["updates"], *returns])
+        rows.append(
+            [seed, reached, round(last["seconds"]), last["env_steps"], last["updates"], *returns]
+        )
         report(given, results, rows)  # after every seed, since the next may be interrupted
 
 
 def report(given: argparse.Namespace, results: list[dict[str, Any]], rows: list[list[Any]]) -> None:
     """Write what there is so far."""
-    text = table(["seed", f"reached {given.target:g}", "seconds", "environment steps", "updates", *given.rules], rows)
+    text = table(
+        [
+            "seed",
+            f"reached {given.target:g}",
+            "seconds",
+            "environment steps",
+            "updates",
+            *given.rules,
+        ],
+        rows,
+    )
     name = f"time-to-result-{given.env.split('/')[-1].split('-')[0]}{'' if given.device == 'cpu' else f'-{given.device}'}"
-    settings = {key: str(value) for key, value in vars(given).items() if key not in ("out", "conf", "save")}
-    write(name, f"Time to {given.target:g} on {given.env}", [DESCRIPTION, text], results, given.out, settings, given.threads)
+    settings = {
+        key: str(value) for key, value in vars(given).items() if key not in ("out", "conf", "save")
+    }
+    write(
+        name,
+        f"Time to {given.target:g} on {given.env}",
+        [DESCRIPTION, text],
+        results,
+        given.out,
+        settings,
+        given.threads,
+    )
 
 
 DESCRIPTION = (__doc__ or "").split("\n\n")[-1].strip()

@@ -1,10 +1,12 @@
-"""What k answers allow a method that knows the family but not the test tasks, beside the limit that has these in sight.
+"""What k answers allow a method that knows the family but not the test tasks, beside the limit that
+has these in sight.
 
     python benchmarks/unseen_limit.py HalfCheetahVel --seeds 0 1 2 --models M0.zip M1.zip M2.zip
 
-The tables' limit takes the 2^k policies that are best for the 30 test tasks. Here they are the 2^k that are best for many
-other tasks of the family; then each test task gets the best of them, as if k answers could tell which that is. Policies,
-episodes and test tasks are those of the benchmark's cells. Writes ``benchmarks/results/<Family>/unseen-limit.md``.
+The tables' limit takes the 2^k policies that are best for the 30 test tasks. Here they are the 2^k
+that are best for many other tasks of the family; then each test task gets the best of them, as if k
+answers could tell which that is. Policies, episodes and test tasks are those of the benchmark's
+cells. Writes ``benchmarks/results/<Family>/unseen-limit.md``.
 """
 
 import argparse
@@ -25,36 +27,51 @@ from sb3_poem.loading import load_model
 COLUMNS = (0, 1, 2, 3, 5)
 
 
-def limits(env_id: str, model_file: Path, seed: int, n_others: int) -> tuple[list[float], list[float]]:
+def limits(
+    env_id: str, model_file: Path, seed: int, n_others: int
+) -> tuple[list[float], list[float]]:
     """The limits with the test tasks in sight, and without, after :data:`COLUMNS` answers."""
     model, env, budget = load_model(str(model_file)), TaskVecEnv.from_id(env_id, 120), Budget()
     family = FamilyView(env)
     tasks = family.test_tasks(budget.tasks, budget.task_seed)
     others = family.sample_tasks(n_others, np.random.default_rng([budget.task_seed, seed, 1]))
     stream = budget.task_seed + SEED_STRIDE * seed
-    known = known_task_return(model, env, tasks, n_episodes=1, seed=stream, selection_episodes=SELECTION_EPISODES)
-    on_others = return_matrix(model, env, others, known.candidate_latents, SELECTION_EPISODES, evaluation_seed(stream, 1))
+    known = known_task_return(
+        model, env, tasks, n_episodes=1, seed=stream, selection_episodes=SELECTION_EPISODES
+    )
+    on_others = return_matrix(
+        model, env, others, known.candidate_latents, SELECTION_EPISODES, evaluation_seed(stream, 1)
+    )
     env.close()
     ordered = others.shape[1] == 1
     if ordered:
         on_others = on_others[np.argsort(others[:, 0])]
     books = [best_codebook(on_others, 2**k, ordered=ordered) for k in COLUMNS]
-    return [known.limit(k) for k in COLUMNS], [float(known.candidate_returns[:, book].max(axis=1).mean()) for book in books]
+    return [known.limit(k) for k in COLUMNS], [
+        float(known.candidate_returns[:, book].max(axis=1).mean()) for book in books
+    ]
 
 
 def row(name: str, values: np.ndarray) -> str:
     """Mean and deviation over seeds."""
-    cells = [f"{mean:.1f} ± {deviation:.1f}" for mean, deviation in zip(values.mean(0), values.std(0, ddof=1), strict=True)]
+    cells = [
+        f"{mean:.1f} ± {deviation:.1f}"
+        for mean, deviation in zip(values.mean(0), values.std(0, ddof=1), strict=True)
+    ]
     return f"| {name} | " + " | ".join(cells) + " |"
 
 
 def main() -> None:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("family")
     parser.add_argument("--models", nargs="+", type=Path, required=True, help="one for each seed")
     parser.add_argument("--seeds", nargs="+", type=int, required=True, help="at least two")
-    parser.add_argument("--others", type=int, default=600, help="tasks that the policies are chosen on")
+    parser.add_argument(
+        "--others", type=int, default=600, help="tasks that the policies are chosen on"
+    )
     given = parser.parse_args()
     if not 2 <= len(given.seeds) == len(given.models):
         parser.error("--seeds and --models: name at least two seeds, and a model for each")

@@ -1,6 +1,7 @@
 """Meta-RL with adaptation from human feedback, as an extension of Stable-Baselines3.
 
-Names load on first use, so that ``import sb3_poem`` and the command line's help do not wait for torch.
+Names load on first use, so that ``import sb3_poem`` and the command line's help do not wait for
+torch.
 """
 
 from importlib import import_module

@@ -25,7 +25,11 @@ def as_model(model: Any, device: th.device | str = "auto") -> Any:
         return load_model(model, device)
     if hasattr(model, "latent_dim") and not isinstance(model, type):
         return model
-    what = f"the class {model.__name__}" if isinstance(model, type) else f"of type {type(model).__name__}"
+    what = (
+        f"the class {model.__name__}"
+        if isinstance(model, type)
+        else f"of type {type(model).__name__}"
+    )
     raise TypeError(
         f"`model` is {what}, but must be a trained POEMSAC or PEARLSAC, a file or folder of one, or the name of a model "
         f"that ships: {', '.join(pretrained_names())}"
@@ -35,8 +39,8 @@ def as_model(model: Any, device: th.device | str = "auto") -> Any:
 def load_model(name: str | Path, device: th.device | str = "auto") -> PEARLSAC:
     """Load a model of either algorithm.
 
-    :param name: A file that ``save`` wrote (``.zip`` may be left out), a checkpoint, a folder that ``save_pretrained``
-        wrote, or the name of a shipped model
+    :param name: A file that ``save`` wrote (``.zip`` may be left out), a checkpoint, a folder that
+        ``save_pretrained`` wrote, or the name of a shipped model
     :param device: As PyTorch names it
     :raises FileNotFoundError: if it is none of these; the message lists the shipped models
     :raises ValueError: if a file is truncated, or of another program
@@ -44,10 +48,14 @@ def load_model(name: str | Path, device: th.device | str = "auto") -> PEARLSAC:
     path = Path(name)
     archive = path if path.is_file() else path.with_name(f"{path.name}.zip")
     if archive.suffix == ".safetensors":
-        raise ValueError(f"{name} holds no whole model: AdaptedPolicy.load reads a policy, and of a model name the folder")
+        raise ValueError(
+            f"{name} holds no whole model: AdaptedPolicy.load reads a policy, and of a model name the folder"
+        )
     if archive.is_file():
         if is_checkpoint(archive):
-            return _class_named(read_checkpoint(archive)["algorithm"], archive).load_checkpoint(archive, device=device)
+            return _class_named(read_checkpoint(archive)["algorithm"], archive).load_checkpoint(
+                archive, device=device
+            )
         # where that cannot be told, POEMSAC.load says what is wrong with the file
         return BY_CLASS_NAME.get(algorithm_of(archive), POEMSAC).load(archive, device=device)
     path = find_folder(path)

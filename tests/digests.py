@@ -1,9 +1,11 @@
-"""Digests of what training and adaptation come to: equal before and after a change that should change no number.
+"""Digests of what training and adaptation come to: equal before and after a change that should
+change no number.
 
     python -P tests/digests.py before.json            # on the tree as it was
     python -P tests/digests.py after.json before.json # on the changed tree: names what differs, and fails if anything does
 
-Digests compare one machine with itself: another processor rounds otherwise. All arithmetic is on one thread.
+Digests compare one machine with itself: another processor rounds otherwise. All arithmetic is on
+one thread.
 """
 
 import argparse
@@ -23,7 +25,14 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_poem import PEARLSAC, POEMSAC, ANOLEAdapter, MAMLRewardAdapter, ReturnOracle, RewardOracleAdapter
+from sb3_poem import (
+    PEARLSAC,
+    POEMSAC,
+    ANOLEAdapter,
+    MAMLRewardAdapter,
+    ReturnOracle,
+    RewardOracleAdapter,
+)
 from sb3_poem.adaptation import adapt_tasks
 from sb3_poem.baselines import MAMLRewardModel, meta_train_reward, rollout_fragments
 from sb3_poem.common.vec_env import make_task_vec_env
@@ -45,19 +54,33 @@ SMALL: dict[str, Any] = {
 VARIANTS: dict[str, tuple[type[PEARLSAC], str, dict[str, Any]]] = {
     "POEMSAC PointGoal": (POEMSAC, POINT_GOAL, {}),
     "POEMSAC PointGoal fp32": (POEMSAC, POINT_GOAL, {"precision": "fp32", "policy_delay": 2}),
-    "POEMSAC PointGoal n_steps": (POEMSAC, POINT_GOAL, {"n_steps": 3, "relabel_fraction": 0.5, "noise_color": 1}),
+    "POEMSAC PointGoal n_steps": (
+        POEMSAC,
+        POINT_GOAL,
+        {"n_steps": 3, "relabel_fraction": 0.5, "noise_color": 1},
+    ),
     "POEMSAC PointGoal rollouts": (POEMSAC, POINT_GOAL, {"preference_source": "rollout"}),
-    "POEMSAC PointGoal ablations": (POEMSAC, POINT_GOAL, {"similarity": "inner", "context": "pearl"}),
+    "POEMSAC PointGoal ablations": (
+        POEMSAC,
+        POINT_GOAL,
+        {"similarity": "inner", "context": "pearl"},
+    ),
     "POEMSAC HalfCheetahVel": (POEMSAC, HALF_CHEETAH, {"relabel_fraction": 0.5}),
     "PEARLSAC PointGoal": (PEARLSAC, POINT_GOAL, {}),
-    "PEARLSAC PointGoal contexts": (PEARLSAC, POINT_GOAL, {"context_relabel_fraction": 0.5, "relabel_fraction": 0.5}),
+    "PEARLSAC PointGoal contexts": (
+        PEARLSAC,
+        POINT_GOAL,
+        {"context_relabel_fraction": 0.5, "relabel_fraction": 0.5},
+    ),
     "PEARLSAC HalfCheetahVel n_steps": (PEARLSAC, HALF_CHEETAH, {"n_steps": 3}),
 }
 
 
 def digest(arrays: Iterable[Any]) -> str:
     """One digest of arrays, whose order does not matter."""
-    parts = sorted(hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest() for array in arrays)
+    parts = sorted(
+        hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest() for array in arrays
+    )
     return hashlib.sha256("".join(parts).encode()).hexdigest()[:16]
 
 
@@ -68,7 +91,10 @@ def of_model(model: PEARLSAC) -> str:
     observations = rng.normal(size=(6, *model.observation_space.shape)).astype(np.float32)
     arrays = [parameter.detach().numpy() for parameter in model.policy.parameters()]
     arrays += [model.predict(observations, latents, deterministic=True)[0]]
-    arrays += [model.sample_latents(9, np.random.default_rng(4), source) for source in ("prior", "aggregate")]
+    arrays += [
+        model.sample_latents(9, np.random.default_rng(4), source)
+        for source in ("prior", "aggregate")
+    ]
     if isinstance(model, POEMSAC):
         arrays.append(model.similarities(latents, latents))
     return digest([*arrays, model.train_tasks.tasks, model.task_latents])
@@ -84,8 +110,29 @@ def trained(name: str) -> PEARLSAC:
 def killed_and_resumed() -> str:
     """A run that is killed after an epoch's checkpoint and continued by another process."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "sb3_poem.cli", "train", "--env", POINT_GOAL, "--seed", "3", "-f", folder]
-        command += ["--eval-freq", "-1", "--save-freq", "1500", "-n", "9000", "--num-threads", "1", "--resume"]
+        command = [
+            sys.executable,
+            "-m",
+            "sb3_poem.cli",
+            "train",
+            "--env",
+            POINT_GOAL,
+            "--seed",
+            "3",
+            "-f",
+            folder,
+        ]
+        command += [
+            "--eval-freq",
+            "-1",
+            "--save-freq",
+            "1500",
+            "-n",
+            "9000",
+            "--num-threads",
+            "1",
+            "--resume",
+        ]
         command += ["-params", "gradient_steps:20", "--device", "cpu"]
         quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         first = subprocess.Popen(command, **quiet)
@@ -104,7 +151,9 @@ def adapted(model: Any, env_id: str, env_kwargs: dict[str, Any], **options: Any)
     """The latents and answers of two tasks."""
     env = make_task_vec_env(env_id, 4, **env_kwargs)
     tasks = np.asarray(env.env_method("sample_tasks", 2, np.random.default_rng(7), indices=[0])[0])
-    result = adapt_tasks(model, env, tasks, ReturnOracle, n_queries=options.pop("n_queries", 5), seed=2, **options)
+    result = adapt_tasks(
+        model, env, tasks, ReturnOracle, n_queries=options.pop("n_queries", 5), seed=2, **options
+    )
     env.close()
     answers = "".join(answer.value for answers in result.preferences for answer in answers)
     return digest([result.latents, np.frombuffer(answers.encode(), dtype=np.uint8)])
@@ -127,7 +176,9 @@ def baseline(name: str) -> str:
     if name == "reward oracle":
         return run(model, adapter=RewardOracleAdapter)
     reward = meta_train_reward(model, n_iterations=20, seed=1)
-    return run(MAMLRewardModel(reward, model), adapter=MAMLRewardAdapter, n_queries=2, gradient_steps=5)
+    return run(
+        MAMLRewardModel(reward, model), adapter=MAMLRewardAdapter, n_queries=2, gradient_steps=5
+    )
 
 
 def measures() -> Iterator[tuple[str, Callable[[], str]]]:
@@ -144,7 +195,9 @@ def measures() -> Iterator[tuple[str, Callable[[], str]]]:
 
 def main() -> None:
     """Write the digests, and compare."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("out", type=Path)
     parser.add_argument("reference", type=Path, nargs="?")
     given = parser.parse_args()

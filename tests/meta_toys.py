@@ -44,13 +44,14 @@ def small(algorithm: type[Model], env: Any = POINT_GOAL, **arguments: Any) -> Mo
 
 
 class Walk(TaskFamily):
-    """
-    A point on the line; its task is where it should be. Rewards need the place and the effort. Further out than ``edge`` the
-    episode ends.
+    """A point on the line; its task is where it should be. Rewards need the place and the effort.
+    Further out than ``edge`` the episode ends.
     """
 
     observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float64)
-    action_space = spaces.Box(np.array([-2.0], np.float32), np.array([4.0], np.float32))  # not [-1, 1], and not symmetric
+    action_space = spaces.Box(
+        np.array([-2.0], np.float32), np.array([4.0], np.float32)
+    )  # not [-1, 1], and not symmetric
     task_space = spaces.Box(-1.0, 1.0, (1,), np.float64)
     reward_feature_dim = 2
 
@@ -68,7 +69,11 @@ class Walk(TaskFamily):
     def _simulate(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
         self._place += 0.1 * (float(action[0]) + self._wind())
         self._time += 1
-        return self._observation(), np.array([self._place, float(action[0])]), abs(self._place) > self.edge
+        return (
+            self._observation(),
+            np.array([self._place, float(action[0])]),
+            abs(self._place) > self.edge,
+        )
 
     def _wind(self) -> float:
         return 0.0
@@ -82,7 +87,11 @@ class EvenWalk(Walk):
 
     action_space = spaces.Box(-3.0, 3.0, (1,), np.float32)
     symmetries = (
-        Symmetry(SignedPermutation((0, 1), (-1, 1)), SignedPermutation((0,), (-1,)), SignedPermutation((0, 1), (-1, -1))),
+        Symmetry(
+            SignedPermutation((0, 1), (-1, 1)),
+            SignedPermutation((0,), (-1,)),
+            SignedPermutation((0, 1), (-1, -1)),
+        ),
     )
 
 
@@ -134,18 +143,26 @@ class Poisoned(gym.Wrapper):
 
 
 def walks(n: int, family: type[Walk] = Walk, steps: int = 10, **kwargs: Any) -> DummyVecEnv:
-    """Copies of a walk that is cut after some steps. Not registered, so that a model needs ``horizon=steps``."""
+    """Copies of a walk that is cut after some steps. Not registered, so that a model needs
+    ``horizon=steps``.
+    """
     return DummyVecEnv([lambda: gym.wrappers.TimeLimit(family(**kwargs), steps) for _ in range(n)])
 
 
 def parameters(model: PEARLSAC) -> dict[str, th.Tensor]:
     """Copies of all that training changes in the networks and their optimisers."""
     result = {f"policy.{name}": value.clone() for name, value in model.policy.state_dict().items()}
-    optimizers = {"optimizer": model.policy.optimizer, "ent_coef_optimizer": model.ent_coef_optimizer}
+    optimizers = {
+        "optimizer": model.policy.optimizer,
+        "ent_coef_optimizer": model.ent_coef_optimizer,
+    }
     for name, optimizer in optimizers.items():
         if optimizer is not None:
             for index, state in optimizer.state_dict()["state"].items():
-                result |= {f"{name}.{index}.{key}": th.as_tensor(value).clone() for key, value in state.items()}
+                result |= {
+                    f"{name}.{index}.{key}": th.as_tensor(value).clone()
+                    for key, value in state.items()
+                }
     if model.log_ent_coef is not None:
         result["log_ent_coef"] = model.log_ent_coef.detach().clone()
     return result
@@ -157,7 +174,9 @@ def differing(first: Mapping[str, th.Tensor], second: Mapping[str, th.Tensor]) -
     return sorted(
         name
         for name in names
-        if name not in first or name not in second or not th.equal(first[name].nan_to_num(1e30), second[name].nan_to_num(1e30))
+        if name not in first
+        or name not in second
+        or not th.equal(first[name].nan_to_num(1e30), second[name].nan_to_num(1e30))
     )
 
 
@@ -175,7 +194,15 @@ LEARN: dict[str, Any] = {
     "kl_coef": 0.1,
     "relabel_fraction": 0.5,
     "precision": "fp32",
-    "policy_kwargs": {"net_arch": {"pi": [64, 64], "qf": [64, 64], "encoder": [64, 64], "decoder": [64], "embedding": [32]}},
+    "policy_kwargs": {
+        "net_arch": {
+            "pi": [64, 64],
+            "qf": [64, 64],
+            "encoder": [64, 64],
+            "decoder": [64],
+            "embedding": [32],
+        }
+    },
     "seed": 1,
     "device": "cpu",
 }
@@ -197,18 +224,21 @@ class Interrupt(BaseCallback):
 
 
 def point_goal_bounds(tasks: np.ndarray) -> tuple[float, float]:
-    """
-    Mean returns on PointGoal that no policy can exceed: one that does not know the task, and one that does.
+    """Mean returns on PointGoal that no policy can exceed: one that does not know the task, and one
+    that does.
 
-    After t steps each coordinate is within 0.05 t of the start. The best that a policy can do that is the same for all tasks
-    is to be, at each t, at the reachable point of the smallest mean distance; one that knows its task is at the nearest.
+    After t steps each coordinate is within 0.05 t of the start. The best that a policy can do that
+    is the same for all tasks is to be, at each t, at the reachable point of the smallest mean
+    distance; one that knows its task is at the nearest.
 
     :param tasks: (n, 1) angles
     """
     goals = np.concatenate([np.cos(tasks), np.sin(tasks)], axis=1)
     reach = 0.05 * np.arange(1, POINT_GOAL_STEPS + 1)
     known = -sum(np.linalg.norm(np.maximum(np.abs(goals) - r, 0.0), axis=1).mean() for r in reach)
-    places = np.stack(np.meshgrid(np.linspace(-1, 1, 81), np.linspace(0, 1, 41)), axis=-1).reshape(-1, 2)
+    places = np.stack(np.meshgrid(np.linspace(-1, 1, 81), np.linspace(0, 1, 41)), axis=-1).reshape(
+        -1, 2
+    )
     distances = np.linalg.norm(places[:, None, :] - goals, axis=2).mean(axis=1)
     blind = -sum(distances[np.abs(places).max(axis=1) <= r + 1e-9].min() for r in reach)
     return float(blind), float(known)
@@ -219,12 +249,28 @@ def assert_same_model(one: PEARLSAC, two: PEARLSAC) -> None:
     assert not differing(parameters(one), parameters(two))
     for name, value in vars(one.train_tasks).items():
         assert np.array_equal(value, getattr(two.train_tasks, name)), name
-    for name in ("num_timesteps", "epoch", "env_id", "horizon", "predicted_rewards_error", "seed", "_n_updates"):
+    for name in (
+        "num_timesteps",
+        "epoch",
+        "env_id",
+        "horizon",
+        "predicted_rewards_error",
+        "seed",
+        "_n_updates",
+    ):
         assert getattr(one, name) == getattr(two, name), name
-    latents, obs = np.random.default_rng(1).normal(size=(6, 5)), np.random.default_rng(0).normal(size=(6, 2))
-    assert np.array_equal(one.predict(obs, latents, deterministic=True)[0], two.predict(obs, latents, deterministic=True)[0])
+    latents, obs = (
+        np.random.default_rng(1).normal(size=(6, 5)),
+        np.random.default_rng(0).normal(size=(6, 2)),
+    )
+    assert np.array_equal(
+        one.predict(obs, latents, deterministic=True)[0],
+        two.predict(obs, latents, deterministic=True)[0],
+    )
     if isinstance(one, POEMSAC):
-        assert np.array_equal(one.similarities(latents, latents), two.similarities(latents, latents))
+        assert np.array_equal(
+            one.similarities(latents, latents), two.similarities(latents, latents)
+        )
     for source in ("prior", "aggregate"):
         draws = [model.sample_latents(9, np.random.default_rng(4), source) for model in (one, two)]
         assert np.array_equal(*draws)

@@ -15,7 +15,9 @@ from sb3_poem import cli, resources
 
 
 def sb3_poem(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "sb3_poem", *arguments], capture_output=True, text=True, check=False)
+    return subprocess.run(
+        [sys.executable, "-m", "sb3_poem", *arguments], capture_output=True, text=True, check=False
+    )
 
 
 def processor_seconds_of_children() -> float:
@@ -44,7 +46,12 @@ def test_help_and_models_do_not_import_what_is_slow(call: str) -> None:
     assert done.stdout.splitlines()[-1] == "set()"
 
 
-PARTS = [*([command] for command in cli.COMMANDS), ["label", "export"], ["label", "replay"], ["benchmark", "run"]]
+PARTS = [
+    *([command] for command in cli.COMMANDS),
+    ["label", "export"],
+    ["label", "replay"],
+    ["benchmark", "run"],
+]
 
 
 @pytest.mark.parametrize("command", [*PARTS, ["benchmark", "report"]], ids=" ".join)
@@ -78,7 +85,12 @@ def test_models_are_listed_a_line_each(capsys: pytest.CaptureFixture[str]) -> No
     ],
 )
 def test_a_shell_completes_the_line(line: str, expected: set[str], tmp_path: Path) -> None:
-    request = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_IFS": "\n"}
+    request = {
+        "_ARGCOMPLETE": "1",
+        "COMP_LINE": line,
+        "COMP_POINT": str(len(line)),
+        "_ARGCOMPLETE_IFS": "\n",
+    }
     environment = {**os.environ, **request, "_ARGCOMPLETE_STDOUT_FILENAME": str(tmp_path / "out")}
     subprocess.run([sys.executable, "-m", "sb3_poem"], env=environment, check=True)
     assert {word.strip() for word in (tmp_path / "out").read_text().splitlines()} == expected
@@ -92,12 +104,17 @@ def test_a_shell_completes_the_line(line: str, expected: set[str], tmp_path: Pat
         (["adapt"], "--model"),
         (["adapt", "--model", "x", "--colour", "red"], "--colour"),
         (["adapt", "--model", "x", "--queries", "0"], "at least 1"),
-        (["adapt", "--model", "x", "--queries", "2.5"], "--queries: invalid whole number value: '2.5'"),
+        (
+            ["adapt", "--model", "x", "--queries", "2.5"],
+            "--queries: invalid whole number value: '2.5'",
+        ),
         (["adapt", "--model", "x", "--tasks", "0"], "at least 1"),
         (["adapt", "--model", "x", "--oracle", "coin"], "invalid choice"),
     ],
 )
-def test_a_wrong_command_is_refused(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_wrong_command_is_refused(
+    arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit) as stop:
         cli.main(arguments)
     assert stop.value.code == 2
@@ -145,11 +162,16 @@ def test_shipped_files_of_other_names_are_not_found() -> None:
     ids=lambda command: command[0],
 )
 def test_modules_that_register_environments_are_found_in_the_working_folder(
-    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    command: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     # as for the console script, which has its own folder there
-    monkeypatch.setattr(sys, "path", [folder for folder in sys.path if folder not in ("", os.getcwd())])
+    monkeypatch.setattr(
+        sys, "path", [folder for folder in sys.path if folder not in ("", os.getcwd())]
+    )
     (tmp_path / "families_here.py").write_text("print('families are registered')")
     monkeypatch.delitem(sys.modules, "families_here", raising=False)
     assert cli.main([*command, "--gym-packages", "families_here"]) == 1
@@ -159,7 +181,8 @@ def test_modules_that_register_environments_are_found_in_the_working_folder(
     for name in ("families_there", "families_here.py"):
         assert cli.main([*command, "--gym-packages", name]) == 1
         assert (
-            f"--gym-packages {name}: there is no such module, neither installed nor in {tmp_path}" in capsys.readouterr().err
+            f"--gym-packages {name}: there is no such module, neither installed nor in {tmp_path}"
+            in capsys.readouterr().err
         )
 
 
@@ -176,14 +199,24 @@ def without_display(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "platform", "linux")
 
 
-@pytest.mark.parametrize(("libraries", "expected"), [({"EGL", "OSMesa"}, "egl"), ({"OSMesa"}, "osmesa"), (set(), None)])
-def test_rendering_without_a_display(monkeypatch: pytest.MonkeyPatch, libraries: set[str], expected: str | None) -> None:
+@pytest.mark.parametrize(
+    ("libraries", "expected"), [({"EGL", "OSMesa"}, "egl"), ({"OSMesa"}, "osmesa"), (set(), None)]
+)
+def test_rendering_without_a_display(
+    monkeypatch: pytest.MonkeyPatch, libraries: set[str], expected: str | None
+) -> None:
     without_display(monkeypatch)
-    monkeypatch.setattr("ctypes.util.find_library", lambda name: f"lib{name}.so" if name in libraries else None)
+    monkeypatch.setattr(
+        "ctypes.util.find_library", lambda name: f"lib{name}.so" if name in libraries else None
+    )
     monkeypatch.setenv("MUJOCO_GL", "")  # so that monkeypatch restores it afterwards
     monkeypatch.delenv("MUJOCO_GL")
     assert headless.can_draw() == (expected is not None)
-    with contextlib.nullcontext() if expected else pytest.raises(RuntimeError, match="install libegl1"):
+    with (
+        contextlib.nullcontext()
+        if expected
+        else pytest.raises(RuntimeError, match="install libegl1")
+    ):
         headless.choose_headless_backend()
     assert os.environ.get("MUJOCO_GL") == expected
 

@@ -12,12 +12,33 @@ import numpy as np
 import pytest
 from rl_zoo3.utils import SimpleLinearSchedule
 
-from sb3_poem import PEARLSAC, POEMSAC, MistakeOracle, Preference, PreferenceAdapter, ReturnOracle, TaskVecEnv, cli
-from sb3_poem.adaptation import AdaptedPolicy, evaluate_adaptation, information_limit, known_task_return
+from sb3_poem import (
+    PEARLSAC,
+    POEMSAC,
+    MistakeOracle,
+    Preference,
+    PreferenceAdapter,
+    ReturnOracle,
+    TaskVecEnv,
+    cli,
+)
+from sb3_poem.adaptation import (
+    AdaptedPolicy,
+    evaluate_adaptation,
+    information_limit,
+    known_task_return,
+)
 from sb3_poem.cli.subject import parse_env_kwargs
 from sb3_poem.label import Store
 
-SMALL = {"gradient_steps": 5, "meta_batch_size": 4, "batch_size": 16, "context_size": 16, "n_train_tasks": 12, "seed": 3}
+SMALL = {
+    "gradient_steps": 5,
+    "meta_batch_size": 4,
+    "batch_size": 16,
+    "context_size": 16,
+    "n_train_tasks": 12,
+    "seed": 3,
+}
 ENV_ID = "poem/PointGoal-v0"
 TINY = ["--env-kwargs", "width:48", "height:48"]  # videos that are made quickly
 
@@ -40,8 +61,23 @@ def test_json_holds_what_the_library_measures(
     model: tuple[POEMSAC, str], tmp_path: Path, inference: str, options: dict[str, int]
 ) -> None:
     file = tmp_path / "new" / "result.json"
-    flags = ["--oracle", "mistake", "--mistake-rate", 0.0, "--queries", 3, "--tasks", 4, "--episodes", 2, "--seed", 5]
-    flags += [flag for name, value in options.items() for flag in (f"--{name.replace('_', '-')}", value)]
+    flags = [
+        "--oracle",
+        "mistake",
+        "--mistake-rate",
+        0.0,
+        "--queries",
+        3,
+        "--tasks",
+        4,
+        "--episodes",
+        2,
+        "--seed",
+        5,
+    ]
+    flags += [
+        flag for name, value in options.items() for flag in (f"--{name.replace('_', '-')}", value)
+    ]
     assert adapt(model[1], *flags, "--inference", inference, "--json", file) == 0
     result = json.loads(file.read_text())
 
@@ -63,27 +99,59 @@ def test_json_holds_what_the_library_measures(
     assert result["queries"] == [0, 1, 2, 3]
     np.testing.assert_allclose(result["task_returns"], expected.task_returns, rtol=1e-4)
     np.testing.assert_allclose(result["mean_return"], np.mean(result["task_returns"], axis=0))
-    known = known_task_return(POEMSAC.load(model[1]), vec_env, tasks, n_episodes=2, seed=5, selection_episodes=2)
+    known = known_task_return(
+        POEMSAC.load(model[1]), vec_env, tasks, n_episodes=2, seed=5, selection_episodes=2
+    )
     assert result["known_task_return"] == pytest.approx(known.mean_return, rel=1e-4)
-    assert result["limit"] == pytest.approx([information_limit(known.candidate_returns, k) for k in range(4)], rel=1e-4)
+    assert result["limit"] == pytest.approx(
+        [information_limit(known.candidate_returns, k) for k in range(4)], rel=1e-4
+    )
     assert result["limit"] == sorted(result["limit"])
     assert result["seed"] == 5
     assert result["versions"]["mujoco"] == "3.3.0"
-    assert {result["oracle"], result["inference"], result["env_id"]} == {"mistake", inference, ENV_ID}
+    assert {result["oracle"], result["inference"], result["env_id"]} == {
+        "mistake",
+        inference,
+        ENV_ID,
+    }
 
 
-def test_table_plot_and_video(model: tuple[POEMSAC, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_table_plot_and_video(
+    model: tuple[POEMSAC, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     imageio = pytest.importorskip("imageio.v3")
     plot, video = tmp_path / "plot.png", tmp_path / "video.gif"
-    flags = ["--env", ENV_ID, "--queries", 2, "--tasks", 2, "--episodes", 1, "--record", 0, 2, *TINY]
+    flags = [
+        "--env",
+        ENV_ID,
+        "--queries",
+        2,
+        "--tasks",
+        2,
+        "--episodes",
+        1,
+        "--record",
+        0,
+        2,
+        *TINY,
+    ]
     assert adapt(model[1], *flags, "--plot", plot, "--video", video) == 0
     shown = capsys.readouterr().out
     for words in ("answers", "limit", "std. error", "task known", str(plot), str(video)):
         assert words in shown
     prose = " ".join(shown.split())
-    assert "task known: the best of 300 policies for each task, measured anew on 1 episodes" in prose
-    assert "limit: the best 2^answers of those 300 for these very tasks, chosen with the tasks in sight" in prose
-    assert shown.index("after 0 answers: return") < shown.index("after 2 answers: return") < shown.index("task known")
+    assert (
+        "task known: the best of 300 policies for each task, measured anew on 1 episodes" in prose
+    )
+    assert (
+        "limit: the best 2^answers of those 300 for these very tasks, chosen with the tasks in sight"
+        in prose
+    )
+    assert (
+        shown.index("after 0 answers: return")
+        < shown.index("after 2 answers: return")
+        < shown.index("task known")
+    )
     assert plot.read_bytes().startswith(b"\x89PNG")
     frames = imageio.imread(video, index=None)
     assert len(frames) == model[0].horizon
@@ -98,20 +166,53 @@ def test_the_environment_is_made_as_in_training(tmp_path: Path) -> None:
     for given, expected in (([], 0.09), (["--env-kwargs", "step_length:0.02"], 0.02)):
         for name in ("model.zip", "folder"):
             file = tmp_path / "result.json"
-            flags = ["--queries", 1, "--tasks", 2, "--episodes", 2, "--record", 0, "--seed", 5, "--json", file, *given]
+            flags = [
+                "--queries",
+                1,
+                "--tasks",
+                2,
+                "--episodes",
+                2,
+                "--record",
+                0,
+                "--seed",
+                5,
+                "--json",
+                file,
+                *given,
+            ]
             assert adapt(str(tmp_path / name), *flags) == 0
             result = json.loads(file.read_text())
             assert result["env_kwargs"] == {"step_length": expected}
             vec_env = TaskVecEnv.from_id(ENV_ID, 4, step_length=expected)
-            evaluation = evaluate_adaptation(trained, vec_env, np.array(result["tasks"]), record_at=[0], n_episodes=2, seed=5)
-            assert result["mean_return"] == pytest.approx(evaluation.mean_returns.tolist(), rel=1e-4)
+            evaluation = evaluate_adaptation(
+                trained, vec_env, np.array(result["tasks"]), record_at=[0], n_episodes=2, seed=5
+            )
+            assert result["mean_return"] == pytest.approx(
+                evaluation.mean_returns.tolist(), rel=1e-4
+            )
 
 
 def test_same_seed_same_result_and_fresh_tasks(model: tuple[POEMSAC, str], tmp_path: Path) -> None:
     results = []
     for name, seed in (("a", 3), ("b", 3), ("c", 4)):
         file = tmp_path / f"{name}.json"
-        assert adapt(model[1], "--queries", 1, "--tasks", 3, "--episodes", 1, "--seed", seed, "--json", file) == 0
+        assert (
+            adapt(
+                model[1],
+                "--queries",
+                1,
+                "--tasks",
+                3,
+                "--episodes",
+                1,
+                "--seed",
+                seed,
+                "--json",
+                file,
+            )
+            == 0
+        )
         results.append(json.loads(file.read_text()))
     assert results[0]["task_returns"] == results[1]["task_returns"]
     assert results[0]["tasks"] != results[2]["tasks"]
@@ -119,7 +220,9 @@ def test_same_seed_same_result_and_fresh_tasks(model: tuple[POEMSAC, str], tmp_p
     assert not np.isin(np.array(results[0]["tasks"]), model[0].train_tasks.tasks).any()
 
 
-def test_pretrained_folder_and_the_other_algorithm(model: tuple[POEMSAC, str], tmp_path: Path) -> None:
+def test_pretrained_folder_and_the_other_algorithm(
+    model: tuple[POEMSAC, str], tmp_path: Path
+) -> None:
     flags = ["--queries", 1, "--tasks", 2, "--episodes", 1, "--json", tmp_path / "result.json"]
     model[0].save_pretrained(tmp_path / "folder")
     assert adapt(str(tmp_path / "folder"), *flags) == 0
@@ -130,18 +233,46 @@ def test_pretrained_folder_and_the_other_algorithm(model: tuple[POEMSAC, str], t
 
 def test_a_model_with_a_schedule_of_rl_zoo3_in_a_process_of_its_own(tmp_path: Path) -> None:
     """Such a model brings rl_zoo3 with it, which replaces one of Gymnasium's wrappers."""
-    model = POEMSAC("MlpPolicy", ENV_ID, SimpleLinearSchedule(1e-3), policy_kwargs={"net_arch": [16, 16]}, **SMALL)
+    model = POEMSAC(
+        "MlpPolicy",
+        ENV_ID,
+        SimpleLinearSchedule(1e-3),
+        policy_kwargs={"net_arch": [16, 16]},
+        **SMALL,
+    )
     model.learn(300).save(tmp_path / "model.zip")
-    flags = ["--model", str(tmp_path / "model"), "--queries", "1", "--tasks", "1", "--episodes", "1"]
+    flags = [
+        "--model",
+        str(tmp_path / "model"),
+        "--queries",
+        "1",
+        "--tasks",
+        "1",
+        "--episodes",
+        "1",
+    ]
     command = [sys.executable, "-m", "sb3_poem.cli", "adapt", *flags]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "task known" in done.stdout
 
 
-def test_a_person_answers_with_a_task(model: tuple[POEMSAC, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_person_answers_with_a_task(
+    model: tuple[POEMSAC, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     answer_by(monkeypatch, tmp_path, "what?\nr\n")
-    flags = ["--oracle", "human", "--queries", 1, "--task", 1.25, "--episodes", 1, "--json", tmp_path / "result.json"]
+    flags = [
+        "--oracle",
+        "human",
+        "--queries",
+        1,
+        "--task",
+        1.25,
+        "--episodes",
+        1,
+        "--json",
+        tmp_path / "result.json",
+    ]
     assert adapt(model[1], *flags, *TINY) == 0
     result = json.loads((tmp_path / "result.json").read_text())
     assert result["answers"] == [["right"]]
@@ -154,7 +285,12 @@ def test_a_person_answers_by_their_own_wish(
 ) -> None:
     answer_by(monkeypatch, tmp_path, "l\n")
     state, video = tmp_path / "state.json", tmp_path / "video.gif"
-    assert adapt(model[1], "--oracle", "human", "--queries", 1, "--json", state, "--video", video, *TINY) == 0
+    assert (
+        adapt(
+            model[1], "--oracle", "human", "--queries", 1, "--json", state, "--video", video, *TINY
+        )
+        == 0
+    )
     assert video.is_file()
     adapter = PreferenceAdapter.load(state, model[0], ENV_ID)
     assert adapter.done
@@ -169,7 +305,10 @@ def answer_by(monkeypatch: pytest.MonkeyPatch, folder: Path, answers: str | None
 
 
 def test_a_person_who_stops_goes_on_later_as_if_they_had_not(
-    model: tuple[POEMSAC, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    model: tuple[POEMSAC, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     flags = ["--oracle", "human", "--queries", 3, "--seed", 2, *TINY]
     answer_by(monkeypatch, tmp_path / "at once", "l\nr\nl\n")
@@ -195,7 +334,11 @@ def test_a_person_who_stops_goes_on_later_as_if_they_had_not(
     assert adapt(model[1], *flags, "--resume", "--save", "policy.safetensors") == 0
     np.testing.assert_array_equal(AdaptedPolicy.load("policy.safetensors").latent, expected)
     (session,) = Store("label_data").sessions()
-    assert [row["preference"] for row in Store("label_data").answers(session.id)] == ["left", "right", "left"]
+    assert [row["preference"] for row in Store("label_data").answers(session.id)] == [
+        "left",
+        "right",
+        "left",
+    ]
 
 
 def interrupt(*_: object, **__: object) -> str:
@@ -210,15 +353,22 @@ class ThenInterrupt(io.StringIO):
 
 
 def test_a_session_of_another_model_of_that_name_is_not_gone_on_with(
-    model: tuple[POEMSAC, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    model: tuple[POEMSAC, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     flags = ["--oracle", "human", "--queries", 2, *TINY]
     answer_by(monkeypatch, tmp_path, "l\n")
     assert adapt(model[1], *flags, "--resume") == 0
     assert "There is nothing to go on with" in capsys.readouterr().out
-    POEMSAC("MlpPolicy", ENV_ID, policy_kwargs={"net_arch": [16, 16]}, **{**SMALL, "seed": 4}).save(tmp_path / "model.zip")
+    POEMSAC("MlpPolicy", ENV_ID, policy_kwargs={"net_arch": [16, 16]}, **{**SMALL, "seed": 4}).save(
+        tmp_path / "model.zip"
+    )
     answer_by(monkeypatch, tmp_path, "l\n")
-    assert adapt("model.zip", *flags, "--resume", "--candidates", "prior") == 0  # other options, so another session
+    assert (
+        adapt("model.zip", *flags, "--resume", "--candidates", "prior") == 0
+    )  # other options, so another session
     capsys.readouterr()
     assert adapt(model[1], *flags, "--resume", "--candidates", "prior") == 1
     assert "question 1 of session 2 was another one" in capsys.readouterr().err
@@ -278,7 +428,9 @@ def test_an_interrupt_before_anything_was_measured(
 def test_the_policy_of_one_task_is_saved(model: tuple[POEMSAC, str], tmp_path: Path) -> None:
     flags = ["--queries", 2, "--task", 1.0, "--episodes", 1, "--save", tmp_path / "a.safetensors"]
     assert adapt(model[1], *flags) == 0
-    expected = evaluate_adaptation(model[0], TaskVecEnv.from_id(ENV_ID, 2), np.array([[1.0]]), record_at=[2], n_episodes=1)
+    expected = evaluate_adaptation(
+        model[0], TaskVecEnv.from_id(ENV_ID, 2), np.array([[1.0]]), record_at=[2], n_episodes=1
+    )
     saved = AdaptedPolicy.load(tmp_path / "a.safetensors")
     np.testing.assert_allclose(saved.latent, expected.latents[0, -1], rtol=1e-4)
 
@@ -295,7 +447,10 @@ def test_the_policy_of_one_task_is_saved(model: tuple[POEMSAC, str], tmp_path: P
         (["--oracle", "human", "--tasks", 3], "one task"),
         (["--queries", 5, "--record", 0, 6], "--record 6 is more than --queries 5"),
         (["--oracle", "human", "--plot", "a.png"], "--plot needs returns"),
-        (["--save", "a.safetensors"], "--save keeps the policy of one task, but 30 are adapted: add --tasks 1"),
+        (
+            ["--save", "a.safetensors"],
+            "--save keeps the policy of one task, but 30 are adapted: add --tasks 1",
+        ),
         (["--save", "a.zip", "--tasks", 1], "must end in .safetensors"),
         (["--store", "a"], "--store is about a person's answers, but --oracle is return"),
         (["--resume"], "--resume is about a person's answers, but --oracle is return"),

@@ -36,14 +36,18 @@ def test_enjoy_adapts_then_shows_the_policy_in_a_window(
     monkeypatch.setenv("DISPLAY", ":0")
     gym.register("Watched-v0", WatchedEnv, max_episode_steps=25)
     try:
-        assert show("enjoy", "--model", "PointGoal", "--env", "Watched-v0", "--task", 1.0, *QUICK) == 0
+        assert (
+            show("enjoy", "--model", "PointGoal", "--env", "Watched-v0", "--task", 1.0, *QUICK) == 0
+        )
     finally:
         del gym.registry["Watched-v0"]
     assert len(WatchedEnv.tasks) >= 2 * 25
     assert set(WatchedEnv.tasks) == {1.0}
     task, policy, *episodes = capsys.readouterr().out.splitlines()
     assert task == "Task of Watched-v0: 1"
-    assert policy.startswith("Policy of PointGoal, adapted by the oracle that knows the return: return -")
+    assert policy.startswith(
+        "Policy of PointGoal, adapted by the oracle that knows the return: return -"
+    )
     assert policy.endswith(" after 2 answers")
     adapted = float(policy.rpartition("return ")[2].split()[0])
     shown = [float(line.split("return ")[1].split()[0]) for line in episodes]
@@ -51,17 +55,35 @@ def test_enjoy_adapts_then_shows_the_policy_in_a_window(
 
 
 def test_the_best_policy_for_a_known_task(capsys: pytest.CaptureFixture[str]) -> None:
-    assert show("enjoy", "--model", "PointGoal", "--task", 1.0, "--known-task", "--no-render", "--episodes", 2) == 0
+    assert (
+        show(
+            "enjoy",
+            "--model",
+            "PointGoal",
+            "--task",
+            1.0,
+            "--known-task",
+            "--no-render",
+            "--episodes",
+            2,
+        )
+        == 0
+    )
     shown = capsys.readouterr().out
     assert "Policy of PointGoal: the best of 300 for this task; return -" in shown
     assert float(shown.splitlines()[-1].split("return ")[1].split()[0]) > -14
 
 
-def test_a_policy_that_was_saved_is_shown_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_policy_that_was_saved_is_shown_as_it_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     model, file = load_model("PointGoal", "cpu"), tmp_path / "policy.safetensors"
     AdaptedPolicy(model, np.zeros(model.latent_dim)).save(file)
     assert show("enjoy", "--model", file, "--no-render", "--episodes", 1) == 0
-    assert capsys.readouterr().out.splitlines() == [f"Policy: that in {file}, which is adapted already", "Episode 1: 25 steps"]
+    assert capsys.readouterr().out.splitlines() == [
+        f"Policy: that in {file}, which is adapted already",
+        "Episode 1: 25 steps",
+    ]
     assert show("enjoy", "--model", file, "--no-render", "--episodes", 1, "--task", 1.0) == 0
     assert "return -" in capsys.readouterr().out
     assert show("enjoy", "--model", file, "--no-render", "--known-task") == 1
@@ -70,12 +92,28 @@ def test_a_policy_that_was_saved_is_shown_as_it_is(tmp_path: Path, capsys: pytes
     assert "is a policy that is adapted already" in capsys.readouterr().err
 
 
-def test_record_video_films_before_and_after_or_one_policy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_record_video_films_before_and_after_or_one_policy(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     imageio = pytest.importorskip("imageio.v3")
     pair, one = tmp_path / "pair.gif", tmp_path / "one.gif"
     assert show("record-video", "--model", "PointGoal", "--out", pair, *QUICK, *TINY) == 0
     assert "after 2 answers" in capsys.readouterr().out
-    assert show("record-video", "--model", "PointGoal", "--out", one, "--queries", 0, "--episodes", 1, *TINY) == 0
+    assert (
+        show(
+            "record-video",
+            "--model",
+            "PointGoal",
+            "--out",
+            one,
+            "--queries",
+            0,
+            "--episodes",
+            1,
+            *TINY,
+        )
+        == 0
+    )
     two_clips, clip = imageio.imread(pair, index=None), imageio.imread(one, index=None)
     assert len(two_clips) == len(clip) == 25
     assert two_clips.shape[2] > 2 * clip.shape[2]
@@ -95,9 +133,18 @@ def test_record_video_films_before_and_after_or_one_policy(tmp_path: Path, capsy
         ),
         (["enjoy", "--no-render", "--model", "PointGoaal"], "Did you mean 'PointGoal'?"),
         (["enjoy", "--algo", "ppo", "--env", "Pendulum-v1"], "add --no-render"),
-        (["enjoy", "--model", "PointGoal", "--no-render", "--device", "gpu"], "--device gpu: there is no such device"),
-        (["record-video", "--model", "PointGoal", "--out", "a.avi"], "--out a.avi: the name must end in .mp4 or .gif"),
-        (["record-video", "--model", "PointGoal", "--out", "a.gif", "--task", 1, 2], "--task needs 1 numbers"),
+        (
+            ["enjoy", "--model", "PointGoal", "--no-render", "--device", "gpu"],
+            "--device gpu: there is no such device",
+        ),
+        (
+            ["record-video", "--model", "PointGoal", "--out", "a.avi"],
+            "--out a.avi: the name must end in .mp4 or .gif",
+        ),
+        (
+            ["record-video", "--model", "PointGoal", "--out", "a.gif", "--task", 1, 2],
+            "--task needs 1 numbers",
+        ),
     ],
 )
 def test_what_cannot_be_shown_is_said(

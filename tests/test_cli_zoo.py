@@ -52,7 +52,18 @@ def config(tmp_path: Path) -> Path:
 
 
 def train(*arguments: object) -> int:
-    return cli.main(["train", "--env", "poem/PointGoal-v0", "--seed", "0", "--verbose", "0", *map(str, arguments)])
+    return cli.main(
+        [
+            "train",
+            "--env",
+            "poem/PointGoal-v0",
+            "--seed",
+            "0",
+            "--verbose",
+            "0",
+            *map(str, arguments),
+        ]
+    )
 
 
 def test_algorithms_are_registered() -> None:
@@ -62,11 +73,19 @@ def test_algorithms_are_registered() -> None:
     assert {"poem_sac", "pearl_sac"} <= set(HYPERPARAMS_SAMPLER) & set(HYPERPARAMS_CONVERTER)
 
 
-ENTRY = {"gamma": 0.85, "learning_rate": SimpleLinearSchedule(5e-3), "batch_size": 32, "kl_coef": 0.4, "reward_coef": 0.0}
+ENTRY = {
+    "gamma": 0.85,
+    "learning_rate": SimpleLinearSchedule(5e-3),
+    "batch_size": 32,
+    "kl_coef": 0.4,
+    "reward_coef": 0.0,
+}
 
 
 @pytest.mark.parametrize("algorithm", ["poem_sac", "pearl_sac"])
-def test_sampled_hyperparameters_are_arguments_of_the_algorithm_around_the_entry(algorithm: str) -> None:
+def test_sampled_hyperparameters_are_arguments_of_the_algorithm_around_the_entry(
+    algorithm: str,
+) -> None:
     register_algorithms()
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     draws = []
@@ -75,24 +94,37 @@ def test_sampled_hyperparameters_are_arguments_of_the_algorithm_around_the_entry
         draws.append(HYPERPARAMS_SAMPLER[algorithm](trial, 2, 1, {"entry": ENTRY}))
         check_keys(list(draws[-1]), algorithm, "the sampler")
         assert HYPERPARAMS_CONVERTER[algorithm](trial.params) == draws[-1]
-    for name, low, high in (("kl_coef", 0.1, 1.6), ("batch_size", 16, 64), ("gamma", 0.4, 0.9625), ("latent_dim", 3, 10)):
+    for name, low, high in (
+        ("kl_coef", 0.1, 1.6),
+        ("batch_size", 16, 64),
+        ("gamma", 0.4, 0.9625),
+        ("latent_dim", 3, 10),
+    ):
         values = [draw[name] for draw in draws]
         middle = sorted(values)[20]
         assert low <= min(values) < middle < max(values) <= high + 1e-9, name
-    rates = [float(draw["learning_rate"].removeprefix("lin_")) for draw in draws]  # the schedule stays
+    rates = [
+        float(draw["learning_rate"].removeprefix("lin_")) for draw in draws
+    ]  # the schedule stays
     assert 1.25e-3 <= min(rates) < 5e-3 < max(rates) <= 2e-2
     assert "reward_coef" not in draws[0]  # nothing lies around 0
     assert ("preference_coef" in draws[0]) == (algorithm == "poem_sac")
 
 
-@pytest.mark.parametrize("file", sorted(resources.shipped_folder("zoo_configs").glob("*.yml")), ids=lambda file: file.name)
+@pytest.mark.parametrize(
+    "file",
+    sorted(resources.shipped_folder("zoo_configs").glob("*.yml")),
+    ids=lambda file: file.name,
+)
 def test_shipped_hyperparameters_are_known_and_cover_the_environments(file: Path) -> None:
     import gymnasium as gym
 
     register_algorithms()
     algorithm = "pearl_sac" if file.stem.startswith("pearl") else "poem_sac"
     entries = yaml.safe_load(file.read_text())
-    assert "default" in entries or {name for name in gym.registry if name.startswith("poem/")} <= set(entries)
+    assert "default" in entries or {
+        name for name in gym.registry if name.startswith("poem/")
+    } <= set(entries)
     for env_id, entry in entries.items():
         check_keys(list(entry), algorithm, f"{file}, {env_id}")
         assert entry["policy"] == "MlpPolicy"
@@ -109,7 +141,9 @@ def test_what_only_sac_takes_is_refused_by_the_same_words(
     assert UNSUPPORTED[key] in error
 
 
-def test_train_then_enjoy_then_continue(config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_train_then_enjoy_then_continue(
+    config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     logs = tmp_path / "logs"
     assert train("-c", config, "-f", logs, "--eval-freq", -1) == 0
     run = logs / "poem_sac" / "poem-PointGoal-v0_1"
@@ -119,7 +153,18 @@ def test_train_then_enjoy_then_continue(config: Path, tmp_path: Path, capsys: py
     assert saved["n_train_tasks"] == len(model.task_latents) == 6
 
     capsys.readouterr()
-    enjoy = ["enjoy", "--env", "poem/PointGoal-v0", "-f", str(logs), "--no-render", "--episodes", "2", "--queries", "1"]
+    enjoy = [
+        "enjoy",
+        "--env",
+        "poem/PointGoal-v0",
+        "-f",
+        str(logs),
+        "--no-render",
+        "--episodes",
+        "2",
+        "--queries",
+        "1",
+    ]
     assert cli.main(enjoy) == 0
     shown = capsys.readouterr().out
     assert f"Policy of {run / 'poem-PointGoal-v0.zip'}, adapted by the oracle" in shown
@@ -129,21 +174,58 @@ def test_train_then_enjoy_then_continue(config: Path, tmp_path: Path, capsys: py
     assert cli.main([*enjoy, "--exp-id", "7"]) == 1
     assert "there is no run 7 of poem_sac on poem/PointGoal-v0" in capsys.readouterr().err
 
-    assert train("-c", config, "-f", logs, "--eval-freq", -1, "-i", run / "poem-PointGoal-v0.zip", "-n", 150) == 0
+    assert (
+        train(
+            "-c",
+            config,
+            "-f",
+            logs,
+            "--eval-freq",
+            -1,
+            "-i",
+            run / "poem-PointGoal-v0.zip",
+            "-n",
+            150,
+        )
+        == 0
+    )
     assert (logs / "poem_sac" / "poem-PointGoal-v0_2" / "poem-PointGoal-v0.zip").is_file()
 
 
 def test_evaluation_is_by_adaptation_and_keeps_the_best(
-    config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    config: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(experiment, "AdaptationEvalCallback", partial(experiment.AdaptationEvalCallback, n_tasks=2))
-    flags = ["-c", config, "-f", tmp_path / "logs", "--eval-freq", 150, "--eval-episodes", 1, "--log-interval", 1]
+    monkeypatch.setattr(
+        experiment, "AdaptationEvalCallback", partial(experiment.AdaptationEvalCallback, n_tasks=2)
+    )
+    flags = [
+        "-c",
+        config,
+        "-f",
+        tmp_path / "logs",
+        "--eval-freq",
+        150,
+        "--eval-episodes",
+        1,
+        "--log-interval",
+        1,
+    ]
     assert train(*flags, "--verbose", 1) == 0
     shown = capsys.readouterr().out
     assert shown.count("Evaluation after") == 2
-    for name in ("return_after_0_queries", "return_after_10_queries", "known_task_return", "preference_accuracy"):
+    for name in (
+        "return_after_0_queries",
+        "return_after_10_queries",
+        "known_task_return",
+        "preference_accuracy",
+    ):
         assert name in shown
-    assert POEMSAC.load(tmp_path / "logs/poem_sac/poem-PointGoal-v0_1/best_model.zip").num_timesteps in (150, 300)
+    assert POEMSAC.load(
+        tmp_path / "logs/poem_sac/poem-PointGoal-v0_1/best_model.zip"
+    ).num_timesteps in (150, 300)
 
 
 def test_evaluation_takes_its_own_arguments_of_the_environment(
@@ -156,21 +238,60 @@ def test_evaluation_takes_its_own_arguments_of_the_environment(
         return make_task_vec_env(env_id, n_envs, **arguments)
 
     monkeypatch.setattr("sb3_poem.adaptation.callback.make_task_vec_env", make)
-    monkeypatch.setattr(experiment, "AdaptationEvalCallback", partial(experiment.AdaptationEvalCallback, n_tasks=2))
+    monkeypatch.setattr(
+        experiment, "AdaptationEvalCallback", partial(experiment.AdaptationEvalCallback, n_tasks=2)
+    )
     flags = ["-c", config, "-f", tmp_path / "logs", "--eval-freq", 300, "--eval-episodes", 1]
     assert train(*flags, "--eval-env-kwargs", "step_length:0.2") == 0
     assert [arguments.get("step_length") for arguments in made] == [0.2]
 
 
-def test_a_search_on_a_family_without_shared_dynamics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_search_on_a_family_without_shared_dynamics(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     gym.register("Windy-v0", lambda **kwargs: WindyWalk(), max_episode_steps=10)
     config = tmp_path / "windy.yml"
-    entry = {"policy": "MlpPolicy", "n_timesteps": 60, "n_envs": 2, **{k: SMALL[k] for k in ("batch_size", "context_size")}}
-    config.write_text(yaml.safe_dump({"Windy-v0": {**entry, "n_train_tasks": 6, "gradient_steps": 2, "meta_batch_size": 2}}))
-    monkeypatch.setitem(SAMPLERS, "poem_sac", lambda trial, *_: {"relabel_fraction": trial.suggest_float("r", 0.2, 0.8)})
-    monkeypatch.setattr(experiment, "TrialAdaptationCallback", partial(experiment.TrialAdaptationCallback, n_tasks=2))
-    flags = ["-optimize", "--n-trials", "1", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots"]
-    command = ["train", "--env", "Windy-v0", "-c", str(config), "-f", str(tmp_path / "logs"), *flags]
+    entry = {
+        "policy": "MlpPolicy",
+        "n_timesteps": 60,
+        "n_envs": 2,
+        **{k: SMALL[k] for k in ("batch_size", "context_size")},
+    }
+    config.write_text(
+        yaml.safe_dump(
+            {"Windy-v0": {**entry, "n_train_tasks": 6, "gradient_steps": 2, "meta_batch_size": 2}}
+        )
+    )
+    monkeypatch.setitem(
+        SAMPLERS,
+        "poem_sac",
+        lambda trial, *_: {"relabel_fraction": trial.suggest_float("r", 0.2, 0.8)},
+    )
+    monkeypatch.setattr(
+        experiment,
+        "TrialAdaptationCallback",
+        partial(experiment.TrialAdaptationCallback, n_tasks=2),
+    )
+    flags = [
+        "-optimize",
+        "--n-trials",
+        "1",
+        "--n-evaluations",
+        "1",
+        "--eval-episodes",
+        "1",
+        "--no-optim-plots",
+    ]
+    command = [
+        "train",
+        "--env",
+        "Windy-v0",
+        "-c",
+        str(config),
+        "-f",
+        str(tmp_path / "logs"),
+        *flags,
+    ]
     try:
         assert cli.main(command) == 0
     finally:
@@ -179,9 +300,13 @@ def test_a_search_on_a_family_without_shared_dynamics(tmp_path: Path, monkeypatc
     assert "COMPLETE" in report.read_text()
 
 
-def test_a_checkpoint_continues_bit_for_bit(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_checkpoint_continues_bit_for_bit(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def weights(run: int) -> dict[str, np.ndarray]:
-        model = POEMSAC.load(tmp_path / f"logs/poem_sac/poem-PointGoal-v0_{run}/poem-PointGoal-v0.zip")
+        model = POEMSAC.load(
+            tmp_path / f"logs/poem_sac/poem-PointGoal-v0_{run}/poem-PointGoal-v0.zip"
+        )
         assert model.num_timesteps == 600
         return {name: value.numpy() for name, value in model.policy.state_dict().items()}
 
@@ -216,15 +341,36 @@ def test_a_checkpoint_continues_bit_for_bit(config: Path, tmp_path: Path, monkey
 def test_hyperparameters_are_searched_around_the_entry_which_comes_first(
     config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(experiment, "TrialAdaptationCallback", partial(experiment.TrialAdaptationCallback, n_tasks=2))
+    monkeypatch.setattr(
+        experiment,
+        "TrialAdaptationCallback",
+        partial(experiment.TrialAdaptationCallback, n_tasks=2),
+    )
     entry = {"gamma": 0.9, "learning_rate": "lin_2e-3", "kl_coef": 0.2, "relabel_fraction": 0.5}
     entry |= {"reward_coef": 0.3, "policy_coef": 0.5, "preference_coef": 3.0}
     write_entry(config, n_timesteps=150, **entry)
-    flags = ["-optimize", "--n-trials", 2, "--n-evaluations", 1, "--eval-episodes", 1, "--no-optim-plots"]
+    flags = [
+        "-optimize",
+        "--n-trials",
+        2,
+        "--n-evaluations",
+        1,
+        "--eval-episodes",
+        1,
+        "--no-optim-plots",
+    ]
     assert train("-c", config, "-f", tmp_path / "logs", *flags) == 0
     (report,) = (tmp_path / "logs" / "poem_sac").glob("report_*.csv")
-    first, second = pd.read_csv(report).filter(like="params_").rename(columns=lambda name: name[7:]).to_dict("records")
-    own = {name: SMALL[name] for name in ("gradient_steps", "batch_size", "context_size", "meta_batch_size")}
+    first, second = (
+        pd.read_csv(report)
+        .filter(like="params_")
+        .rename(columns=lambda name: name[7:])
+        .to_dict("records")
+    )
+    own = {
+        name: SMALL[name]
+        for name in ("gradient_steps", "batch_size", "context_size", "meta_batch_size")
+    }
     own |= {"one_minus_gamma": 0.1, "lin_learning_rate": 2e-3, "latent_dim": 5, "tau": 0.005}
     own |= {name: value for name, value in entry.items() if name.endswith(("_coef", "_fraction"))}
     assert first == pytest.approx(own)
@@ -233,7 +379,9 @@ def test_hyperparameters_are_searched_around_the_entry_which_comes_first(
     assert sum(second[name] != pytest.approx(value) for name, value in own.items()) > 8
 
 
-def test_our_vectorised_environment_collects(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_our_vectorised_environment_collects(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from sb3_poem.common.vec_env import TaskVecEnv
 
     made = []
@@ -263,7 +411,9 @@ def write_entry(path: Path, **changes: object) -> Path:
     return path
 
 
-def test_unknown_key_is_named_with_file_algorithm_and_near_matches(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unknown_key_is_named_with_file_algorithm_and_near_matches(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     config = write_entry(tmp_path / "typo.yml", latent_dims=3)
     assert train("-c", config, "-f", tmp_path / "logs") == 1
     error = capsys.readouterr().err
@@ -272,20 +422,26 @@ def test_unknown_key_is_named_with_file_algorithm_and_near_matches(tmp_path: Pat
     assert not list((tmp_path / "logs").rglob("*.csv")), "nothing may have started"
 
 
-def test_unknown_key_on_the_command_line_is_named(config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unknown_key_on_the_command_line_is_named(
+    config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert train("-c", config, "-f", tmp_path / "logs", "-params", "gama:0.9") == 1
     error = capsys.readouterr().err
     assert "'gama' in -params" in error
     assert "'gamma'" in error
 
 
-def test_a_key_of_poem_is_unknown_to_pearl(config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_key_of_poem_is_unknown_to_pearl(
+    config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_entry(config, preference_coef=1.0)
     assert train("--algo", "pearl_sac", "-c", config, "-f", tmp_path / "logs") == 1
     assert "pearl_sac has no such hyperparameter" in capsys.readouterr().err
 
 
-def test_a_key_that_is_a_flag_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_key_that_is_a_flag_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     config = write_entry(tmp_path / "seed.yml", seed=3)
     assert train("-c", config, "-f", tmp_path / "logs") == 1
     assert "--seed" in capsys.readouterr().err
@@ -295,7 +451,10 @@ def test_a_folder_that_cannot_be_written_is_refused_before_training(
     config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "file").write_text("in the way")
-    for flags in (["-f", tmp_path / "file" / "logs"], ["-f", tmp_path / "logs", "-tb", tmp_path / "file" / "tb"]):
+    for flags in (
+        ["-f", tmp_path / "file" / "logs"],
+        ["-f", tmp_path / "logs", "-tb", tmp_path / "file" / "tb"],
+    ):
         assert train("-c", config, *flags) == 1
         assert f"cannot write to the folder '{flags[-1]}'" in capsys.readouterr().err
 
@@ -306,8 +465,12 @@ def test_broken_yaml_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert f"{tmp_path / 'broken.yml'} is not valid YAML" in capsys.readouterr().err
 
 
-def test_a_number_that_yaml_reads_as_text_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "text.yml").write_text(yaml.safe_dump({"poem/PointGoal-v0": SMALL}) + "  learning_rate: 1e-3\n")
+def test_a_number_that_yaml_reads_as_text_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "text.yml").write_text(
+        yaml.safe_dump({"poem/PointGoal-v0": SMALL}) + "  learning_rate: 1e-3\n"
+    )
     assert train("-c", tmp_path / "text.yml", "-f", tmp_path / "logs") == 1
     error = capsys.readouterr().err
     assert "learning_rate in " in error
@@ -322,13 +485,22 @@ def test_a_number_that_yaml_reads_as_text_is_named(tmp_path: Path, capsys: pytes
         (("-params", "kl_coef:'abc'"), ("kl_coef in -params must be a number, got 'abc'",)),
         (("-params", "kl_coef:'0.1'"), ("kl_coef in -params is the text '0.1'; write 0.1",)),
         (("-params", "batch_size:2.5"), ("batch_size in -params must be a whole number, got 2.5",)),
-        (("-params", "learning_rate:'fast'"), ("learning_rate in -params must be a number, or 'lin_' and a number",)),
-        (("-params", "n_timesteps:0"), ("n_timesteps in -params must be a positive number, got 0",)),
+        (
+            ("-params", "learning_rate:'fast'"),
+            ("learning_rate in -params must be a number, or 'lin_' and a number",),
+        ),
+        (
+            ("-params", "n_timesteps:0"),
+            ("n_timesteps in -params must be a positive number, got 0",),
+        ),
         (("-n", "0"), ("-n/--n-timesteps must be at least 1, got 0",)),
         (("-n", "-300"), ("-n/--n-timesteps must be at least 1, got -300",)),
         (("-c", "missing.yml"), ("-c missing.yml: there is no such file",)),
         (("-c", "missing"), ("-c missing: there is no such module", ".yml")),
-        (("--env", "HalfCheetahVel"), ("--env HalfCheetahVel", "did you mean poem/HalfCheetahVel-v0?")),
+        (
+            ("--env", "HalfCheetahVel"),
+            ("--env HalfCheetahVel", "did you mean poem/HalfCheetahVel-v0?"),
+        ),
         (("--env", "nothing-like-it"), ("--env nothing-like-it", "--gym-packages")),
         (("--gym-packages", "no_module"), ("--gym-packages no_module: there is no such module",)),
     ],
@@ -352,7 +524,10 @@ def test_a_wrong_argument_is_named_before_training(
         ("", "must hold a mapping of hyperparameters for each environment id"),
         ("[1, 2]", "must hold a mapping"),
         ("poem/PointGoal-v0: 5", "must hold a mapping"),
-        ("poem/PointGoal-v0: {policy: MlpPolicy}", "entry 'poem/PointGoal-v0' has no 'n_timesteps'"),
+        (
+            "poem/PointGoal-v0: {policy: MlpPolicy}",
+            "entry 'poem/PointGoal-v0' has no 'n_timesteps'",
+        ),
     ],
 )
 def test_a_file_of_another_form_is_refused(
@@ -374,7 +549,10 @@ def test_what_changes_a_family_is_refused_before_training(
     config = write_entry(tmp_path / "wrapped.yml", **{key: value})
     assert train("--algo", algorithm, "-c", config, "-f", tmp_path / "logs") == 1
     error = capsys.readouterr().err
-    assert f"'{key}' in {config}, entry 'poem/PointGoal-v0' is not for {algorithm}: it changes what is seen or paid" in error
+    assert (
+        f"'{key}' in {config}, entry 'poem/PointGoal-v0' is not for {algorithm}: it changes what is seen or paid"
+        in error
+    )
     assert not list((tmp_path / "logs").rglob("*.csv")), "nothing may have started"
 
 
@@ -385,12 +563,36 @@ def test_an_environment_that_is_no_task_family_is_refused(
     assert "Pendulum-v1 is no task family" in capsys.readouterr().err
 
 
-def test_algorithms_of_rl_zoo3_still_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--algo", "ppo", "--env", "Pendulum-v1", "-n", "256", "--eval-freq", "-1", "--verbose", "0"]
+def test_algorithms_of_rl_zoo3_still_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = [
+        "--algo",
+        "ppo",
+        "--env",
+        "Pendulum-v1",
+        "-n",
+        "256",
+        "--eval-freq",
+        "-1",
+        "--verbose",
+        "0",
+    ]
     settings = ["-params", "n_envs:1", "n_steps:128", "-f", str(tmp_path)]
     assert cli.main(["train", *arguments, *settings]) == 0
     assert (tmp_path / "ppo" / "Pendulum-v1_1" / "Pendulum-v1.zip").is_file()
-    enjoy = ["enjoy", "--algo", "ppo", "--env", "Pendulum-v1", "-f", str(tmp_path), "-n", "200", "--no-render"]
+    enjoy = [
+        "enjoy",
+        "--algo",
+        "ppo",
+        "--env",
+        "Pendulum-v1",
+        "-f",
+        str(tmp_path),
+        "-n",
+        "200",
+        "--no-render",
+    ]
     assert cli.main(enjoy) == 0
     assert "1 Episodes" in capsys.readouterr().out
 
@@ -420,7 +622,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, th.Tensor]:
     config = write_entry(folder / "small.yml")
     assert train("-c", config, "-f", folder, *LONG) == 0
     (run,) = (folder / "poem_sac").iterdir()
-    assert not (run / "checkpoint.zip").exists()  # nobody asked for it, and nothing is left to go on with
+    assert not (
+        run / "checkpoint.zip"
+    ).exists()  # nobody asked for it, and nothing is left to go on with
     return parameters(POEMSAC.load(run / "poem-PointGoal-v0.zip"))
 
 
@@ -480,7 +684,17 @@ def test_an_interrupt_ends_training_after_the_epoch_and_says_how_to_go_on(
 
 def test_an_interrupt_of_the_program(tmp_path: Path, whole: dict[str, th.Tensor]) -> None:
     config = interrupts(tmp_path / "c.yml", {"at": 480})
-    command = [sys.executable, "-m", "sb3_poem.cli", "train", "--env", "poem/PointGoal-v0", "--seed", "0", "-P"]
+    command = [
+        sys.executable,
+        "-m",
+        "sb3_poem.cli",
+        "train",
+        "--env",
+        "poem/PointGoal-v0",
+        "--seed",
+        "0",
+        "-P",
+    ]
     done = subprocess.run(
         [*command, "-c", str(config), "-f", str(tmp_path), *LONG],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
@@ -488,7 +702,10 @@ def test_an_interrupt_of_the_program(tmp_path: Path, whole: dict[str, th.Tensor]
         text=True,
     )
     assert done.returncode == 130, done.stderr
-    assert "Interrupted at 600 of 900 steps; go on with: sb3-poem train --env poem/PointGoal-v0 --seed 0 -P" in done.stderr
+    assert (
+        "Interrupted at 600 of 900 steps; go on with: sb3-poem train --env poem/PointGoal-v0 --seed 0 -P"
+        in done.stderr
+    )
     assert train("-c", config, "-f", tmp_path, *LONG, "--resume") == 0
     assert not differing(parameters(trained(tmp_path, 2)), whole)
 
@@ -501,18 +718,26 @@ def test_a_second_interrupt_stops_at_once_and_loses_no_older_checkpoint(
     assert train(*flags) == 130
     assert train(*flags, "--resume") == 130  # within the first epoch of this run
     error = capfd.readouterr().err.splitlines()[-1]
-    assert error == "Interrupted at 630 of 900 steps, before the first checkpoint; the same command begins again"
+    assert (
+        error
+        == "Interrupted at 630 of 900 steps, before the first checkpoint; the same command begins again"
+    )
     assert train(*flags, "--resume", "-params", "n_timesteps:900", "callback:None") == 0
     assert "after 600 steps" in capfd.readouterr().out
     assert not differing(parameters(trained(tmp_path, 3)), whole)
 
 
-def test_an_interrupt_before_the_first_checkpoint(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_an_interrupt_before_the_first_checkpoint(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     config = interrupts(tmp_path / "c.yml", {"at": 60, "times": 2})
     assert train("-c", config, "-f", tmp_path, *LONG) == 130
     assert "before the first checkpoint; the same command begins again" in capfd.readouterr().err
     assert train("-c", config, "-f", tmp_path, *LONG, "--resume") == 130
-    assert "has no checkpoint of poem/PointGoal-v0 with seed 0; training begins from zero" in capfd.readouterr().out
+    assert (
+        "has no checkpoint of poem/PointGoal-v0 with seed 0; training begins from zero"
+        in capfd.readouterr().out
+    )
     (tmp_path / "poem_sac" / "poem-PointGoal-v0_2" / "poem-PointGoal-v0.zip").write_bytes(b"half")
     assert train("-c", config, "-f", tmp_path, *LONG, "--resume") == 1
     assert "is truncated" in capfd.readouterr().err

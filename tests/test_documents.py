@@ -48,7 +48,9 @@ def learn_little(model: PEARLSAC, *arguments: Any, **options: Any) -> PEARLSAC:
     return LEARN(model, 1, **options)
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if "```python" in (TOP / page).read_text()])
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if "```python" in (TOP / page).read_text()]
+)
 def test_python_blocks_run(page: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(PEARLSAC, "learn", learn_little)
     env = gym.make("poem/HalfCheetahVel-v0", render_mode="rgb_array")
@@ -73,7 +75,9 @@ def test_python_blocks_run(page: str, folder: Path, monkeypatch: pytest.MonkeyPa
 
 def commands(page: str) -> Iterator[str]:
     """The lines of ``sb3-poem`` in a page, without their comments."""
-    for block in re.findall(r"^```\w*\n(.*?)^```", (TOP / page).read_text(), flags=re.DOTALL | re.MULTILINE):
+    for block in re.findall(
+        r"^```\w*\n(.*?)^```", (TOP / page).read_text(), flags=re.DOTALL | re.MULTILINE
+    ):
         for line in block.splitlines():
             if line.startswith("sb3-poem "):
                 yield line.split(" #")[0].strip()
@@ -87,7 +91,9 @@ def test_commands_are_understood(page: str, capsys: pytest.CaptureFixture[str]) 
         assert not others or given.command == "train", command
 
 
-def test_readme_s_commands_run(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_readme_s_commands_run(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     for command in commands("README.md"):
         if any(set(some.split()) <= set(command.split()) for some in ONLY_READ):
             continue
@@ -116,13 +122,17 @@ def test_every_relative_link_leads_somewhere() -> None:
     assert len(pages) > 60
     for page in pages:
         for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text()):
-            assert "://" in target or (page.parent / target).exists(), f"{page.relative_to(TOP)}: {target}"
+            assert "://" in target or (page.parent / target).exists(), (
+                f"{page.relative_to(TOP)}: {target}"
+            )
         for target in re.findall(r"benchmarks/results/[\w*/.-]*[\w/]", page.read_text()):
             assert list(TOP.glob(target)), f"{page.relative_to(TOP)}: {target}"
 
 
 def test_results_are_small_and_listed() -> None:
-    """Each folder has a manifest that names its files: with the command, and the commit that it ran at."""
+    """Each folder has a manifest that names its files: with the command, and the commit that it ran
+    at.
+    """
     results = TOP / "benchmarks/results"
     files = [file for file in results.rglob("*") if file.is_file() and file.suffix != ".pdf"]
     assert sum(file.stat().st_size for file in files) < 4e6

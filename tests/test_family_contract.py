@@ -23,7 +23,15 @@ FAMILIES = [
     *(
         (f"poem/{name}-v0", SMALL)
         for name in (
-            *("PointGoal", "HalfCheetahVel", "HalfCheetahFwdBack", "AntVel", "AntFwdBack", "AntDir2D", "AntGoal"),
+            *(
+                "PointGoal",
+                "HalfCheetahVel",
+                "HalfCheetahFwdBack",
+                "AntVel",
+                "AntFwdBack",
+                "AntDir2D",
+                "AntGoal",
+            ),
             *("HumanoidDir2D", "MetaWorldML1", "FetchReach"),
         )
     ),
@@ -35,13 +43,17 @@ FAMILIES = [
 ]
 
 
-@pytest.mark.parametrize(("env_id", "kwargs"), FAMILIES, ids=lambda value: value if isinstance(value, str) else "")
+@pytest.mark.parametrize(
+    ("env_id", "kwargs"), FAMILIES, ids=lambda value: value if isinstance(value, str) else ""
+)
 def test_every_registered_family_keeps_the_contract(env_id, kwargs):
     check_task_family(env_id, n_steps=8, **kwargs)
 
 
 def test_no_registered_family_is_left_out():
-    assert {env_id for env_id, _ in FAMILIES} == {env_id for env_id in gym.registry if env_id.startswith("poem/")}
+    assert {env_id for env_id, _ in FAMILIES} == {
+        env_id for env_id in gym.registry if env_id.startswith("poem/")
+    }
 
 
 class Walk(TaskFamily):
@@ -240,7 +252,11 @@ class FeaturesThatAreReused(Walk):
 
 class RewardThatDoesNotBroadcast(Walk):
     def _reward(self, tasks, features):
-        return -np.abs(features[0] - tasks[0]) if features.ndim == 1 else -np.abs(features - tasks[:, 0])
+        return (
+            -np.abs(features[0] - tasks[0])
+            if features.ndim == 1
+            else -np.abs(features - tasks[:, 0])
+        )
 
 
 class RewardThatRounds(Walk):
@@ -295,12 +311,16 @@ class SymmetryOfAnotherWidth(Walk):
 
 
 class SymmetryThatScales(Walk):
-    symmetries = (Symmetry(SignedPermutation((0, 1), (-1, 2)), *[SignedPermutation((0,), (-1,))] * 2),)
+    symmetries = (
+        Symmetry(SignedPermutation((0, 1), (-1, 2)), *[SignedPermutation((0,), (-1,))] * 2),
+    )
 
 
 class SymmetryOfUnevenActions(Walk):
     action_space = spaces.Box(-1.0, 2.0, (1,), np.float32)
-    symmetries = (Symmetry(SignedPermutation((0, 1), (-1, 1)), *[SignedPermutation((0,), (-1,))] * 2),)
+    symmetries = (
+        Symmetry(SignedPermutation((0, 1), (-1, 1)), *[SignedPermutation((0,), (-1,))] * 2),
+    )
 
 
 class InfinitePotential(Walk):
@@ -316,7 +336,10 @@ BROKEN = [
     (NoFeatureDim, "reward_feature_dim must be a whole number"),
     (TwiceTheSameTask, "all_tasks must hold every task once"),
     (TasksOutsideTheirSpace, "all_tasks must have shape .* lie in task_space"),
-    (Float32Observations, "reset must return an observation of observation_space's shape .* dtype float32"),
+    (
+        Float32Observations,
+        "reset must return an observation of observation_space's shape .* dtype float32",
+    ),
     (ObservationsOutsideTheirSpace, "reset returned .* not inside observation_space .* widen it"),
     (NotANumber, "finite float as reward, but gave nan"),
     (FeaturesOfAnotherWidth, r'info\["reward_features"\] must be .* shape \(reward_feature_dim,\)'),
@@ -357,7 +380,9 @@ def test_the_good_family_passes():
     check_task_family(Walk)
 
 
-@pytest.mark.parametrize(("family", "message"), BROKEN, ids=lambda value: getattr(value, "__name__", ""))
+@pytest.mark.parametrize(
+    ("family", "message"), BROKEN, ids=lambda value: getattr(value, "__name__", "")
+)
 def test_each_violation_has_its_message(family, message):
     with pytest.raises(AssertionError, match=f"(?s){message}"):
         check_task_family(family)
@@ -370,7 +395,9 @@ class _Batch(BatchFamily):
     wrong = ""
 
     def __init__(self, **kwargs):
-        super().__init__(observation_space=Walk.observation_space, action_space=Walk.action_space, **kwargs)
+        super().__init__(
+            observation_space=Walk.observation_space, action_space=Walk.action_space, **kwargs
+        )
 
     def _allocate(self, n):
         self._x = np.zeros((n, 2))
@@ -412,7 +439,9 @@ class _Batch(BatchFamily):
 def test_a_vectorised_version_that_differs(wrong, message):
     single = type("Single", (_Batch, BatchTaskFamily), {"wrong": wrong})
     vector = type("Vector", (_Batch, TaskFamilyVector), {"wrong": wrong})
-    gym.register("test/Differs-v0", entry_point=single, vector_entry_point=vector, max_episode_steps=5)
+    gym.register(
+        "test/Differs-v0", entry_point=single, vector_entry_point=vector, max_episode_steps=5
+    )
     try:
         with pytest.raises(AssertionError, match=f"{message} must equal the single environment's"):
             check_task_family("test/Differs-v0")
@@ -425,7 +454,10 @@ def test_a_vectorised_version_that_differs(wrong, message):
     [
         ({"vector_entry_point": WalkVector}, "must have a time limit.*max_episode_steps"),
         (
-            {"vector_entry_point": lambda **kwargs: gym.vector.SyncVectorEnv([Walk]), "max_episode_steps": 5},
+            {
+                "vector_entry_point": lambda **kwargs: gym.vector.SyncVectorEnv([Walk]),
+                "max_episode_steps": 5,
+            },
             "must make a poem_envs.TaskFamilyVector.*functools.partial",
         ),
     ],

@@ -131,9 +131,7 @@ CONSTRUCTOR = [
     works("tau", lambda _: changed(tau=0.5)),
     works("gamma", lambda _: changed(gamma=0.5)),
     works(
-        "gradient_steps",
-        lambda _: made(gradient_steps=-1, n_train_tasks=2).learn(1)._n_updates,
-        50,
+        "gradient_steps", lambda _: made(gradient_steps=-1, n_train_tasks=2).learn(1)._n_updates, 50
     ),
     works("n_steps", lambda _: changed(n_steps=3)),
     works("ent_coef auto", lambda _: 0.09 < learned(ent_coef="auto_0.1").log_ent_coef.exp() < 0.11),
@@ -366,14 +364,11 @@ FILES = [
     works("actor", lambda _: trained().actor is trained().policy.actor),
     works("critic_target", lambda _: not same(trained().critic, trained().critic_target)),
     works(
-        "deepcopy of a policy",
-        lambda _: same(copy.deepcopy(trained().policy), trained().policy),
+        "deepcopy of a policy", lambda _: same(copy.deepcopy(trained().policy), trained().policy)
     ),
     works("deepcopy of a model", lambda _: copy.deepcopy(trained()).learn(1).num_timesteps, EPOCH),
     works(
-        "from_pretrained a name",
-        lambda _: POEMSAC.from_pretrained("PointGoal").env_id,
-        POINT_GOAL,
+        "from_pretrained a name", lambda _: POEMSAC.from_pretrained("PointGoal").env_id, POINT_GOAL
     ),
     works(
         "pickle an adapted policy",
@@ -403,7 +398,9 @@ PREDICT = [
     ),
     works(
         "deterministic",
-        lambda _: np.array_equal(*(trained().predict(OBS, np.zeros(5), deterministic=True)[0] for _ in "12")),
+        lambda _: np.array_equal(
+            *(trained().predict(OBS, np.zeros(5), deterministic=True)[0] for _ in "12")
+        ),
     ),
     works("policy.predict", lambda _: trained().policy.predict(OBS, np.zeros(5))[0].shape, (6, 2)),
     works(
@@ -491,9 +488,7 @@ ENVIRONMENTS = [
     works("render_mode", lambda _: on(point(render_mode="rgb_array")).n_envs, 1),
     works("TimeLimit", lambda _: on(wrappers.TimeLimit(point().unwrapped, 25)).horizon, 25),
     works(
-        "RecordEpisodeStatistics",
-        lambda _: on(wrappers.RecordEpisodeStatistics(point())).n_envs,
-        1,
+        "RecordEpisodeStatistics", lambda _: on(wrappers.RecordEpisodeStatistics(point())).n_envs, 1
     ),
     works("Monitor", lambda f: on(Monitor(point(), str(f / "a"))) and names(f), ["a.monitor.csv"]),
     works("DummyVecEnv", lambda _: on(DummyVecEnv([point] * 3)).n_envs, 3),
@@ -522,9 +517,7 @@ ENVIRONMENTS = [
     works("RecordVideo", lambda f: filmed(f, recorder), [".mp4"]),
     works("VecVideoRecorder", lambda f: filmed(f, vec_recorder), [".mp4"]),
     works(
-        "set_task",
-        lambda _: tasks(point(), lambda env: sb3_poem.set_task(env, [1.25])),
-        [1.25] * 2,
+        "set_task", lambda _: tasks(point(), lambda env: sb3_poem.set_task(env, [1.25])), [1.25] * 2
     ),
     works(
         "get_wrapper_attr",
@@ -564,21 +557,15 @@ CHANGED = [
     refused("VecNormalize", lambda _: on(VecNormalize(points(2))), "VecNormalize...without it"),
     refused("VecFrameStack", lambda _: on(VecFrameStack(points(2), 4)), OBSERVATIONS),
     refused(
-        "TransformReward",
-        lambda _: inside(wrappers.TransformReward, lambda r: 10 * r),
-        REWARDS,
+        "TransformReward", lambda _: inside(wrappers.TransformReward, lambda r: 10 * r), REWARDS
     ),
     refused(
-        "NormalizeReward",
-        lambda _: on(points(2, wrapper_class=wrappers.NormalizeReward)),
-        REWARDS,
+        "NormalizeReward", lambda _: on(points(2, wrapper_class=wrappers.NormalizeReward)), REWARDS
     ),
     refused("NormalizeObservation", lambda _: inside(wrappers.NormalizeObservation), OBSERVATIONS),
     refused("FrameStackObservation", lambda _: inside(stacked, 2), OBSERVATIONS),
     refused(
-        "ClipAction",
-        lambda _: inside(wrappers.ClipAction),
-        "(?i)action...(?i)wrap|without|bound",
+        "ClipAction", lambda _: inside(wrappers.ClipAction), "(?i)action...(?i)wrap|without|bound"
     ),
     refused(
         "RescaleAction",
@@ -586,9 +573,7 @@ CHANGED = [
         "(?i)action...(?i)wrap|without",
     ),
     refused(
-        "a dictionary of observations",
-        lambda _: on(BitFlippingEnv(continuous=True)),
-        "GoalFamily",
+        "a dictionary of observations", lambda _: on(BitFlippingEnv(continuous=True)), "GoalFamily"
     ),
 ]
 
@@ -609,9 +594,7 @@ MISLEADING = [
         id="evaluate_policy",
     ),
     pytest.param(
-        lambda _: PreferenceAdapter(made(), POINT_GOAL),
-        "(?i)train",
-        id="an untrained model",
+        lambda _: PreferenceAdapter(made(), POINT_GOAL), "(?i)train", id="an untrained model"
     ),
 ]
 
@@ -651,9 +634,7 @@ def result(folder: Path, number: int = 1) -> POEMSAC:
 FLAGS = [
     works("-n", lambda run: result(run).num_timesteps, 450),
     works(
-        "-params",
-        lambda run: (result(run).gamma, result(run).policy.net_arch["pi"]),
-        (0.9, [8]),
+        "-params", lambda run: (result(run).gamma, result(run).policy.net_arch["pi"]), (0.9, [8])
     ),
     works("-c", lambda run: result(run).batch_size, ENTRY["batch_size"]),
     works("--seed", lambda run: result(run).seed, 0),
@@ -735,9 +716,7 @@ COMMANDS = [
     ),
     works("record-video", recorded, ["a.gif"]),
     works(
-        "models",
-        lambda _: [name for name in pretrained_names() if name not in said("models")],
-        [],
+        "models", lambda _: [name for name in pretrained_names() if name not in said("models")], []
     ),
     works("python -m sb3_poem", as_a_module, 0),
 ]

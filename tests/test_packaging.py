@@ -25,26 +25,45 @@ def setup_cfg() -> configparser.ConfigParser:
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A wheel of the tracked and untracked files of this tree, built where nothing earlier was built."""
+    """A wheel of the tracked and untracked files of this tree, built where nothing earlier was
+    built.
+    """
     folder = tmp_path_factory.mktemp("wheel")
     source = folder / "source"
     listed = subprocess.run(
-        ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"], cwd=ROOT, check=True, capture_output=True
+        ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
     ).stdout.decode()
     for name in filter(None, listed.split("\0")):
         if (ROOT / name).is_file():
             (source / name).parent.mkdir(parents=True, exist_ok=True)
             (source / name).write_bytes((ROOT / name).read_bytes())
-    command = [sys.executable, "-m", "build", "--wheel", "--outdir", str(folder / "dist"), str(source)]
+    command = [
+        sys.executable,
+        "-m",
+        "build",
+        "--wheel",
+        "--outdir",
+        str(folder / "dist"),
+        str(source),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if "ConnectionError" in done.stdout or "No matching distribution found for setuptools" in done.stdout:
+    if (
+        "ConnectionError" in done.stdout
+        or "No matching distribution found for setuptools" in done.stdout
+    ):
         pytest.skip("the build backend cannot be fetched here")
     assert done.returncode == 0, done.stdout + done.stderr
     return next((folder / "dist").glob("*.whl"))
 
 
 def test_every_package_of_the_tree_is_declared(setup_cfg: configparser.ConfigParser) -> None:
-    declared = set(setup_cfg["options"]["packages"].split()) - {"sb3_poem.pretrained", "sb3_poem.zoo_configs"}
+    declared = set(setup_cfg["options"]["packages"].split()) - {
+        "sb3_poem.pretrained",
+        "sb3_poem.zoo_configs",
+    }
     present = {
         ".".join(init.parent.relative_to(root).parts)
         for package, root in PACKAGE_ROOTS.items()
@@ -53,7 +72,9 @@ def test_every_package_of_the_tree_is_declared(setup_cfg: configparser.ConfigPar
     assert declared == present
 
 
-def test_every_tested_version_is_within_the_declared_ranges(setup_cfg: configparser.ConfigParser) -> None:
+def test_every_tested_version_is_within_the_declared_ranges(
+    setup_cfg: configparser.ConfigParser,
+) -> None:
     from packaging.requirements import Requirement
     from packaging.utils import canonicalize_name
 
@@ -64,15 +85,27 @@ def test_every_tested_version_is_within_the_declared_ranges(setup_cfg: configpar
             tested[canonicalize_name(name)] = version
     extras = setup_cfg["options.extras_require"]
     declared = setup_cfg["options"]["install_requires"] + extras["dev"] + extras["label"]
-    requirements = [Requirement(line) for line in declared.splitlines() if line.strip() and not line.startswith("#")]
+    requirements = [
+        Requirement(line)
+        for line in declared.splitlines()
+        if line.strip() and not line.startswith("#")
+    ]
     assert len(requirements) > 20
     for requirement in requirements:
-        assert requirement.specifier.contains(tested[canonicalize_name(requirement.name)]), requirement
+        assert requirement.specifier.contains(tested[canonicalize_name(requirement.name)]), (
+            requirement
+        )
 
 
-def test_the_supported_pythons_are_the_same_everywhere(setup_cfg: configparser.ConfigParser) -> None:
+def test_the_supported_pythons_are_the_same_everywhere(
+    setup_cfg: configparser.ConfigParser,
+) -> None:
     prefix = "Programming Language :: Python :: 3."
-    minors = [line.removeprefix(prefix) for line in setup_cfg["metadata"]["classifiers"].splitlines() if prefix in line]
+    minors = [
+        line.removeprefix(prefix)
+        for line in setup_cfg["metadata"]["classifiers"].splitlines()
+        if prefix in line
+    ]
     first, last = f"3.{minors[0]}", f"3.{minors[-1]}"
     assert (first, last) == ("3.11", "3.13")
     assert setup_cfg["options"]["python_requires"] == f">={first}"
@@ -84,7 +117,10 @@ def test_the_supported_pythons_are_the_same_everywhere(setup_cfg: configparser.C
 
 
 def test_citation_names_this_version() -> None:
-    assert f"version: {(ROOT / 'sb3_poem/version.txt').read_text().strip()}\n" in (ROOT / "CITATION.cff").read_text()
+    assert (
+        f"version: {(ROOT / 'sb3_poem/version.txt').read_text().strip()}\n"
+        in (ROOT / "CITATION.cff").read_text()
+    )
 
 
 def test_wheel_holds_all_that_is_needed_and_nothing_else(wheel: Path) -> None:
@@ -95,14 +131,20 @@ def test_wheel_holds_all_that_is_needed_and_nothing_else(wheel: Path) -> None:
         for file in (root / package).rglob("*")
         if file.is_file() and "__pycache__" not in file.parts
     }
-    expected |= {f"sb3_poem/zoo_configs/{file.name}" for file in (ROOT / "zoo_configs").glob("*.yml")}
+    expected |= {
+        f"sb3_poem/zoo_configs/{file.name}" for file in (ROOT / "zoo_configs").glob("*.yml")
+    }
     expected |= {
         f"sb3_poem/{file.relative_to(ROOT)}"
         for pattern in ("*.safetensors", "*.json", "*.md")
         for file in (ROOT / "pretrained").rglob(pattern)
     }
     assert {name for name in names if ".dist-info/" not in name} == expected
-    assert {Path(name).name for name in names if ".dist-info/" in name} >= {"METADATA", "LICENSE", "entry_points.txt"}
+    assert {Path(name).name for name in names if ".dist-info/" in name} >= {
+        "METADATA",
+        "LICENSE",
+        "entry_points.txt",
+    }
 
 
 PROBE = """
@@ -121,18 +163,32 @@ print(json.dumps({
 
 
 def test_wheel_works_installed_elsewhere(wheel: Path, tmp_path: Path) -> None:
-    """In a fresh environment which finds the dependencies of this one behind its own packages, away from the checkout."""
+    """In a fresh environment which finds the dependencies of this one behind its own packages, away
+    from the checkout.
+    """
     subprocess.run([sys.executable, "-m", "venv", str(tmp_path / "venv")], check=True)
     python = tmp_path / "venv/bin/python"
-    install = [str(python), "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", str(wheel)]
+    install = [
+        str(python),
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--no-deps",
+        "--no-index",
+        str(wheel),
+    ]
     subprocess.run(install, check=True, cwd=tmp_path)
-    # A plain path line: the .pth files in that folder, and so the editable install of the checkout, are not read.
+    # A plain path line: the .pth files in that folder, and so the editable install of the checkout,
+    # are not read.
     site_packages = next((tmp_path / "venv/lib").glob("python*/site-packages"))
     (site_packages / "dependencies.pth").write_text(sysconfig.get_paths()["purelib"] + "\n")
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
 
     def run(*command: str) -> str:
-        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        )
         assert done.returncode == 0, done.stderr
         return done.stdout
 

@@ -19,7 +19,8 @@ def test_written_frames_are_read_back(tmp_path: Path, suffix: str) -> None:
     path = write_video(clip(12), tmp_path / "new" / f"clip{suffix}", fps=10)
     frames = imageio.imread(path, index=None)
     assert frames.shape[0] == 12
-    # Video codecs lose a little; the order and the brightness stay. Odd sides grow by one for H.264.
+    # Video codecs lose a little; the order and the brightness stay. Odd sides grow by one for
+    # H.264.
     assert frames.shape[1:3] == ((34, 48) if suffix == ".mp4" else (33, 47))
     np.testing.assert_allclose(frames.mean(axis=(1, 2, 3)), 10 * np.arange(12), atol=3)
 
@@ -49,7 +50,9 @@ def test_side_by_side_places_both_and_holds_the_last_frame() -> None:
 
 def test_captions_are_drawn_above_the_frames() -> None:
     plain = side_by_side(clip(1, 120, 160), clip(1, 120, 160))
-    captioned = side_by_side(clip(1, 120, 160), clip(1, 120, 160), captions=("before", "after ten answers"))
+    captioned = side_by_side(
+        clip(1, 120, 160), clip(1, 120, 160), captions=("before", "after ten answers")
+    )
     band = captioned[0].shape[0] - plain[0].shape[0]
     assert band > 0
     np.testing.assert_array_equal(captioned[0][band:], plain[0])
@@ -66,7 +69,14 @@ def test_side_by_side_refuses_what_does_not_fit() -> None:
 
 def test_plot_shows_what_it_was_given(tmp_path: Path) -> None:
     returns = np.array([[-5.0, -3.0, -1.0], [-7.0, -5.0, -2.0]])
-    figure = plot_returns([0, 1, 5], returns, limit=[-6, -3.5, -1], known_task=-0.5, title="family", path=tmp_path / "a/b.png")
+    figure = plot_returns(
+        [0, 1, 5],
+        returns,
+        limit=[-6, -3.5, -1],
+        known_task=-0.5,
+        title="family",
+        path=tmp_path / "a/b.png",
+    )
     axes = figure.axes[0]
     lines = {line.get_label(): np.asarray(line.get_ydata(), dtype=float) for line in axes.lines}
     np.testing.assert_allclose(lines["adapted policy"], [-6.0, -4.0, -1.5])

@@ -213,9 +213,7 @@ ALGORITHMS = [
     ),
     refused("an argument misspelt", lambda _: made(preference_coeff=1.0), "'preference_coeff'"),
     refused(
-        "of PEARLSAC",
-        lambda _: made(context_relabel_fraction=0.5),
-        "context_relabel_fraction",
+        "of PEARLSAC", lambda _: made(context_relabel_fraction=0.5), "context_relabel_fraction"
     ),
     refused("net_arch outside", lambda _: made(net_arch=[8]), "net_arch...policy_kwargs"),
     refused("net_arch vf", lambda _: policy(net_arch={"vf": [8]}), r"net_arch...\['vf'\]...qf"),
@@ -223,9 +221,7 @@ ALGORITHMS = [
     refused("policy_kwargs misspelt", lambda _: policy(netarch=[8]), "netarch"),
     argument(made, "policy_kwargs", [64, 64]),
     refused(
-        "tensorboard_log",
-        lambda s: made(tensorboard_log=str(s / "text.zip")).learn(1),
-        "text.zip",
+        "tensorboard_log", lambda s: made(tensorboard_log=str(s / "text.zip")).learn(1), "text.zip"
     ),
     refused("learn a text", lambda _: made().learn("1000"), "total_timesteps...1000"),
     refused("learn misspelt", lambda _: made().learn(1, callbacks=[]), "callbacks"),
@@ -255,9 +251,7 @@ ALGORITHMS = [
     ),
     refused("load a SAC", lambda s: POEMSAC.load(s / "sac.zip"), "sac.zip...another algorithm"),
     refused(
-        "load PEARLSAC",
-        lambda s: POEMSAC.load(s / "pearl.zip"),
-        "pearl.zip...another algorithm",
+        "load PEARLSAC", lambda s: POEMSAC.load(s / "pearl.zip"), "pearl.zip...another algorithm"
     ),
     refused("load a checkpoint", lambda s: POEMSAC.load(s / "checkpoint.zip"), "load_checkpoint"),
     refused("load and misspell", lambda s: POEMSAC.load(s / "poem.zip", gama=0.5), "gama"),
@@ -274,14 +268,10 @@ ALGORITHMS = [
     refused("load_replay_buffer", lambda s: made().load_replay_buffer(s / "bufer"), "bufer"),
     refused("save in file", lambda s: trained().save(s / "text.zip" / "m"), "text.zip"),
     refused(
-        "from_pretrained",
-        lambda _: POEMSAC.from_pretrained("PointGaol"),
-        "PointGaol...PointGoal",
+        "from_pretrained", lambda _: POEMSAC.from_pretrained("PointGaol"), "PointGaol...PointGoal"
     ),
     refused(
-        "from_pretrained of a zip",
-        lambda s: POEMSAC.from_pretrained(s / "poem.zip"),
-        r"\bload\b",
+        "from_pretrained of a zip", lambda s: POEMSAC.from_pretrained(s / "poem.zip"), r"\bload\b"
     ),
     refused(
         "from_pretrained of PEARLSAC",
@@ -311,14 +301,10 @@ ADAPTERS = [
     refused("model a class", lambda _: adapter(POEMSAC), "model...class POEMSAC"),
     refused("adapter env None", lambda _: adapter(env=None), "env...id...VecEnv"),
     refused(
-        "adapter env misspelt",
-        lambda _: adapter(env="poem/PointGaol-v0"),
-        "PointGaol...PointGoal",
+        "adapter env misspelt", lambda _: adapter(env="poem/PointGaol-v0"), "PointGaol...PointGoal"
     ),
     refused(
-        "env of another family",
-        lambda _: adapter(env=CHEETAH),
-        "observation_space...PointGoal",
+        "env of another family", lambda _: adapter(env=CHEETAH), "observation_space...PointGoal"
     ),
     argument(adapter, "n_queries", 0, "at least 1"),
     argument(adapter, "n_queries", 2.5),
@@ -373,9 +359,7 @@ ADAPTERS = [
         "MAMLRewardModel...meta_train_reward",
     ),
     refused(
-        "RewardOracle of POEMSAC",
-        lambda _: RewardOracleAdapter(trained(), POINT_GOAL),
-        "PEARLSAC",
+        "RewardOracle of POEMSAC", lambda _: RewardOracleAdapter(trained(), POINT_GOAL), "PEARLSAC"
     ),
     refused(
         "RewardOracle n_queries",
@@ -448,9 +432,7 @@ TOOLS = [
         "no task family",
     ),
     refused(
-        "TaskVecEnv's tasks",
-        lambda _: vec().set_tasks([[1.0]]),
-        r"tasks...\(1, 1\)...\(2, 1\)",
+        "TaskVecEnv's tasks", lambda _: vec().set_tasks([[1.0]]), r"tasks...\(1, 1\)...\(2, 1\)"
     ),
     argument(AdaptationEvalCallback, "every", 0, "at least 1"),
     argument(AdaptationEvalCallback, "n_tasks", 0, "at least 1"),

@@ -19,9 +19,8 @@ STEP_WEIGHT = 200.0 / HORIZON  # returns as over HalfCheetahVel's 200 steps
 
 
 class SpeedEnv(gym.Env):
-    """
-    A cart that moves at the speed it is told to; its task is a goal speed in [0, 3], its reward -10 |speed - goal|, and
-    20 steps an episode. Observations (place, speed) do not hold the goal.
+    """A cart that moves at the speed it is told to; its task is a goal speed in [0, 3], its reward
+    -10 |speed - goal|, and 20 steps an episode. Observations (place, speed) do not hold the goal.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
@@ -47,7 +46,9 @@ class SpeedEnv(gym.Env):
     def compute_rewards(tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
         return -STEP_WEIGHT * np.abs(features[..., 0] - tasks[..., 0])
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict]:
         super().reset(seed=seed)
         self.task = self._next_task
         self._time = 0
@@ -61,14 +62,22 @@ class SpeedEnv(gym.Env):
         features = np.array([speed])
         reward = float(self.compute_rewards(self.task, features))
         truncated = self._time >= HORIZON
-        return np.array([self._place, speed]), reward, self._place > self.end_at, truncated, {"reward_features": features}
+        return (
+            np.array([self._place, speed]),
+            reward,
+            self._place > self.end_at,
+            truncated,
+            {"reward_features": features},
+        )
 
     def render(self) -> np.ndarray:
         return np.full((16, 16, 3), min(255, int(abs(self._place) * 40)), dtype=np.uint8)
 
 
 class SpeedVecEnv(VecEnv):
-    """Many copies of :class:`SpeedEnv` in arrays, with the face of ``TaskVecEnv``; its episodes all end by their horizon."""
+    """Many copies of :class:`SpeedEnv` in arrays, with the face of ``TaskVecEnv``; its episodes all
+    end by their horizon.
+    """
 
     def __init__(self, num_envs: int) -> None:
         self._one = SpeedEnv()
@@ -101,7 +110,9 @@ class SpeedVecEnv(VecEnv):
         rewards = SpeedEnv.compute_rewards(self.tasks, self.last_reward_features)
         return observations, rewards, np.full(self.num_envs, done), infos
 
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+    def env_method(
+        self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any
+    ) -> list[Any]:
         return [getattr(self._one, method_name)(*args, **kwargs)]
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
@@ -126,10 +137,11 @@ class Blinded(gym.Wrapper):
 
 
 class SpeedModel:
-    """
-    The perfect model of :class:`SpeedEnv`: the first entry of z is the normal score of the speed, the others do nothing.
+    """The perfect model of :class:`SpeedEnv`: the first entry of z is the normal score of the
+    speed, the others do nothing.
 
-    S(z, z') = 2 g(z) v(z') - v(z')^2, which is g^2 less than -(g - v)^2: for every task it orders speeds as their returns do.
+    S(z, z') = 2 g(z) v(z') - v(z')^2, which is g^2 less than -(g - v)^2: for every task it orders
+    speeds as their returns do.
     """
 
     observation_space = SpeedEnv.observation_space
@@ -171,7 +183,11 @@ class SpeedModel:
         return centres + 0.1 * rng.standard_normal(centres.shape)
 
     def predict(
-        self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
+        self,
+        observation: np.ndarray,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
     ) -> tuple[np.ndarray, Any]:
         actions = 2.0 * self.speed(state) / TOP_SPEED - 1.0
         return np.clip(actions[..., None], -1.0, 1.0).astype(np.float32), state

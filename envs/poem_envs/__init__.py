@@ -1,6 +1,8 @@
-"""Task families for meta-reinforcement learning. Importing this package registers them with Gymnasium, under ``poem/``.
+"""Task families for meta-reinforcement learning. Importing this package registers them with
+Gymnasium, under ``poem/``.
 
-MuJoCo, Meta-World and gymnasium-robotics are loaded by the first ``gymnasium.make``, so that this import is quick.
+MuJoCo, Meta-World and gymnasium-robotics are loaded by the first ``gymnasium.make``, so that this
+import is quick.
 """
 
 from importlib import import_module

@@ -17,15 +17,19 @@ def _symmetries(hidden_qpos: int) -> tuple[Symmetry, ...]:
 
     :param hidden_qpos: how many of the torso's x and y the observation leaves out
     """
-    # The hinges are hip_1, ankle_1, ..., ankle_4; legs 1 to 4 stand at (+, +), (-, +), (-, -) and (+, -) of x and y. A
-    # reflection turns the hips the other way; a half turn finds the axes of the ankles reversed.
+    # The hinges are hip_1, ankle_1, ..., ankle_4; legs 1 to 4 stand at (+, +), (-, +), (-, -) and
+    # (+, -) of x and y. A reflection turns the hips the other way; a half turn finds the axes of
+    # the ankles reversed.
     half_turn = SignedPermutation((4, 5, 6, 7, 0, 1, 2, 3), (1, -1) * 4)
     reflection = SignedPermutation((6, 7, 4, 5, 2, 3, 0, 1), (-1, 1) * 4)
     # the motors are hip_4, ankle_4, hip_1, ankle_1, ..., ankle_3
     motors = (6, 7, 0, 1, 2, 3, 4, 5)
 
     def whole(
-        hinges: SignedPermutation, position: tuple[int, ...], quaternion: tuple[int, ...], turning: tuple[int, ...]
+        hinges: SignedPermutation,
+        position: tuple[int, ...],
+        quaternion: tuple[int, ...],
+        turning: tuple[int, ...],
     ) -> Symmetry:
         placed, n = position[hidden_qpos:], 3 - hidden_qpos
         order = [*range(n + 4), *(n + 4 + i for i in hinges.order)]
@@ -33,9 +37,14 @@ def _symmetries(hidden_qpos: int) -> tuple[Symmetry, ...]:
         order += [*range(n, n + 6), *(n + 6 + i for i in hinges.order)]
         signs = (*placed, *quaternion, *hinges.signs, *position, *turning, *hinges.signs)
         actions = SignedPermutation(
-            tuple(motors.index(hinges.order[hinge]) for hinge in motors), tuple(hinges.signs[hinge] for hinge in motors)
+            tuple(motors.index(hinges.order[hinge]) for hinge in motors),
+            tuple(hinges.signs[hinge] for hinge in motors),
         )
-        return Symmetry(SignedPermutation(tuple(order), signs), actions, SignedPermutation((0, 1, 2), (*position[:2], 1)))
+        return Symmetry(
+            SignedPermutation(tuple(order), signs),
+            actions,
+            SignedPermutation((0, 1, 2), (*position[:2], 1)),
+        )
 
     turned = whole(half_turn, (-1, -1, 1), (1, -1, -1, 1), (-1, -1, 1))
     reflected = whole(reflection, (1, -1, 1), (1, -1, 1, -1), (-1, 1, -1))
@@ -93,17 +102,23 @@ class _AntVel(_Ant):
         super().__init__(ctrl_cost_weight=ctrl_cost_weight, **kwargs)
 
     def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
-        forward = self.forward_reward_offset - self.forward_reward_weight * np.abs(features[..., 0] - tasks[..., 0])
+        forward = self.forward_reward_offset - self.forward_reward_weight * np.abs(
+            features[..., 0] - tasks[..., 0]
+        )
         return forward - self.ctrl_cost_weight * features[..., 2] + self.healthy_reward
 
     def _task_markers(self, task: np.ndarray, position: np.ndarray) -> list[dict[str, Any]]:
-        return [arrow(np.array([position[0], position[1], 1.3]), (1.0, 0.0), length=float(task[0]) / 2)]
+        return [
+            arrow(np.array([position[0], position[1], 1.3]), (1.0, 0.0), length=float(task[0]) / 2)
+        ]
 
 
 class _AntDirection(_Ant):
     """Ant that is to run in a direction, whichever directions there are."""
 
-    def __init__(self, *, forward_reward_weight: float = 1.0, healthy_reward: float = 1.0, **kwargs: Any) -> None:
+    def __init__(
+        self, *, forward_reward_weight: float = 1.0, healthy_reward: float = 1.0, **kwargs: Any
+    ) -> None:
         self.forward_reward_weight = forward_reward_weight
         self.healthy_reward = healthy_reward
         super().__init__(**kwargs)
@@ -145,10 +160,16 @@ class _AntGoal(_Ant):
     ) -> None:
         self.distance_reward_weight = distance_reward_weight
         self.task_space = spaces.Box(-self.goal_radius, self.goal_radius, (2,), np.float64)
-        super().__init__(ctrl_cost_weight=ctrl_cost_weight, terminate_when_unhealthy=terminate_when_unhealthy, **kwargs)
+        super().__init__(
+            ctrl_cost_weight=ctrl_cost_weight,
+            terminate_when_unhealthy=terminate_when_unhealthy,
+            **kwargs,
+        )
 
     def _draw_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        radius = self.goal_radius * np.sqrt(rng.uniform(size=n))  # so that the density is even over the disc
+        radius = self.goal_radius * np.sqrt(
+            rng.uniform(size=n)
+        )  # so that the density is even over the disc
         angle = rng.uniform(0.0, 2 * np.pi, size=n)
         return np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
 
@@ -160,7 +181,9 @@ class _AntGoal(_Ant):
 
     def _potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
         # observations and features both begin with the position
-        distance = np.abs(observations[..., 0] - tasks[..., 0]) + np.abs(observations[..., 1] - tasks[..., 1])
+        distance = np.abs(observations[..., 0] - tasks[..., 0]) + np.abs(
+            observations[..., 1] - tasks[..., 1]
+        )
         return -self.distance_reward_weight * distance
 
     def _task_markers(self, task: np.ndarray, position: np.ndarray) -> list[dict[str, Any]]:
@@ -174,7 +197,9 @@ def speed_towards(angles: np.ndarray, velocities: np.ndarray) -> np.ndarray:
     :param velocities: ``(..., at least 2)``, the first two are taken
     :return: ``(...)``
     """
-    angle = np.array(angles[..., 0])  # contiguous: strided input may take another, differently rounded path
+    angle = np.array(
+        angles[..., 0]
+    )  # contiguous: strided input may take another, differently rounded path
     return velocities[..., 0] * np.cos(angle) + velocities[..., 1] * np.sin(angle)
 
 
@@ -303,7 +328,9 @@ class AntFwdBackEnv(_AntFwdBack, MujocoTaskEnv):
 
 
 class AntFwdBackVectorEnv(_AntFwdBack, MujocoTaskVectorEnv):
-    """The vectorised :class:`AntFwdBackEnv`: same arguments, and those of a vectorised MuJoCo family."""
+    """The vectorised :class:`AntFwdBackEnv`: same arguments, and those of a vectorised MuJoCo
+    family.
+    """
 
 
 class AntDir2DEnv(_AntDir2D, MujocoTaskEnv):

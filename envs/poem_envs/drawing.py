@@ -1,4 +1,6 @@
-"""A few antialiased shapes on a numpy image, and a window to show it: enough to render a toy without a graphics library."""
+"""A few antialiased shapes on a numpy image, and a window to show it: enough to render a toy
+without a graphics library.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ class Canvas:
         reach = radius + 1.0 / self._per_unit  # beyond it no pixel is touched
         rows = _span(np.abs(self._y[:, 0] - y) <= reach)
         columns = _span(np.abs(self._x - x) <= reach)
-        self._paint(np.hypot(self._x[columns] - x, self._y[rows] - y) - radius, colour, rows, columns)
+        self._paint(
+            np.hypot(self._x[columns] - x, self._y[rows] - y) - radius, colour, rows, columns
+        )
 
     def upper_half_circle(self, radius: float, line_width: float, colour: Colour) -> None:
         """Paint the line of the half-circle around the origin where y >= 0.
@@ -52,14 +56,20 @@ class Canvas:
         return np.rint(self._pixels).astype(np.uint8)
 
     def _paint(
-        self, signed_distance: np.ndarray, colour: Colour, rows: slice = slice(None), columns: slice = slice(None)
+        self,
+        signed_distance: np.ndarray,
+        colour: Colour,
+        rows: slice = slice(None),
+        columns: slice = slice(None),
     ) -> None:
         """Paint where the distance to a shape's edge, ``(rows, columns)``, is negative inside it."""
         coverage = np.clip(0.5 - signed_distance * self._per_unit, 0.0, 1.0)
         touched = coverage > 0.0
         window = self._pixels[rows, columns]
         old = window[touched]
-        window[touched] = old + coverage[touched][:, None] * (np.array(colour, dtype=np.float64) - old)
+        window[touched] = old + coverage[touched][:, None] * (
+            np.array(colour, dtype=np.float64) - old
+        )
 
 
 def _span(inside: np.ndarray) -> slice:
@@ -81,11 +91,15 @@ class ImageWindow:
 
         self._glfw = glfw
         if not glfw.init():
-            raise RuntimeError("render_mode='human' needs a display; use 'rgb_array' on a machine without one")
+            raise RuntimeError(
+                "render_mode='human' needs a display; use 'rgb_array' on a machine without one"
+            )
         glfw.window_hint(glfw.RESIZABLE, glfw.FALSE)
         self._window: Any = glfw.create_window(width, height, title, None, None)
         if not self._window:
-            raise RuntimeError("render_mode='human' could not open a window; use 'rgb_array' on a machine without a display")
+            raise RuntimeError(
+                "render_mode='human' could not open a window; use 'rgb_array' on a machine without a display"
+            )
 
     def show(self, image: np.ndarray) -> None:
         """Show an image.
@@ -97,12 +111,16 @@ class ImageWindow:
         glfw = self._glfw
         glfw.make_context_current(self._window)
         height, width, _ = image.shape
-        frame_width, frame_height = glfw.get_framebuffer_size(self._window)  # larger than the window on dense displays
+        frame_width, frame_height = glfw.get_framebuffer_size(
+            self._window
+        )  # larger than the window on dense displays
         GL.glViewport(0, 0, frame_width, frame_height)
         GL.glPixelStorei(GL.GL_UNPACK_ALIGNMENT, 1)
         GL.glRasterPos2f(-1.0, -1.0)
         GL.glPixelZoom(frame_width / width, frame_height / height)
-        GL.glDrawPixels(width, height, GL.GL_RGB, GL.GL_UNSIGNED_BYTE, np.ascontiguousarray(image[::-1]))
+        GL.glDrawPixels(
+            width, height, GL.GL_RGB, GL.GL_UNSIGNED_BYTE, np.ascontiguousarray(image[::-1])
+        )
         glfw.swap_buffers(self._window)
         glfw.poll_events()
 

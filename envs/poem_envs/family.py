@@ -1,7 +1,8 @@
-"""Task families: environments that share observations and actions, and differ in a hidden parameter, the *task*.
+"""Task families: environments that share observations and actions, and differ in a hidden
+parameter, the *task*.
 
-:class:`TaskFamily` is the base class of a single environment; :mod:`poem_envs.vector` builds vectorised ones on the same
-contract.
+:class:`TaskFamily` is the base class of a single environment; :mod:`poem_envs.vector` builds
+vectorised ones on the same contract.
 """
 
 from __future__ import annotations
@@ -17,12 +18,14 @@ from gymnasium.error import ResetNeeded
 
 from poem_envs.headless import has_display
 
-# Rounding in float32 policies and files may leave a value just outside its bounds: up to this it is clipped, not refused.
+# Rounding in float32 policies and files may leave a value just outside its bounds: up to this it is
+# clipped, not refused.
 BOUNDS_TOLERANCE = 1e-6
 
 
 class SignedPermutation(NamedTuple):
-    """A reordering with changes of sign: entry i of the result is ``signs[i]`` times entry ``order[i]``.
+    """A reordering with changes of sign: entry i of the result is ``signs[i]`` times entry
+    ``order[i]``.
 
     :param order: ``(n,)`` indices, each once
     :param signs: ``(n,)`` of 1 and -1
@@ -38,15 +41,19 @@ class SignedPermutation(NamedTuple):
     def then(self, other: SignedPermutation) -> SignedPermutation:
         """This one first, the other next."""
         order = tuple(self.order[i] for i in other.order)
-        return SignedPermutation(order, tuple(sign * self.signs[i] for i, sign in zip(other.order, other.signs, strict=True)))
+        return SignedPermutation(
+            order,
+            tuple(sign * self.signs[i] for i, sign in zip(other.order, other.signs, strict=True)),
+        )
 
 
 class Symmetry(NamedTuple):
     """A symmetry of a family's dynamics, as the reflection of a robot whose left is like its right.
 
-    If an action takes the environment from one observation to the next, with some reward features, then the mirrored action
-    takes it from the one's mirror image to the other's, with the mirrored features. Nothing is said of rewards: those of what
-    is mirrored are computed from its features, for any task.
+    If an action takes the environment from one observation to the next, with some reward features,
+    then the mirrored action takes it from the one's mirror image to the other's, with the mirrored
+    features. Nothing is said of rewards: those of what is mirrored are computed from its features,
+    for any task.
 
     :param observations: of the entries of an observation
     :param actions: of the entries of an action
@@ -63,10 +70,11 @@ class Symmetry(NamedTuple):
 
 
 class TaskDefinition(ABC):
-    """The tasks of a family and their rewards: what its single and its vectorised environment have in common.
+    """The tasks of a family and their rewards: what its single and its vectorised environment have
+    in common.
 
-    A subclass sets the attributes below and defines :meth:`_reward`; unless its tasks are uniform on ``task_space`` or
-    finitely many (``all_tasks``), it defines :meth:`_draw_tasks` too.
+    A subclass sets the attributes below and defines :meth:`_reward`; unless its tasks are uniform
+    on ``task_space`` or finitely many (``all_tasks``), it defines :meth:`_draw_tasks` too.
     """
 
     #: Where tasks live: a bounded box of shape ``(task_dim,)``.
@@ -75,9 +83,11 @@ class TaskDefinition(ABC):
     all_tasks: np.ndarray | None = None
     #: Number of reward features, the last dimension of ``info["reward_features"]``.
     reward_feature_dim: int
-    #: Whether tasks differ in the reward alone, so that one task's trajectories can be relabelled with another's rewards.
+    #: Whether tasks differ in the reward alone, so that one task's trajectories can be relabelled
+    #: with another's rewards.
     shared_dynamics: bool = True
-    #: Symmetries of the dynamics, by which training may see every transition in other forms too; none unless a family says so.
+    #: Symmetries of the dynamics, by which training may see every transition in other forms too;
+    #: none unless a family says so.
     symmetries: tuple[Symmetry, ...] = ()
     #: The names of the sets that tasks can be drawn from, of which the first is for training.
     splits: tuple[str, ...] = ("train",)
@@ -87,7 +97,8 @@ class TaskDefinition(ABC):
     def sample_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draw tasks from the family's own distribution.
 
-        :param n: how many, at least 1; of a finite family, at most all of them, which are drawn without replacement
+        :param n: how many, at least 1; of a finite family, at most all of them, which are drawn
+            without replacement
         :param rng: the generator to draw from; the environment's own one is left alone
         :return: ``(n, task_dim)`` float64
         :raises ValueError: if ``n`` is below 1 or above the number of tasks of a finite family
@@ -105,8 +116,9 @@ class TaskDefinition(ABC):
     def compute_rewards(self, tasks: npt.ArrayLike, features: npt.ArrayLike) -> np.ndarray:
         """The rewards that steps with the given features earn in the given tasks.
 
-        A pure function: ``step`` returns exactly this for its own task and features, so that a trajectory logged in one
-        task can be relabelled for any other. Leading dimensions broadcast against each other.
+        A pure function: ``step`` returns exactly this for its own task and features, so that a
+        trajectory logged in one task can be relabelled for any other. Leading dimensions broadcast
+        against each other.
 
         :param tasks: ``(..., task_dim)``
         :param features: ``(..., reward_feature_dim)``, as in ``info["reward_features"]``
@@ -117,7 +129,9 @@ class TaskDefinition(ABC):
         features = np.asarray(features, dtype=np.float64)
         task_dim = self.task_space.shape[0]
         if tasks.shape[-1:] != (task_dim,):
-            raise ValueError(f"tasks has shape {tasks.shape}, but its last dimension must be task_dim={task_dim}")
+            raise ValueError(
+                f"tasks has shape {tasks.shape}, but its last dimension must be task_dim={task_dim}"
+            )
         if features.shape[-1:] != (self.reward_feature_dim,):
             raise ValueError(
                 f"features has shape {features.shape}, but its last dimension must be "
@@ -131,8 +145,9 @@ class TaskDefinition(ABC):
         return type(self)._potential is not TaskDefinition._potential
 
     def compute_potential(self, tasks: npt.ArrayLike, observations: npt.ArrayLike) -> np.ndarray:
-        """The reward per step of staying where observations show the robot, roughly; by it training can be shaped (Ng, Harada
-        & Russell, ICML 1999), which changes how fast policies are learned, not which ones are best.
+        """The reward per step of staying where observations show the robot, roughly; by it training
+        can be shaped (Ng, Harada & Russell, ICML 1999), which changes how fast policies are
+        learned, not which ones are best.
 
         :param tasks: ``(..., task_dim)``
         :param observations: ``(..., obs_dim)``; leading dimensions broadcast
@@ -143,15 +158,23 @@ class TaskDefinition(ABC):
 
     def _potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
         """Optional, for families whose rewards say where to be rather than how to move."""
-        raise NotImplementedError(f"{type(self).__name__} defines no _potential(tasks, observations)")
+        raise NotImplementedError(
+            f"{type(self).__name__} defines no _potential(tasks, observations)"
+        )
 
     @abstractmethod
     def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
-        """The reward function. Only elementwise operations, so that one step and a batch give the same bits."""
+        """The reward function. Only elementwise operations, so that one step and a batch give the
+        same bits.
+        """
 
     def _draw_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Draw from the distribution of an infinite family: uniform on ``task_space`` unless overridden."""
-        return rng.uniform(self.task_space.low, self.task_space.high, size=(n, *self.task_space.shape))
+        """Draw from the distribution of an infinite family: uniform on ``task_space`` unless
+        overridden.
+        """
+        return rng.uniform(
+            self.task_space.low, self.task_space.high, size=(n, *self.task_space.shape)
+        )
 
     @abstractmethod
     def _describe_episode(self, copy: int) -> str:
@@ -168,18 +191,24 @@ class TaskDefinition(ABC):
         self.split = split
 
     def _checked_tasks(self, tasks: npt.ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:
-        """Return ``tasks`` as a fresh float64 array, or raise a ValueError that says what is wrong with them."""
+        """Return ``tasks`` as a fresh float64 array, or raise a ValueError that says what is wrong
+        with them.
+        """
         try:
             array = np.array(tasks, dtype=np.float64)
         except (TypeError, ValueError) as error:
-            raise ValueError(f"{name}={tasks!r} is not an array of numbers of shape {shape}") from error
+            raise ValueError(
+                f"{name}={tasks!r} is not an array of numbers of shape {shape}"
+            ) from error
         if array.shape != shape:
             raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
         low, high = self.task_space.low, self.task_space.high
         clipped = np.clip(array, low, high)
         inside = np.all(np.abs(array - clipped) <= BOUNDS_TOLERANCE, axis=-1)  # false for NaN
         if not inside.all():
-            raise ValueError(f"{_first(array, ~inside, name)} must be finite and inside task_space, from {low} to {high}")
+            raise ValueError(
+                f"{_first(array, ~inside, name)} must be finite and inside task_space, from {low} to {high}"
+            )
         if self.all_tasks is None:
             return clipped
         distance = np.abs(clipped[..., None, :] - self.all_tasks).max(axis=-1)
@@ -240,15 +269,23 @@ def _is_flat(space: Any) -> bool:
 
 
 class _FamilyType(ABCMeta):
-    """Looks at a family when it is made, whether or not its constructor called ``super().__init__``."""
+    """Looks at a family when it is made, whether or not its constructor called
+    ``super().__init__``.
+    """
 
     def __call__(cls, *args: Any, **kwargs: Any) -> Any:
         family = super().__call__(*args, **kwargs)
-        missing = {name: what for name, what in REQUIRED_ATTRIBUTES.items() if not hasattr(family, name)}
+        missing = {
+            name: what for name, what in REQUIRED_ATTRIBUTES.items() if not hasattr(family, name)
+        }
         if missing:
             wanted = ", ".join(f"{name} ({what})" for name, what in missing.items())
-            raise TypeError(f"the task family {cls.__name__} must set {wanted}; see poem_envs.TaskFamily")
-        modes = [mode for mode in family.metadata["render_modes"] if mode != "human" or has_display()]
+            raise TypeError(
+                f"the task family {cls.__name__} must set {wanted}; see poem_envs.TaskFamily"
+            )
+        modes = [
+            mode for mode in family.metadata["render_modes"] if mode != "human" or has_display()
+        ]
         family.metadata = {**family.metadata, "render_modes": modes}
         return family
 
@@ -256,7 +293,8 @@ class _FamilyType(ABCMeta):
 class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
     """Base class of a single environment whose task is hidden.
 
-    A subclass sets ``observation_space``, ``action_space``, ``task_space``, ``reward_feature_dim`` and defines three methods::
+    A subclass sets ``observation_space``, ``action_space``, ``task_space``, ``reward_feature_dim``
+    and defines three methods::
 
         class Walk1D(TaskFamily):
             observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float64)
@@ -275,24 +313,27 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray], metaclass=_Fam
             def _reward(self, tasks, features):             # elementwise, broadcasting
                 return -np.abs(features[..., 0] - tasks[..., 0])
 
-    The base class checks actions and tasks, draws and keeps the task, computes the reward and fills in the info.
+    The base class checks actions and tasks, draws and keeps the task, computes the reward and fills
+    in the info.
 
     **The task.** As long as none was chosen, ``reset(seed=...)`` draws one from the family's
-    distribution, from a stream of its own that the seed determines, and a reset without a seed keeps
-    it. :meth:`set_task` chooses one, from the next reset on, and then no seed draws another; so does
-    ``reset(options={"task": task})``. Gymnasium's wrappers forward no ``set_task``:
-    ``poem_envs.set_task(env, task)`` reaches through them. None of this touches the random numbers of
-    the episode itself, so two tasks see the same start.
+    distribution, from a stream of its own that the seed determines, and a reset without a seed
+    keeps it. :meth:`set_task` chooses one, from the next reset on, and then no seed draws another;
+    so does ``reset(options={"task": task})``. Gymnasium's wrappers forward no ``set_task``:
+    ``poem_envs.set_task(env, task)`` reaches through them. None of this touches the random numbers
+    of the episode itself, so two tasks see the same start.
 
     **The info** of every step holds ``"reward_features"``, ``(reward_feature_dim,)`` float64: everything that rewards of this
-    family depend on (see :meth:`~TaskDefinition.compute_rewards`). A family whose :meth:`_step_info` gives ``"success"``,
-    whether the step reached what the task asks for, has ``"is_success"`` there too, as SB3 calls it: whether any step of the
-    episode so far did. Training, evaluation and the command line then report success rates.
+    family depend on (see :meth:`~TaskDefinition.compute_rewards`). A family whose
+    :meth:`_step_info` gives ``"success"``, whether the step reached what the task asks for, has
+    ``"is_success"`` there too, as SB3 calls it: whether any step of the episode so far did.
+    Training, evaluation and the command line then report success rates.
 
     :param render_mode: one of ``metadata["render_modes"]``, or None
     :param render_task: whether rendering shows the hidden task, for a developer who debugs
     :param split: one of :attr:`splits`, to draw tasks from
-    :raises ValueError: if there is no such split or render mode, or no display for ``render_mode="human"``
+    :raises ValueError: if there is no such split or render mode, or no display for
+        ``render_mode="human"``
     :raises TypeError: if a method or an attribute is missing; the message says which
     """
 
@@ -307,7 +348,9 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray], metaclass=_Fam
     _succeeded: bool = False
     _reset_options: ClassVar[frozenset[str]] = frozenset({"task"})
 
-    def __init__(self, *, render_mode: str | None = None, render_task: bool = False, split: str = "train") -> None:
+    def __init__(
+        self, *, render_mode: str | None = None, render_task: bool = False, split: str = "train"
+    ) -> None:
         check_render_mode(render_mode, self.metadata)
         self._choose_split(split)
         self.render_mode = render_mode
@@ -322,14 +365,18 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray], metaclass=_Fam
         """Choose the task of the episodes that begin from the next reset on.
 
         :param task: ``(task_dim,)``, inside ``task_space``
-        :raises ValueError: if it has another shape, is not finite, or lies outside ``task_space`` (or the finite family)
+        :raises ValueError: if it has another shape, is not finite, or lies outside ``task_space``
+            (or the finite family)
         """
         self._next_task = self._checked_tasks(task, self.task_space.shape, "task")
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin an episode.
 
-        :param seed: makes this and the following episodes reproducible; draws another task, unless one was chosen
+        :param seed: makes this and the following episodes reproducible; draws another task, unless
+            one was chosen
         :param options: ``{"task": task}`` is short for :meth:`set_task` just before
         :return: the observation and an empty info
         """
@@ -353,8 +400,10 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray], metaclass=_Fam
         """Take one step.
 
         :param action: inside ``action_space``; a tiny excess (1e-6) is clipped
-        :return: observation, reward, terminated, truncated (always False, time limits are a wrapper's), info
-        :raises ValueError: if the action has another shape, is not finite or lies outside ``action_space``
+        :return: observation, reward, terminated, truncated (always False, time limits are a
+            wrapper's), info
+        :raises ValueError: if the action has another shape, is not finite or lies outside
+            ``action_space``
         :raises gymnasium.error.ResetNeeded: before the first reset
         """
         if self._task is None:
@@ -378,10 +427,14 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray], metaclass=_Fam
 
     @abstractmethod
     def _simulate(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
-        """Apply a valid action; return new arrays of observation and reward features, and whether the episode ended early."""
+        """Apply a valid action; return new arrays of observation and reward features, and whether
+        the episode ended early.
+        """
 
     def _step_info(self) -> dict[str, Any]:
-        """Further entries of the info of the step just taken, say ``{"success": True}``: none unless overridden."""
+        """Further entries of the info of the step just taken, say ``{"success": True}``: none
+        unless overridden.
+        """
         return {}
 
     def _describe_episode(self, copy: int = 0) -> str:
@@ -400,15 +453,22 @@ def check_render_mode(render_mode: str | None, metadata: dict[str, Any]) -> None
     :param render_mode: what was asked for
     :param metadata: the environment's own
     :raises ValueError: if it can render, but not so, or not on this machine
-    :raises TypeError: if it cannot render at all; upon that SB3's ``make_vec_env``, which always asks, makes it without
+    :raises TypeError: if it cannot render at all; upon that SB3's ``make_vec_env``, which always
+        asks, makes it without
     """
     modes = metadata["render_modes"]
     if render_mode is not None and not modes:
-        raise TypeError(f"render_mode={render_mode!r} is not supported: this environment cannot be rendered")
+        raise TypeError(
+            f"render_mode={render_mode!r} is not supported: this environment cannot be rendered"
+        )
     if render_mode is not None and render_mode not in modes:
-        raise ValueError(f"render_mode={render_mode!r} is not supported, choose None or one of {modes}")
+        raise ValueError(
+            f"render_mode={render_mode!r} is not supported, choose None or one of {modes}"
+        )
     if render_mode == "human" and not has_display():
-        raise ValueError("render_mode='human' needs a display; use 'rgb_array' on a machine without one")
+        raise ValueError(
+            "render_mode='human' needs a display; use 'rgb_array' on a machine without one"
+        )
 
 
 def check_options(options: dict[str, Any] | None, known: frozenset[str]) -> dict[str, Any]:
@@ -419,12 +479,17 @@ def check_options(options: dict[str, Any] | None, known: frozenset[str]) -> dict
     """
     unknown = set(options or {}) - known
     if unknown:
-        raise ValueError(f"options={options!r} of reset holds unknown keys {sorted(unknown)}, known are {sorted(known)}")
+        raise ValueError(
+            f"options={options!r} of reset holds unknown keys {sorted(unknown)}, known are {sorted(known)}"
+        )
     return options or {}
 
 
-def checked_actions(actions: npt.ArrayLike, space: spaces.Box, num_envs: int | None = None) -> np.ndarray:
-    """Return actions as a new float64 array inside the bounds, or raise a ValueError that says what is wrong with them.
+def checked_actions(
+    actions: npt.ArrayLike, space: spaces.Box, num_envs: int | None = None
+) -> np.ndarray:
+    """Return actions as a new float64 array inside the bounds, or raise a ValueError that says what
+    is wrong with them.
 
     :param actions: ``space.shape``, or ``(num_envs, *space.shape)``
     :param space: the bounds of one action
@@ -434,7 +499,9 @@ def checked_actions(actions: npt.ArrayLike, space: spaces.Box, num_envs: int | N
     try:
         array = np.asarray(actions, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"action={actions!r} is not an array of numbers of shape {shape}") from error
+        raise ValueError(
+            f"action={actions!r} is not an array of numbers of shape {shape}"
+        ) from error
     if array.shape != shape:
         raise ValueError(f"action has shape {array.shape}, expected {shape}")
     low, high = space.low.astype(np.float64), space.high.astype(np.float64)
@@ -442,7 +509,9 @@ def checked_actions(actions: npt.ArrayLike, space: spaces.Box, num_envs: int | N
     acceptable = np.abs(array - clipped) <= BOUNDS_TOLERANCE  # false for NaN
     if not acceptable.all():
         index = tuple(int(i) for i in np.argwhere(~acceptable)[0])
-        copy, component = ("", index) if num_envs is None else (f" of environment copy {index[0]}", index[1:])
+        copy, component = (
+            ("", index) if num_envs is None else (f" of environment copy {index[0]}", index[1:])
+        )
         bounds = f"[{low[component]:g}, {high[component]:g}]"
         raise ValueError(
             f"action{copy} is {array[index]} at component {', '.join(map(str, component))}, "

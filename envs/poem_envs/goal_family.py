@@ -17,17 +17,18 @@ from poem_envs.mujoco_rendering import prepare_to_render
 
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 GOAL_SITE = "target"
-#: Wrappers whose work the family, or what is around it, does itself; by name, since rl_zoo3 replaces Gymnasium's TimeLimit
+#: Wrappers whose work the family, or what is around it, does itself; by name, since rl_zoo3
+#: replaces Gymnasium's TimeLimit
 TAKEN_OFF = frozenset({"TimeLimit", "OrderEnforcing", "PassiveEnvChecker"})
 SetGoal = Callable[[gym.Env, np.ndarray], None]
 
 
 class GoalFamily(TaskFamily):
-    """
-    The task family of a goal-conditioned environment, such as those of gymnasium-robotics.
+    """The task family of a goal-conditioned environment, such as those of gymnasium-robotics.
 
-    The environment must be what HER takes: observations are a dictionary of ``"observation"``, ``"achieved_goal"`` and
-    ``"desired_goal"``, and ``compute_reward(achieved_goal, desired_goal, info)`` is its reward, sparse or dense. Then
+    The environment must be what HER takes: observations are a dictionary of ``"observation"``,
+    ``"achieved_goal"`` and ``"desired_goal"``, and ``compute_reward(achieved_goal, desired_goal,
+    info)`` is its reward, sparse or dense. Then
 
     - the observation is ``"observation"``, and ``"achieved_goal"`` behind it if asked for; ``"desired_goal"`` is left out;
     - a task is a desired goal, drawn as the environment's own reset draws it;
@@ -38,22 +39,26 @@ class GoalFamily(TaskFamily):
 
         gym.register("my/FetchSlide-v0", entry_point=GoalFamily, kwargs={"env": "gymnasium_robotics:FetchSlide-v4"})
 
-    The environment's resets must depend on their seed alone. Its time limit is the family's too (:attr:`max_episode_steps`),
-    unless the family is registered with another or ``gym.make`` is given one. Other wrappers than those of ``gym.make`` are
-    refused.
+    The environment's resets must depend on their seed alone. Its time limit is the family's too
+    (:attr:`max_episode_steps`), unless the family is registered with another or ``gym.make`` is
+    given one. Other wrappers than those of ``gym.make`` are refused.
 
     :param env: an id, or a function that makes the environment
-    :param observe_achieved_goal: whether the observation holds the achieved goal, which is needed unless
-        ``"observation"`` says where the agent is by itself
-    :param set_goal: gives the environment a goal after its reset, so that its own info and images follow it: called as
-        ``set_goal(env.unwrapped, goal)``; None sets the attribute ``goal``, as gymnasium-robotics has it
-    :param goal_low: lower bounds of the goals, ``(goal_dim,)``; None takes those of ``desired_goal``
+    :param observe_achieved_goal: whether the observation holds the achieved goal, which is needed
+        unless ``"observation"`` says where the agent is by itself
+    :param set_goal: gives the environment a goal after its reset, so that its own info and images
+        follow it: called as ``set_goal(env.unwrapped, goal)``; None sets the attribute ``goal``, as
+        gymnasium-robotics has it
+    :param goal_low: lower bounds of the goals, ``(goal_dim,)``; None takes those of
+        ``desired_goal``
     :param goal_high: upper bounds
     :param render_mode: as the environment has them
-    :param render_task: whether rendering shows the goal. If not, MuJoCo sites that mark it are made invisible, and whatever
-        else the environment draws for its goal is drawn at the achieved goal
+    :param render_task: whether rendering shows the goal. If not, MuJoCo sites that mark it are made
+        invisible, and whatever else the environment draws for its goal is drawn at the achieved
+        goal
     :param env_kwargs: further arguments of the environment
-    :raises ValueError: if the environment is not goal-conditioned, or wrapped; the message says what is missing
+    :raises ValueError: if the environment is not goal-conditioned, or wrapped; the message says
+        what is missing
     """
 
     metadata = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012 (Gymnasium declares it so)
@@ -80,7 +85,9 @@ class GoalFamily(TaskFamily):
                 "makes it"
             )
         self._source, self._set_goal_function = env, set_goal
-        self._env_kwargs = env_kwargs if render_mode is None else {**env_kwargs, "render_mode": render_mode}
+        self._env_kwargs = (
+            env_kwargs if render_mode is None else {**env_kwargs, "render_mode": render_mode}
+        )
         self._observe_achieved_goal = observe_achieved_goal
         self._goal_env: gym.Env | None = None
         self._success: bool | None = None
@@ -91,18 +98,26 @@ class GoalFamily(TaskFamily):
         self._define_spaces(goal_low, goal_high)
         self._rewards_broadcast = self._check_reward()
 
-    def _define_spaces(self, goal_low: npt.ArrayLike | None, goal_high: npt.ArrayLike | None) -> None:
+    def _define_spaces(
+        self, goal_low: npt.ArrayLike | None, goal_high: npt.ArrayLike | None
+    ) -> None:
         space: Any = self.env.observation_space  # a Dict of flat boxes, as check_goal_env saw to
         goal = space["desired_goal"]
         low, high = (
-            np.broadcast_to(np.asarray(own if given is None else given, dtype=np.float64), goal.shape)
+            np.broadcast_to(
+                np.asarray(own if given is None else given, dtype=np.float64), goal.shape
+            )
             for own, given in ((goal.low, goal_low), (goal.high, goal_high))
         )
         self.task_space = spaces.Box(low, high, dtype=np.float64)
         self.reward_feature_dim = goal.shape[0]
         parts = [space[key] for key in GOAL_KEYS[: 1 + self._observe_achieved_goal]]
-        low, high = (np.concatenate([getattr(part, bound) for part in parts]) for bound in ("low", "high"))
-        self.observation_space = spaces.Box(low.astype(np.float64), high.astype(np.float64), dtype=np.float64)
+        low, high = (
+            np.concatenate([getattr(part, bound) for part in parts]) for bound in ("low", "high")
+        )
+        self.observation_space = spaces.Box(
+            low.astype(np.float64), high.astype(np.float64), dtype=np.float64
+        )
         assert isinstance(self.env.action_space, spaces.Box)
         self.action_space = self.env.action_space
 
@@ -121,7 +136,9 @@ class GoalFamily(TaskFamily):
                 )
             self.max_episode_steps = getattr(wrapper, "_max_episode_steps", self.max_episode_steps)
             wrapper = wrapper.env
-        return wrapper  # the family checks actions itself, and a time limit of its own ends episodes
+        return (
+            wrapper  # the family checks actions itself, and a time limit of its own ends episodes
+        )
 
     @property  # type: ignore[override]
     def spec(self) -> EnvSpec | None:
@@ -137,13 +154,16 @@ class GoalFamily(TaskFamily):
             registered.max_episode_steps = self.max_episode_steps
 
     def step(self, action: npt.ArrayLike) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """See :class:`TaskFamily`; a family that was not made by ``gym.make`` keeps its time limit itself."""
+        """See :class:`TaskFamily`; a family that was not made by ``gym.make`` keeps its time limit
+        itself.
+        """
         observation, reward, terminated, _, info = super().step(action)
         truncated = self._spec is None and self._elapsed_steps >= (self.max_episode_steps or np.inf)
         return observation, reward, terminated, truncated, info
 
     def _check_reward(self) -> bool:
-        """Whether ``compute_reward`` takes many goals at once; if not, it is called for one after another.
+        """Whether ``compute_reward`` takes many goals at once; if not, it is called for one after
+        another.
 
         :raises ValueError: if it cannot be called, or the environment cannot be given a goal
         """
@@ -173,7 +193,9 @@ class GoalFamily(TaskFamily):
         if self._rewards_broadcast:
             rewards = self._own_reward(achieved, desired)
         else:
-            rows = [self._own_reward(a[None], d[None]) for a, d in zip(achieved, desired, strict=True)]
+            rows = [
+                self._own_reward(a[None], d[None]) for a, d in zip(achieved, desired, strict=True)
+            ]
             rewards = np.concatenate(rows) if rows else np.empty(0)
         return rewards.reshape(tasks.shape[:-1])
 
@@ -184,8 +206,12 @@ class GoalFamily(TaskFamily):
 
     def _goals_of_resets(self, env: gym.Env, seeds: Iterable[int]) -> np.ndarray:
         """The goals that the environment draws itself, ``(seeds, goal_dim)``."""
-        goals = np.stack([env.reset(seed=seed)[0]["desired_goal"] for seed in seeds]).astype(np.float64)
-        outside = (goals < self.task_space.low - BOUNDS_TOLERANCE) | (goals > self.task_space.high + BOUNDS_TOLERANCE)
+        goals = np.stack([env.reset(seed=seed)[0]["desired_goal"] for seed in seeds]).astype(
+            np.float64
+        )
+        outside = (goals < self.task_space.low - BOUNDS_TOLERANCE) | (
+            goals > self.task_space.high + BOUNDS_TOLERANCE
+        )
         if outside.any():
             raise ValueError(
                 f"goal_low and goal_high span {self.task_space}, but {self.env} draws the goal "
@@ -219,11 +245,20 @@ class GoalFamily(TaskFamily):
 
     def _simulate(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
         assert self._task is not None
-        observation, reward, terminated, _, info = self.env.step(action.astype(self.action_space.dtype))
+        observation, reward, terminated, _, info = self.env.step(
+            action.astype(self.action_space.dtype)
+        )
         self._check_step(observation, float(reward))
         success = info.get("success", info.get("is_success"))
-        self._success, self._achieved_goal = None if success is None else bool(success), observation["achieved_goal"].copy()
-        return self._observation(observation), observation["achieved_goal"].astype(np.float64), bool(terminated)
+        self._success, self._achieved_goal = (
+            None if success is None else bool(success),
+            observation["achieved_goal"].copy(),
+        )
+        return (
+            self._observation(observation),
+            observation["achieved_goal"].astype(np.float64),
+            bool(terminated),
+        )
 
     def _check_step(self, observation: dict[str, np.ndarray], reward: float) -> None:
         assert self._task is not None
@@ -269,7 +304,9 @@ class GoalFamily(TaskFamily):
 
 @contextlib.contextmanager
 def unchanged_physics(env: gym.Env) -> Iterator[None]:
-    """Put a MuJoCo environment back into its present state afterwards: some let a rendering change the solver's warm start."""
+    """Put a MuJoCo environment back into its present state afterwards: some let a rendering change
+    the solver's warm start.
+    """
     model, data = getattr(env, "model", None), getattr(env, "data", None)
     if model is None or data is None:
         yield
@@ -294,22 +331,25 @@ def hide_goal_sites(env: gym.Env) -> None:
 
 
 def check_goal_env(env: gym.Env) -> None:
-    """
-    Refuse what is no goal-conditioned environment.
+    """Refuse what is no goal-conditioned environment.
 
-    :param env: the environment
-    :raises ValueError: if its spaces are others, or ``compute_reward`` is missing; the message says what is needed
+    :raises ValueError: if its spaces are others, or ``compute_reward`` is missing; the message says
+        what is needed
     """
     bare, space = env.unwrapped, env.observation_space
     if not isinstance(space, spaces.Dict) or any(key not in space.spaces for key in GOAL_KEYS):
-        found = f"a Dict of {sorted(space.spaces)}" if isinstance(space, spaces.Dict) else str(space)
+        found = (
+            f"a Dict of {sorted(space.spaces)}" if isinstance(space, spaces.Dict) else str(space)
+        )
         raise ValueError(
             f"{bare} is not goal-conditioned: its observation space must be a Dict of {', '.join(map(repr, GOAL_KEYS))}, "
             f"but is {found}"
         )
     for key in GOAL_KEYS:
         if not isinstance(space[key], spaces.Box) or len(space[key].shape or ()) != 1:
-            raise ValueError(f"{bare}: the space of {key!r} must be a flat Box, but is {space[key]}")
+            raise ValueError(
+                f"{bare}: the space of {key!r} must be a flat Box, but is {space[key]}"
+            )
     if space["achieved_goal"].shape != space["desired_goal"].shape:
         raise ValueError(
             f"{bare}: 'achieved_goal' and 'desired_goal' must have the same shape, but have "

@@ -54,7 +54,10 @@ class _HalfCheetahFwdBack(_HalfCheetah):
         super().__init__(**kwargs)
 
     def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
-        return self.forward_reward_weight * tasks[..., 0] * features[..., 0] - self.ctrl_cost_weight * features[..., 1]
+        return (
+            self.forward_reward_weight * tasks[..., 0] * features[..., 0]
+            - self.ctrl_cost_weight * features[..., 1]
+        )
 
     def _task_markers(self, task: np.ndarray, position: np.ndarray) -> list[dict[str, Any]]:
         return [arrow(np.array([position[0], 0.0, 1.3]), (float(task[0]), 0.0), length=1.0)]
@@ -132,7 +135,9 @@ class HalfCheetahVelEnv(_HalfCheetahVel, MujocoTaskEnv):
 
 
 class HalfCheetahVelVectorEnv(_HalfCheetahVel, MujocoTaskVectorEnv):
-    """The vectorised :class:`HalfCheetahVelEnv`: same arguments, and those of a vectorised MuJoCo family."""
+    """The vectorised :class:`HalfCheetahVelEnv`: same arguments, and those of a vectorised MuJoCo
+    family.
+    """
 
 
 class HalfCheetahFwdBackEnv(_HalfCheetahFwdBack, MujocoTaskEnv):
@@ -172,4 +177,6 @@ class HalfCheetahFwdBackEnv(_HalfCheetahFwdBack, MujocoTaskEnv):
 
 
 class HalfCheetahFwdBackVectorEnv(_HalfCheetahFwdBack, MujocoTaskVectorEnv):
-    """The vectorised :class:`HalfCheetahFwdBackEnv`: same arguments, and those of a vectorised MuJoCo family."""
+    """The vectorised :class:`HalfCheetahFwdBackEnv`: same arguments, and those of a vectorised
+    MuJoCo family.
+    """

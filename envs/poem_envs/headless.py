@@ -10,7 +10,9 @@ _logger = logging.getLogger(__name__)
 
 def has_display() -> bool:
     """Whether windows can open; on systems other than Linux it is taken for granted."""
-    return sys.platform != "linux" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+    return sys.platform != "linux" or any(
+        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
+    )
 
 
 def can_draw() -> bool:
@@ -38,11 +40,15 @@ def choose_headless_backend() -> None:
         os.environ["MUJOCO_GL"] = backend
         _logger.info("no display: rendering with MUJOCO_GL=%s", backend)
         return
-    raise RuntimeError("rendering on a machine without a display needs libEGL or libOSMesa: install libegl1 or libosmesa6")
+    raise RuntimeError(
+        "rendering on a machine without a display needs libEGL or libOSMesa: install libegl1 or libosmesa6"
+    )
 
 
 def release_graphics() -> None:
-    """Let go of the EGL context that this thread rendered with last: it can be used in one thread at a time."""
+    """Let go of the EGL context that this thread rendered with last: it can be used in one thread
+    at a time.
+    """
     egl = sys.modules.get("mujoco.egl")
     if egl is None or egl.EGL_DISPLAY is None:
         return

@@ -78,7 +78,8 @@ class _Humanoid(MujocoFamily):
         return np.concatenate([super()._observations(), self._derived], axis=1)
 
     def _derive(self, copies: np.ndarray, controls: np.ndarray) -> None:
-        """Compute what the observation and the reward take from the simulator, at the copies' current states.
+        """Compute what the observation and the reward take from the simulator, at the copies'
+        current states.
 
         :param copies: their numbers
         :param controls: the actions that are applied, ``(len(copies), nu)``
@@ -87,8 +88,17 @@ class _Humanoid(MujocoFamily):
         if self._forward_data is None:
             self._forward_data = mujoco.MjData(model)
         data = self._forward_data
-        derived = [data.cinert.reshape(-1), data.cvel.reshape(-1), data.qfrc_actuator, data.cfrc_ext.reshape(-1)]
-        ctrl, warm_start, centre_of_mass = data.ctrl, data.qacc_warmstart, data.subtree_com[self._torso, :2]
+        derived = [
+            data.cinert.reshape(-1),
+            data.cvel.reshape(-1),
+            data.qfrc_actuator,
+            data.cfrc_ext.reshape(-1),
+        ]
+        ctrl, warm_start, centre_of_mass = (
+            data.ctrl,
+            data.qacc_warmstart,
+            data.subtree_com[self._torso, :2],
+        )
         for copy, control in zip(copies.tolist(), controls, strict=True):
             mujoco.mj_setState(model, data, self._states[copy], mujoco.mjtState.mjSTATE_FULLPHYSICS)
             ctrl[:] = control
@@ -104,7 +114,9 @@ class _Humanoid(MujocoFamily):
 
 
 class _HumanoidDir2D(_Humanoid):
-    def __init__(self, *, forward_reward_weight: float = 1.25, healthy_reward: float = 5.0, **kwargs: Any) -> None:
+    def __init__(
+        self, *, forward_reward_weight: float = 1.25, healthy_reward: float = 5.0, **kwargs: Any
+    ) -> None:
         self.forward_reward_weight = forward_reward_weight
         self.healthy_reward = healthy_reward
         self.task_space = spaces.Box(-np.pi / 2, np.pi / 2, (1,), np.float64)
@@ -190,4 +202,6 @@ class HumanoidDir2DEnv(_HumanoidDir2D, MujocoTaskEnv):
 
 
 class HumanoidDir2DVectorEnv(_HumanoidDir2D, MujocoTaskVectorEnv):
-    """The vectorised :class:`HumanoidDir2DEnv`: same arguments, and those of a vectorised MuJoCo family."""
+    """The vectorised :class:`HumanoidDir2DEnv`: same arguments, and those of a vectorised MuJoCo
+    family.
+    """

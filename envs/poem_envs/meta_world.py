@@ -1,4 +1,6 @@
-"""Meta-World's meta-learning benchmarks as task families: placements of one manipulation (ML1), or of ten (ML10)."""
+"""Meta-World's meta-learning benchmarks as task families: placements of one manipulation (ML1), or
+of ten (ML10).
+"""
 
 from __future__ import annotations
 
@@ -98,7 +100,9 @@ class MetaWorldEnv(TaskFamily):
         return {"success": self._success}
 
     def get_physics_state(self) -> np.ndarray:
-        """The simulator's state, ``(state_dim,)``: enough to go on from it in an episode of the same task and start."""
+        """The simulator's state, ``(state_dim,)``: enough to go on from it in an episode of the
+        same task and start.
+        """
         if self._sawyer is None:
             raise RuntimeError("get_physics_state() was called before the first reset()")
         return self._sawyer.get_state()
@@ -112,17 +116,23 @@ class MetaWorldEnv(TaskFamily):
         shape = self.get_physics_state().shape
         array = np.array(state, dtype=np.float64)
         if array.shape != shape or not np.isfinite(array).all():
-            raise ValueError(f"state={state!r} must be finite and have shape {shape}, as get_physics_state() returns it")
+            raise ValueError(
+                f"state={state!r} must be finite and have shape {shape}, as get_physics_state() returns it"
+            )
         assert self._sawyer is not None
         self._sawyer.set_state(array)
 
     def render(self) -> Any:
-        """Render the current state as ``render_mode`` says: an image ``(height, width, 3)`` for ``"rgb_array"``."""
+        """Render the current state as ``render_mode`` says: an image ``(height, width, 3)`` for
+        ``"rgb_array"``.
+        """
         if self._sawyer is None:
             raise RuntimeError("render() was called before the first reset()")
         image = self._sawyer.render()
         # Meta-World's models have these cameras upside down.
-        upside_down = isinstance(image, np.ndarray) and (self._sawyer_arguments["camera_name"] or "").startswith("corner")
+        upside_down = isinstance(image, np.ndarray) and (
+            self._sawyer_arguments["camera_name"] or ""
+        ).startswith("corner")
         return image[::-1, ::-1].copy() if upside_down else image
 
     def close(self) -> None:
@@ -251,10 +261,14 @@ class MetaWorldML1Env(MetaWorldEnv):
 
     def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
         if not self._reaching:
-            return np.broadcast_to(features[..., 0], np.broadcast_shapes(tasks.shape[:-1], features.shape[:-1])).copy()
+            return np.broadcast_to(
+                features[..., 0], np.broadcast_shapes(tasks.shape[:-1], features.shape[:-1])
+            ).copy()
         beyond = np.maximum(_distance(features, tasks) - TARGET_RADIUS, 0.0)
         relative = beyond / _distance(self._hand_init_pos, tasks)
-        return 10.0 / (1.0 + 9.0 * relative * relative)  # 0.1 of the full reward at the distance of the start
+        return 10.0 / (
+            1.0 + 9.0 * relative * relative
+        )  # 0.1 of the full reward at the distance of the start
 
 
 class MetaWorldML10Env(MetaWorldEnv):
@@ -293,11 +307,15 @@ class MetaWorldML10Env(MetaWorldEnv):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         table = load_metaworld().ML10_V3
-        trained, held_out = ([name.removesuffix("-v3") for name in table[part]] for part in ("train", "test"))
+        trained, held_out = (
+            [name.removesuffix("-v3") for name in table[part]] for part in ("train", "test")
+        )
         #: The names of the manipulations, by number.
         self.manipulations = [*trained, *held_out]
         self._numbers = (
-            np.arange(len(trained), len(self.manipulations)) if self.split == "held-out" else np.arange(len(trained))
+            np.arange(len(trained), len(self.manipulations))
+            if self.split == "held-out"
+            else np.arange(len(trained))
         )
         bounds = [placements_of(name) for name in self.manipulations]
         self._placement_dims = [len(placements.low) for placements in bounds]
@@ -305,21 +323,28 @@ class MetaWorldML10Env(MetaWorldEnv):
         low = np.min([_padded(placements.low, width) for placements in bounds], axis=0)
         high = np.max([_padded(placements.high, width) for placements in bounds], axis=0)
         last = len(self.manipulations) - 1.0
-        self.task_space = spaces.Box(np.concatenate([[0.0], low]), np.concatenate([[last], high]), dtype=np.float64)
+        self.task_space = spaces.Box(
+            np.concatenate([[0.0], low]), np.concatenate([[last], high]), dtype=np.float64
+        )
 
     def _draw_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
         rng = split_stream(rng, self.splits.index(self.split))
         rounds = -(-n // len(self._numbers))
         numbers = np.concatenate([rng.permutation(self._numbers) for _ in range(rounds)])[:n]
         width = self.task_space.shape[0] - 1
-        draws = [_padded(placements_of(self.manipulations[number]).draw(rng), width) for number in numbers]
+        draws = [
+            _padded(placements_of(self.manipulations[number]).draw(rng), width)
+            for number in numbers
+        ]
         return np.column_stack([numbers, draws])
 
     def _checked_tasks(self, tasks: npt.ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:
         checked = super()._checked_tasks(tasks, shape, name)
         for task in checked.reshape(-1, checked.shape[-1]):
             if abs(task[0] - round(task[0])) > 1e-6:
-                raise ValueError(f"{name}={task.tolist()} must begin with a manipulation's number, a whole one")
+                raise ValueError(
+                    f"{name}={task.tolist()} must begin with a manipulation's number, a whole one"
+                )
             manipulation, placement = self._place(task, np.random.default_rng(0))
             if np.any(task[1 + len(placement) :] != 0.0):
                 raise ValueError(
@@ -336,7 +361,9 @@ class MetaWorldML10Env(MetaWorldEnv):
         return np.array([reward])
 
     def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
-        return np.broadcast_to(features[..., 0], np.broadcast_shapes(tasks.shape[:-1], features.shape[:-1])).copy()
+        return np.broadcast_to(
+            features[..., 0], np.broadcast_shapes(tasks.shape[:-1], features.shape[:-1])
+        ).copy()
 
 
 #: The vectorised :class:`MetaWorldML1Env`: same arguments, and those of ``ProcessFamilyVector``.
@@ -346,7 +373,8 @@ MetaWorldML10VectorEnv = functools.partial(ProcessFamilyVector, MetaWorldML10Env
 
 
 def split_stream(rng: np.random.Generator, split: int) -> np.random.Generator:
-    """A generator of a split's own, so that equal generators give different tasks in different splits.
+    """A generator of a split's own, so that equal generators give different tasks in different
+    splits.
 
     :param rng: which determines it; the first split draws from it directly
     :param split: the number of the split
@@ -355,13 +383,13 @@ def split_stream(rng: np.random.Generator, split: int) -> np.random.Generator:
 
 
 def check_placement(manipulation: str, placement: np.ndarray, name: str) -> None:
-    """
-    :raises ValueError: if Meta-World has no such placement of the manipulation
-    """
+    """:raises ValueError: if Meta-World has no such placement of the manipulation"""
     placements = placements_of(manipulation)
     low, high = placements.low, placements.high
     if np.any(placement < low - 1e-6) or np.any(placement > high + 1e-6):
-        raise ValueError(f"{name}: placement {placement.tolist()} of {manipulation!r} must be inside {low} to {high}")
+        raise ValueError(
+            f"{name}: placement {placement.tolist()} of {manipulation!r} must be inside {low} to {high}"
+        )
     try:
         placements.check(placement)
     except PlacementRefusedError as error:

@@ -1,4 +1,6 @@
-"""MuJoCo task families: one robot, one reward, any number of copies stepped by MuJoCo's own threads."""
+"""MuJoCo task families: one robot, one reward, any number of copies stepped by MuJoCo's own
+threads.
+"""
 
 from __future__ import annotations
 
@@ -24,19 +26,21 @@ RENDER_MODES = ["human", "rgb_array", "depth_array", "rgbd_tuple"]
 class MujocoFamily(BatchFamily):
     """The dynamics of a MuJoCo robot, for :class:`MujocoTaskEnv` and :class:`MujocoTaskVectorEnv`.
 
-    A robot sets the class attributes and defines :meth:`_reward_features`, :meth:`_draw_start` where its start is another, and
-    :meth:`_unhealthy` where it can fall. A family on top of it defines tasks, reward, and how a task is shown
-    (:meth:`_task_markers`).
+    A robot sets the class attributes and defines :meth:`_reward_features`, :meth:`_draw_start`
+    where its start is another, and :meth:`_unhealthy` where it can fall. A family on top of it
+    defines tasks, reward, and how a task is shown (:meth:`_task_markers`).
 
     **A control step** sets MuJoCo's solver warm start (``qacc_warmstart``) to zero and makes ``frame_skip`` physics steps.
-    Gymnasium's environments let the warm start run on between control steps; it is no part of MuJoCo's physics state
-    (``mjSTATE_FULLPHYSICS``), and ``mujoco.rollout`` starts each call at zero. So ours makes the next state a function
-    of state and action alone, the same in one environment as in many. It moves a step's result by the solver's tolerance (in
-    tests by up to 1e-13 for HalfCheetah and Ant, and 1e-4 for Humanoid, whose model allows its solver few iterations); apart
-    from it the dynamics are Gymnasium's bit for bit.
+    Gymnasium's environments let the warm start run on between control steps; it is no part of
+    MuJoCo's physics state (``mjSTATE_FULLPHYSICS``), and ``mujoco.rollout`` starts each call at
+    zero. So ours makes the next state a function of state and action alone, the same in one
+    environment as in many. It moves a step's result by the solver's tolerance (in tests by up to
+    1e-13 for HalfCheetah and Ant, and 1e-4 for Humanoid, whose model allows its solver few
+    iterations); apart from it the dynamics are Gymnasium's bit for bit.
 
     **Velocities** of the reward are differences of positions over the control step, ``(after - before) / dt``, both taken from
-    the integrated state. Gymnasium's Ant and Humanoid read body positions, which MuJoCo updates one physics step late.
+    the integrated state. Gymnasium's Ant and Humanoid read body positions, which MuJoCo updates one
+    physics step late.
 
     :param xml_file: model file; a bare name is one of Gymnasium's
     :param frame_skip: physics steps in a control step
@@ -45,10 +49,12 @@ class MujocoFamily(BatchFamily):
     :param height: of rendered images, pixels
     :param camera_id: camera of the model to render from; None for one that follows the robot
     :param camera_name: the same by name
-    :param default_camera_config: attributes of the following camera, such as ``{"distance": 4.0}``, over the robot's own
+    :param default_camera_config: attributes of the following camera, such as ``{"distance": 4.0}``,
+        over the robot's own
     :param max_geom: as in Gymnasium
     :param visual_options: as in Gymnasium
-    :param render_quality: "full", or "fast": without shadows, reflections and antialiasing, for RGB images alone
+    :param render_quality: "full", or "fast": without shadows, reflections and antialiasing, for RGB
+        images alone
     :raises OSError: if there is no such model file
     :raises ValueError: if the rendering quality is unknown, or does not go with the render mode
     """
@@ -82,7 +88,9 @@ class MujocoFamily(BatchFamily):
     ) -> None:
         self.model = mujoco.MjModel.from_xml_path(_model_path(xml_file))
         if self.model.na:
-            raise ValueError(f"xml_file={xml_file!r} has actuators with activations, which these environments do not handle")
+            raise ValueError(
+                f"xml_file={xml_file!r} has actuators with activations, which these environments do not handle"
+            )
         self.frame_skip = frame_skip
         self.reset_noise_scale = reset_noise_scale
         initial = mujoco.MjData(self.model)
@@ -116,7 +124,9 @@ class MujocoFamily(BatchFamily):
         return self._states[:, 1 : 1 + self.model.nq]
 
     def _draw_start(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Draw an episode's first ``qpos`` and ``qvel``: unless overridden, as Gymnasium's HalfCheetah and Ant do."""
+        """Draw an episode's first ``qpos`` and ``qvel``: unless overridden, as Gymnasium's
+        HalfCheetah and Ant do.
+        """
         scale = self.reset_noise_scale
         qpos = self.init_qpos + rng.uniform(low=-scale, high=scale, size=self.model.nq)
         qvel = self.init_qvel + scale * rng.standard_normal(self.model.nv)
@@ -147,7 +157,9 @@ class MujocoFamily(BatchFamily):
         return self.model.nq - self.hidden_qpos + self.model.nv
 
     def _allocate(self, n: int) -> None:
-        self._states = np.zeros((n, 1 + self.model.nq + self.model.nv))  # time, qpos, qvel: MuJoCo's mjSTATE_FULLPHYSICS
+        self._states = np.zeros(
+            (n, 1 + self.model.nq + self.model.nv)
+        )  # time, qpos, qvel: MuJoCo's mjSTATE_FULLPHYSICS
 
     def _begin_episodes(self, copies: np.ndarray, rngs: Sequence[np.random.Generator]) -> None:
         for copy, rng in zip(copies, rngs, strict=True):
@@ -155,7 +167,9 @@ class MujocoFamily(BatchFamily):
 
     def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if self._integrator is None:
-            self._integrator = Integrator(self.model, self.frame_skip, len(self._states), self._nthread)
+            self._integrator = Integrator(
+                self.model, self.frame_skip, len(self._states), self._nthread
+            )
         after = self._integrator.advance(self._states, actions)
         self._check_divergence(after)
         qpos_before = self._qpos.copy()
@@ -163,7 +177,8 @@ class MujocoFamily(BatchFamily):
         return self._reward_features(qpos_before, actions), self._unhealthy()
 
     def _check_divergence(self, after: np.ndarray) -> None:
-        # A simulation that blows up is reset by MuJoCo within the step, with no more than a warning; its clock tells.
+        # A simulation that blows up is reset by MuJoCo within the step, with no more than a
+        # warning; its clock tells.
         late = np.abs(after[:, 0] - self._states[:, 0] - self.dt) > 0.5 * self.model.opt.timestep
         diverged = late | ~np.isfinite(after).all(axis=1)
         if diverged.any():
@@ -217,7 +232,10 @@ class MujocoTaskVectorEnv(MujocoFamily, TaskFamilyVector):
     :param nthread: number of threads; None for as many as this process may use cores
     """
 
-    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "render_modes": RENDER_MODES,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }
 
     def __init__(self, *, nthread: int | None = None, **kwargs: Any) -> None:
         if nthread is not None and nthread < 1:
@@ -231,5 +249,7 @@ def _model_path(xml_file: str) -> str:
     if not path.startswith((".", os.sep)):
         path = os.path.join(os.path.dirname(gymnasium.__file__), "envs", "mujoco", "assets", path)
     if not os.path.exists(path):
-        raise OSError(f"xml_file={xml_file!r} does not exist; give a path, or the bare name of one of Gymnasium's models")
+        raise OSError(
+            f"xml_file={xml_file!r} does not exist; give a path, or the bare name of one of Gymnasium's models"
+        )
     return path

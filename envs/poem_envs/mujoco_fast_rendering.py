@@ -1,4 +1,6 @@
-"""Rendering of MuJoCo states for a processor without a graphics card: no shadows, reflections or haze, coarse shapes."""
+"""Rendering of MuJoCo states for a processor without a graphics card: no shadows, reflections or
+haze, coarse shapes.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +16,14 @@ from poem_envs.mujoco_rendering import close_at_exit, stays_closed
 
 RENDER_QUALITIES = ("full", "fast")
 MAX_GEOM = 200
-# Slices and stacks of a sphere, and quads of a plane: at the size of a web page nobody sees the difference.
+# Slices and stacks of a sphere, and quads of a plane: at the size of a web page nobody sees the
+# difference.
 COARSE = (12, 6, 1)
 
 
 class FastRenderer:
-    """Renders states of one model as RGB images. On a software renderer an image takes a small part of what Gymnasium's takes.
+    """Renders states of one model as RGB images. On a software renderer an image takes a small part
+    of what Gymnasium's takes.
 
     A graphics context belongs to the thread that rendered first; render from no other.
 
@@ -66,7 +70,8 @@ class FastRenderer:
         """Render one state.
 
         :param state: time, positions and velocities, ``(1 + nq + nv,)``
-        :param markers: shapes to add: ``type``, ``pos``, ``size``, ``mat``, ``rgba`` of an ``MjvGeom``
+        :param markers: shapes to add: ``type``, ``pos``, ``size``, ``mat``, ``rgba`` of an
+            ``MjvGeom``
         :return: ``(height, width, 3)`` uint8
         """
         mujoco.mj_setState(self._model, self._data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
@@ -85,7 +90,9 @@ class FastRenderer:
         self._context.make_current()  # another environment may have rendered since
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._resources)
         everything = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(self._model, data, self._options, None, self._camera, everything, self._scene)
+        mujoco.mjv_updateScene(
+            self._model, data, self._options, None, self._camera, everything, self._scene
+        )
         for marker in markers:
             self._add(marker)
         mujoco.mjr_render(self._viewport, self._scene, self._resources)
@@ -99,12 +106,16 @@ class FastRenderer:
         self._context.free()
         stays_closed(self)
 
-    def _make_camera(self, camera_id: int | None, camera_name: str | None, config: dict[str, Any]) -> mujoco.MjvCamera:
+    def _make_camera(
+        self, camera_id: int | None, camera_name: str | None, config: dict[str, Any]
+    ) -> mujoco.MjvCamera:
         camera = mujoco.MjvCamera()
         if camera_name is not None:
             camera_id = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_CAMERA, camera_name)
             if camera_id < 0:
-                raise ValueError(f"camera_name={camera_name!r}: the model has no camera of this name")
+                raise ValueError(
+                    f"camera_name={camera_name!r}: the model has no camera of this name"
+                )
         if camera_id is not None and camera_id >= 0:
             camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera_id
             return camera
@@ -119,33 +130,50 @@ class FastRenderer:
 
     def _add(self, marker: dict[str, Any]) -> None:
         if self._scene.ngeom >= self._scene.maxgeom:
-            raise RuntimeError(f"a scene of more than {self._scene.maxgeom} shapes cannot be rendered fast")
+            raise RuntimeError(
+                f"a scene of more than {self._scene.maxgeom} shapes cannot be rendered fast"
+            )
         geom = self._scene.geoms[self._scene.ngeom]
         size = np.asarray(marker.get("size", (0.1, 0.1, 0.1)), dtype=np.float64)
         rotation = np.asarray(marker.get("mat", np.eye(3)), dtype=np.float64).reshape(9)
         colour = np.asarray(marker.get("rgba", (1.0, 1.0, 1.0, 1.0)), dtype=np.float32)
-        mujoco.mjv_initGeom(geom, marker["type"], size, np.asarray(marker["pos"], dtype=np.float64), rotation, colour)
+        mujoco.mjv_initGeom(
+            geom,
+            marker["type"],
+            size,
+            np.asarray(marker["pos"], dtype=np.float64),
+            rotation,
+            colour,
+        )
         self._scene.ngeom += 1
 
 
 def renders_fast(render_quality: str, render_mode: str | None) -> bool:
-    """
-    Whether images come from a :class:`FastRenderer`.
+    """Whether images come from a :class:`FastRenderer`.
 
     :param render_quality: "full" or "fast", as users give it
     :param render_mode: of the environment
-    :raises ValueError: if the quality is another, or "fast" is asked of a mode that has no images in colour
+    :raises ValueError: if the quality is another, or "fast" is asked of a mode that has no images
+        in colour
     """
     if render_quality not in RENDER_QUALITIES:
-        raise ValueError(f"render_quality must be one of {RENDER_QUALITIES}, got {render_quality!r}")
+        raise ValueError(
+            f"render_quality must be one of {RENDER_QUALITIES}, got {render_quality!r}"
+        )
     if render_quality == "fast" and render_mode not in (None, "rgb_array"):
-        raise ValueError(f'render_quality="fast" goes with render_mode="rgb_array" alone, got {render_mode!r}')
+        raise ValueError(
+            f'render_quality="fast" goes with render_mode="rgb_array" alone, got {render_mode!r}'
+        )
     return render_quality == "fast"
 
 
 def _make_context(width: int, height: int) -> Any:
-    """A graphics context off screen. ``mujoco.GLContext`` itself is fixed when MuJoCo is imported, which was long ago."""
+    """A graphics context off screen. ``mujoco.GLContext`` itself is fixed when MuJoCo is imported,
+    which was long ago.
+    """
     choose_headless_backend()
     backend = os.environ.get("MUJOCO_GL", "").lower()
-    module = importlib.import_module(f"mujoco.{backend}") if backend in ("egl", "osmesa") else mujoco
+    module = (
+        importlib.import_module(f"mujoco.{backend}") if backend in ("egl", "osmesa") else mujoco
+    )
     return module.GLContext(width, height)

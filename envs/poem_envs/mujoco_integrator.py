@@ -16,7 +16,9 @@ class Integrator:
     :param nthread: number of threads; 0 or 1 for the calling one
     """
 
-    def __init__(self, model: mujoco.MjModel, frame_skip: int, batch_size: int, nthread: int) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, frame_skip: int, batch_size: int, nthread: int
+    ) -> None:
         nthread = min(nthread, batch_size)
         self._rollout = Rollout(nthread=nthread if nthread > 1 else 0)
         self._data = [mujoco.MjData(model) for _ in range(max(nthread, 1))]
@@ -28,7 +30,8 @@ class Integrator:
     def advance(self, states: np.ndarray, controls: np.ndarray) -> np.ndarray:
         """Advance every state under a constant control, with a cold solver start.
 
-        :param states: ``(batch_size, 1 + nq + nv)``: time, positions, velocities; contiguous float64
+        :param states: ``(batch_size, 1 + nq + nv)``: time, positions, velocities; contiguous
+            float64
         :param controls: ``(batch_size, nu)``
         :return: the states after, a view that the next call overwrites
         """

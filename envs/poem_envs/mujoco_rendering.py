@@ -54,7 +54,15 @@ class StateRenderer:
         self._data = mujoco.MjData(model)
         self._follows = camera_id is None and camera_name is None
         self._renderer = MujocoRenderer(
-            model, self._data, camera_config, width, height, max_geom, camera_id, camera_name, visual_options
+            model,
+            self._data,
+            camera_config,
+            width,
+            height,
+            max_geom,
+            camera_id,
+            camera_name,
+            visual_options,
         )
 
     def render(self, state: np.ndarray, render_mode: str, markers: list[dict[str, Any]]) -> Any:
@@ -88,7 +96,8 @@ class StateRenderer:
 def renderer_inside(env: Any) -> Any:
     """The ``MujocoRenderer`` of an environment that renders by itself; None where there is none.
 
-    :param env: the bare environment; mazes of gymnasium-robotics keep the robot's environment one deeper
+    :param env: the bare environment; mazes of gymnasium-robotics keep the robot's environment one
+        deeper
     """
     for holder in (env, getattr(env, "ant_env", None), getattr(env, "point_env", None)):
         renderer = getattr(holder, "mujoco_renderer", None)
@@ -98,11 +107,10 @@ def renderer_inside(env: Any) -> Any:
 
 
 def prepare_to_render(env: Any, render_mode: str | None) -> None:
-    """Choose a backend, and make an environment's graphics context the current one: Gymnasium does not when another
-    environment has rendered since, and gives an image of nothing.
+    """Choose a backend, and make an environment's graphics context the current one: Gymnasium does
+    not when another environment has rendered since, and gives an image of nothing.
 
     :param env: a bare environment that renders by itself
-    :param render_mode: its render mode
     """
     renderer = renderer_inside(env)
     if renderer is None or render_mode is None:
@@ -113,8 +121,8 @@ def prepare_to_render(env: Any, render_mode: str | None) -> None:
 
 
 def close_viewers(env: Any) -> None:
-    """Close what an environment renders with, so that a later rendering opens it anew: Gymnasium's own ``close`` keeps what
-    it has closed, and renders black with it.
+    """Close what an environment renders with, so that a later rendering opens it anew: Gymnasium's
+    own ``close`` keeps what it has closed, and renders black with it.
 
     :param env: a bare environment that renders by itself
     """
@@ -131,7 +139,8 @@ def close_viewers(env: Any) -> None:
 
 def close_at_exit(renderer: _Closable) -> None:
     """Close a renderer when the program ends, if it still is open then."""
-    # A graphics context must go before the library that made it, which ends itself at exit: so register after its import.
+    # A graphics context must go before the library that made it, which ends itself at exit: so
+    # register after its import.
     if not _open_renderers:
         atexit.register(_close_open_renderers)
     _open_renderers.add(renderer)
@@ -155,7 +164,9 @@ def arrow(start: np.ndarray, direction: tuple[float, float], length: float) -> d
     :param length: in metres
     """
     x, y = direction
-    rotation = np.array([[0.0, -y, x], [0.0, x, y], [-1.0, 0.0, 0.0]])  # columns; the arrow points along its own z axis
+    rotation = np.array(
+        [[0.0, -y, x], [0.0, x, y], [-1.0, 0.0, 0.0]]
+    )  # columns; the arrow points along its own z axis
     return {
         "type": mujoco.mjtGeom.mjGEOM_ARROW,
         "pos": np.asarray(start, dtype=np.float64),

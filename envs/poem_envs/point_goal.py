@@ -54,13 +54,17 @@ class _PointGoal(BatchFamily):
         return self._positions.copy()
 
     def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
-        angle = np.array(tasks[..., 0])  # contiguous: strided input may take another, differently rounded path
+        angle = np.array(
+            tasks[..., 0]
+        )  # contiguous: strided input may take another, differently rounded path
         x = features[..., 0] - np.cos(angle)
         y = features[..., 1] - np.sin(angle)
         return -np.sqrt(x * x + y * y)
 
     def _potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
-        return self._reward(tasks, observations)  # the position is what the robot sees and what earns
+        return self._reward(
+            tasks, observations
+        )  # the position is what the robot sees and what earns
 
     def _physics_state(self, copy: int) -> np.ndarray:
         return self._positions[copy].copy()
@@ -68,7 +72,9 @@ class _PointGoal(BatchFamily):
     def _set_physics_state(self, copy: int, state: np.ndarray) -> None:
         self._positions[copy] = state
 
-    def _render_copy(self, copy: int, render_mode: str, task: np.ndarray | None) -> np.ndarray | None:
+    def _render_copy(
+        self, copy: int, render_mode: str, task: np.ndarray | None
+    ) -> np.ndarray | None:
         canvas = Canvas(self.width, self.height, centre=(0.0, 0.4), extent=2.7)
         canvas.upper_half_circle(1.0, 0.015, (190, 190, 190))
         canvas.disc(0.0, 0.0, 0.02, (190, 190, 190))
@@ -148,6 +154,8 @@ class PointGoalEnv(_PointGoal, BatchTaskFamily):
 
 
 class PointGoalVectorEnv(_PointGoal, TaskFamilyVector):
-    """The vectorised :class:`PointGoalEnv`: same arguments, and those of :class:`~poem_envs.vector.TaskFamilyVector`."""
+    """The vectorised :class:`PointGoalEnv`: same arguments, and those of
+    :class:`~poem_envs.vector.TaskFamilyVector`.
+    """
 
     metadata = {**PointGoalEnv.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012

@@ -1,7 +1,9 @@
-"""Any task family, vectorised over processes: for simulators whose steps spend their time in Python, where threads would wait.
+"""Any task family, vectorised over processes: for simulators whose steps spend their time in
+Python, where threads would wait.
 
-A worker process starts with :mod:`poem_envs.worker` alone, so that user scripts need no ``if __name__ == "__main__"`` and no
-worker loads torch. What a worker does is in :class:`CopyGroup`; the vectorised environment steps a group of its own meanwhile.
+A worker process starts with :mod:`poem_envs.worker` alone, so that user scripts need no ``if
+__name__ == "__main__"`` and no worker loads torch. What a worker does is in :class:`CopyGroup`; the
+vectorised environment steps a group of its own meanwhile.
 """
 
 from __future__ import annotations
@@ -38,7 +40,9 @@ class EpisodeStart(NamedTuple):
 
 
 class GroupStep(NamedTuple):
-    """A step of a group: observations, reward features, early ends, and further infos, a row for each of its copies."""
+    """A step of a group: observations, reward features, early ends, and further infos, a row for
+    each of its copies.
+    """
 
     observations: np.ndarray
     features: np.ndarray
@@ -57,8 +61,12 @@ class CopyGroup:
         self.envs = list(envs)
         self.first = first
 
-    def begin(self, starts: Sequence[EpisodeStart]) -> tuple[list[np.ndarray], list[np.random.Generator]]:
-        """Begin episodes in some copies; returns their observations, and their generators after all draws."""
+    def begin(
+        self, starts: Sequence[EpisodeStart]
+    ) -> tuple[list[np.ndarray], list[np.random.Generator]]:
+        """Begin episodes in some copies; returns their observations, and their generators after all
+        draws.
+        """
         observations = []
         for start in starts:
             env = self.envs[start.copy]
@@ -87,7 +95,9 @@ class CopyGroup:
         try:
             return getattr(self.envs[copy], method)(*arguments)
         except Exception as error:
-            raise RuntimeError(f"environment copy {self.first + copy}: {type(error).__name__}: {error}") from error
+            raise RuntimeError(
+                f"environment copy {self.first + copy}: {type(error).__name__}: {error}"
+            ) from error
 
     def set_attribute(self, name: str, value: Any) -> None:
         """Set an attribute of every copy."""
@@ -101,14 +111,17 @@ class CopyGroup:
 
 
 class WorkerError(Exception):
-    """The traceback of an error in a worker process, as text; the cause of the error that is raised for it."""
+    """The traceback of an error in a worker process, as text; the cause of the error that is raised
+    for it.
+    """
 
     def __str__(self) -> str:
         return "\n" + str(self.args[0])
 
 
 class RemoteGroup:
-    """A :class:`CopyGroup` in a process of its own: calls are sent, and their results received later.
+    """A :class:`CopyGroup` in a process of its own: calls are sent, and their results received
+    later.
 
     :param make: what makes the copies there, pickled by ``cloudpickle``
     :param first: the number of the first copy
@@ -136,8 +149,7 @@ class RemoteGroup:
             raise RuntimeError(self._gone()) from None
 
     def receive(self) -> Any:
-        """
-        The result of the oldest call that is under way.
+        """The result of the oldest call that is under way.
 
         :raises RuntimeError: if the call failed, or the worker is gone
         """
@@ -169,17 +181,20 @@ def _end_worker(connection: Connection, process: subprocess.Popen[bytes]) -> Non
 
 
 class ProcessFamilyVector(TaskFamilyVector):
-    """The vectorised version of any task family: its copies share the work of ``nthread`` processes, this one among them.
+    """The vectorised version of any task family: its copies share the work of ``nthread``
+    processes, this one among them.
 
-    Results equal those of single environments bit for bit, whatever the number of processes. Register a family with it::
+    Results equal those of single environments bit for bit, whatever the number of processes.
+    Register a family with it::
 
         gym.register("my/Walk-v0", Walk1D, vector_entry_point=functools.partial(ProcessFamilyVector, Walk1D), ...)
 
-    :param family: a :class:`~poem_envs.TaskFamily` class, or a function that makes such an environment
+    :param family: a :class:`~poem_envs.TaskFamily` class, or a function that makes such an
+        environment
     :param num_envs: number of copies
     :param nthread: number of processes; None for as many as this process may use cores
-    :param max_episode_steps: episodes are truncated after so many steps; None for as many as a :class:`GoalFamily`'s
-        environment has, or never
+    :param max_episode_steps: episodes are truncated after so many steps; None for as many as a
+        :class:`GoalFamily`'s environment has, or never
     :param render_mode: as the family has them; ``"human"`` for one copy only
     :param render_task: whether rendering shows the hidden tasks
     :param family_kwargs: further arguments of the family
@@ -217,7 +232,10 @@ class ProcessFamilyVector(TaskFamilyVector):
         if max_episode_steps is None:
             max_episode_steps = getattr(self._template, "max_episode_steps", None)
         self._copy_definition()
-        observation_space, action_space = self._template.observation_space, self._template.action_space
+        observation_space, action_space = (
+            self._template.observation_space,
+            self._template.action_space,
+        )
         assert isinstance(observation_space, spaces.Box)
         assert isinstance(action_space, spaces.Box)
         super().__init__(
@@ -233,13 +251,18 @@ class ProcessFamilyVector(TaskFamilyVector):
     def _copy_definition(self) -> None:
         family = self._template
         self.task_space, self.all_tasks = family.task_space, family.all_tasks
-        self.reward_feature_dim, self.shared_dynamics = family.reward_feature_dim, family.shared_dynamics
+        self.reward_feature_dim, self.shared_dynamics = (
+            family.reward_feature_dim,
+            family.shared_dynamics,
+        )
         self.splits = family.splits
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        return getattr(self._template, name)  # what a family has of its own, as a single environment does
+        return getattr(
+            self._template, name
+        )  # what a family has of its own, as a single environment does
 
     def set_attribute(self, name: str, value: Any) -> None:
         setattr(self._template, name, value)
@@ -271,7 +294,9 @@ class ProcessFamilyVector(TaskFamilyVector):
     def _allocate(self, n: int) -> None:
         chunks = np.array_split(np.arange(n), min(self._nthread, n))
         # Which copies each group has: (group, number within the group) of every copy.
-        self._places = [(group, place) for group, chunk in enumerate(chunks) for place in range(len(chunk))]
+        self._places = [
+            (group, place) for group, chunk in enumerate(chunks) for place in range(len(chunk))
+        ]
         self._firsts = [int(chunk[0]) for chunk in chunks]
         self._sizes = [len(chunk) for chunk in chunks]
         space = self._template.observation_space
@@ -285,14 +310,20 @@ class ProcessFamilyVector(TaskFamilyVector):
             for index, (first, size) in enumerate(zip(self._firsts, self._sizes, strict=True)):
                 make = functools.partial(_make_copies, self._make, size, self._attributes)
                 last = index == len(self._sizes) - 1
-                self._groups.append(CopyGroup(make(), first) if last else RemoteGroup(cloudpickle.dumps(make), first))
+                self._groups.append(
+                    CopyGroup(make(), first)
+                    if last
+                    else RemoteGroup(cloudpickle.dumps(make), first)
+                )
             self._receive({index: None for index in range(len(self._groups) - 1)})
         except BaseException:  # the next call tries again, rather than to use what is half made
             self._end_groups()
             raise
 
     def _receive(self, local: dict[int, Any]) -> dict[int, Any]:
-        """Collect the results of a call to the groups in ``local``, all of them even if one failed: none may be left over."""
+        """Collect the results of a call to the groups in ``local``, all of them even if one failed:
+        none may be left over.
+        """
         results: dict[int, Any] = {}
         failure: Exception | None = None
         for index, result in local.items():
@@ -315,12 +346,16 @@ class ProcessFamilyVector(TaskFamilyVector):
         :return: results by the number of the group
         """
         if self._interrupted and method != "begin":
-            raise ResetNeeded("a call of this environment was interrupted, and left its copies in the middle of it; reset it")
+            raise ResetNeeded(
+                "a call of this environment was interrupted, and left its copies in the middle of it; reset it"
+            )
         try:
             if not self._groups:
                 self._start()
             local: dict[int, Any] = dict.fromkeys(arguments)
-            for index in sorted(arguments):  # this process's own group is the last, so that the others work meanwhile
+            for index in sorted(
+                arguments
+            ):  # this process's own group is the last, so that the others work meanwhile
                 group = self._groups[index]
                 if isinstance(group, RemoteGroup):
                     group.send(method, *arguments[index])
@@ -349,12 +384,18 @@ class ProcessFamilyVector(TaskFamilyVector):
         members: dict[int, list[int]] = {}
         for copy, rng in zip(copies.tolist(), rngs, strict=True):
             group, place = self._places[copy]
-            start = EpisodeStart(place, rng, self._tasks[copy].copy(), self._seeds[copy], int(self._episodes[copy]))
+            start = EpisodeStart(
+                place, rng, self._tasks[copy].copy(), self._seeds[copy], int(self._episodes[copy])
+            )
             starts.setdefault(group, []).append(start)
             members.setdefault(group, []).append(copy)
-        results = self._call("begin", {group: (group_starts,) for group, group_starts in starts.items()})
+        results = self._call(
+            "begin", {group: (group_starts,) for group, group_starts in starts.items()}
+        )
         for group, (observations, generators) in results.items():
-            for copy, observation, generator in zip(members[group], observations, generators, strict=True):
+            for copy, observation, generator in zip(
+                members[group], observations, generators, strict=True
+            ):
                 self._last_observations[copy] = observation
                 self._rngs[copy] = generator  # which has drawn, in another process
 
@@ -363,8 +404,12 @@ class ProcessFamilyVector(TaskFamilyVector):
         results = self._call("step", {index: (chunk,) for index, chunk in enumerate(chunks)})
         steps: list[GroupStep] = [results[index] for index in range(len(chunks))]
         self._last_observations = np.concatenate([step.observations for step in steps])
-        self._last_infos = {key: np.concatenate([step.infos[key] for step in steps]) for key in steps[0].infos}
-        return np.concatenate([step.features for step in steps]), np.concatenate([step.terminated for step in steps])
+        self._last_infos = {
+            key: np.concatenate([step.infos[key] for step in steps]) for key in steps[0].infos
+        }
+        return np.concatenate([step.features for step in steps]), np.concatenate(
+            [step.terminated for step in steps]
+        )
 
     def _step_infos(self) -> dict[str, np.ndarray]:
         return dict(self._last_infos)
@@ -391,7 +436,9 @@ class ProcessFamilyVector(TaskFamilyVector):
         self._groups = []
 
 
-def _make_copies(make: Callable[[], TaskFamily], n: int, attributes: dict[str, Any]) -> list[TaskFamily]:
+def _make_copies(
+    make: Callable[[], TaskFamily], n: int, attributes: dict[str, Any]
+) -> list[TaskFamily]:
     envs = [make() for _ in range(n)]
     for env in envs:
         for name, value in attributes.items():

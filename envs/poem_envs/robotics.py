@@ -131,16 +131,15 @@ class AntMazeEnv(GoalFamily):
         )
 
 
-#: The vectorised families: same arguments, and those of :class:`~poem_envs.process_vector.ProcessFamilyVector`.
+#: The vectorised families: same arguments, and those of
+#: :class:`~poem_envs.process_vector.ProcessFamilyVector`.
 FetchReachVectorEnv = functools.partial(ProcessFamilyVector, FetchReachEnv)
 FetchPushVectorEnv = functools.partial(ProcessFamilyVector, FetchPushEnv)
 AntMazeVectorEnv = functools.partial(ProcessFamilyVector, AntMazeEnv)
 
 
 def checked_reward_type(reward_type: str) -> str:
-    """
-    :raises ValueError: for anything but ``"dense"`` and ``"sparse"``
-    """
+    """:raises ValueError: for anything but ``"dense"`` and ``"sparse"``"""
     if reward_type not in ("dense", "sparse"):
         raise ValueError(f"reward_type={reward_type!r} must be 'dense' or 'sparse'")
     return reward_type

@@ -19,8 +19,7 @@ SUPPORTED = "metaworld >= 3.1, < 4"
 
 
 def load_metaworld() -> Any:
-    """
-    Meta-World's table of environments.
+    """Meta-World's table of environments.
 
     :return: the module ``metaworld.env_dict``
     :raises ImportError: if Meta-World is absent, or of a version whose environments differ
@@ -28,7 +27,9 @@ def load_metaworld() -> Any:
     try:
         found = version("metaworld")
     except PackageNotFoundError:
-        raise ImportError(f"the Meta-World families need {SUPPORTED}; install it: pip install 'metaworld>=3.1,<4'") from None
+        raise ImportError(
+            f"the Meta-World families need {SUPPORTED}; install it: pip install 'metaworld>=3.1,<4'"
+        ) from None
     major, minor = (int(part) for part in found.split(".")[:2])
     if major != 3 or minor < 1:
         raise ImportError(
@@ -46,8 +47,7 @@ def manipulation_names() -> list[str]:
 
 
 def checked_manipulation(env_name: str) -> str:
-    """
-    The name of a manipulation, without ``-v3``.
+    """The name of a manipulation, without ``-v3``.
 
     :param env_name: with it or without
     :raises ValueError: if there is none of that name; the message lists the nearest
@@ -57,40 +57,53 @@ def checked_manipulation(env_name: str) -> str:
     if name in known:
         return name
     near = difflib.get_close_matches(str(name), known, n=5, cutoff=0.4)
-    hint = f"did you mean {', '.join(map(repr, near))}?" if near else f"choose one of {', '.join(known)}"
-    raise ValueError(f"env_name={env_name!r} is none of Meta-World's {len(known)} manipulations; {hint}")
+    hint = (
+        f"did you mean {', '.join(map(repr, near))}?"
+        if near
+        else f"choose one of {', '.join(known)}"
+    )
+    raise ValueError(
+        f"env_name={env_name!r} is none of Meta-World's {len(known)} manipulations; {hint}"
+    )
 
 
 class PlacementRefusedError(ValueError):
-    """Meta-World would redraw the placement, for example because object and goal are too near to each other."""
+    """Meta-World would redraw the placement, for example because object and goal are too near to
+    each other.
+    """
 
 
 class Sawyer:
-    """
-    One manipulation, in any placement.
+    """One manipulation, in any placement.
 
-    Meta-World's own reset leaves some starts depending on the episode before: it computes them from data that the simulator
-    has not brought up to date since objects were moved. Here a reset is what Meta-World does in an environment that has just
-    been made, bit for bit, however often it was used before.
+    Meta-World's own reset leaves some starts depending on the episode before: it computes them from
+    data that the simulator has not brought up to date since objects were moved. Here a reset is
+    what Meta-World does in an environment that has just been made, bit for bit, however often it
+    was used before.
 
     :param manipulation: its name, without ``-v3``
-    :param renders_fast: whether images are made by :class:`~poem_envs.mujoco_fast_rendering.FastRenderer`
-    :param render_arguments: ``render_mode``, ``camera_name``, ``width`` and ``height``, as Meta-World has them
+    :param renders_fast: whether images are made by
+        :class:`~poem_envs.mujoco_fast_rendering.FastRenderer`
+    :param render_arguments: ``render_mode``, ``camera_name``, ``width`` and ``height``, as
+        Meta-World has them
     """
 
-    def __init__(self, manipulation: str, *, renders_fast: bool = False, **render_arguments: Any) -> None:
+    def __init__(
+        self, manipulation: str, *, renders_fast: bool = False, **render_arguments: Any
+    ) -> None:
         self.manipulation = manipulation
         self.arguments = {"renders_fast": renders_fast, **render_arguments}
         self.env = _environment_class(manipulation)(**render_arguments)
         self._fast_renderer: FastRenderer | None = None
-        self.env._set_task_called = True  # placements are set here, without Meta-World's pickled tasks
+        self.env._set_task_called = (
+            True  # placements are set here, without Meta-World's pickled tasks
+        )
         self.env.max_path_length = np.inf  # time limits are a wrapper's
         self.env._get_state_rand_vec = self._take_placement
         self._placement: np.ndarray | None = None
 
     def reset(self, placement: np.ndarray, show_goal: bool = False) -> np.ndarray:
-        """
-        Begin an episode.
+        """Begin an episode.
 
         :param placement: Meta-World's ``rand_vec``, ``(placement_dim,)``
         :param show_goal: whether rendering shows where the goal is
@@ -98,7 +111,8 @@ class Sawyer:
         :raises PlacementRefusedError: if Meta-World would not have it
         """
         env = self.env
-        # The first pass moves bodies in the model, which the second one's quantities then follow from.
+        # The first pass moves bodies in the model, which the second one's quantities then follow
+        # from.
         for _ in range(2):
             mujoco.mj_resetData(env.model, env.data)
             self._placement = placement.copy()
@@ -111,8 +125,7 @@ class Sawyer:
         return observation
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool]:
-        """
-        Take a step.
+        """Take a step.
 
         :param action: ``(4,)`` float64
         :return: the observation ``(39,)``, Meta-World's reward, and whether the step was a success
@@ -127,7 +140,9 @@ class Sawyer:
         return observation, float(reward), bool(info["success"])
 
     def render(self) -> Any:
-        """What Meta-World returns in its ``render_mode``; an image ``(height, width, 3)``, uint8, where it renders fast."""
+        """What Meta-World returns in its ``render_mode``; an image ``(height, width, 3)``, uint8,
+        where it renders fast.
+        """
         if not self.arguments["renders_fast"]:
             prepare_to_render(self.env, self.env.render_mode)
             return self.env.render()
@@ -135,7 +150,12 @@ class Sawyer:
         if self._fast_renderer is None:
             env = self.env
             self._fast_renderer = FastRenderer(
-                env.model, width=env.width, height=env.height, camera_id=None, camera_name=env.camera_name, camera_config={}
+                env.model,
+                width=env.width,
+                height=env.height,
+                camera_id=None,
+                camera_name=env.camera_name,
+                camera_config={},
             )
         return self._fast_renderer.render_data(self.env.data, [])
 
@@ -151,11 +171,15 @@ class Sawyer:
         return np.concatenate([self._get_mujoco_state(), self.env._prev_obs])
 
     def set_state(self, state: np.ndarray) -> None:
-        """Put the simulator into a state of :meth:`get_state`, within an episode of the same placement."""
+        """Put the simulator into a state of :meth:`get_state`, within an episode of the same
+        placement.
+        """
         env, spec = self.env, mujoco.mjtState.mjSTATE_INTEGRATION
         n_previous = len(env._prev_obs)
         mujoco.mj_setState(env.model, env.data, state[:-n_previous], spec)
-        mujoco.mj_forward(env.model, env.data)  # brings positions up to date, and changes the solver's warm start
+        mujoco.mj_forward(
+            env.model, env.data
+        )  # brings positions up to date, and changes the solver's warm start
         mujoco.mj_setState(env.model, env.data, state[:-n_previous], spec)
         env._prev_obs = state[-n_previous:].copy()
 
@@ -167,18 +191,23 @@ class Sawyer:
 
     def _take_placement(self) -> np.ndarray:
         if self._placement is None:
-            raise PlacementRefusedError("Meta-World refuses the placement: it places object and goal too near to each other")
+            raise PlacementRefusedError(
+                "Meta-World refuses the placement: it places object and goal too near to each other"
+            )
         placement, self._placement = self._placement, None
         return placement
 
 
-# Simulators at rest, by what they were made with. An environment whose tasks are different manipulations changes simulators
-# at its resets; without this, each of many environments would come to hold one for every manipulation.
+# Simulators at rest, by what they were made with. An environment whose tasks are different
+# manipulations changes simulators at its resets; without this, each of many environments would come
+# to hold one for every manipulation.
 _at_rest: dict[tuple[Any, ...], list[Sawyer]] = {}
 
 
 def take_sawyer(manipulation: str, **arguments: Any) -> Sawyer:
-    """A simulator of a manipulation, made anew if none is at rest; arguments as :class:`Sawyer` has them."""
+    """A simulator of a manipulation, made anew if none is at rest; arguments as :class:`Sawyer` has
+    them.
+    """
     at_rest = _at_rest.get(_key(manipulation, arguments))
     return at_rest.pop() if at_rest else Sawyer(manipulation, **arguments)
 
@@ -193,8 +222,8 @@ def _key(manipulation: str, arguments: dict[str, Any]) -> tuple[Any, ...]:
 
 
 class Placements:
-    """
-    Which placements a manipulation has, as Meta-World draws them. It needs an environment for that, whose arm stays still.
+    """Which placements a manipulation has, as Meta-World draws them. It needs an environment for
+    that, whose arm stays still.
 
     :param manipulation: its name, without ``-v3``
     """
@@ -220,9 +249,7 @@ class Placements:
         return np.array(env._last_rand_vec, dtype=np.float64)
 
     def check(self, placement: np.ndarray) -> None:
-        """
-        :raises PlacementRefusedError: if Meta-World would redraw the placement
-        """
+        """:raises PlacementRefusedError: if Meta-World would redraw the placement"""
         self._sawyer.env._get_state_rand_vec = self._sawyer._take_placement
         self._sawyer._placement = placement.copy()
         self._sawyer.env.reset_model()
@@ -236,7 +263,9 @@ def placements_of(manipulation: str) -> Placements:
 
 @functools.cache
 def _environment_class(manipulation: str) -> type:
-    """Meta-World's class, with models that are copied rather than compiled anew: 16 ms in place of 230."""
+    """Meta-World's class, with models that are copied rather than compiled anew: 16 ms in place of
+    230.
+    """
     base: Any = load_metaworld().ALL_V3_ENVIRONMENTS[f"{manipulation}-v3"]
     compiled: dict[str, mujoco.MjModel] = {}
 

@@ -1,4 +1,5 @@
-"""Families that simulate many copies at once: write the dynamics of a batch, get a single and a vectorised environment.
+"""Families that simulate many copies at once: write the dynamics of a batch, get a single and a
+vectorised environment.
 
 Both run the same code, the single one as a batch of one, so their results agree bit for bit.
 """
@@ -30,7 +31,8 @@ from poem_envs.family import (
 
 
 class BatchFamily(TaskDefinition):
-    """The dynamics of ``n`` independent copies of an environment, as a mixin for the two classes below.
+    """The dynamics of ``n`` independent copies of an environment, as a mixin for the two classes
+    below.
 
     A family writes this once, and combines it twice::
 
@@ -38,8 +40,8 @@ class BatchFamily(TaskDefinition):
         class Walk1DEnv(_Walk1D, BatchTaskFamily): ...         # one copy, a Gymnasium environment
         class Walk1DVectorEnv(_Walk1D, TaskFamilyVector): ...  # n copies, a Gymnasium vector environment
 
-    Its constructor hands ``observation_space`` and ``action_space`` (of one copy) and all that it does not know to
-    ``super().__init__``.
+    Its constructor hands ``observation_space`` and ``action_space`` (of one copy) and all that it
+    does not know to ``super().__init__``.
     """
 
     if TYPE_CHECKING:  # the constructor of either class below
@@ -63,11 +65,14 @@ class BatchFamily(TaskDefinition):
         """Step all copies.
 
         :param actions: ``(n, action_dim)`` float64, valid
-        :return: new arrays: reward features ``(n, reward_feature_dim)``, and whether each episode ended early ``(n,)``
+        :return: new arrays: reward features ``(n, reward_feature_dim)``, and whether each episode
+            ended early ``(n,)``
         """
 
     def _step_infos(self) -> dict[str, np.ndarray]:
-        """Further entries of the infos of the step just taken, a row for each copy: none unless overridden."""
+        """Further entries of the infos of the step just taken, a row for each copy: none unless
+        overridden.
+        """
         return {}
 
     @abstractmethod
@@ -98,7 +103,9 @@ class BatchFamily(TaskDefinition):
         array = np.array(state, dtype=np.float64)
         shape = self._physics_state(copy).shape
         if array.shape != shape or not np.isfinite(array).all():
-            raise ValueError(f"state={state!r} must be finite and have shape {shape}, as get_physics_state() returns it")
+            raise ValueError(
+                f"state={state!r} must be finite and have shape {shape}, as get_physics_state() returns it"
+            )
         return array
 
 
@@ -138,11 +145,14 @@ class BatchTaskFamily(BatchFamily, TaskFamily):
         return {key: values[0] for key, values in self._step_infos().items()}
 
     def get_physics_state(self) -> np.ndarray:
-        """The simulator's state, ``(state_dim,)``: enough to render this moment again, or to go on from it."""
+        """The simulator's state, ``(state_dim,)``: enough to render this moment again, or to go on
+        from it.
+        """
         return self._physics_state(0)
 
     def set_physics_state(self, state: npt.ArrayLike) -> None:
-        """Put the simulator into a state of :meth:`get_physics_state`, say to render a recorded trajectory. The task stays.
+        """Put the simulator into a state of :meth:`get_physics_state`, say to render a recorded
+        trajectory. The task stays.
 
         :param state: ``(state_dim,)``
         :raises ValueError: if it has another shape or is not finite
@@ -150,9 +160,13 @@ class BatchTaskFamily(BatchFamily, TaskFamily):
         self._set_physics_state(0, self._checked_physics_state(state, 0))
 
     def render(self) -> Any:
-        """Render the current state as ``render_mode`` says: an image ``(height, width, 3)`` for ``"rgb_array"``."""
+        """Render the current state as ``render_mode`` says: an image ``(height, width, 3)`` for
+        ``"rgb_array"``.
+        """
         if self.render_mode is None:
-            gym.logger.warn("render() was called without a render_mode; pass one to the constructor, say 'rgb_array'")
+            gym.logger.warn(
+                "render() was called without a render_mode; pass one to the constructor, say 'rgb_array'"
+            )
             return None
         return self._render_copy(0, self.render_mode, self._task if self.render_task else None)
 
@@ -206,10 +220,14 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         if num_envs < 1:
             raise ValueError(f"num_envs={num_envs!r} must be at least 1")
         if max_episode_steps is not None and max_episode_steps < 1:
-            raise ValueError(f"max_episode_steps={max_episode_steps!r} must be at least 1, or None for no limit")
+            raise ValueError(
+                f"max_episode_steps={max_episode_steps!r} must be at least 1, or None for no limit"
+            )
         check_render_mode(render_mode, self.metadata)
         if render_mode == "human" and num_envs > 1:
-            raise ValueError(f"render_mode='human' shows one environment, but num_envs={num_envs}; use 'rgb_array'")
+            raise ValueError(
+                f"render_mode='human' shows one environment, but num_envs={num_envs}; use 'rgb_array'"
+            )
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps
         self.render_mode = render_mode
@@ -235,29 +253,31 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         """The tasks in effect, ``(num_envs, task_dim)``; None before the first reset."""
         return None if self._tasks is None else self._tasks.copy()
 
-    def set_tasks(self, tasks: npt.ArrayLike, copies: Sequence[int] | np.ndarray | None = None) -> None:
+    def set_tasks(
+        self, tasks: npt.ArrayLike, copies: Sequence[int] | np.ndarray | None = None
+    ) -> None:
         """Choose the tasks of the episodes that begin from each copy's next reset on.
 
         :param tasks: ``(num_envs, task_dim)``, or one row for each of ``copies``
         :param copies: numbers of the copies to set; None for all
-        :raises ValueError: if a task has another shape, is not finite, or lies outside ``task_space`` (or the finite family)
+        :raises ValueError: if a task has another shape, is not finite, or lies outside
+            ``task_space`` (or the finite family)
         """
         index = np.arange(self.num_envs) if copies is None else np.asarray(copies, dtype=np.intp)
-        self._next_tasks[index] = self._checked_tasks(tasks, (len(index), *self.task_space.shape), "tasks")
+        self._next_tasks[index] = self._checked_tasks(
+            tasks, (len(index), *self.task_space.shape), "tasks"
+        )
         self._task_chosen[index] = True
 
     def keep_tasks(self) -> None:
-        """Keep every copy's task through its next reset, also if that has a seed, which would draw another: the task that was
-        chosen for it, or else the one in effect. Before the first reset there is none in effect.
+        """Keep every copy's task through its next reset, also if that has a seed, which would draw
+        another: the task that was chosen for it, or else the one in effect. Before the first reset
+        there is none in effect.
         """
         self._tasks_kept[:] = self._tasks is not None
 
     def set_attribute(self, name: str, value: Any) -> None:
-        """Set an attribute of the family, as if on each copy.
-
-        :param name: its name
-        :param value: its value
-        """
+        """Set an attribute of the family, as if on each copy."""
         setattr(self, name, value)
 
     def reset(
@@ -268,8 +288,8 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin an episode in every copy.
 
-        :param seed: ``s`` seeds copy ``i`` with ``s + i``; or one seed (or None) for each copy. It draws other tasks, except
-            for copies whose task was chosen
+        :param seed: ``s`` seeds copy ``i`` with ``s + i``; or one seed (or None) for each copy. It
+            draws other tasks, except for copies whose task was chosen
         :param options: ``{"tasks": tasks}`` is short for :meth:`set_tasks` just before
         :return: the observations ``(num_envs, obs_dim)`` and an empty info
         """
@@ -278,7 +298,9 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         if "tasks" in options:
             self.set_tasks(options["tasks"])
         if not self._rngs:
-            self._rngs, self._seeds = map(list, zip(*(seeding.np_random(s) for s in seeds), strict=True))
+            self._rngs, self._seeds = map(
+                list, zip(*(seeding.np_random(s) for s in seeds), strict=True)
+            )
             self._episodes[:] = 0
         for copy, copy_seed in enumerate(seeds):
             if copy_seed is not None:
@@ -288,7 +310,9 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
             self._tasks = self._next_tasks.copy()
             undecided = ~self._task_chosen
         else:
-            undecided = ~self._task_chosen & ~self._tasks_kept & np.array([s is not None for s in seeds])
+            undecided = (
+                ~self._task_chosen & ~self._tasks_kept & np.array([s is not None for s in seeds])
+            )
         for copy in np.flatnonzero(undecided).tolist():
             self._tasks[copy] = self.sample_tasks(1, task_stream(self._rngs[copy]))[0]
         self._begin(np.arange(self.num_envs))
@@ -296,12 +320,16 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
             self.render()
         return self._observations(), {}
 
-    def step(self, actions: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(
+        self, actions: npt.ArrayLike
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Step every copy.
 
         :param actions: ``(num_envs, action_dim)``; a tiny excess over the bounds (1e-6) is clipped
-        :return: observations ``(num_envs, obs_dim)``, rewards, terminations, truncations ``(num_envs,)`` and infos
-        :raises ValueError: if an action has another shape, is not finite or lies outside its space; it names the copy
+        :return: observations ``(num_envs, obs_dim)``, rewards, terminations, truncations
+            ``(num_envs,)`` and infos
+        :raises ValueError: if an action has another shape, is not finite or lies outside its space;
+            it names the copy
         :raises gymnasium.error.ResetNeeded: before the first reset
         """
         if self._tasks is None:
@@ -330,14 +358,16 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         return observations, rewards, terminations, truncations, infos
 
     def get_physics_state(self, copy: int) -> np.ndarray:
-        """The simulator's state of one copy, ``(state_dim,)``, which a single environment's ``set_physics_state`` takes.
+        """The simulator's state of one copy, ``(state_dim,)``, which a single environment's
+        ``set_physics_state`` takes.
 
         :param copy: its number
         """
         return self._physics_state(copy)
 
     def set_physics_state(self, copy: int, state: npt.ArrayLike) -> None:
-        """Put one copy into a state of :meth:`get_physics_state`. Its task and the number of its step stay.
+        """Put one copy into a state of :meth:`get_physics_state`. Its task and the number of its
+        step stay.
 
         :param copy: its number
         :param state: ``(state_dim,)``
@@ -348,7 +378,9 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
     def render(self) -> tuple[Any, ...] | None:
         """Render every copy as ``render_mode`` says, and return the images."""
         if self.render_mode is None:
-            gym.logger.warn("render() was called without a render_mode; pass one to the constructor, say 'rgb_array'")
+            gym.logger.warn(
+                "render() was called without a render_mode; pass one to the constructor, say 'rgb_array'"
+            )
             return None
         return tuple(self.render_copy(copy) for copy in range(self.num_envs))
 
@@ -383,7 +415,9 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         if isinstance(seed, (int, np.integer)):
             return [int(seed) + copy for copy in range(self.num_envs)]
         if len(seed) != self.num_envs:
-            raise ValueError(f"seed={seed!r} holds {len(seed)} seeds, expected one for each of num_envs={self.num_envs}")
+            raise ValueError(
+                f"seed={seed!r} holds {len(seed)} seeds, expected one for each of num_envs={self.num_envs}"
+            )
         return [None if s is None else int(s) for s in seed]
 
     def _begin(self, copies: np.ndarray) -> None:
@@ -419,7 +453,9 @@ def set_task(env: Any, task: npt.ArrayLike) -> None:
             set_task(single, row)
     elif isinstance(env, gym.vector.VectorEnv) and isinstance(env.unwrapped, TaskFamilyVector):
         env.unwrapped.set_tasks(_task_of_each(task, env.num_envs))
-    elif hasattr(env, "env_method") and env.has_attr("set_task"):  # SB3's, which is not imported here
+    elif hasattr(env, "env_method") and env.has_attr(
+        "set_task"
+    ):  # SB3's, which is not imported here
         for copy, row in enumerate(_task_of_each(task, env.num_envs)):
             env.env_method("set_task", row, indices=[copy])
     else:

@@ -1,6 +1,8 @@
-"""The process in which a part of a :class:`~poem_envs.process_vector.ProcessFamilyVector`'s copies live.
+"""The process in which a part of a :class:`~poem_envs.process_vector.ProcessFamilyVector`'s copies
+live.
 
-Started as ``python -m poem_envs.worker <file descriptor>``; it ends when the other end of the connection is closed.
+Started as ``python -m poem_envs.worker <file descriptor>``; it ends when the other end of the
+connection is closed.
 """
 
 from __future__ import annotations
@@ -18,7 +20,9 @@ from poem_envs.process_vector import CopyGroup
 
 
 def serve(connection: Connection) -> None:
-    """Answer calls of a group's methods, the first of which makes the group, until the connection is closed."""
+    """Answer calls of a group's methods, the first of which makes the group, until the connection
+    is closed.
+    """
     group: CopyGroup | None = None
     while True:
         try:
@@ -44,5 +48,7 @@ def serve(connection: Connection) -> None:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent's end ends this one
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # Ctrl-C reaches all processes; the parent's end ends this one
     serve(Connection(int(sys.argv[1])))

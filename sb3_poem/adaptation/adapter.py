@@ -33,11 +33,12 @@ class OtherModelError(ValueError):
 
 
 class PreferenceAdapter:
-    """
-    Adapts a model to the hidden task of an environment by asking which of two trajectories is better.
+    """Adapts a model to the hidden task of an environment by asking which of two trajectories is
+    better.
 
-    Nothing blocks: ``ask()`` gives a question, ``tell()`` takes its answer whenever there is one, ``policy()`` is usable
-    at any time. The adapter reads no rewards and neither reads nor sets the task.
+    Nothing blocks: ``ask()`` gives a question, ``tell()`` takes its answer whenever there is one,
+    ``policy()`` is usable at any time. The adapter reads no rewards and neither reads nor sets the
+    task.
 
     .. code-block:: python
 
@@ -48,35 +49,40 @@ class PreferenceAdapter:
         policy = adapter.policy()
 
     The new task is the one in effect in :attr:`env`, or the one that its first reset draws. Measure
-    the policy there: ``evaluate_policy(policy, adapter.env)``. Another environment has another task;
-    ``env.reset(seed=...)`` draws another, too, unless one was chosen, by
+    the policy there: ``evaluate_policy(policy, adapter.env)``. Another environment has another
+    task; ``env.reset(seed=...)`` draws another, too, unless one was chosen, by
     ``sb3_poem.set_task(env, task)`` or ``reset(options={"task": task})``.
 
-    :param model: A trained ``POEMSAC`` (or, within limits, ``PEARLSAC``), a file or folder of one, or
-        the name of one that ships.
+    :param model: A trained ``POEMSAC`` (or, within limits, ``PEARLSAC``), a file or folder of one,
+        or the name of one that ships.
     :param env: The environment with the new task: a ``gym.Env``, its id, or a vector environment of
         Gymnasium's or SB3's, of which the first copy is watched.
     :param n_queries: How many answers are asked for at most (K).
     :param inference: "bayes", or "paper" (Algorithm 2 of Xu & Zhu 2025).
-    :param query_rule: "worst-case" (eq. 10), "information-gain" or "random"; None takes "information-gain" for
-        "bayes" and "worst-case" for "paper".
-    :param n_candidates: Candidate latents (N_z); None takes 400 for "bayes" and the paper's 100 for "paper".
+    :param query_rule: "worst-case" (eq. 10), "information-gain" or "random"; None takes
+        "information-gain" for "bayes" and "worst-case" for "paper".
+    :param n_candidates: Candidate latents (N_z); None takes 400 for "bayes" and the paper's 100 for
+        "paper".
     :param epsilon: Tolerated error of eq. 9, in [0, 0.5); used by the paper's rules.
-    :param candidates: Where candidates come from: "prior" (N(0, I)) or "aggregate" (the training tasks'
-        posteriors and what lies between neighbours); None takes the prior, and for
-        "bayes" the aggregate where that is far from the prior.
-    :param likelihood: For "bayes": "decoder" (predicted returns of the trajectories shown) or "similarity" (S); None
-        takes the decoder where the model has one and knows its error, which takes tasks that share their dynamics.
+    :param candidates: Where candidates come from: "prior" (N(0, I)) or "aggregate" (the training
+        tasks' posteriors and what lies between neighbours); None takes the prior, and for "bayes"
+        the aggregate where that is far from the prior.
+    :param likelihood: For "bayes": "decoder" (predicted returns of the trajectories shown) or
+        "similarity" (S); None takes the decoder where the model has one and knows its error, which
+        takes tasks that share their dynamics.
     :param decision: For "bayes": "expected-fitness", "posterior-mean" or "most-likely".
-    :param noise_model: For "bayes": how the oracle errs; None takes ``oracle.noise_model`` where there is one, else no error.
-    :param oracle: Who answers in :meth:`adapt`; a callable (left, right) -> Preference. If it has ``needs_frames``,
-        trajectories carry frames. If it has ``bind`` and no environment yet, it is bound to ``env``.
+    :param noise_model: For "bayes": how the oracle errs; None takes ``oracle.noise_model`` where
+        there is one, else no error.
+    :param oracle: Who answers in :meth:`adapt`; a callable (left, right) -> Preference. If it has
+        ``needs_frames``, trajectories carry frames. If it has ``bind`` and no environment yet, it
+        is bound to ``env``.
     :param seed: Makes everything reproducible; None draws one, kept in ``seed``.
     :param deterministic: Whether policies act by their mode.
     :param library: For "bayes": trajectories to ask about instead of rolling out new ones.
     :param render: Whether questions carry frames, for :meth:`Query.to_video`. An ``env`` that is no
         id must have been made with ``render_mode="rgb_array"``.
-    :raises ValueError: If an argument is out of its range, or the model belongs to another environment.
+    :raises ValueError: If an argument is out of its range, or the model belongs to another
+        environment.
     :raises TypeError: If an argument is of another kind.
     """
 
@@ -123,8 +129,7 @@ class PreferenceAdapter:
 
     @classmethod
     def make_options(cls, oracle: Any = None, **options: Any) -> Any:
-        """
-        The options of an adaptation, which one task and many tasks share.
+        """The options of an adaptation, which one task and many tasks share.
 
         :param oracle: Who will answer.
         :param options: Those of the constructor.
@@ -148,16 +153,22 @@ class PreferenceAdapter:
         if seed is not None:
             check_whole("seed", seed, 0)
         self.options = options
-        self.seed = int(np.random.SeedSequence().generate_state(1)[0] >> 1) if seed is None else int(seed)
+        self.seed = (
+            int(np.random.SeedSequence().generate_state(1)[0] >> 1) if seed is None else int(seed)
+        )
         self.render = render
-        self.model, self.env = model_and_env(model, env, 1, render or bool(getattr(oracle, "needs_frames", False)))
+        self.model, self.env = model_and_env(
+            model, env, 1, render or bool(getattr(oracle, "needs_frames", False))
+        )
         self._owns_env = isinstance(env, str)
         options.check(self.model, self.env, library)
         warn_if_untrained(self.model)
         self._take_oracle(oracle)
         self.library = None if library is None else list(library)
         self.inference = options.make_inference(self.model, inference_rng(self.seed), self.library)
-        if self.inference.library is not None and self._owns_env:  # nothing is rolled out there: draw the task now
+        if (
+            self.inference.library is not None and self._owns_env
+        ):  # nothing is rolled out there: draw the task now
             self.env.seed(self.seed)
             self.env.reset()
         if hasattr(self.inference, "bind"):  # a method that is allowed to read rewards
@@ -186,24 +197,30 @@ class PreferenceAdapter:
         return self._pending
 
     def ask(self) -> Query:
-        """
-        The next question. While one waits for its answer, it is that one again.
+        """The next question. While one waits for its answer, it is that one again.
 
         :return: Two trajectories on the new task.
         :raises RuntimeError: If all questions have been answered.
         """
         if self._pending is None:
             if self.done:
-                raise RuntimeError(f"all {self.options.n_queries} questions have been answered; take policy()")
+                raise RuntimeError(
+                    f"all {self.options.n_queries} questions have been answered; take policy()"
+                )
             self._pending = self._make_query()
-        elif self._needs_frames and self._pending.left.frames is None and self.inference.library is None:
+        elif (
+            self._needs_frames
+            and self._pending.left.frames is None
+            and self.inference.library is None
+        ):
             # It comes from a file, which holds no frames; the same seed gives the same rollouts.
-            self._pending = self._roll_out(*self.inference.same_latents(self._pending.left.latent, self._pending.right.latent))
+            self._pending = self._roll_out(
+                *self.inference.same_latents(self._pending.left.latent, self._pending.right.latent)
+            )
         return self._pending
 
     def tell(self, preference: Preference | str) -> None:
-        """
-        Answer the pending question.
+        """Answer the pending question.
 
         :param preference: A :class:`Preference`, or "left", "right" or "equal".
         :raises RuntimeError: If no question waits for an answer.
@@ -211,7 +228,11 @@ class PreferenceAdapter:
         :raises ValueError: If it is another word. In both cases the question goes on waiting.
         """
         if self._pending is None:
-            state = "the last question has its answer already" if self.n_answers else "no question has been asked"
+            state = (
+                "the last question has its answer already"
+                if self.n_answers
+                else "no question has been asked"
+            )
             raise RuntimeError(f"tell() without a pending question: {state}; call ask() first")
         answer = as_preference(preference)
         query = self._pending
@@ -221,22 +242,23 @@ class PreferenceAdapter:
         self._pending = None
 
     def undo(self) -> Query:
-        """
-        Take the last answer back; its question waits again. One step back, and only until the next question is asked for.
+        """Take the last answer back; its question waits again. One step back, and only until the
+        next question is asked for.
 
         :return: The question.
         :raises RuntimeError: If there is nothing to take back.
         """
         if self._previous is None or self._pending is not None:
-            raise RuntimeError("nothing to undo: undo() takes back the last answer, before the next question is asked for")
+            raise RuntimeError(
+                "nothing to undo: undo() takes back the last answer, before the next question is asked for"
+            )
         snapshot, query = self._previous
         self.inference.restore(snapshot, self.inference.answers[:-1])
         self._pending, self._previous = query, None
         return query
 
     def policy(self) -> AdaptedPolicy:
-        """
-        The policy for the answers so far; usable at any time.
+        """The policy for the answers so far; usable at any time.
 
         :return: A policy with SB3's ``predict``.
         """
@@ -249,21 +271,28 @@ class PreferenceAdapter:
         return f"{type(self).__name__}({describe_model(self.model)}{named}, {answers})"
 
     def adapt(self, oracle: Oracle | None = None, progress_bar: bool = False) -> AdaptedPolicy:
-        """
-        Ask the oracle until done.
+        """Ask the oracle until done.
 
-        :param oracle: A callable (left, right) -> Preference; None takes the one given at construction.
+        :param oracle: A callable (left, right) -> Preference; None takes the one given at
+            construction.
         :param progress_bar: Whether to show one.
         :return: The adapted policy.
         :raises ValueError: If there is no oracle.
         """
         oracle = self.oracle if oracle is None else oracle
         if oracle is None:
-            raise ValueError("adapt() needs an oracle: pass it here or at construction, or use ask() and tell()")
+            raise ValueError(
+                "adapt() needs an oracle: pass it here or at construction, or use ask() and tell()"
+            )
         self._take_oracle(oracle)
         from tqdm import tqdm
 
-        with tqdm(total=self.options.n_queries, initial=self.n_answers, unit="query", disable=not progress_bar) as bar:
+        with tqdm(
+            total=self.options.n_queries,
+            initial=self.n_answers,
+            unit="query",
+            disable=not progress_bar,
+        ) as bar:
             while not self.done:
                 query = self.ask()
                 self.tell(oracle(query.left, query.right))
@@ -306,20 +335,28 @@ class PreferenceAdapter:
         return self._roll_out(*self.inference.ask_latents())
 
     def _roll_out(self, left: np.ndarray, right: np.ndarray) -> Query:
-        """Both rollouts start alike, one after the other in the first copy: other copies may hold other tasks."""
+        """Both rollouts start alike, one after the other in the first copy: other copies may hold
+        other tasks.
+        """
         seed = rollout_seed(self.seed, self.n_answers)
         trajectories = []
         for latent in (left, right):
             # Each fills a wave of its own; copies beyond the first repeat it and are not read.
             trajectories += rollout_latents(
-                self.model, self.env, latent[None, :], None, [seed], self.options.deterministic, frames=self._needs_frames
+                self.model,
+                self.env,
+                latent[None, :],
+                None,
+                [seed],
+                self.options.deterministic,
+                frames=self._needs_frames,
             )
         return Query(*trajectories)
 
     def to_dict(self) -> dict[str, Any]:
-        """
-        Everything as JSON-ready data: options, answers with their trajectories, posterior, random state, and the pending
-        question. Frames stay out; model, environment, oracle and library too.
+        """Everything as JSON-ready data: options, answers with their trajectories, posterior,
+        random state, and the pending question. Frames stay out; model, environment, oracle and
+        library too.
 
         :return: A dictionary that :meth:`from_dict` reads.
         """
@@ -338,7 +375,9 @@ class PreferenceAdapter:
                 {"preference": answer.preference.value, **_pair_to_dict(answer.left, answer.right)}
                 for answer in self.inference.answers
             ],
-            "pending": None if self._pending is None else _pair_to_dict(self._pending.left, self._pending.right),
+            "pending": None
+            if self._pending is None
+            else _pair_to_dict(self._pending.left, self._pending.right),
             "inference": self.inference.snapshot().to_dict(),
         }
 
@@ -353,51 +392,66 @@ class PreferenceAdapter:
         library: Sequence[Trajectory] | None = None,
         render: bool = False,
     ) -> PreferenceAdapter:
-        """
-        Continue where :meth:`to_dict` stood: the same answers lead to the same policy as without the interruption.
+        """Continue where :meth:`to_dict` stood: the same answers lead to the same policy as without
+        the interruption.
 
         :param data: The dictionary.
         :param model: The same model.
         :param env: An environment with the same task.
-        :param oracle: Who answers in :meth:`adapt`. A stochastic oracle's own generator is its own affair.
+        :param oracle: Who answers in :meth:`adapt`. A stochastic oracle's own generator is its own
+            affair.
         :param library: The same library, if there was one.
         :param render: See :class:`PreferenceAdapter`.
         :return: The adapter.
-        :raises OtherModelError: If the model has other weights, another family or another latent's dimension.
+        :raises OtherModelError: If the model has other weights, another family or another latent's
+            dimension.
         :raises ValueError: If the data is broken, or of another version.
         """
         if data.get("format") != cls._format():
-            raise ValueError(f"not a saved adaptation: `format` is {data.get('format')!r}, not {cls._format()!r}")
+            raise ValueError(
+                f"not a saved adaptation: `format` is {data.get('format')!r}, not {cls._format()!r}"
+            )
         if data.get("version") != FORMAT_VERSION:
-            raise ValueError(f"a saved adaptation of version {data.get('version')!r}; this program reads {FORMAT_VERSION}")
+            raise ValueError(
+                f"a saved adaptation of version {data.get('version')!r}; this program reads {FORMAT_VERSION}"
+            )
         from sb3_poem.loading import as_model
 
         model = as_model(model)
         try:
             _check_same_model(data["model"], model)
             if data["uses_library"] and library is None:
-                raise ValueError("this adaptation asks about a library of trajectories; pass the same `library` again")
+                raise ValueError(
+                    "this adaptation asks about a library of trajectories; pass the same `library` again"
+                )
             adapter = cls.__new__(cls)
             options = cls.options_class.from_dict(data["options"])
             adapter._start(model, env, options, oracle, int(data["seed"]), library, render)
         except (KeyError, TypeError) as error:
-            raise ValueError(f"a saved adaptation that is incomplete or broken: {error!r}") from error
+            raise ValueError(
+                f"a saved adaptation that is incomplete or broken: {error!r}"
+            ) from error
         adapter.restore(data)
         return adapter
 
     def restore(self, data: dict[str, Any]) -> None:
-        """
-        Go to where another adapter of the same model, options and seed stood when :meth:`to_dict` was called.
+        """Go to where another adapter of the same model, options and seed stood when
+        :meth:`to_dict` was called.
 
         :param data: The dictionary.
         :raises ValueError: If the data is broken.
         """
         try:
-            answers = [Answer(Preference(item["preference"]), *_pair_from_dict(item)) for item in data["answers"]]
+            answers = [
+                Answer(Preference(item["preference"]), *_pair_from_dict(item))
+                for item in data["answers"]
+            ]
             pending = None if data["pending"] is None else Query(*_pair_from_dict(data["pending"]))
             self.inference.restore(Snapshot.from_dict(data["inference"]), answers)
         except (KeyError, TypeError) as error:
-            raise ValueError(f"a saved adaptation that is incomplete or broken: {error!r}") from error
+            raise ValueError(
+                f"a saved adaptation that is incomplete or broken: {error!r}"
+            ) from error
         self._pending, self._previous = pending, None
 
     def to_json(self) -> str:
@@ -406,8 +460,7 @@ class PreferenceAdapter:
 
     @classmethod
     def from_json(cls, text: str, model: Any, env: Env, **kwargs: Any) -> PreferenceAdapter:
-        """
-        :meth:`from_dict` of a JSON text.
+        """:meth:`from_dict` of a JSON text.
 
         :param text: What :meth:`to_json` gave.
         :param model: The same model.
@@ -421,21 +474,24 @@ class PreferenceAdapter:
         except (ValueError, RecursionError) as error:
             raise ValueError(f"not a saved adaptation: {error}") from error
         if not isinstance(data, dict):
-            raise ValueError(f"not a saved adaptation: it holds a {type(data).__name__}, not an object")
+            raise ValueError(
+                f"not a saved adaptation: it holds a {type(data).__name__}, not an object"
+            )
         return cls.from_dict(data, model, env, **kwargs)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """
-        Write the state as a JSON file; an existing file is replaced only once the new one is whole.
+        """Write the state as a JSON file; an existing file is replaced only once the new one is
+        whole.
 
         :param path: The file; its folder must exist.
         """
         write_json_atomically(path, self.to_dict())
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], model: Any, env: Env, **kwargs: Any) -> PreferenceAdapter:
-        """
-        Continue from a file of :meth:`save`.
+    def load(
+        cls, path: str | os.PathLike[str], model: Any, env: Env, **kwargs: Any
+    ) -> PreferenceAdapter:
+        """Continue from a file of :meth:`save`.
 
         :param path: The file.
         :param model: The same model.
@@ -462,7 +518,9 @@ def _check_same_model(facts: dict[str, Any], model: Any) -> None:
         )
     env_id = getattr(model, "env_id", None)
     if facts["env_id"] is not None and env_id is not None and facts["env_id"] != env_id:
-        raise OtherModelError(f"the adaptation was saved with a model for {facts['env_id']}, but this one is for {env_id}")
+        raise OtherModelError(
+            f"the adaptation was saved with a model for {facts['env_id']}, but this one is for {env_id}"
+        )
     if facts["digest"] != getattr(model, "digest", None):
         raise OtherModelError(
             f"the adaptation was saved with a model of other weights than this {describe_model(model)}: its latents mean "

@@ -11,7 +11,12 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.adaptation.adapter import PreferenceAdapter
 from sb3_poem.adaptation.environments import check_model_fits
-from sb3_poem.adaptation.evaluation import evaluate_adaptation, evaluate_latents, known_task_return, preference_order
+from sb3_poem.adaptation.evaluation import (
+    evaluate_adaptation,
+    evaluate_latents,
+    known_task_return,
+    preference_order,
+)
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.pearl_sac.callbacks import EpochCallback
@@ -21,25 +26,30 @@ OF_ADAPT_TASKS = {"adapter", "library", "oracle_factory", "progress_bar"}
 
 
 class AdaptationEvalCallback(EpochCallback):
-    """
-    Adapts the model to held-out tasks from preferences while it trains, logs how well that goes, and keeps the best model.
+    """Adapts the model to held-out tasks from preferences while it trains, logs how well that goes,
+    and keeps the best model.
 
-    Logs ``eval/return_after_<k>_queries`` for each k, ``eval/known_task_return`` (the best of many latents for each
-    task), ``eval/preference_accuracy`` and ``eval/kendall_tau`` of Property 1, ``eval/coverage_loss`` (the return that is
-    lost by replacing each training task's latent by the nearest of 1,000 prior draws). It has its own generators:
-    training is the same with it and without it. Evaluation steps do not count as training steps. For a family whose infos say
-    whether a step was a success, ``eval/success_rate_after_<k>_queries`` and ``eval/known_task_success_rate`` too.
+    Logs ``eval/return_after_<k>_queries`` for each k, ``eval/known_task_return`` (the best of many
+    latents for each task), ``eval/preference_accuracy`` and ``eval/kendall_tau`` of Property 1,
+    ``eval/coverage_loss`` (the return that is lost by replacing each training task's latent by the
+    nearest of 1,000 prior draws). It has its own generators: training is the same with it and
+    without it. Evaluation steps do not count as training steps. For a family whose infos say
+    whether a step was a success, ``eval/success_rate_after_<k>_queries`` and
+    ``eval/known_task_success_rate`` too.
 
     :param every: Epochs between two evaluations
-    :param n_tasks: Held-out tasks; a finite family of no more than that is evaluated on all its tasks
+    :param n_tasks: Held-out tasks; a finite family of no more than that is evaluated on all its
+        tasks
     :param record_at: Numbers of answers after which the adapted policy is measured
     :param n_episodes: Episodes of each task and measurement
-    :param best_model_save_path: Folder for ``best_model.zip``, the model of the highest return after the most answers. A run
-        that is resumed with the same folder goes on comparing with it
+    :param best_model_save_path: Folder for ``best_model.zip``, the model of the highest return
+        after the most answers. A run that is resumed with the same folder goes on comparing with it
     :param seed: Seed of the held-out tasks and of everything else here
-    :param adaptation_kwargs: Options of :func:`sb3_poem.adaptation.adapt_tasks`, for instance ``inference``. A model without a
-        similarity is asked random queries unless they say otherwise
-    :param env_kwargs: Arguments of the environment that differ from training's, for instance a ``split`` of its tasks
+    :param adaptation_kwargs: Options of :func:`sb3_poem.adaptation.adapt_tasks`, for instance
+        ``inference``. A model without a similarity is asked random queries unless they say
+        otherwise
+    :param env_kwargs: Arguments of the environment that differ from training's, for instance a
+        ``split`` of its tasks
     :param verbose: 1 prints each result
     :raises ValueError: for a number of tasks or episodes below 1; when training starts, for an
         environment that is not registered, or options that ``adapt_tasks`` does not take
@@ -60,18 +70,26 @@ class AdaptationEvalCallback(EpochCallback):
     ) -> None:
         super().__init__(every, verbose)
         if n_tasks < 1 or n_episodes < 1:
-            raise ValueError(f"n_tasks and n_episodes must be at least 1, got {n_tasks} and {n_episodes}")
+            raise ValueError(
+                f"n_tasks and n_episodes must be at least 1, got {n_tasks} and {n_episodes}"
+            )
         if not record_at:
-            raise ValueError(f"record_at must hold at least one number of answers, got {record_at!r}")
+            raise ValueError(
+                f"record_at must hold at least one number of answers, got {record_at!r}"
+            )
         self.n_tasks = n_tasks
         self.record_at = tuple(record_at)
         self.n_episodes = n_episodes
-        self.best_model_save_path = None if best_model_save_path is None else Path(best_model_save_path)
+        self.best_model_save_path = (
+            None if best_model_save_path is None else Path(best_model_save_path)
+        )
         self.seed = seed
         self.adaptation_kwargs = dict(adaptation_kwargs or {})
         self.env_kwargs = dict(env_kwargs or {})
         adapter = self.adaptation_kwargs.get("adapter", PreferenceAdapter)
-        adapter.make_options(**{k: v for k, v in self.adaptation_kwargs.items() if k not in OF_ADAPT_TASKS})
+        adapter.make_options(
+            **{k: v for k, v in self.adaptation_kwargs.items() if k not in OF_ADAPT_TASKS}
+        )
         self.best_return = -np.inf
         self.last_evaluation: dict[str, float] = {}
         self._env: VecEnv | None = None
@@ -87,7 +105,11 @@ class AdaptationEvalCallback(EpochCallback):
 
     @property
     def _best_model(self) -> Path | None:
-        return None if self.best_model_save_path is None else self.best_model_save_path / "best_model.zip"
+        return (
+            None
+            if self.best_model_save_path is None
+            else self.best_model_save_path / "best_model.zip"
+        )
 
     def _make_env(self) -> tuple[VecEnv, np.ndarray]:
         if self._env is None:
@@ -99,7 +121,9 @@ class AdaptationEvalCallback(EpochCallback):
                 )
             limit = spec.max_episode_steps
             arguments = {**spec.kwargs, **self.env_kwargs}
-            self._env = make_task_vec_env(spec.id, 2 * self.n_tasks, max_episode_steps=limit, **arguments)
+            self._env = make_task_vec_env(
+                spec.id, 2 * self.n_tasks, max_episode_steps=limit, **arguments
+            )
             check_model_fits(self.model, self._env)
         family = FamilyView(self._env)
         family.check_same_family(self.model.task_space, self.model.reward_feature_dim)
@@ -112,7 +136,9 @@ class AdaptationEvalCallback(EpochCallback):
         options: dict[str, Any] = {"seed": self.seed, "n_episodes": self.n_episodes}
         if not hasattr(self.model, "similarities") and "adapter" not in self.adaptation_kwargs:
             self.adaptation_kwargs.setdefault("query_rule", "random")
-        result = evaluate_adaptation(self.model, env, tasks, record_at=self.record_at, **options, **self.adaptation_kwargs)
+        result = evaluate_adaptation(
+            self.model, env, tasks, record_at=self.record_at, **options, **self.adaptation_kwargs
+        )
         known = known_task_return(self.model, env, tasks, **options)
         metrics = {f"return_after_{k}_queries": result.after(k) for k in self.record_at}
         metrics["known_task_return"] = known.mean_return
@@ -122,7 +148,9 @@ class AdaptationEvalCallback(EpochCallback):
             metrics["known_task_success_rate"] = known.success_rate
         metrics["coverage_loss"] = self._coverage_loss(env)
         if hasattr(self.model, "similarities"):
-            metrics["preference_accuracy"], metrics["kendall_tau"] = preference_order(self.model, known)
+            metrics["preference_accuracy"], metrics["kendall_tau"] = preference_order(
+                self.model, known
+            )
         for name, value in metrics.items():
             self.logger.record(f"eval/{name}", value)
         self.last_evaluation = metrics
@@ -143,7 +171,10 @@ class AdaptationEvalCallback(EpochCallback):
         own, tasks = self.model.task_latents[chosen], self.model.train_tasks.tasks[chosen]
         draws = rng.standard_normal((1000, self.model.latent_dim))
         nearest = draws[((own[:, None, :] - draws[None, :, :]) ** 2).sum(axis=2).argmin(axis=1)]
-        returns = [evaluate_latents(self.model, env, latents, tasks, 1, self.seed).mean() for latents in (own, nearest)]
+        returns = [
+            evaluate_latents(self.model, env, latents, tasks, 1, self.seed).mean()
+            for latents in (own, nearest)
+        ]
         return float(returns[0] - returns[1])
 
     def _on_training_end(self) -> None:

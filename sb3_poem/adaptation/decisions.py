@@ -8,13 +8,13 @@ import numpy as np
 
 DECISIONS = ("expected-fitness", "posterior-mean", "most-likely")
 
-# How much fitter than the posterior mean's policy another one must look to be taken instead of it, in standard deviations of
-# S over the prior's policies. S is an estimate, and the best-looking of hundreds of options is partly luck; the mean is not
-# chosen by it.
+# How much fitter than the posterior mean's policy another one must look to be taken instead of it,
+# in standard deviations of S over the prior's policies. S is an estimate, and the best-looking of
+# hundreds of options is partly luck; the mean is not chosen by it.
 MEAN_ADVANTAGE = 0.1
-# Options that look as fit as the best one to within this, for every task that is plausible (root mean square over the
-# posterior, in the same unit), are not told apart: at the far side of a cluster of latents S went on rising where returns
-# fell.
+# Options that look as fit as the best one to within this, for every task that is plausible (root
+# mean square over the posterior, in the same unit), are not told apart: at the far side of a
+# cluster of latents S went on rising where returns fell.
 ALIKE = 0.5
 
 
@@ -27,8 +27,7 @@ def decide(
     reference: np.ndarray,
     has_holes: bool = False,
 ) -> np.ndarray:
-    """
-    The latent to act on.
+    """The latent to act on.
 
     - "expected-fitness": the posterior mean if its policy is nearly as fit as any, else the middle of those options that S
       does not tell from the fittest. Fitness is S(z, option), averaged over the posterior of z; options are the particles,
@@ -38,14 +37,15 @@ def decide(
     - "most-likely": the particle of the largest weight.
 
     :param decision: One of these.
-    :param model: A model with ``similarity``; None leaves only the other two, and "expected-fitness" then means the particle
-        nearest to the posterior mean, which lies within a mode.
+    :param model: A model with ``similarity``; None leaves only the other two, and
+        "expected-fitness" then means the particle nearest to the posterior mean, which lies within
+        a mode.
     :param particles: (n, d).
     :param weights: (n,) summing to one.
     :param training_latents: (N, d) or None.
     :param reference: (m, d) draws of the prior, whose policies give S its unit.
-    :param has_holes: Whether the prior is a mixture, with latents between its parts that no training has seen: S may think
-        much of their policies, so the posterior mean is no option.
+    :param has_holes: Whether the prior is a mixture, with latents between its parts that no
+        training has seen: S may think much of their policies, so the posterior mean is no option.
     :return: (d,).
     :raises ValueError: If the decision is unknown.
     """
@@ -80,11 +80,11 @@ def decide(
 
 
 def standard_scores(similarities: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """
-    S in units that are the same for all tasks, as those of large norm would outvote the others.
+    """S in units that are the same for all tasks, as those of large norm would outvote the others.
 
     :param similarities: (n, options) S(z_i, option).
-    :param reference: (n, m) S(z_i, policy) of the prior's policies, whose mean and standard deviation are 0 and 1.
+    :param reference: (n, m) S(z_i, policy) of the prior's policies, whose mean and standard
+        deviation are 0 and 1.
     :return: (n, options).
     """
     scale = reference.std(axis=1, keepdims=True)

@@ -19,13 +19,14 @@ Env: TypeAlias = Union[gym.Env, gym.vector.VectorEnv, str, "VecEnv"]
 COPIES = 60
 
 
-def model_and_env(model: Any, env: Env, n_copies: int = COPIES, render: bool = False) -> tuple[Any, VecEnv]:
-    """
-    What adaptation is given, as it works with it.
+def model_and_env(
+    model: Any, env: Env, n_copies: int = COPIES, render: bool = False
+) -> tuple[Any, VecEnv]:
+    """What adaptation is given, as it works with it.
 
     :param model: A model, a file or folder of one, or the name of one that ships.
-    :param env: A ``gym.Env``, its id, a Gymnasium ``VectorEnv`` or an SB3 ``VecEnv``; the latter stays
-        as it is. The id on which the model was trained makes it with the same arguments.
+    :param env: A ``gym.Env``, its id, a Gymnasium ``VectorEnv`` or an SB3 ``VecEnv``; the latter
+        stays as it is. The id on which the model was trained makes it with the same arguments.
     :param n_copies: How many copies an id makes.
     :param render: Whether they render RGB images.
     :return: The model, and a vector environment.
@@ -53,21 +54,22 @@ def model_and_env(model: Any, env: Env, n_copies: int = COPIES, render: bool = F
         return model, vectorised(env)
     if isinstance(env, gym.vector.VectorEnv):
         return model, as_task_vec_env(env)
-    raise TypeError(f"`env` must be a gymnasium.Env, an id, a Gymnasium VectorEnv or an SB3 VecEnv, but is {env!r}")
+    raise TypeError(
+        f"`env` must be a gymnasium.Env, an id, a Gymnasium VectorEnv or an SB3 VecEnv, but is {env!r}"
+    )
 
 
 def check_model_fits(model: Any, vec_env: VecEnv) -> None:
-    """
-    Refuse a model of other observations, actions or tasks.
+    """Refuse a model of other observations, actions or tasks.
 
-    :param model: The model.
-    :param vec_env: The environment.
     :raises ValueError: If a space differs, or a wrapper changes what is seen, done or paid.
     """
     names = ["observation_space", "action_space"]
     family = FamilyView.of(vec_env)
     if family is not None:
-        unknown_wrappers(vec_env)  # refuses those that are known to change what is seen, done or paid
+        unknown_wrappers(
+            vec_env
+        )  # refuses those that are known to change what is seen, done or paid
     if hasattr(model, "task_space") and family is not None:
         names.append("task_space")
     for name in names:

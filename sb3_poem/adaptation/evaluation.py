@@ -1,4 +1,6 @@
-"""How well adaptation does: true returns after each answer, what a known task would give, and Property 1 on held-out tasks."""
+"""How well adaptation does: true returns after each answer, what a known task would give, and
+Property 1 on held-out tasks.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,8 @@ if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
 
-# Latents to try for each task, where every one must be rolled out in every task, and where one rollout serves all of them.
+# Latents to try for each task, where every one must be rolled out in every task, and where one
+# rollout serves all of them.
 LATENTS_WITH_OWN_DYNAMICS, LATENTS_WITH_SHARED_DYNAMICS = 30, 300
 
 N_TEST_TASKS = 30
@@ -30,11 +33,11 @@ N_TEST_TASKS = 30
 
 @dataclass(frozen=True, eq=False)
 class EpisodeOutcomes:
-    """
-    What the episodes of some latents on some tasks came to.
+    """What the episodes of some latents on some tasks came to.
 
     :param returns: (n, n_episodes) true returns.
-    :param successes: (n, n_episodes), whether an episode was a success; None for a family that does not say.
+    :param successes: (n, n_episodes), whether an episode was a success; None for a family that does
+        not say.
     """
 
     returns: np.ndarray
@@ -54,8 +57,8 @@ def evaluate_latents(
     seed: int = 0,
     deterministic: bool = True,
 ) -> np.ndarray:
-    """
-    True returns of latents on tasks, (n, n_episodes): those of :func:`evaluate_episodes`, with the same arguments.
+    """True returns of latents on tasks, (n, n_episodes): those of :func:`evaluate_episodes`, with
+    the same arguments.
     """
     return evaluate_episodes(model, env, latents, tasks, n_episodes, seed, deterministic).returns
 
@@ -69,10 +72,11 @@ def evaluate_episodes(
     seed: int = 0,
     deterministic: bool = True,
 ) -> EpisodeOutcomes:
-    """
-    True returns of latents on tasks: an episode's rewards up to its end, early or not, not discounted; and successes.
+    """True returns of latents on tasks: an episode's rewards up to its end, early or not, not
+    discounted; and successes.
 
-    Episode e of row i always starts from the same seed, so the same rows with other latents are compared on equal starts.
+    Episode e of row i always starts from the same seed, so the same rows with other latents are
+    compared on equal starts.
 
     :param model: See :func:`adapt_tasks`.
     :param env: See :func:`adapt_tasks`.
@@ -102,22 +106,23 @@ def evaluate_episodes(
     ]
     successes = None
     if all(outcome.success is not None for outcome in outcomes):
-        successes = np.array([outcome.success for outcome in outcomes], dtype=bool).reshape(n_episodes, n).T
+        successes = (
+            np.array([outcome.success for outcome in outcomes], dtype=bool).reshape(n_episodes, n).T
+        )
     return EpisodeOutcomes(np.array(returns).reshape(n_episodes, n).T, successes)
 
 
 @dataclass(frozen=True, eq=False)
 class AdaptationEvaluation:
-    """
-    True returns of adapted policies.
+    """True returns of adapted policies.
 
     :param tasks: (n_tasks, task_dim).
     :param record_at: Numbers of answers, ascending.
     :param latents: (n_tasks, len(record_at), latent_dim) the estimates.
     :param returns: (n_tasks, len(record_at), n_episodes).
     :param preferences: A task's answers in order.
-    :param successes: (n_tasks, len(record_at), n_episodes), whether an episode was a success; None for a family that does
-        not say.
+    :param successes: (n_tasks, len(record_at), n_episodes), whether an episode was a success; None
+        for a family that does not say.
     """
 
     tasks: np.ndarray
@@ -148,23 +153,23 @@ class AdaptationEvaluation:
         return None if self.successes is None else self.successes.mean(axis=(0, 2))
 
     def after(self, n_answers: int) -> float:
-        """
-        Mean return after so many answers.
+        """Mean return after so many answers.
 
         :param n_answers: One of ``record_at``.
         :return: The mean over tasks and episodes.
         :raises ValueError: If it was not recorded.
         """
         if n_answers not in self.record_at:
-            raise ValueError(f"returns were recorded after {self.record_at} answers, not after {n_answers}")
+            raise ValueError(
+                f"returns were recorded after {self.record_at} answers, not after {n_answers}"
+            )
         return float(self.mean_returns[self.record_at.index(n_answers)])
 
     def to_dict(self) -> dict[str, Any]:
-        """
-        JSON-ready data.
+        """JSON-ready data.
 
-        :return: Every task's mean return, and success rate if there are successes, after every recorded number of answers;
-            and the means.
+        :return: Every task's mean return, and success rate if there are successes, after every
+            recorded number of answers; and the means.
         """
         data: dict[str, Any] = {
             "queries": list(self.record_at),
@@ -192,13 +197,12 @@ def evaluate_adaptation(
     on_record: Callable[[AdaptationEvaluation], None] | None = None,
     **options: Any,
 ) -> AdaptationEvaluation:
-    """
-    Adapt to each task, and measure the true return of the policy after some numbers of answers.
+    """Adapt to each task, and measure the true return of the policy after some numbers of answers.
 
     :param model: See :func:`adapt_tasks`.
     :param env: See :func:`adapt_tasks`.
-    :param tasks: (n_tasks, task_dim), or a number: so many that no model was trained on, which ``seed``
-        draws, the same as in :func:`known_task_return`; None takes 30.
+    :param tasks: (n_tasks, task_dim), or a number: so many that no model was trained on, which
+        ``seed`` draws, the same as in :func:`known_task_return`; None takes 30.
     :param oracle_factory: See :func:`adapt_tasks`.
     :param record_at: After how many answers to measure; the largest is the number of questions.
     :param n_episodes: Episodes per measurement.
@@ -210,7 +214,9 @@ def evaluate_adaptation(
     :raises ValueError: If an argument is out of its range.
     """
     if len(record_at) == 0:
-        raise ValueError(f"`record_at` must hold at least one number of answers, but is {tuple(record_at)}")
+        raise ValueError(
+            f"`record_at` must hold at least one number of answers, but is {tuple(record_at)}"
+        )
     for k in record_at:
         check_whole("record_at", k, 0)
     check_whole("n_episodes", n_episodes, 1)
@@ -221,7 +227,11 @@ def evaluate_adaptation(
 
     def measure(adapted: TaskAdaptations) -> None:
         latents = adapted.latents[:, -1]
-        outcomes.append(evaluate_episodes(model, vec_env, latents, adapted.tasks, n_episodes, start, deterministic))
+        outcomes.append(
+            evaluate_episodes(
+                model, vec_env, latents, adapted.tasks, n_episodes, start, deterministic
+            )
+        )
         if on_record is not None:
             on_record(_evaluation(adapted, outcomes))
 
@@ -240,25 +250,30 @@ def evaluate_adaptation(
     return _evaluation(adapted, outcomes)
 
 
-def _evaluation(adapted: TaskAdaptations, outcomes: Sequence[EpisodeOutcomes]) -> AdaptationEvaluation:
+def _evaluation(
+    adapted: TaskAdaptations, outcomes: Sequence[EpisodeOutcomes]
+) -> AdaptationEvaluation:
     """One outcome (n_tasks, n_episodes) for each number of answers."""
     returns = np.stack([outcome.returns for outcome in outcomes], axis=1)
     known = [outcome.successes for outcome in outcomes if outcome.successes is not None]
     successes = np.stack(known, axis=1) if len(known) == len(outcomes) else None
-    return AdaptationEvaluation(adapted.tasks, adapted.record_at, adapted.latents, returns, adapted.preferences, successes)
+    return AdaptationEvaluation(
+        adapted.tasks, adapted.record_at, adapted.latents, returns, adapted.preferences, successes
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class KnownTaskReturn:
-    """
-    What the model's repertoire holds for each task.
+    """What the model's repertoire holds for each task.
 
     :param tasks: (n_tasks, task_dim).
-    :param returns: (n_tasks, n_episodes) of each task's best latent, on episodes that had no part in choosing it.
+    :param returns: (n_tasks, n_episodes) of each task's best latent, on episodes that had no part
+        in choosing it.
     :param latents: (n_tasks, latent_dim) those latents.
     :param candidate_latents: (n_latents, latent_dim) all that were tried.
     :param candidate_returns: (n_tasks, n_latents) their returns on every task (J).
-    :param successes: (n_tasks, n_episodes), of the episodes of ``returns``; None for a family that does not say.
+    :param successes: (n_tasks, n_episodes), of the episodes of ``returns``; None for a family that
+        does not say.
     """
 
     tasks: np.ndarray
@@ -283,15 +298,19 @@ class KnownTaskReturn:
         return None if self.successes is None else float(self.successes.mean())
 
     def limit(self, k: int, noise_model: NoiseModel | None = None) -> float:
-        """
-        The information limit for k answers within this repertoire, see :func:`information_limit`.
+        """The information limit for k answers within this repertoire, see
+        :func:`information_limit`.
 
         :param k: Number of answers.
         :param noise_model: How the oracle errs; None is an oracle that does not.
         :return: A mean return.
         """
         ordered = self.tasks.shape[1] == 1
-        returns = self.candidate_returns[np.argsort(self.tasks[:, 0])] if ordered else self.candidate_returns
+        returns = (
+            self.candidate_returns[np.argsort(self.tasks[:, 0])]
+            if ordered
+            else self.candidate_returns
+        )
         return information_limit(returns, k, noise_model=noise_model, ordered=ordered)
 
 
@@ -307,18 +326,18 @@ def known_task_return(
     selection_episodes: int = 1,
     deterministic: bool = True,
 ) -> KnownTaskReturn:
-    """
-    The return if the task were known: for each task the best of many latents.
+    """The return if the task were known: for each task the best of many latents.
 
-    Beside the adapted return it tells which to work on: the repertoire of policies, or the inference among them. Where
-    tasks share their dynamics every latent is rolled out once, and its trajectory relabelled for every task. The winners
-    are then rolled out anew, so that the luck of having been chosen does not count.
+    Beside the adapted return it tells which to work on: the repertoire of policies, or the
+    inference among them. Where tasks share their dynamics every latent is rolled out once, and its
+    trajectory relabelled for every task. The winners are then rolled out anew, so that the luck of
+    having been chosen does not count.
 
     :param model: See :func:`adapt_tasks`.
     :param env: See :func:`adapt_tasks`.
     :param tasks: See :func:`evaluate_adaptation`.
-    :param n_latents: How many latents to try; None for 300, or for 30 where tasks do not share their dynamics and every latent
-        must be rolled out in every task.
+    :param n_latents: How many latents to try; None for 300, or for 30 where tasks do not share
+        their dynamics and every latent must be rolled out in every task.
     :param n_episodes: Fresh episodes per winner.
     :param seed: Of the draws and the episodes.
     :param source: Where latents come from: "prior", "aggregate", or "both" in equal parts.
@@ -330,12 +349,26 @@ def known_task_return(
     model, vec_env = model_and_env(model, env)
     tasks = _test_tasks(model, vec_env, tasks, seed)
     if n_latents is None:
-        n_latents = LATENTS_WITH_SHARED_DYNAMICS if FamilyView(vec_env).shared_dynamics else LATENTS_WITH_OWN_DYNAMICS
+        n_latents = (
+            LATENTS_WITH_SHARED_DYNAMICS
+            if FamilyView(vec_env).shared_dynamics
+            else LATENTS_WITH_OWN_DYNAMICS
+        )
     check_whole("n_latents", n_latents, 1)
     candidates = _draw_latents(model, n_latents, source, np.random.default_rng([seed, 2]))
-    returns = return_matrix(model, vec_env, tasks, candidates, selection_episodes, evaluation_seed(seed, 1), deterministic)
+    returns = return_matrix(
+        model,
+        vec_env,
+        tasks,
+        candidates,
+        selection_episodes,
+        evaluation_seed(seed, 1),
+        deterministic,
+    )
     best = candidates[np.argmax(returns, axis=1)]
-    fresh = evaluate_episodes(model, vec_env, best, tasks, n_episodes, evaluation_seed(seed), deterministic)
+    fresh = evaluate_episodes(
+        model, vec_env, best, tasks, n_episodes, evaluation_seed(seed), deterministic
+    )
     return KnownTaskReturn(tasks, fresh.returns, best, candidates, returns, fresh.successes)
 
 
@@ -348,12 +381,10 @@ def return_matrix(
     seed: int = 0,
     deterministic: bool = True,
 ) -> np.ndarray:
-    """
-    J[i, j], the mean true return on task i of the policy of latent j.
+    """J[i, j], the mean true return on task i of the policy of latent j.
 
-    :param model: A model.
-    :param vec_env: A vector environment of the task family. If its tasks share their dynamics each latent is rolled out
-        once for all tasks, else once for each.
+    :param vec_env: A vector environment of the task family. If its tasks share their dynamics each
+        latent is rolled out once for all tasks, else once for each.
     :param tasks: (n_tasks, task_dim).
     :param latents: (n_latents, latent_dim).
     :param n_episodes: Episodes to average over.
@@ -366,28 +397,39 @@ def return_matrix(
     family = FamilyView(vec_env)
     if not family.shared_dynamics:
         rows = np.repeat(tasks, len(latents), axis=0)
-        returns = evaluate_latents(model, vec_env, np.tile(latents, (len(tasks), 1)), rows, n_episodes, seed, deterministic)
+        returns = evaluate_latents(
+            model, vec_env, np.tile(latents, (len(tasks), 1)), rows, n_episodes, seed, deterministic
+        )
         return returns.mean(axis=1).reshape(len(tasks), len(latents))
     # The task in effect does not matter, and it must be one that every copy accepts.
     some_task = np.repeat(tasks[:1], n_episodes * len(latents), axis=0)
-    features = rollout_features(model, vec_env, np.tile(latents, (n_episodes, 1)), some_task, seed, deterministic)
+    features = rollout_features(
+        model, vec_env, np.tile(latents, (n_episodes, 1)), some_task, seed, deterministic
+    )
     totals = np.stack(
-        [family.compute_rewards(tasks[:, None, :], episode[None, :, :]).sum(axis=1) for episode in features], axis=1
+        [
+            family.compute_rewards(tasks[:, None, :], episode[None, :, :]).sum(axis=1)
+            for episode in features
+        ],
+        axis=1,
     )
     return totals.reshape(len(tasks), n_episodes, len(latents)).mean(axis=1)
 
 
 def property_one(similarities: np.ndarray, returns: np.ndarray) -> tuple[float, float]:
-    """
-    How well S orders policies as true returns do (Property 1).
+    """How well S orders policies as true returns do (Property 1).
 
     :param similarities: (n_tasks, n_policies) S(z_i, z_j).
     :param returns: (n_tasks, n_policies) J[i, j].
-    :return: Preference accuracy, the share of pairs of policies with different returns that S puts in the right order (a
-        tie of S counts one half); and Kendall's tau-b, averaged over tasks. NaN if no task tells any two policies apart.
+    :return: Preference accuracy, the share of pairs of policies with different returns that S puts
+        in the right order (a tie of S counts one half); and Kendall's tau-b, averaged over tasks.
+        NaN if no task tells any two policies apart.
     :raises ValueError: If the shapes differ.
     """
-    similarities, returns = np.asarray(similarities, dtype=np.float64), np.asarray(returns, dtype=np.float64)
+    similarities, returns = (
+        np.asarray(similarities, dtype=np.float64),
+        np.asarray(returns, dtype=np.float64),
+    )
     if similarities.shape != returns.shape or similarities.ndim != 2:
         raise ValueError(
             f"`similarities` and `returns` must have the same shape (n_tasks, n_policies), but have {similarities.shape} and "
@@ -408,9 +450,8 @@ def property_one(similarities: np.ndarray, returns: np.ndarray) -> tuple[float, 
 
 
 def preference_order(model: Any, known: KnownTaskReturn) -> tuple[float, float]:
-    """
-    Property 1 on held-out tasks. A held-out task's latent is the best of the candidates for it; S between those latents
-    is compared with the returns of their policies on those tasks.
+    """Property 1 on held-out tasks. A held-out task's latent is the best of the candidates for it;
+    S between those latents is compared with the returns of their policies on those tasks.
 
     :param model: A model with ``similarity``.
     :param known: What :func:`known_task_return` found for the tasks.
@@ -422,7 +463,9 @@ def preference_order(model: Any, known: KnownTaskReturn) -> tuple[float, float]:
     return property_one(similarities, known.candidate_returns[:, policies])
 
 
-def _test_tasks(model: Any, vec_env: VecEnv, tasks: np.ndarray | int | None, seed: int) -> np.ndarray:
+def _test_tasks(
+    model: Any, vec_env: VecEnv, tasks: np.ndarray | int | None, seed: int
+) -> np.ndarray:
     if tasks is None or isinstance(tasks, (int, np.integer)):
         n_tasks = N_TEST_TASKS if tasks is None else int(tasks)
         return FamilyView.for_training(vec_env, model.horizon).test_tasks(n_tasks, seed)
@@ -430,8 +473,7 @@ def _test_tasks(model: Any, vec_env: VecEnv, tasks: np.ndarray | int | None, see
 
 
 def evaluation_seed(seed: int, stream: int = 0) -> int:
-    """
-    Where the reset seeds of evaluation episodes start: far from those of the questions.
+    """Where the reset seeds of evaluation episodes start: far from those of the questions.
 
     :param seed: The evaluation's seed.
     :param stream: Different episodes for different purposes.

@@ -21,8 +21,7 @@ ANSWERS = {
 
 @dataclass(frozen=True, eq=False)
 class HumanAnswer:
-    """
-    An answer, with all that is known of it.
+    """An answer, with all that is known of it.
 
     :param preference: The answer.
     :param left: The trajectory on the left.
@@ -43,11 +42,11 @@ class HumanAnswer:
 
 
 class HumanOracle:
-    """
-    Shows both trajectories side by side in a video file, and asks at the terminal.
+    """Shows both trajectories side by side in a video file, and asks at the terminal.
 
-    The n-th question's file is ``query-001.gif`` and so on (or ``.mp4``) within the folder. The prompt takes l, left or 1; r,
-    right or 2; e, equal, = or ?; upper or lower case; anything else is asked again.
+    The n-th question's file is ``query-001.gif`` and so on (or ``.mp4``) within the folder. The
+    prompt takes l, left or 1; r, right or 2; e, equal, = or ?; upper or lower case; anything else
+    is asked again.
 
     :param folder: Where the videos go; it is made if missing.
     :param video_format: "gif" (any viewer plays it) or "mp4" (smaller).
@@ -55,8 +54,8 @@ class HumanOracle:
     :param mistake_rate: How often a person is taken to err, for the Bayesian rule.
     :param read: Reads a line after showing a prompt; ``input`` by default.
     :param write: Shows a line; ``print`` by default.
-    :param record: Called with each :class:`HumanAnswer` as soon as it is understood; ``sb3_poem.label`` has one that keeps
-        them in the store of the web page.
+    :param record: Called with each :class:`HumanAnswer` as soon as it is understood;
+        ``sb3_poem.label`` has one that keeps them in the store of the web page.
     :raises ValueError: If the format is unknown.
     """
 
@@ -87,8 +86,7 @@ class HumanOracle:
         return f"HumanOracle({self.n_asked} asked, videos in {self.folder})"
 
     def __call__(self, left: Trajectory, right: Trajectory) -> Preference:
-        """
-        Write the video, and ask until an answer is understood.
+        """Write the video, and ask until an answer is understood.
 
         :param left: A trajectory with frames.
         :param right: Another.

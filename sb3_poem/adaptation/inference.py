@@ -1,4 +1,6 @@
-"""Inferring a latent from answers, without an environment: the paper's rule, and what both rules share."""
+"""Inferring a latent from answers, without an environment: the paper's rule, and what both rules
+share.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,8 @@ from sb3_poem.adaptation.state import generator_from_state, generator_state
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.trajectory import Trajectory, decode_array, encode_array
 
-# What a question compares: a trajectory, or where no trajectory is at hand the latent of the policy that would make it.
+# What a question compares: a trajectory, or where no trajectory is at hand the latent of the policy
+# that would make it.
 Shown = Trajectory | np.ndarray
 
 
@@ -32,8 +35,7 @@ SIGNS = {Preference.LEFT: 1.0, Preference.RIGHT: -1.0, Preference.EQUAL: 0.0}
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """
-    One answered question.
+    """One answered question.
 
     :param preference: The answer.
     :param left: What stood on the left.
@@ -46,8 +48,7 @@ class Answer:
 
 
 def latent_of(shown: Shown) -> np.ndarray:
-    """
-    The latent behind what was shown.
+    """The latent behind what was shown.
 
     :param shown: A trajectory or a latent.
     :return: (d,).
@@ -55,12 +56,13 @@ def latent_of(shown: Shown) -> np.ndarray:
     return shown.latent if isinstance(shown, Trajectory) else np.asarray(shown, dtype=np.float64)
 
 
-def preference_log_likelihood(log_left: np.ndarray, log_right: np.ndarray, answers: list[Preference]) -> np.ndarray:
-    """
-    Log-likelihood of answers from the log-probabilities of LEFT and RIGHT.
+def preference_log_likelihood(
+    log_left: np.ndarray, log_right: np.ndarray, answers: list[Preference]
+) -> np.ndarray:
+    """Log-likelihood of answers from the log-probabilities of LEFT and RIGHT.
 
-    EQUAL has the geometric mean of both: it is largest where neither is more probable and, other than half of each,
-    it tells a latent that calls the two alike from one that is sure of either.
+    EQUAL has the geometric mean of both: it is largest where neither is more probable and, other
+    than half of each, it tells a latent that calls the two alike from one that is sure of either.
 
     :param log_left: (m, k) log P(LEFT) of k questions under m latents.
     :param log_right: (m, k) log P(RIGHT).
@@ -72,15 +74,15 @@ def preference_log_likelihood(log_left: np.ndarray, log_right: np.ndarray, answe
 
 
 class LatentInference(ABC):
-    """
-    Ask and tell on latents alone: ``ask_latents()`` names two policies, ``tell()`` takes the answer, ``estimate()`` gives
-    the latent.
+    """Ask and tell on latents alone: ``ask_latents()`` names two policies, ``tell()`` takes the
+    answer, ``estimate()`` gives the latent.
 
-    :param model: A trained model: ``latent_dim``, ``sample_latents``, ``similarity`` and, depending on the options,
-        ``predicted_returns``, ``predicted_rewards_error`` and ``task_latents``.
+    :param model: A trained model: ``latent_dim``, ``sample_latents``, ``similarity`` and, depending
+        on the options, ``predicted_returns``, ``predicted_rewards_error`` and ``task_latents``.
     :param n_candidates: How many candidate latents are kept (N_z).
     :param epsilon: Tolerated error of eq. 9, in [0, 0.5).
-    :param candidates: Where they come from: "prior" (N(0, I)) or "aggregate" (the training tasks' posteriors).
+    :param candidates: Where they come from: "prior" (N(0, I)) or "aggregate" (the training tasks'
+        posteriors).
     :param query_rule: "worst-case" (eq. 10), "information-gain" or "random".
     :param rng: The only source of randomness.
     :raises ValueError: If an argument is out of its range.
@@ -90,7 +92,13 @@ class LatentInference(ABC):
     library: list[Trajectory] | None = None
 
     def __init__(
-        self, model: Any, n_candidates: int, epsilon: float, candidates: str, query_rule: str, rng: np.random.Generator
+        self,
+        model: Any,
+        n_candidates: int,
+        epsilon: float,
+        candidates: str,
+        query_rule: str,
+        rng: np.random.Generator,
     ) -> None:
         check_inference_options(n_candidates, epsilon, candidates, query_rule)
         self.model = model
@@ -103,15 +111,13 @@ class LatentInference(ABC):
 
     @abstractmethod
     def ask_latents(self) -> tuple[np.ndarray, np.ndarray]:
-        """
-        The two policies to compare next.
+        """The two policies to compare next.
 
         :return: Two latents (d,).
         """
 
     def ask_library(self) -> tuple[int, int]:
-        """
-        The two trajectories of the library to compare next.
+        """The two trajectories of the library to compare next.
 
         :return: Two different indices.
         :raises RuntimeError: If there is no library.
@@ -119,8 +125,7 @@ class LatentInference(ABC):
         raise RuntimeError("there is no library to ask about; pass `library`")
 
     def same_latents(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """
-        The policies of a pending question that was read from a file.
+        """The policies of a pending question that was read from a file.
 
         :param left: The latent in the file.
         :param right: The other.
@@ -130,18 +135,17 @@ class LatentInference(ABC):
 
     @abstractmethod
     def tell(self, preference: Preference, left: Shown, right: Shown) -> None:
-        """
-        Take an answer.
+        """Take an answer.
 
         :param preference: The answer.
-        :param left: What stood on the left: its trajectory, or its latent where the likelihood needs no trajectory.
+        :param left: What stood on the left: its trajectory, or its latent where the likelihood
+            needs no trajectory.
         :param right: The same for the right.
         """
 
     @abstractmethod
     def estimate(self) -> np.ndarray:
-        """
-        The latent to act on, given the answers so far.
+        """The latent to act on, given the answers so far.
 
         :return: (d,).
         """
@@ -155,16 +159,17 @@ class LatentInference(ABC):
         """Put back what :meth:`_arrays` gave."""
 
     def snapshot(self) -> Snapshot:
-        """
-        The posterior and the random state, as they are now.
+        """The posterior and the random state, as they are now.
 
         :return: A copy that :meth:`restore` takes.
         """
-        return Snapshot(generator_state(self.rng), {name: array.copy() for name, array in self._arrays().items()})
+        return Snapshot(
+            generator_state(self.rng),
+            {name: array.copy() for name, array in self._arrays().items()},
+        )
 
     def restore(self, snapshot: Snapshot, answers: list[Answer]) -> None:
-        """
-        Go back, or on, to a snapshot.
+        """Go back, or on, to a snapshot.
 
         :param snapshot: What :meth:`snapshot` gave.
         :param answers: The answers up to then.
@@ -173,15 +178,16 @@ class LatentInference(ABC):
         try:
             self._set_arrays({name: array.copy() for name, array in snapshot.arrays.items()})
         except KeyError as error:
-            raise ValueError(f"not a snapshot of {type(self).__name__}: {error} is missing") from error
+            raise ValueError(
+                f"not a snapshot of {type(self).__name__}: {error} is missing"
+            ) from error
         self.rng = generator_from_state(snapshot.random_state)
         self.answers = list(answers)
 
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """
-    An inference between two answers.
+    """An inference between two answers.
 
     :param random_state: Of its generator.
     :param arrays: Everything else that changes, by name.
@@ -191,8 +197,7 @@ class Snapshot:
     arrays: dict[str, np.ndarray]
 
     def to_dict(self) -> dict[str, Any]:
-        """
-        Write it as JSON-ready data.
+        """Write it as JSON-ready data.
 
         :return: A dictionary that :meth:`from_dict` reads.
         """
@@ -203,8 +208,7 @@ class Snapshot:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Snapshot:
-        """
-        Read what :meth:`to_dict` wrote.
+        """Read what :meth:`to_dict` wrote.
 
         :param data: The dictionary.
         :return: The snapshot.
@@ -218,13 +222,13 @@ class Snapshot:
 
 
 class PaperInference(LatentInference):
-    """
-    Algorithm 2 of Xu & Zhu (2025): candidates that satisfy every answer within the tolerance of eq. 9, the pair of
-    eq. 10, and the candidate of highest Bradley-Terry likelihood (line 17).
+    """Algorithm 2 of Xu & Zhu (2025): candidates that satisfy every answer within the tolerance of
+    eq. 9, the pair of eq. 10, and the candidate of highest Bradley-Terry likelihood (line 17).
 
-    The paper's loop draws until N_z candidates are found, which need not happen: contradicting answers leave no such
-    latent, and the accepted share halves with every answer. Here the draws are bounded; what is missing is filled up by
-    the draws that satisfy most answers, and among those by the highest likelihood. EQUAL excludes nobody.
+    The paper's loop draws until N_z candidates are found, which need not happen: contradicting
+    answers leave no such latent, and the accepted share halves with every answer. Here the draws
+    are bounded; what is missing is filled up by the draws that satisfy most answers, and among
+    those by the highest likelihood. EQUAL excludes nobody.
 
     :param model: A trained model.
     :param n_candidates: N_z.
@@ -245,7 +249,9 @@ class PaperInference(LatentInference):
         rng: np.random.Generator | None = None,
         max_draws: int = 16384,
     ) -> None:
-        super().__init__(model, n_candidates, epsilon, candidates, query_rule, rng or np.random.default_rng())
+        super().__init__(
+            model, n_candidates, epsilon, candidates, query_rule, rng or np.random.default_rng()
+        )
         self.max_draws = max(max_draws, n_candidates)
         self.candidates = self.prior.sample(n_candidates, self.rng)
         self._fresh = True
@@ -271,21 +277,22 @@ class PaperInference(LatentInference):
         self._fresh = False
 
     def estimate(self) -> np.ndarray:
-        """
-        Line 17: of the candidates that were drawn for the last question, the one under which the answers, the last one
-        included, are most likely. Before any answer all are equally likely; then the one nearest to their centre.
+        """Line 17: of the candidates that were drawn for the last question, the one under which the
+        answers, the last one included, are most likely. Before any answer all are equally likely;
+        then the one nearest to their centre.
 
         :return: (d,).
         """
         if not self.answers:
             centre = self.candidates.mean(axis=0)
-            return self.candidates[np.argmin(np.linalg.norm(self.candidates - centre, axis=1))].copy()
+            return self.candidates[
+                np.argmin(np.linalg.norm(self.candidates - centre, axis=1))
+            ].copy()
         differences = self._differences(self.candidates)
         return self.candidates[np.argmax(self._log_likelihoods(differences))].copy()
 
     def satisfied(self, latents: np.ndarray) -> np.ndarray:
-        """
-        How many answers each latent satisfies within the tolerance (eq. 9).
+        """How many answers each latent satisfies within the tolerance (eq. 9).
 
         :param latents: (m, d).
         :return: (m,) integers, at most the number of answers.
@@ -296,12 +303,16 @@ class PaperInference(LatentInference):
 
     def _most_informative(self, similarities: np.ndarray) -> tuple[int, int]:
         probabilities = np.exp(log_sigmoid(pair_differences(similarities)))  # eq. 7
-        gains = information_gains(probabilities, np.full(self.n_candidates, 1.0 / self.n_candidates))
+        gains = information_gains(
+            probabilities, np.full(self.n_candidates, 1.0 / self.n_candidates)
+        )
         return pair_at(int(np.argmax(gains)), self.n_candidates)
 
     def _differences(self, latents: np.ndarray) -> np.ndarray:
         """(m, k) S(z, z_left) - S(z, z_right) of every answered question."""
-        shown = np.stack([latent_of(item) for answer in self.answers for item in (answer.left, answer.right)])
+        shown = np.stack(
+            [latent_of(item) for answer in self.answers for item in (answer.left, answer.right)]
+        )
         similarities = self.model.similarities(latents, shown)
         return similarities[:, 0::2] - similarities[:, 1::2]
 
@@ -312,10 +323,14 @@ class PaperInference(LatentInference):
 
     def _log_likelihoods(self, differences: np.ndarray) -> np.ndarray:
         answers = [answer.preference for answer in self.answers]
-        return preference_log_likelihood(log_sigmoid(differences), log_sigmoid(-differences), answers)
+        return preference_log_likelihood(
+            log_sigmoid(differences), log_sigmoid(-differences), answers
+        )
 
     def _draw_candidates(self) -> np.ndarray:
-        """Lines 3 to 9, bounded. The last question's candidates take part in the fall-back alone: line 3 starts afresh."""
+        """Lines 3 to 9, bounded. The last question's candidates take part in the fall-back alone:
+        line 3 starts afresh.
+        """
         rest = [(self.candidates, self._differences(self.candidates))]
         found: list[np.ndarray] = []
         n_found, drawn, batch = 0, 0, max(1024, self.n_candidates)
@@ -334,9 +349,13 @@ class PaperInference(LatentInference):
         return np.concatenate(found)[: self.n_candidates]
 
     def _best(self, differences: np.ndarray, n: int) -> np.ndarray:
-        """Rows of the n latents that satisfy most answers, and among equals are the likeliest; best first."""
+        """Rows of the n latents that satisfy most answers, and among equals are the likeliest; best
+        first.
+        """
         satisfied = self._satisfied(differences)
-        contenders = np.flatnonzero(satisfied >= np.partition(satisfied, len(satisfied) - n)[len(satisfied) - n])
+        contenders = np.flatnonzero(
+            satisfied >= np.partition(satisfied, len(satisfied) - n)[len(satisfied) - n]
+        )
         likelihoods = self._log_likelihoods(differences[contenders])
         return contenders[np.lexsort((-likelihoods, -satisfied[contenders]))[:n]]
 
@@ -348,9 +367,10 @@ class PaperInference(LatentInference):
         self._fresh = bool(arrays["fresh"])
 
 
-def check_inference_options(n_candidates: int, epsilon: float, candidates: str, query_rule: str) -> None:
-    """
-    Check what both rules share.
+def check_inference_options(
+    n_candidates: int, epsilon: float, candidates: str, query_rule: str
+) -> None:
+    """Check what both rules share.
 
     :param n_candidates: At least 2.
     :param epsilon: In [0, 0.5).
@@ -368,8 +388,7 @@ def check_inference_options(n_candidates: int, epsilon: float, candidates: str, 
 
 
 def log_sigmoid(x: np.ndarray) -> np.ndarray:
-    """
-    log(1 / (1 + exp(-x))) without overflow.
+    """log(1 / (1 + exp(-x))) without overflow.
 
     :param x: Any shape.
     :return: The same shape.

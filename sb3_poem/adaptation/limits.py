@@ -16,24 +16,27 @@ EXACT_CODEBOOKS = 5000
 MAX_SWAP_ROUNDS = 50
 
 
-def information_limit(returns: np.ndarray, k: int, *, noise_model: NoiseModel | None = None, ordered: bool = False) -> float:
-    """
-    The highest mean return that any method can reach with k binary answers.
+def information_limit(
+    returns: np.ndarray, k: int, *, noise_model: NoiseModel | None = None, ordered: bool = False
+) -> float:
+    """The highest mean return that any method can reach with k binary answers.
 
-    k answers tell at most 2^k tasks apart, so a method ends in one of at most 2^k policies; the best choice of those and,
-    for every task, the best of them, bounds it (:func:`best_codebook`). Answers of an oracle that errs tell less than a
-    bit each: then the rate-distortion bound at the bits that they do tell applies (:func:`rate_distortion_limit`).
+    k answers tell at most 2^k tasks apart, so a method ends in one of at most 2^k policies; the
+    best choice of those and, for every task, the best of them, bounds it (:func:`best_codebook`).
+    Answers of an oracle that errs tell less than a bit each: then the rate-distortion bound at the
+    bits that they do tell applies (:func:`rate_distortion_limit`).
 
-    The bound holds for the tasks that are given: with 30 test tasks it ends at the known-task return after five
-    answers. For a bound on the family take a dense grid of tasks. An answer of EQUAL, which tells a little more than
-    LEFT or RIGHT alone, is not provided for.
+    The bound holds for the tasks that are given: with 30 test tasks it ends at the known-task
+    return after five answers. For a bound on the family take a dense grid of tasks. An answer of
+    EQUAL, which tells a little more than LEFT or RIGHT alone, is not provided for.
 
     :param returns: (n_tasks, n_policies) return of each policy on each task (J).
     :param k: Number of answers.
     :param noise_model: How the oracle errs; None is an oracle that does not.
     :param ordered: See :func:`best_codebook`.
     :return: The mean return over the tasks.
-    :raises ValueError: If the matrix is empty or not finite, k is negative, or the noise model is of an unknown kind.
+    :raises ValueError: If the matrix is empty or not finite, k is negative, or the noise model is
+        of an unknown kind.
     """
     if k < 0:
         raise ValueError(f"`k` must not be negative, but is {k}")
@@ -48,18 +51,19 @@ def information_limit(returns: np.ndarray, k: int, *, noise_model: NoiseModel | 
 
 
 def best_codebook(returns: np.ndarray, size: int, *, ordered: bool = False) -> np.ndarray:
-    """
-    The set of policies of a given size with the highest mean over tasks of the best return (k-medoids on the matrix).
+    """The set of policies of a given size with the highest mean over tasks of the best return
+    (k-medoids on the matrix).
 
-    Found exactly where all sets can be tried, or by dynamic programming where tasks lie on a line (``ordered``); else by
-    greedy choice and swaps, which may lie slightly below the optimum.
+    Found exactly where all sets can be tried, or by dynamic programming where tasks lie on a line
+    (``ordered``); else by greedy choice and swaps, which may lie slightly below the optimum.
 
     :param returns: (n_tasks, n_policies).
     :param size: How many policies, at least 1.
-    :param ordered: Whether the rows are in the order of a one-dimensional task parameter. The optimum is then found
-        among all ways to cut the line into ``size`` intervals, one policy each. That is exact if of any two policies the
-        one is better up to some task and the other from there on, as with a goal speed; noise in the returns
-        may break this, so the general search is tried too.
+    :param ordered: Whether the rows are in the order of a one-dimensional task parameter. The
+        optimum is then found among all ways to cut the line into ``size`` intervals, one policy
+        each. That is exact if of any two policies the one is better up to some task and the other
+        from there on, as with a goal speed; noise in the returns may break this, so the general
+        search is tried too.
     :return: (min(size, n_policies),) policy indices, ascending.
     :raises ValueError: If the matrix is empty or not finite, or the size is below 1.
     """
@@ -79,8 +83,8 @@ def best_codebook(returns: np.ndarray, size: int, *, ordered: bool = False) -> n
 
 
 def best_intervals(returns: np.ndarray, size: int) -> np.ndarray:
-    """
-    The policies of the best cut of an ordered list of tasks into at most ``size`` intervals, by dynamic programming.
+    """The policies of the best cut of an ordered list of tasks into at most ``size`` intervals, by
+    dynamic programming.
 
     :param returns: (n_tasks, n_policies), rows in the order of the task parameter.
     :param size: How many intervals at most.
@@ -148,7 +152,9 @@ def _swap(returns: np.ndarray, chosen: np.ndarray) -> np.ndarray:
 def _check_returns(returns: np.ndarray) -> np.ndarray:
     returns = np.asarray(returns, dtype=np.float64)
     if returns.ndim != 2 or 0 in returns.shape:
-        raise ValueError(f"`returns` must have shape (n_tasks, n_policies), neither 0, but has shape {returns.shape}")
+        raise ValueError(
+            f"`returns` must have shape (n_tasks, n_policies), neither 0, but has shape {returns.shape}"
+        )
     if not np.isfinite(returns).all():
         raise ValueError("`returns` must be finite")
     return returns

@@ -22,8 +22,7 @@ OracleFactory = Callable[..., Callable[[Trajectory, Trajectory], Any]]
 
 @dataclass(frozen=True, eq=False)
 class TaskAdaptations:
-    """
-    Many tasks, adapted.
+    """Many tasks, adapted.
 
     :param tasks: (n_tasks, task_dim).
     :param record_at: Numbers of answers at which estimates were kept, ascending.
@@ -55,32 +54,37 @@ def adapt_tasks(
     on_record: Callable[[TaskAdaptations], None] | None = None,
     **options: Any,
 ) -> TaskAdaptations:
-    """
-    Adapt a model to each of many tasks, with all rollouts of a question in lockstep.
+    """Adapt a model to each of many tasks, with all rollouts of a question in lockstep.
 
-    Task i is adapted as ``adapter(model, env, seed=seed + i, ...)`` would alone: with the same candidates, questions
-    and reset seeds. (Matrix products may round otherwise in a batch than alone, in the last bits; and with
-    ``deterministic=False`` the actions' noise is drawn for all rollouts of a question together.) The tasks are set in
-    ``env`` for the rollouts, and known to the oracles; inference never sees them.
+    Task i is adapted as ``adapter(model, env, seed=seed + i, ...)`` would alone: with the same
+    candidates, questions and reset seeds. (Matrix products may round otherwise in a batch than
+    alone, in the last bits; and with ``deterministic=False`` the actions' noise is drawn for all
+    rollouts of a question together.) The tasks are set in ``env`` for the rollouts, and known to
+    the oracles; inference never sees them.
 
     :param model: See :class:`PreferenceAdapter`.
-    :param env: See :class:`PreferenceAdapter`; a task family. Any number of copies will do; twice the
-        number of tasks is best, and an id makes 60.
+    :param env: See :class:`PreferenceAdapter`; a task family. Any number of copies will do; twice
+        the number of tasks is best, and an id makes 60.
     :param tasks: (n_tasks, task_dim).
-    :param oracle_factory: Called as ``oracle_factory(env=vec_env, task=task, seed=seed + i)``, gives task i's oracle. The
-        oracles' classes will do, and ``functools.partial(MistakeOracle, 0.1)``.
-    :param adapter: The method: :class:`PreferenceAdapter`, or a baseline's adapter that ends in a latent.
+    :param oracle_factory: Called as ``oracle_factory(env=vec_env, task=task, seed=seed + i)``,
+        gives task i's oracle. The oracles' classes will do, and ``functools.partial(MistakeOracle,
+        0.1)``.
+    :param adapter: The method: :class:`PreferenceAdapter`, or a baseline's adapter that ends in a
+        latent.
     :param n_queries: Answers per task.
-    :param record_at: Numbers of answers at which to keep the estimate; None keeps 0, 1, ..., n_queries.
+    :param record_at: Numbers of answers at which to keep the estimate; None keeps 0, 1, ...,
+        n_queries.
     :param seed: Task i takes seed + i.
     :param library: See :class:`PreferenceAdapter`.
     :param progress_bar: Whether to show one.
-    :param on_record: Called with all that there is so far, each time that estimates are kept. It may
-        use ``vec_env``.
-    :param options: Further options of the adapter; for :class:`PreferenceAdapter` ``inference``, ``query_rule``,
-        ``n_candidates``, ``epsilon``, ``candidates``, ``likelihood``, ``decision``, ``noise_model``, ``deterministic``.
+    :param on_record: Called with all that there is so far, each time that estimates are kept. It
+        may use ``vec_env``.
+    :param options: Further options of the adapter; for :class:`PreferenceAdapter` ``inference``,
+        ``query_rule``, ``n_candidates``, ``epsilon``, ``candidates``, ``likelihood``, ``decision``,
+        ``noise_model``, ``deterministic``.
     :return: The estimates.
-    :raises ValueError: If an argument is out of its range, or the model belongs to another environment.
+    :raises ValueError: If an argument is out of its range, or the model belongs to another
+        environment.
     :raises TypeError: If an argument is of another kind.
     """
     from tqdm import tqdm
@@ -89,14 +93,20 @@ def adapt_tasks(
     _check_factory(oracle_factory)
     tasks = np.asarray(tasks, dtype=np.float64)
     if tasks.ndim != 2 or len(tasks) < 1:
-        raise ValueError(f"`tasks` must have shape (n_tasks, task_dim) with at least one task, but has shape {tasks.shape}")
+        raise ValueError(
+            f"`tasks` must have shape (n_tasks, task_dim) with at least one task, but has shape {tasks.shape}"
+        )
     check_whole("seed", seed, 0)
     kept = _check_record_at(record_at, n_queries)
-    oracles = [oracle_factory(env=vec_env, task=task, seed=seed + i) for i, task in enumerate(tasks)]
+    oracles = [
+        oracle_factory(env=vec_env, task=task, seed=seed + i) for i, task in enumerate(tasks)
+    ]
     settings = adapter.make_options(oracles[0], n_queries=n_queries, **options)
     settings.check(model, vec_env, library)
     warn_if_untrained(model)
-    inferences = [settings.make_inference(model, inference_rng(seed + i), library) for i in range(len(tasks))]
+    inferences = [
+        settings.make_inference(model, inference_rng(seed + i), library) for i in range(len(tasks))
+    ]
 
     for inference, task in zip(inferences, tasks, strict=True):
         if hasattr(inference, "bind"):  # a method that is allowed to read rewards
@@ -109,7 +119,14 @@ def adapt_tasks(
             row = kept.index(query)
             latents[:, row] = [inference.estimate() for inference in inferences]
             if on_record is not None:
-                on_record(TaskAdaptations(tasks, kept[: row + 1], latents[:, : row + 1].copy(), list(map(list, preferences))))
+                on_record(
+                    TaskAdaptations(
+                        tasks,
+                        kept[: row + 1],
+                        latents[:, : row + 1].copy(),
+                        list(map(list, preferences)),
+                    )
+                )
         if query == n_queries or query >= kept[-1]:
             break
         shown: list[Trajectory] = []
@@ -154,5 +171,7 @@ def _check_record_at(record_at: Sequence[int] | None, n_queries: int) -> tuple[i
         check_whole("record_at", k, 0)
     kept = tuple(sorted({int(k) for k in record_at}))
     if not kept or kept[-1] > n_queries:
-        raise ValueError(f"`record_at` must hold numbers from 0 to n_queries={n_queries}, but is {tuple(record_at)}")
+        raise ValueError(
+            f"`record_at` must hold numbers from 0 to n_queries={n_queries}, but is {tuple(record_at)}"
+        )
     return kept

@@ -1,4 +1,6 @@
-"""Moving particles without losing the posterior: resampling, elliptical slice sampling of many at once, and kernels."""
+"""Moving particles without losing the posterior: resampling, elliptical slice sampling of many at
+once, and kernels.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +8,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-# A slice's reference Gaussian is this much wider than the particles, so that the ratio of target to reference does not grow in
-# the tails.
+# A slice's reference Gaussian is this much wider than the particles, so that the ratio of target to
+# reference does not grow in the tails.
 WIDENING = 1.3
 
 
 def systematic_resample(weights: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
-    """
-    Draw n indices with the given weights by one uniform number, which keeps the counts within one of n w_i.
+    """Draw n indices with the given weights by one uniform number, which keeps the counts within
+    one of n w_i.
 
     :param weights: (m,) summing to one.
     :param n: How many to draw.
@@ -22,15 +24,17 @@ def systematic_resample(weights: np.ndarray, n: int, rng: np.random.Generator) -
     """
     positions = (rng.random() + np.arange(n)) / n
     cumulative = np.cumsum(weights)
-    return np.minimum(np.searchsorted(cumulative / cumulative[-1], positions, side="right"), len(weights) - 1)
+    return np.minimum(
+        np.searchsorted(cumulative / cumulative[-1], positions, side="right"), len(weights) - 1
+    )
 
 
 def fit_gaussian(particles: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """
-    A Gaussian over weighted particles.
+    """A Gaussian over weighted particles.
 
-    With fewer effective particles than dimensions the sample covariance is singular, and moves would stay in its plane; it
-    is shrunk towards its own diagonal by as much as particles are missing.
+    With fewer effective particles than dimensions the sample covariance is singular, and moves
+    would stay in its plane; it is shrunk towards its own diagonal by as much as particles are
+    missing.
 
     :param particles: (n, d).
     :param weights: (n,) summing to one.
@@ -57,12 +61,12 @@ def kernel_neighbours(
     log_prior: Callable[[np.ndarray], np.ndarray] | None,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """
-    A neighbour of each particle, without a look at the likelihood.
+    """A neighbour of each particle, without a look at the likelihood.
 
-    The kernel shrinks towards the mean as much as it spreads, so that the particles' mean and covariance stay (Liu & West
-    2001). Where the prior has holes (between the modes of a mixture, off the surface on which its latents lie) there should
-    be no particles however the likelihood looks: then a step is taken with the ratio of the prior's densities.
+    The kernel shrinks towards the mean as much as it spreads, so that the particles' mean and
+    covariance stay (Liu & West 2001). Where the prior has holes (between the modes of a mixture,
+    off the surface on which its latents lie) there should be no particles however the likelihood
+    looks: then a step is taken with the ratio of the prior's densities.
 
     :param particles: (n, d).
     :param mean: (d,) of all particles.
@@ -76,7 +80,9 @@ def kernel_neighbours(
     proposals = mean + np.sqrt(1.0 - width**2) * (particles - mean) + width * noise
     if log_prior is None:
         return proposals
-    accepted = np.log(1.0 - rng.random(len(particles))) < log_prior(proposals) - log_prior(particles)
+    accepted = np.log(1.0 - rng.random(len(particles))) < log_prior(proposals) - log_prior(
+        particles
+    )
     return np.where(accepted[:, None], proposals, particles)
 
 
@@ -90,13 +96,13 @@ def elliptical_slice_moves(
     tries: int,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """
-    One elliptical slice move (Murray, Adams & MacKay 2010) of every particle, in lockstep.
+    """One elliptical slice move (Murray, Adams & MacKay 2010) of every particle, in lockstep.
 
-    The ellipse belongs to a reference Gaussian that is fitted to the posterior, and the ratio of prior times likelihood
-    to it is the slice's function (Nishihara, Murray & Adams 2014): so any prior density will do, the step fits the
-    posterior's scale and shape without tuning, and the first tries mostly hit. A particle whose bracket has not hit after
-    the last try stays where it is, which leaves the posterior invariant too: the path to any point within the tries is as
+    The ellipse belongs to a reference Gaussian that is fitted to the posterior, and the ratio of
+    prior times likelihood to it is the slice's function (Nishihara, Murray & Adams 2014): so any
+    prior density will do, the step fits the posterior's scale and shape without tuning, and the
+    first tries mostly hit. A particle whose bracket has not hit after the last try stays where it
+    is, which leaves the posterior invariant too: the path to any point within the tries is as
     probable as its reverse.
 
     :param particles: (n, d).
@@ -113,7 +119,11 @@ def elliptical_slice_moves(
     inverse = np.linalg.inv(factor)
 
     def log_ratio(latents: np.ndarray, likelihoods: np.ndarray) -> np.ndarray:
-        return likelihoods + log_prior(latents) + 0.5 * np.square((latents - mean) @ inverse.T).sum(axis=1)
+        return (
+            likelihoods
+            + log_prior(latents)
+            + 0.5 * np.square((latents - mean) @ inverse.T).sum(axis=1)
+        )
 
     particles, log_likelihoods = particles.copy(), log_likelihoods.copy()
     centred = particles - mean

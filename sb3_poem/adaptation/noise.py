@@ -1,11 +1,12 @@
-"""
-How an oracle errs, as the Bayesian rule sees it: P(answer | returns of the two trajectories).
+"""How an oracle errs, as the Bayesian rule sees it: P(answer | returns of the two trajectories).
 
-Every model here answers one question, "how probable is LEFT, given that the answer is LEFT or RIGHT?", for *predicted*
-returns. Two sources of doubt meet in it: the oracle's own noise, and the error of the prediction. The second is folded in
-by averaging over it; for a step function and a Gaussian error that gives a probit, and for a logistic function very nearly a
-logistic function of a shrunken argument (MacKay 1992). Both are evaluated as logistic functions, which differ from the probit
-by less than 0.01 and have heavier tails: an answer that the prediction calls impossible should not veto a latent.
+Every model here answers one question, "how probable is LEFT, given that the answer is LEFT or
+RIGHT?", for *predicted* returns. Two sources of doubt meet in it: the oracle's own noise, and the
+error of the prediction. The second is folded in by averaging over it; for a step function and a
+Gaussian error that gives a probit, and for a logistic function very nearly a logistic function of a
+shrunken argument (MacKay 1992). Both are evaluated as logistic functions, which differ from the
+probit by less than 0.01 and have heavier tails: an answer that the prediction calls impossible
+should not veto a latent.
 """
 
 from __future__ import annotations
@@ -17,19 +18,22 @@ import numpy as np
 
 # A probit of unit scale is nearest to a logistic function of this slope.
 PROBIT_SLOPE = 1.702
-# Share of answers that no model explains (a slip, a trajectory that the decoder has never seen the like of). It bounds
-# what one answer can do to the posterior, and costs an error-free oracle's ten answers nothing to speak of.
+# Share of answers that no model explains (a slip, a trajectory that the decoder has never seen the
+# like of). It bounds what one answer can do to the posterior, and costs an error-free oracle's ten
+# answers nothing to speak of.
 LAPSE = 0.01
 
 
 class NoiseModel(Protocol):
     """P(LEFT) from the difference of two returns."""
 
-    def probability_left(self, difference: np.ndarray, error: np.ndarray | float, magnitude: np.ndarray | float) -> np.ndarray:
-        """
-        Probability that the oracle says LEFT, given that it says LEFT or RIGHT.
+    def probability_left(
+        self, difference: np.ndarray, error: np.ndarray | float, magnitude: np.ndarray | float
+    ) -> np.ndarray:
+        """Probability that the oracle says LEFT, given that it says LEFT or RIGHT.
 
-        :param difference: Predicted return of the left trajectory minus that of the right one, any shape.
+        :param difference: Predicted return of the left trajectory minus that of the right one, any
+            shape.
         :param error: Standard deviation of that prediction, same unit, broadcasts.
         :param magnitude: The sum of both returns' absolute values, same unit, broadcasts.
         :return: Probabilities in (0, 1), of the broadcast shape.
@@ -44,9 +48,12 @@ def _logistic(x: np.ndarray, slope: np.ndarray | float) -> np.ndarray:
     x = x.astype(
         np.result_type(x.dtype, np.float32), copy=False
     )  # stays float32 if it is; whole numbers would cut the slope off
-    with np.errstate(over="ignore"):  # to infinity, which is as good as 80: lapses hide what is left of the other answer
+    with np.errstate(
+        over="ignore"
+    ):  # to infinity, which is as good as 80: lapses hide what is left of the other answer
         y = np.asarray(x * np.asarray(-slope, dtype=x.dtype))
-    # in place: for all pairs of a question, new memory for every operation takes longer than the operation
+    # in place: for all pairs of a question, new memory for every operation takes longer than the
+    # operation
     np.exp(np.clip(y, -80.0, 80.0, out=y), out=y)
     y += 1.0
     return np.reciprocal(y, out=y)
@@ -72,15 +79,16 @@ class ExactNoise(_Serialisable):
 
     kind = "exact"
 
-    def probability_left(self, difference: np.ndarray, error: np.ndarray | float, magnitude: np.ndarray | float) -> np.ndarray:
+    def probability_left(
+        self, difference: np.ndarray, error: np.ndarray | float, magnitude: np.ndarray | float
+    ) -> np.ndarray:
         """See :class:`NoiseModel`."""
         return _with_lapse(_logistic(difference, PROBIT_SLOPE / np.maximum(error, 1e-12)))
 
 
 @dataclass(frozen=True)
 class MistakeNoise(_Serialisable):
-    """
-    The right answer, flipped with a fixed probability.
+    """The right answer, flipped with a fixed probability.
 
     :param rate: The probability, in [0, 0.5].
     """
@@ -92,17 +100,21 @@ class MistakeNoise(_Serialisable):
         if not 0.0 <= self.rate <= 0.5:
             raise ValueError(f"`rate` must lie in [0, 0.5], but is {self.rate}")
 
-    def probability_left(self, difference: np.ndarray, error: np.ndarray | float, magnitude: np.ndarray | float) -> np.ndarray:
+    def probability_left(
+        self, difference: np.ndarray, error: np.ndarray | float, magnitude: np.ndarray | float
+    ) -> np.ndarray:
         """See :class:`NoiseModel`."""
-        return self.rate + (1.0 - 2.0 * self.rate) * ExactNoise().probability_left(difference, error, magnitude)
+        return self.rate + (1.0 - 2.0 * self.rate) * ExactNoise().probability_left(
+            difference, error, magnitude
+        )
 
 
 @dataclass(frozen=True)
 class BoltzmannNoise(_Serialisable):
-    """
-    LEFT with probability 1 / (1 + exp(-beta (R_left - R_right))) (C.6 of Xu & Zhu 2025).
+    """LEFT with probability 1 / (1 + exp(-beta (R_left - R_right))) (C.6 of Xu & Zhu 2025).
 
-    :param beta: Inverse temperature, one over the unit of returns; None is the paper's 1 / (|R_left| + |R_right|).
+    :param beta: Inverse temperature, one over the unit of returns; None is the paper's 1 /
+        (|R_left| + |R_right|).
     """
 
     beta: float | None = None
@@ -112,7 +124,9 @@ class BoltzmannNoise(_Serialisable):
         if self.beta is not None and not (np.isfinite(self.beta) and self.beta > 0):
             raise ValueError(f"`beta` must be positive and finite, or None, but is {self.beta}")
 
-    def probability_left(self, difference: np.ndarray, error: np.ndarray | float, magnitude: np.ndarray | float) -> np.ndarray:
+    def probability_left(
+        self, difference: np.ndarray, error: np.ndarray | float, magnitude: np.ndarray | float
+    ) -> np.ndarray:
         """See :class:`NoiseModel`."""
         beta = 1.0 / np.maximum(magnitude, 1e-12) if self.beta is None else self.beta
         shrink = np.sqrt(1.0 + np.pi / 8.0 * (beta * np.asarray(error)) ** 2)
@@ -123,8 +137,7 @@ _KINDS: dict[str, type] = {cls.kind: cls for cls in (ExactNoise, MistakeNoise, B
 
 
 def noise_model_from_dict(data: dict[str, Any]) -> NoiseModel:
-    """
-    Read what a noise model's ``to_dict`` wrote.
+    """Read what a noise model's ``to_dict`` wrote.
 
     :param data: The dictionary.
     :return: The noise model.

@@ -21,11 +21,13 @@ if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
 INFERENCES = ("bayes", "paper")
-# Algorithm 2 has the paper's 100. Bayesian inference gains by more where a task has several coordinates: on 60 tasks after ten
-# answers, 100, 400 and 1,000 particles earned -208, -189 and -192 on AntGoal, and -26.0, -26.9 and -27.7 on HalfCheetahVel.
+# Algorithm 2 has the paper's 100. Bayesian inference gains by more where a task has several
+# coordinates: on 60 tasks after ten answers, 100, 400 and 1,000 particles earned -208, -189 and
+# -192 on AntGoal, and -26.0, -26.9 and -27.7 on HalfCheetahVel.
 N_CANDIDATES = {"bayes": 400, "paper": 100}
-# Nats between the aggregate posterior and N(0, I) up to which draws of the latter are as good as trained latents: measured
-# on HalfCheetahVel (0.04: the prior is better after one answer) and PointGoal (over 1: the aggregate is, by far).
+# Nats between the aggregate posterior and N(0, I) up to which draws of the latter are as good as
+# trained latents: measured on HalfCheetahVel (0.04: the prior is better after one answer) and
+# PointGoal (over 1: the aggregate is, by far).
 PRIOR_COVERS = 0.3
 
 
@@ -49,19 +51,26 @@ class AdaptationOptions:
         if self.inference not in INFERENCES:
             raise ValueError(f"`inference` must be one of {INFERENCES}, but is {self.inference!r}")
         if self.likelihood is not None and self.likelihood not in LIKELIHOODS:
-            raise ValueError(f"`likelihood` must be one of {LIKELIHOODS} or None, but is {self.likelihood!r}")
+            raise ValueError(
+                f"`likelihood` must be one of {LIKELIHOODS} or None, but is {self.likelihood!r}"
+            )
         if self.decision not in DECISIONS:
             raise ValueError(f"`decision` must be one of {DECISIONS}, but is {self.decision!r}")
         if self.noise_model is not None and not hasattr(self.noise_model, "probability_left"):
-            raise ValueError(f"`noise_model` must be None or an object as MistakeNoise(0.2), but is {self.noise_model!r}")
-        if self.n_candidates is None:  # as a number, so that what is saved does not depend on the default
+            raise ValueError(
+                f"`noise_model` must be None or an object as MistakeNoise(0.2), but is {self.noise_model!r}"
+            )
+        if (
+            self.n_candidates is None
+        ):  # as a number, so that what is saved does not depend on the default
             object.__setattr__(self, "n_candidates", N_CANDIDATES[self.inference])
 
-    def check(self, model: Any, vec_env: VecEnv, library: Sequence[Trajectory] | None = None) -> None:
-        """
-        Refuse a model or an environment with which the method cannot run, before anything starts.
+    def check(
+        self, model: Any, vec_env: VecEnv, library: Sequence[Trajectory] | None = None
+    ) -> None:
+        """Refuse a model or an environment with which the method cannot run, before anything
+        starts.
 
-        :param model: The model.
         :param vec_env: The environment to adapt in.
         :param library: See :class:`PreferenceAdapter`.
         :raises ValueError: If they do not fit.
@@ -69,15 +78,16 @@ class AdaptationOptions:
         check_model_fits(model, vec_env)
 
     def _default_candidates(self, model: Any) -> str:
-        """Algorithm 2's own prior, unless "bayes" would find it far from what the policy was trained on."""
+        """Algorithm 2's own prior, unless "bayes" would find it far from what the policy was
+        trained on.
+        """
         far = getattr(model, "aggregate_to_prior_kl", 0.0) > PRIOR_COVERS
         return "aggregate" if self.inference == "bayes" and far else "prior"
 
     def make_inference(
         self, model: Any, rng: np.random.Generator, library: Sequence[Trajectory] | None = None
     ) -> LatentInference:
-        """
-        The inference that these options describe.
+        """The inference that these options describe.
 
         :param model: A trained model.
         :param rng: Its generator.
@@ -89,10 +99,21 @@ class AdaptationOptions:
         assert self.n_candidates is not None
         if self.inference == "paper":
             if library is not None:
-                raise ValueError('a `library` needs inference="bayes": Algorithm 2 compares its own candidates')
+                raise ValueError(
+                    'a `library` needs inference="bayes": Algorithm 2 compares its own candidates'
+                )
             if not hasattr(model, "similarities"):
-                raise ValueError(f'inference="paper" needs a model with a similarity S; {type(model).__name__} has none')
-            return PaperInference(model, self.n_candidates, self.epsilon, candidates, self.query_rule or "worst-case", rng)
+                raise ValueError(
+                    f'inference="paper" needs a model with a similarity S; {type(model).__name__} has none'
+                )
+            return PaperInference(
+                model,
+                self.n_candidates,
+                self.epsilon,
+                candidates,
+                self.query_rule or "worst-case",
+                rng,
+            )
         return BayesInference(
             model,
             self.n_candidates,
@@ -114,8 +135,7 @@ class AdaptationOptions:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> AdaptationOptions:
-        """
-        Read what :meth:`to_dict` wrote.
+        """Read what :meth:`to_dict` wrote.
 
         :param data: The dictionary.
         :return: The options.
@@ -127,8 +147,7 @@ class AdaptationOptions:
 
 
 def inference_rng(seed: int) -> np.random.Generator:
-    """
-    The generator of an adaptation's inference.
+    """The generator of an adaptation's inference.
 
     :param seed: The adaptation's seed.
     :return: A generator.
@@ -137,8 +156,7 @@ def inference_rng(seed: int) -> np.random.Generator:
 
 
 def rollout_seed(seed: int, query: int) -> int:
-    """
-    The reset seed of a question's two rollouts, which is the same for both.
+    """The reset seed of a question's two rollouts, which is the same for both.
 
     :param seed: The adaptation's seed.
     :param query: The question's number, from 0.

@@ -21,25 +21,33 @@ ORACLE_STREAM = 8
 
 
 class TaskOracle(ABC):
-    """
-    An oracle that computes true returns from the trajectories' reward features.
+    """An oracle that computes true returns from the trajectories' reward features.
 
-    :param env: A task family: a ``gym.Env``, or an SB3 ``VecEnv`` of them. It can be given later by :meth:`bind`.
-    :param task: (task_dim,) the task by whose reward to judge; None takes the one in effect in ``env`` (in a ``VecEnv``,
-        in its first copy) whenever a question is asked.
+    :param env: A task family: a ``gym.Env``, or an SB3 ``VecEnv`` of them. It can be given later by
+        :meth:`bind`.
+    :param task: (task_dim,) the task by whose reward to judge; None takes the one in effect in
+        ``env`` (in a ``VecEnv``, in its first copy) whenever a question is asked.
     :param seed: Seeds the oracle's own noise, if it has any.
     """
 
     needs_frames = False
 
-    def __init__(self, env: gym.Env | VecEnv | None = None, task: np.ndarray | None = None, seed: int | None = None) -> None:
+    def __init__(
+        self,
+        env: gym.Env | VecEnv | None = None,
+        task: np.ndarray | None = None,
+        seed: int | None = None,
+    ) -> None:
         self.env = env
         self.task = None if task is None else np.asarray(task, dtype=np.float64)
-        # A stream of its own: an adaptation with the same seed draws its candidates from another (``inference_rng``).
+        # A stream of its own: an adaptation with the same seed draws its candidates from another
+        # (``inference_rng``).
         self.rng = np.random.default_rng(None if seed is None else [seed, ORACLE_STREAM])
 
     def __repr__(self) -> str:
-        shown = {name: value for name, value in vars(self).items() if name not in ("env", "task", "rng")}
+        shown = {
+            name: value for name, value in vars(self).items() if name not in ("env", "task", "rng")
+        }
         shown["task"] = "the environment's" if self.task is None else self.task.tolist()
         return f"{type(self).__name__}({', '.join(f'{name}={value}' for name, value in shown.items())})"
 
@@ -53,8 +61,7 @@ class TaskOracle(ABC):
         """Answer from the two true returns."""
 
     def bind(self, env: gym.Env | VecEnv, task: np.ndarray | None = None) -> TaskOracle:
-        """
-        Give the oracle its environment, and perhaps its task.
+        """Give the oracle its environment, and perhaps its task.
 
         :param env: See the class.
         :param task: See the class; None leaves the task as it is.
@@ -66,8 +73,7 @@ class TaskOracle(ABC):
         return self
 
     def __call__(self, left: Trajectory, right: Trajectory) -> Preference:
-        """
-        Compare two trajectories.
+        """Compare two trajectories.
 
         :param left: One.
         :param right: The other.
@@ -78,8 +84,7 @@ class TaskOracle(ABC):
         return self._compare(self.true_return(left), self.true_return(right))
 
     def true_return(self, trajectory: Trajectory) -> float:
-        """
-        The undiscounted return of a trajectory under the task.
+        """The undiscounted return of a trajectory under the task.
 
         :param trajectory: It, with its reward features.
         :return: The sum of its rewards.
@@ -87,7 +92,9 @@ class TaskOracle(ABC):
         :raises RuntimeError: If no environment was given.
         """
         if self.env is None:
-            raise RuntimeError(f"{type(self).__name__} has no environment: pass `env` or call bind(env)")
+            raise RuntimeError(
+                f"{type(self).__name__} has no environment: pass `env` or call bind(env)"
+            )
         if trajectory.reward_features is None:
             raise ValueError(
                 f"{type(self).__name__} computes returns from reward features, but the trajectory has none: its environment "
@@ -95,7 +102,9 @@ class TaskOracle(ABC):
             )
         value = float(np.sum(step_rewards(self.env, self.task, trajectory)))
         if not np.isfinite(value):
-            raise ValueError(f"the true return of a trajectory is {value}; its reward features are not finite")
+            raise ValueError(
+                f"the true return of a trajectory is {value}; its reward features are not finite"
+            )
         return value
 
 
@@ -112,11 +121,10 @@ class ReturnOracle(TaskOracle):
 
 
 class BoltzmannOracle(TaskOracle):
-    """
-    Left wins with probability 1 / (1 + exp(-beta (R_left - R_right))) (C.6 of Xu & Zhu 2025).
+    """Left wins with probability 1 / (1 + exp(-beta (R_left - R_right))) (C.6 of Xu & Zhu 2025).
 
-    With the paper's beta the exponent's magnitude is at most 1, so an answer is right at most 73 % of the time, and ten
-    answers carry less than two bits.
+    With the paper's beta the exponent's magnitude is at most 1, so an answer is right at most 73 %
+    of the time, and ten answers carry less than two bits.
 
     :param beta: Inverse temperature; None is the paper's 1 / (|R_left| + |R_right|).
     :param env: See :class:`TaskOracle`.
@@ -150,8 +158,7 @@ class BoltzmannOracle(TaskOracle):
 
 
 class MistakeOracle(TaskOracle):
-    """
-    The right answer, flipped with a fixed probability. Equal returns stay EQUAL.
+    """The right answer, flipped with a fixed probability. Equal returns stay EQUAL.
 
     :param rate: The probability, in [0, 1]; 1 always lies. The noise model knows rates up to 0.5.
     :param env: See :class:`TaskOracle`.
@@ -183,18 +190,22 @@ class MistakeOracle(TaskOracle):
         return _better(left, right)
 
 
-def step_rewards(env: gym.Env | VecEnv, task: np.ndarray | None, trajectory: Trajectory) -> np.ndarray:
-    """
-    The true rewards of a trajectory.
+def step_rewards(
+    env: gym.Env | VecEnv, task: np.ndarray | None, trajectory: Trajectory
+) -> np.ndarray:
+    """The true rewards of a trajectory.
 
     :param env: A task family: a ``gym.Env``, or an SB3 ``VecEnv`` of them.
-    :param task: (task_dim,); None takes the one in effect in ``env`` (in a ``VecEnv``, in its first copy).
+    :param task: (task_dim,); None takes the one in effect in ``env`` (in a ``VecEnv``, in its first
+        copy).
     :param trajectory: It, with its reward features.
     :return: (T,).
     :raises ValueError: If it has no reward features, or the environment is no task family.
     """
     if trajectory.reward_features is None:
-        raise ValueError('the trajectory has no reward features: its environment gave no info["reward_features"]')
+        raise ValueError(
+            'the trajectory has no reward features: its environment gave no info["reward_features"]'
+        )
     family = FamilyView(vectorised(env))
     return family.compute_rewards(family.task if task is None else task, trajectory.reward_features)
 

@@ -22,11 +22,9 @@ MODEL_PREFIX = "model."
 
 
 class AdaptedPolicy:
-    """
-    A model with its latent fixed. It follows SB3's ``predict`` protocol, so ``evaluate_policy`` and every other program of
-    SB3's that only predicts takes it for a model.
+    """A model with its latent fixed. It follows SB3's ``predict`` protocol, so ``evaluate_policy``
+    and every other program of SB3's that only predicts takes it for a model.
 
-    :param model: The model.
     :param latent: (latent_dim,).
     :param n_answers: How many answers led to it.
     :param env: The vector environment to whose task (its first copy's) it was adapted; None for a
@@ -34,13 +32,17 @@ class AdaptedPolicy:
     :raises ValueError: If the latent has another shape, or is not finite.
     """
 
-    def __init__(self, model: Any, latent: np.ndarray, n_answers: int = 0, env: VecEnv | None = None) -> None:
+    def __init__(
+        self, model: Any, latent: np.ndarray, n_answers: int = 0, env: VecEnv | None = None
+    ) -> None:
         self.model = model
         self.n_answers = n_answers
         self.env = env
         self.latent = np.array(latent, dtype=np.float64)
         if self.latent.shape != (model.latent_dim,):
-            raise ValueError(f"`latent` has shape {self.latent.shape}, but those of the model have ({model.latent_dim},)")
+            raise ValueError(
+                f"`latent` has shape {self.latent.shape}, but those of the model have ({model.latent_dim},)"
+            )
         if not np.isfinite(self.latent).all():
             raise ValueError(f"`latent` must be finite, but is {self.latent}")
         self.observation_space = model.observation_space
@@ -57,8 +59,7 @@ class AdaptedPolicy:
         episode_start: np.ndarray | None = None,
         deterministic: bool = True,
     ) -> tuple[np.ndarray, Any]:
-        """
-        Act.
+        """Act.
 
         :param observation: (obs_dim,) or (n, obs_dim).
         :param state: Ignored: the latent is fixed. It is there for SB3's callers.
@@ -73,9 +74,8 @@ class AdaptedPolicy:
         return actions, latents
 
     def to_bytes(self) -> bytes:
-        """
-        The policy as one safetensors file: the model, its configuration in the header, the latent and
-        the number of answers. Nothing in it can run code.
+        """The policy as one safetensors file: the model, its configuration in the header, the
+        latent and the number of answers. Nothing in it can run code.
 
         :return: The file's content, which :meth:`from_bytes` reads.
         """
@@ -90,8 +90,7 @@ class AdaptedPolicy:
         return save({**named, LATENT: th.as_tensor(self.latent)}, facts)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """
-        Write :meth:`to_bytes` to a file.
+        """Write :meth:`to_bytes` to a file.
 
         :param path: The file, whose name should end in ``.safetensors``.
         :raises OSError: If it cannot be written.
@@ -100,8 +99,7 @@ class AdaptedPolicy:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], device: str = "auto") -> AdaptedPolicy:
-        """
-        Read what :meth:`save` wrote, or what the page for answering gives for download.
+        """Read what :meth:`save` wrote, or what the page for answering gives for download.
 
         :param path: The file.
         :param device: "auto", "cpu", "cuda".
@@ -112,11 +110,11 @@ class AdaptedPolicy:
         return cls.from_bytes(Path(path).read_bytes(), device, os.fspath(path))
 
     @classmethod
-    def from_bytes(cls, content: bytes, device: str = "auto", source: str = "the content") -> AdaptedPolicy:
-        """
-        Read what :meth:`to_bytes` gave.
+    def from_bytes(
+        cls, content: bytes, device: str = "auto", source: str = "the content"
+    ) -> AdaptedPolicy:
+        """Read what :meth:`to_bytes` gave.
 
-        :param content: It.
         :param device: "auto", "cpu", "cuda".
         :param source: Where it comes from, for the message.
         :return: The policy.
@@ -144,12 +142,19 @@ class AdaptedPolicy:
         config = parse_config(facts.get("config", ""), source)
         algorithms: dict[str, type[PEARLSAC]] = {"POEMSAC": POEMSAC, "PEARLSAC": PEARLSAC}
         if config["algorithm"] not in algorithms:
-            raise ValueError(f"{source} holds a {config['algorithm']}, known are {', '.join(algorithms)}")
-        latent, n_answers = tensors.pop(LATENT, th.zeros(0)).double().numpy(), facts.get("n_answers", "")
+            raise ValueError(
+                f"{source} holds a {config['algorithm']}, known are {', '.join(algorithms)}"
+            )
+        latent, n_answers = (
+            tensors.pop(LATENT, th.zeros(0)).double().numpy(),
+            facts.get("n_answers", ""),
+        )
         parts = {name.removeprefix(MODEL_PREFIX): value for name, value in tensors.items()}
         model = build_model(algorithms[config["algorithm"]], config, parts, source, device)
         if not re.fullmatch("[0-9]{1,9}", n_answers):
-            raise ValueError(f"{source} is broken: n_answers must be a whole number, but is {n_answers[:20]!r}")
+            raise ValueError(
+                f"{source} is broken: n_answers must be a whole number, but is {n_answers[:20]!r}"
+            )
         try:
             return cls(model, latent, int(n_answers))
         except ValueError as error:

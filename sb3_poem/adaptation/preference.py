@@ -20,8 +20,7 @@ class Preference(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """
-    A question: which is better?
+    """A question: which is better?
 
     :param left: A trajectory on the new task.
     :param right: Another one.
@@ -31,8 +30,7 @@ class Query:
     right: Trajectory
 
     def to_video(self, path: str | Path, fps: float = 20.0) -> Path:
-        """
-        Write both side by side, as MP4 or GIF by the file's suffix.
+        """Write both side by side, as MP4 or GIF by the file's suffix.
 
         :param path: The file; missing folders are made.
         :param fps: Frames per second.
@@ -52,11 +50,10 @@ class Query:
 
 
 def as_preference(answer: Any) -> Preference:
-    """
-    Read an answer: a :class:`Preference`, or one of the words "left", "right" and "equal".
+    """Read an answer: a :class:`Preference`, or one of the words "left", "right" and "equal".
 
-    Numbers and booleans are refused, because their meaning is a convention that differs between programs, and a preference
-    read the wrong way round is worse than none.
+    Numbers and booleans are refused, because their meaning is a convention that differs between
+    programs, and a preference read the wrong way round is worse than none.
 
     :param answer: What an oracle returned.
     :return: The preference.
@@ -69,7 +66,9 @@ def as_preference(answer: Any) -> Preference:
         try:
             return Preference(answer)
         except ValueError:
-            raise ValueError(f'an answer must be "left", "right" or "equal", but is {answer!r}') from None
+            raise ValueError(
+                f'an answer must be "left", "right" or "equal", but is {answer!r}'
+            ) from None
     raise TypeError(
         "an answer must be Preference.LEFT, Preference.RIGHT or Preference.EQUAL (or the word), "
         f"but is {answer!r} of type {type(answer).__name__}"

@@ -10,7 +10,9 @@ SOURCES = ("prior", "aggregate")
 
 
 class Prior(Protocol):
-    """A distribution over latents that can be drawn from and evaluated; it may have holes of little density."""
+    """A distribution over latents that can be drawn from and evaluated; it may have holes of little
+    density.
+    """
 
     has_holes: bool
 
@@ -25,8 +27,7 @@ class Prior(Protocol):
 
 
 class GaussianPrior:
-    """
-    N(0, I), Algorithm 2's own prior.
+    """N(0, I), Algorithm 2's own prior.
 
     :param dim: The latents' dimension d.
     """
@@ -41,7 +42,9 @@ class GaussianPrior:
         return rng.standard_normal((n, self.dim))
 
     def balanced_sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """(n, d) draws in pairs of z and -z, so that their mean is the prior's own (an odd one is left over)."""
+        """(n, d) draws in pairs of z and -z, so that their mean is the prior's own (an odd one is
+        left over).
+        """
         half = rng.standard_normal(((n + 1) // 2, self.dim))
         return np.concatenate([half, -half])[:n]
 
@@ -51,9 +54,9 @@ class GaussianPrior:
 
 
 class AggregatePrior:
-    """
-    The mixture of the training tasks' posteriors. A model can draw from it but does not give its density, which moving
-    particles needs; so this *is* a mixture of Gaussians around draws of the model, with a small common width.
+    """The mixture of the training tasks' posteriors. A model can draw from it but does not give its
+    density, which moving particles needs; so this *is* a mixture of Gaussians around draws of the
+    model, with a small common width.
 
     :param centres: (M, d) draws of the model's aggregate posterior.
     :param bandwidth: Width of each Gaussian as a share of the draws' distance to their neighbours.
@@ -65,8 +68,8 @@ class AggregatePrior:
         self.centres = np.asarray(centres, dtype=np.float64)
         distances = np.linalg.norm(self.centres[:, None, :] - self.centres[None, :, :], axis=2)
         np.fill_diagonal(distances, np.inf)
-        # The median draw's distance to its nearest neighbour: narrow enough to change the mixture little, wide enough
-        # that the density has no holes between neighbours.
+        # The median draw's distance to its nearest neighbour: narrow enough to change the mixture
+        # little, wide enough that the density has no holes between neighbours.
         nearest = float(np.median(distances.min(axis=1))) / np.sqrt(self.centres.shape[1])
         self.width = max(bandwidth * nearest, 1e-6)
 
@@ -94,8 +97,7 @@ class AggregatePrior:
 
 
 def make_prior(model: Any, source: str, rng: np.random.Generator, n_centres: int = 256) -> Prior:
-    """
-    The prior of a model.
+    """The prior of a model.
 
     :param model: A trained model.
     :param source: "prior" or "aggregate".

@@ -1,4 +1,6 @@
-"""Which pair of policies to compare next. Everything here works on a matrix of similarities; nothing loops over pairs."""
+"""Which pair of policies to compare next. Everything here works on a matrix of similarities;
+nothing loops over pairs.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +12,15 @@ from sb3_poem.adaptation.noise import NoiseModel
 
 QUERY_RULES = ("worst-case", "information-gain", "random")
 
-# Differences that are compared at a time: with a thousand candidates all pairs' would take gigabytes.
+# Differences that are compared at a time: with a thousand candidates all pairs' would take
+# gigabytes.
 BLOCK_ENTRIES = 2**17
 
 
 def tolerance(epsilon: float) -> float:
-    """
-    How far S(z, z') may fall below S(z, z'') while eq. 9 still holds. The appendix's proof has the opposite sign, which would
-    shrink the half-space and exclude the true latent; eq. 9 itself widens it.
+    """How far S(z, z') may fall below S(z, z'') while eq. 9 still holds. The appendix's proof has
+    the opposite sign, which would shrink the half-space and exclude the true latent; eq. 9 itself
+    widens it.
 
     :param epsilon: The tolerated error, in [0, 0.5).
     :return: log((1 + 2 epsilon) / (1 - 2 epsilon)) >= 0.
@@ -25,9 +28,11 @@ def tolerance(epsilon: float) -> float:
     return float(np.log1p(2.0 * epsilon) - np.log1p(-2.0 * epsilon))
 
 
-def worst_case_sizes(similarities: np.ndarray, epsilon: float, weights: np.ndarray | None = None) -> np.ndarray:
-    """
-    For each pair of policies, the larger of the two sets of latents that may survive the answer (eq. 10's objective).
+def worst_case_sizes(
+    similarities: np.ndarray, epsilon: float, weights: np.ndarray | None = None
+) -> np.ndarray:
+    """For each pair of policies, the larger of the two sets of latents that may survive the answer
+    (eq. 10's objective).
 
     :param similarities: (m, n) S(z_i, z_j) of m latents and n policies.
     :param epsilon: The tolerated error of eq. 9.
@@ -43,31 +48,37 @@ def worst_case_sizes(similarities: np.ndarray, epsilon: float, weights: np.ndarr
         difference = rows[first[some]] - rows[second[some]]
         survives_first, survives_second = difference >= -slack, difference <= slack
         if weights is None:
-            larger = np.maximum(np.count_nonzero(survives_first, axis=1), np.count_nonzero(survives_second, axis=1))
+            larger = np.maximum(
+                np.count_nonzero(survives_first, axis=1), np.count_nonzero(survives_second, axis=1)
+            )
         else:
             larger = np.maximum(survives_first @ weights, survives_second @ weights)
         sizes[some] = larger
     return sizes
 
 
-def worst_case_pair(similarities: np.ndarray, epsilon: float, weights: np.ndarray | None = None) -> tuple[int, int]:
-    """
-    The pair of policies after whose worse answer the fewest latents survive (eq. 10). Of equally good pairs the first.
+def worst_case_pair(
+    similarities: np.ndarray, epsilon: float, weights: np.ndarray | None = None
+) -> tuple[int, int]:
+    """The pair of policies after whose worse answer the fewest latents survive (eq. 10). Of equally
+    good pairs the first.
 
     :param similarities: (m, n).
     :param epsilon: The tolerated error of eq. 9.
     :param weights: (m,) a latent's weight; None counts each as one.
     :return: Two different policy indices.
     """
-    return pair_at(int(np.argmin(worst_case_sizes(similarities, epsilon, weights))), similarities.shape[1])
+    return pair_at(
+        int(np.argmin(worst_case_sizes(similarities, epsilon, weights))), similarities.shape[1]
+    )
 
 
 def information_gains(probabilities: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """
-    Expected information gain of a question: the entropy of the answer minus its mean entropy under each latent.
+    """Expected information gain of a question: the entropy of the answer minus its mean entropy
+    under each latent.
 
-    Of two policies that do the same, every latent says 1/2, so the gain is 0: a resolution limit within the probabilities
-    is what keeps questions apart that nobody could answer.
+    Of two policies that do the same, every latent says 1/2, so the gain is 0: a resolution limit
+    within the probabilities is what keeps questions apart that nobody could answer.
 
     :param probabilities: (pairs, m) P(LEFT) under each latent.
     :param weights: (m,) summing to one.
@@ -80,8 +91,7 @@ def information_gains(probabilities: np.ndarray, weights: np.ndarray) -> np.ndar
 def most_informative_pair(
     values: np.ndarray, weights: np.ndarray, noise: NoiseModel, error: float, magnitude: float
 ) -> tuple[int, int]:
-    """
-    The pair of policies whose comparison is expected to tell most.
+    """The pair of policies whose comparison is expected to tell most.
 
     :param values: (m, n) predicted fitness of n policies under m latents, in the unit of ``error``.
     :param weights: (m,) summing to one.
@@ -95,8 +105,7 @@ def most_informative_pair(
 
 
 def random_pair(n: int, rng: np.random.Generator) -> tuple[int, int]:
-    """
-    Two different policies, uniformly.
+    """Two different policies, uniformly.
 
     :param n: How many there are, at least 2.
     :param rng: The generator.
@@ -107,12 +116,11 @@ def random_pair(n: int, rng: np.random.Generator) -> tuple[int, int]:
 
 
 def pair_differences(values: np.ndarray) -> np.ndarray:
-    """
-    What each latent says of each pair of policies.
+    """What each latent says of each pair of policies.
 
     :param values: (m, n) of m latents and n policies.
-    :return: (n (n - 1) / 2, m) the first policy's value minus the second's, pairs in the order of ``numpy.triu_indices(n,
-        1)``.
+    :return: (n (n - 1) / 2, m) the first policy's value minus the second's, pairs in the order of
+        ``numpy.triu_indices(n, 1)``.
     """
     first, second = _pairs(values.shape[1])
     rows = _policy_rows(values)
@@ -122,8 +130,7 @@ def pair_differences(values: np.ndarray) -> np.ndarray:
 
 
 def pair_at(index: int, n: int) -> tuple[int, int]:
-    """
-    The policies of a pair.
+    """The policies of a pair.
 
     :param index: Its place in the order of :func:`pair_differences`.
     :param n: How many policies there are.
@@ -134,7 +141,8 @@ def pair_at(index: int, n: int) -> tuple[int, int]:
 
 
 def _policy_rows(values: np.ndarray) -> np.ndarray:
-    # Whole rows are gathered several times as fast as columns. Networks do not compute in more than float32 either.
+    # Whole rows are gathered several times as fast as columns. Networks do not compute in more than
+    # float32 either.
     return np.ascontiguousarray(values.T, dtype=np.float32)
 
 

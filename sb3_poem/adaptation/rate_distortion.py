@@ -1,4 +1,6 @@
-"""What so many bits about the task can be worth: the rate-distortion bound, and the bits in an oracle's answers."""
+"""What so many bits about the task can be worth: the rate-distortion bound, and the bits in an
+oracle's answers.
+"""
 
 from __future__ import annotations
 
@@ -12,16 +14,17 @@ TOLERANCE = 1e-4  # nats
 
 
 def answer_capacity(noise: NoiseModel | None, returns: np.ndarray) -> float:
-    """
-    The most that one answer (left or right) can tell, whatever is asked.
+    """The most that one answer (left or right) can tell, whatever is asked.
 
-    It is the capacity of the binary symmetric channel at the oracle's smallest probability of a mistake. Of the
-    probabilities of LEFT that questions can bring about only the extremes matter, since the information is convex in
-    them; and asking in the light of earlier answers adds nothing (Cover & Thomas, Elements of Information Theory, 7.12).
+    It is the capacity of the binary symmetric channel at the oracle's smallest probability of a
+    mistake. Of the probabilities of LEFT that questions can bring about only the extremes matter,
+    since the information is convex in them; and asking in the light of earlier answers adds nothing
+    (Cover & Thomas, Elements of Information Theory, 7.12).
 
     :param noise: How the oracle errs; None is an oracle that does not.
-    :param returns: (n_tasks, n_policies). With a fixed ``beta`` an answer is the surer the larger the difference of returns,
-        and no question is supposed to show a larger one than there is between two policies here.
+    :param returns: (n_tasks, n_policies). With a fixed ``beta`` an answer is the surer the larger
+        the difference of returns, and no question is supposed to show a larger one than there is
+        between two policies here.
     :return: Bits, in [0, 1].
     :raises ValueError: If the noise model is of a kind whose capacity is not known.
     """
@@ -30,7 +33,8 @@ def answer_capacity(noise: NoiseModel | None, returns: np.ndarray) -> float:
     if isinstance(noise, MistakeNoise):
         mistake = noise.rate
     elif isinstance(noise, BoltzmannNoise):
-        # The paper's beta makes the exponent |R_left - R_right| / (|R_left| + |R_right|), at most 1.
+        # The paper's beta makes the exponent |R_left - R_right| / (|R_left| + |R_right|), at most
+        # 1.
         exponent = 1.0 if noise.beta is None else noise.beta * float(np.ptp(returns, axis=1).max())
         mistake = float(0.5 * (1.0 - np.tanh(0.5 * exponent)))
     else:
@@ -41,13 +45,13 @@ def answer_capacity(noise: NoiseModel | None, returns: np.ndarray) -> float:
 
 
 def rate_distortion_limit(returns: np.ndarray, bits: float) -> float:
-    """
-    An upper bound on the mean return of any method that learns at most so many bits about which of the tasks it is.
+    """An upper bound on the mean return of any method that learns at most so many bits about which
+    of the tasks it is.
 
-    It is max E[J] over all ways p(j | i) to choose policies with mutual information I(i; j) <= bits, tasks being equally
-    likely (Shannon 1959), found by the algorithm of Blahut and Arimoto. What is returned is the value of the dual problem,
-    with the bound that holds at every iterate (Csiszar 1974): where iterations are stopped early it is too high, never
-    too low.
+    It is max E[J] over all ways p(j | i) to choose policies with mutual information I(i; j) <=
+    bits, tasks being equally likely (Shannon 1959), found by the algorithm of Blahut and Arimoto.
+    What is returned is the value of the dual problem, with the bound that holds at every iterate
+    (Csiszar 1974): where iterations are stopped early it is too high, never too low.
 
     :param returns: (n_tasks, n_policies), finite.
     :param bits: At least 0.
@@ -69,12 +73,16 @@ def rate_distortion_limit(returns: np.ndarray, bits: float) -> float:
         return (nats + _log_partition(scaled, slope)) / slope
 
     # The dual is convex in 1 / slope, hence unimodal in its logarithm.
-    found = minimize_scalar(bound, bounds=(np.log(1e-2), np.log(1e5)), method="bounded", options={"xatol": 1e-2})
+    found = minimize_scalar(
+        bound, bounds=(np.log(1e-2), np.log(1e5)), method="bounded", options={"xatol": 1e-2}
+    )
     return min(best, float(returns.max() + scale * found.fun))
 
 
 def _log_partition(returns: np.ndarray, slope: float) -> float:
-    """An upper bound, tight within ``TOLERANCE``, on the maximum over p(j | i) of slope E[J] - I(i; j)."""
+    """An upper bound, tight within ``TOLERANCE``, on the maximum over p(j | i) of slope E[J] - I(i;
+    j).
+    """
     best = returns.max(axis=1, keepdims=True)
     kernel = np.exp(slope * (returns - best))
     marginal = np.full(returns.shape[1], 1.0 / returns.shape[1])

@@ -13,18 +13,19 @@ from sb3_poem.common.files import write_atomically
 
 
 def plain(data: dict[str, Any]) -> dict[str, Any]:
-    """
-    Options with Python's numbers for NumPy's, which JSON does not know.
+    """Options with Python's numbers for NumPy's, which JSON does not know.
 
     :param data: By name.
     :return: The same.
     """
-    return {name: value.item() if isinstance(value, np.generic) else value for name, value in data.items()}
+    return {
+        name: value.item() if isinstance(value, np.generic) else value
+        for name, value in data.items()
+    }
 
 
 def generator_state(rng: np.random.Generator) -> dict[str, Any]:
-    """
-    A generator's state as JSON-ready data.
+    """A generator's state as JSON-ready data.
 
     :param rng: A PCG64 generator, as ``numpy.random.default_rng`` makes it.
     :return: The state.
@@ -33,10 +34,8 @@ def generator_state(rng: np.random.Generator) -> dict[str, Any]:
 
 
 def generator_from_state(state: dict[str, Any]) -> np.random.Generator:
-    """
-    Read what :func:`generator_state` wrote.
+    """Read what :func:`generator_state` wrote.
 
-    :param state: The state.
     :return: A generator that continues where the other one stood.
     :raises ValueError: If it is no such state.
     """
@@ -49,8 +48,8 @@ def generator_from_state(state: dict[str, Any]) -> np.random.Generator:
 
 
 def write_json_atomically(path: str | os.PathLike[str], data: dict[str, Any]) -> None:
-    """
-    Write JSON so that the file is either the old one or the whole new one, whatever happens in between.
+    """Write JSON so that the file is either the old one or the whole new one, whatever happens in
+    between.
 
     :param path: The file; missing folders are made.
     :param data: What to write.
@@ -60,8 +59,7 @@ def write_json_atomically(path: str | os.PathLike[str], data: dict[str, Any]) ->
 
 
 def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """
-    Read a JSON object.
+    """Read a JSON object.
 
     :param path: The file.
     :return: The object.
@@ -72,5 +70,7 @@ def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{os.fspath(path)} is not a saved adaptation: {error}") from error
     if not isinstance(data, dict):
-        raise ValueError(f"{os.fspath(path)} is not a saved adaptation: it holds a {type(data).__name__}, not an object")
+        raise ValueError(
+            f"{os.fspath(path)} is not a saved adaptation: it holds a {type(data).__name__}, not an object"
+        )
     return data

@@ -70,15 +70,15 @@ class ANOLEOptions:
             return 2**self.n_queries
         return max(self.n_candidates, n_distinguishable(self.n_queries, self.budget))
 
-    def check(self, model: Any, vec_env: VecEnv, library: Sequence[Trajectory] | None = None) -> None:
-        """
-        Refuse what ANOLE cannot run with.
+    def check(
+        self, model: Any, vec_env: VecEnv, library: Sequence[Trajectory] | None = None
+    ) -> None:
+        """Refuse what ANOLE cannot run with.
 
-        :param model: The model.
         :param vec_env: The environment to adapt in.
         :param library: Trajectories to ask about, or None.
-        :raises ValueError: Without a trained reward decoder, without experience to ask about, and for a family whose
-            tasks do not share their dynamics.
+        :raises ValueError: Without a trained reward decoder, without experience to ask about, and
+            for a family whose tasks do not share their dynamics.
         """
         check_model_fits(model, vec_env)
         if not hasattr(model, "predicted_returns") or getattr(model, "reward_coef", 1.0) == 0:
@@ -88,7 +88,9 @@ class ANOLEOptions:
             )
         if library is not None:
             if len(library) < 2:
-                raise ValueError(f"`library` must hold at least 2 trajectories, but holds {len(library)}")
+                raise ValueError(
+                    f"`library` must hold at least 2 trajectories, but holds {len(library)}"
+                )
             return
         buffer = getattr(model, "replay_buffer", None)
         if buffer is None or not buffer.counts.any():
@@ -107,12 +109,12 @@ class ANOLEOptions:
     def make_inference(
         self, model: Any, rng: np.random.Generator, library: Sequence[Trajectory] | None = None
     ) -> ANOLEInference:
-        """
-        The inference that these options describe.
+        """The inference that these options describe.
 
         :param model: A trained model.
         :param rng: Its generator.
-        :param library: Trajectories to ask about; None draws fragments of the model's replay buffer.
+        :param library: Trajectories to ask about; None draws fragments of the model's replay
+            buffer.
         :return: The inference.
         """
         if library is None:
@@ -126,8 +128,7 @@ class ANOLEOptions:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> ANOLEOptions:
-        """
-        Read what :meth:`to_dict` wrote.
+        """Read what :meth:`to_dict` wrote.
 
         :param data: The dictionary.
         :return: The options.
@@ -136,19 +137,24 @@ class ANOLEOptions:
 
 
 class ANOLEInference(LatentInference):
-    """
-    Ask and tell on fragments. A candidate predicts an answer by the decoder's returns of the two, and what counts is how
-    many answers it contradicts; equal returns, and answers of EQUAL, contradict nothing.
+    """Ask and tell on fragments. A candidate predicts an answer by the decoder's returns of the
+    two, and what counts is how many answers it contradicts; equal returns, and answers of EQUAL,
+    contradict nothing.
 
     :param model: A model with a reward decoder.
-    :param options: The options.
     :param rng: The only source of randomness.
     :param library: The fragments, at least 2.
     """
 
     library: list[Trajectory]
 
-    def __init__(self, model: Any, options: ANOLEOptions, rng: np.random.Generator, library: Sequence[Trajectory]) -> None:
+    def __init__(
+        self,
+        model: Any,
+        options: ANOLEOptions,
+        rng: np.random.Generator,
+        library: Sequence[Trajectory],
+    ) -> None:
         self.model = model
         self.options = options
         self.rng = rng
@@ -156,7 +162,8 @@ class ANOLEInference(LatentInference):
         self.answers: list[Answer] = []
         n = options.total_candidates
         self.candidates = make_prior(model, options.candidates, rng).sample(n, rng)
-        # Ties are broken at random, but always alike: looking at the estimate must not change what comes after.
+        # Ties are broken at random, but always alike: looking at the estimate must not change what
+        # comes after.
         self.priority = rng.permutation(n)
         self.contradictions = np.zeros(n, dtype=np.int64)
         self.alive = np.ones(n, dtype=bool)
@@ -164,25 +171,31 @@ class ANOLEInference(LatentInference):
 
     @property
     def budget(self) -> int:
-        """Mistakes allowed, E; raised to the smallest count of contradictions if all candidates exceed it."""
+        """Mistakes allowed, E; raised to the smallest count of contradictions if all candidates
+        exceed it.
+        """
         return max(self.options.budget, int(self.contradictions.min()))
 
     def ask_library(self) -> tuple[int, int]:
         """See :class:`LatentInference`: the best of random pairs, or one random pair."""
         if self.options.strategy == "random":
             return random_pair(len(self.library), self.rng)
-        pairs = np.array([random_pair(len(self.library), self.rng) for _ in range(self.options.n_pairs)])
+        pairs = np.array(
+            [random_pair(len(self.library), self.rng) for _ in range(self.options.n_pairs)]
+        )
         if self._library_returns is None:
             self._library_returns = self.model.predicted_returns(self.candidates, self.library)
         returns = self._library_returns
-        first, second = pairs[np.argmin(self.scores(returns[:, pairs[:, 0]] - returns[:, pairs[:, 1]]))]
+        first, second = pairs[
+            np.argmin(self.scores(returns[:, pairs[:, 0]] - returns[:, pairs[:, 1]]))
+        ]
         return int(first), int(second)
 
     def scores(self, differences: np.ndarray) -> np.ndarray:
-        """
-        How much of the candidates the worse answer leaves.
+        """How much of the candidates the worse answer leaves.
 
-        :param differences: (n_candidates, n_pairs) predicted return of the left fragment minus that of the right one.
+        :param differences: (n_candidates, n_pairs) predicted return of the left fragment minus that
+            of the right one.
         :return: (n_pairs,) Berlekamp volumes; for "greedy" numbers of candidates.
         """
         if self.options.strategy == "greedy":
@@ -197,13 +210,14 @@ class ANOLEInference(LatentInference):
         return self.library[first].latent.copy(), self.library[second].latent.copy()
 
     def tell(self, preference: Preference, left: Shown, right: Shown) -> None:
-        """
-        See :class:`LatentInference`.
+        """See :class:`LatentInference`.
 
         :raises ValueError: If no trajectories are given.
         """
         if not (isinstance(left, Trajectory) and isinstance(right, Trajectory)):
-            raise ValueError("ANOLE needs the two trajectories that were shown, not their latents alone")
+            raise ValueError(
+                "ANOLE needs the two trajectories that were shown, not their latents alone"
+            )
         returns = self.model.predicted_returns(self.candidates, [left, right])
         contradicted = SIGNS[preference] * (returns[:, 0] - returns[:, 1]) < 0
         self.contradictions = self.contradictions + contradicted
@@ -212,7 +226,9 @@ class ANOLEInference(LatentInference):
         self.answers.append(Answer(preference, left, right))
 
     def estimate(self) -> np.ndarray:
-        """See :class:`LatentInference`: the candidate of fewest contradictions, or for "greedy" one that is left."""
+        """See :class:`LatentInference`: the candidate of fewest contradictions, or for "greedy" one
+        that is left.
+        """
         worse = ~self.alive if self.options.strategy == "greedy" else self.contradictions
         return self.candidates[np.lexsort((self.priority, worse))[0]].copy()
 
@@ -231,26 +247,27 @@ class ANOLEInference(LatentInference):
 
 
 class ANOLEAdapter(PreferenceAdapter):
-    """
-    Adapts a model by ANOLE (Ren et al. 2022), with the face of :class:`PreferenceAdapter`.
+    """Adapts a model by ANOLE (Ren et al. 2022), with the face of :class:`PreferenceAdapter`.
 
-    It asks about fragments of what the training tasks' policies did, and never rolls out on the new task. Candidates are
-    latents; each predicts the answers by the reward decoder.
+    It asks about fragments of what the training tasks' policies did, and never rolls out on the new
+    task. Candidates are latents; each predicts the answers by the reward decoder.
 
     - "berlekamp" (ANOLE): of random pairs the one whose worse answer leaves the smallest Berlekamp volume.
     - "greedy" (greedy binary search): 2^K candidates, the pair that splits them most evenly; what disagrees is dropped,
       unless nothing would be left.
     - "random": one random pair, else as ANOLE.
 
-    :param model: A trained ``PEARLSAC`` with its reward decoder and, unless there is a library, its replay buffer.
+    :param model: A trained ``PEARLSAC`` with its reward decoder and, unless there is a library, its
+        replay buffer.
     :param env: See :class:`PreferenceAdapter`.
     :param n_queries: How many answers are asked for at most (K).
     :param strategy: "berlekamp", "greedy" or "random".
     :param n_candidates: Candidates at least; "greedy" takes 2^K.
     :param mistake_rate: The share of answers that may be mistakes: E = floor(rate K).
-    :param n_pairs: Random pairs to choose from for each question; they are drawn from twice as many fragments.
-    :param fragment_length: Steps of a fragment from the replay buffer; None takes 50, or an episode that is shorter (the paper
-        gives none).
+    :param n_pairs: Random pairs to choose from for each question; they are drawn from twice as many
+        fragments.
+    :param fragment_length: Steps of a fragment from the replay buffer; None takes 50, or an episode
+        that is shorter (the paper gives none).
     :param candidates: Where candidates come from: "prior" or "aggregate".
     :param oracle: See :class:`PreferenceAdapter`.
     :param seed: See :class:`PreferenceAdapter`.
@@ -280,14 +297,21 @@ class ANOLEAdapter(PreferenceAdapter):
         library: Sequence[Trajectory] | None = None,
     ) -> None:
         options = ANOLEOptions(
-            n_queries, strategy, n_candidates, mistake_rate, n_pairs, fragment_length, candidates, deterministic
+            n_queries,
+            strategy,
+            n_candidates,
+            mistake_rate,
+            n_pairs,
+            fragment_length,
+            candidates,
+            deterministic,
         )
         self._start(model, env, options, oracle, seed, library)
 
     @classmethod
     def make_options(cls, oracle: Any = None, **options: Any) -> ANOLEOptions:
-        """
-        See :class:`PreferenceAdapter`. ANOLE takes no notice of the oracle: its budget for mistakes is fixed.
+        """See :class:`PreferenceAdapter`. ANOLE takes no notice of the oracle: its budget for
+        mistakes is fixed.
 
         :param oracle: Who will answer.
         :param options: Those of the constructor.

@@ -1,4 +1,6 @@
-"""Twenty questions with lies: how many ways there are for the answers still to come (Berlekamp 1968)."""
+"""Twenty questions with lies: how many ways there are for the answers still to come (Berlekamp
+1968).
+"""
 
 from __future__ import annotations
 
@@ -8,8 +10,8 @@ import numpy as np
 
 
 def berlekamp_volumes(contradictions: np.ndarray, n_left: int, budget: int) -> np.ndarray:
-    """
-    A candidate's volume: in how many ways the remaining answers may lie without exceeding the budget, if it is the truth.
+    """A candidate's volume: in how many ways the remaining answers may lie without exceeding the
+    budget, if it is the truth.
 
     :param contradictions: (...) how many of the answers so far a candidate contradicts (m).
     :param n_left: Questions to come (K - k).
@@ -21,11 +23,13 @@ def berlekamp_volumes(contradictions: np.ndarray, n_left: int, budget: int) -> n
     return np.where(lies_left >= 0, by_lies_left[np.maximum(lies_left, 0)], 0.0)
 
 
-def worst_case_volumes(differences: np.ndarray, contradictions: np.ndarray, n_left: int, budget: int) -> np.ndarray:
-    """
-    The volume that the worse of two answers leaves, over all candidates.
+def worst_case_volumes(
+    differences: np.ndarray, contradictions: np.ndarray, n_left: int, budget: int
+) -> np.ndarray:
+    """The volume that the worse of two answers leaves, over all candidates.
 
-    :param differences: (n_candidates, n_pairs) predicted return of the left fragment minus that of the right one.
+    :param differences: (n_candidates, n_pairs) predicted return of the left fragment minus that of
+        the right one.
     :param contradictions: (n_candidates,) of the answers so far.
     :param n_left: Questions to come after this one.
     :param budget: Lies that all answers together may hold.
@@ -39,8 +43,8 @@ def worst_case_volumes(differences: np.ndarray, contradictions: np.ndarray, n_le
 
 
 def n_distinguishable(n_queries: int, budget: int) -> int:
-    """
-    How many candidates so many answers with so many lies can tell apart at most (the sphere-packing bound).
+    """How many candidates so many answers with so many lies can tell apart at most (the
+    sphere-packing bound).
 
     :param n_queries: K.
     :param budget: E.

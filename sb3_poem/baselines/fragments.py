@@ -1,4 +1,6 @@
-"""Fragments of the training tasks' trajectories, which ANOLE shows instead of rolling out on the new task."""
+"""Fragments of the training tasks' trajectories, which ANOLE shows instead of rolling out on the
+new task.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +18,7 @@ FRAGMENT_LENGTH = 50
 
 
 def default_fragment_length(horizon: int) -> int:
-    """
-    Steps of a fragment unless told.
+    """Steps of a fragment unless told.
 
     :param horizon: Steps of an episode.
     :return: 50, or an episode.
@@ -26,11 +27,10 @@ def default_fragment_length(horizon: int) -> int:
 
 
 def replay_fragments(model: Any, n: int, length: int, rng: np.random.Generator) -> list[Trajectory]:
-    """
-    Fragments from the replay buffers of the training tasks, tasks and places drawn uniformly.
+    """Fragments from the replay buffers of the training tasks, tasks and places drawn uniformly.
 
-    A fragment lies within one episode. Which latent acted is not kept in the buffers; a fragment carries the latest
-    latent of the training task that it comes from.
+    A fragment lies within one episode. Which latent acted is not kept in the buffers; a fragment
+    carries the latest latent of the training task that it comes from.
 
     :param model: A :class:`PEARLSAC` with its replay buffer.
     :param n: How many.
@@ -46,16 +46,22 @@ def replay_fragments(model: Any, n: int, length: int, rng: np.random.Generator) 
         tasks = rng.choice(with_room, size=n)
         slots = rng.integers(buffer.counts[tasks] - length + 1)[:, None] + np.arange(length)
         rows = np.repeat(tasks[:, None], length, axis=1)
-        batch = buffer.at(th.as_tensor(rows, device=buffer.device), th.as_tensor(slots, device=buffer.device))
+        batch = buffer.at(
+            th.as_tensor(rows, device=buffer.device), th.as_tensor(slots, device=buffer.device)
+        )
         obs, next_obs, features = (
-            part.cpu().numpy() for part in (batch.observations, batch.next_observations, batch.features)
+            part.cpu().numpy()
+            for part in (batch.observations, batch.next_observations, batch.features)
         )
         actions = policy.unscale_action(batch.actions.cpu().numpy())
         # Where the next row is not what followed, an episode ended, or the ring holds newer steps.
         whole = (next_obs[:, :-1] == obs[:, 1:]).all(axis=(1, 2))
         found += [
             Trajectory(
-                np.concatenate([obs[i], next_obs[i, -1:]]), actions[i], model.task_latents[tasks[i]].copy(), features[i]
+                np.concatenate([obs[i], next_obs[i, -1:]]),
+                actions[i],
+                model.task_latents[tasks[i]].copy(),
+                features[i],
             )
             for i in np.flatnonzero(whole)
         ]
@@ -67,12 +73,15 @@ def replay_fragments(model: Any, n: int, length: int, rng: np.random.Generator) 
     )
 
 
-def training_rollouts(model: Any, env: Env, n: int, seed: int = 0, deterministic: bool = False) -> list[Trajectory]:
-    """
-    Episodes of training tasks under their own policies: a ``library`` for a model that was loaded without its replay buffer.
+def training_rollouts(
+    model: Any, env: Env, n: int, seed: int = 0, deterministic: bool = False
+) -> list[Trajectory]:
+    """Episodes of training tasks under their own policies: a ``library`` for a model that was
+    loaded without its replay buffer.
 
     :param model: A trained :class:`PEARLSAC`, or its name, see :class:`PreferenceAdapter`.
-    :param env: An environment of its family, or its id, see :class:`PreferenceAdapter`. Tasks are set in it.
+    :param env: An environment of its family, or its id, see :class:`PreferenceAdapter`. Tasks are
+        set in it.
     :param n: How many.
     :param seed: Draws the training tasks and seeds the episodes.
     :param deterministic: Whether policies act by their mode.
@@ -80,16 +89,23 @@ def training_rollouts(model: Any, env: Env, n: int, seed: int = 0, deterministic
     """
     model, vec_env = model_and_env(model, env)
     chosen = np.random.default_rng([seed, 4]).integers(len(model.train_tasks), size=n)
-    return rollout_latents(model, vec_env, model.task_latents[chosen], model.train_tasks.tasks[chosen], seed, deterministic)
+    return rollout_latents(
+        model,
+        vec_env,
+        model.task_latents[chosen],
+        model.train_tasks.tasks[chosen],
+        seed,
+        deterministic,
+    )
 
 
 def rollout_fragments(model: Any, env: Env, n: int, length: int, seed: int = 0) -> list[Trajectory]:
-    """
-    Fragments of :func:`training_rollouts`, one from a random place of each: what a replay buffer would hold of the present
-    policies, for a model that was loaded without one.
+    """Fragments of :func:`training_rollouts`, one from a random place of each: what a replay buffer
+    would hold of the present policies, for a model that was loaded without one.
 
     :param model: A trained :class:`PEARLSAC`, or its name, see :class:`PreferenceAdapter`.
-    :param env: An environment of its family, or its id, see :class:`PreferenceAdapter`. Tasks are set in it.
+    :param env: An environment of its family, or its id, see :class:`PreferenceAdapter`. Tasks are
+        set in it.
     :param n: How many.
     :param length: Steps of a fragment; an episode that ended earlier is taken whole.
     :param seed: Of the training tasks, the episodes and the places.

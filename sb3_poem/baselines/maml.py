@@ -16,12 +16,12 @@ Parameters = dict[str, th.Tensor]
 
 
 class PreferencePairs(NamedTuple):
-    """
-    Pairs of fragments and which is better.
+    """Pairs of fragments and which is better.
 
     :param left: (..., pairs, steps, in_dim + 1) transitions as :class:`RewardNetwork` takes them.
     :param right: (..., pairs, steps, in_dim + 1).
-    :param label: (..., pairs) 1 where the left one is better, 0 where the right one is, 0.5 where neither is.
+    :param label: (..., pairs) 1 where the left one is better, 0 where the right one is, 0.5 where
+        neither is.
     """
 
     left: th.Tensor
@@ -30,8 +30,7 @@ class PreferencePairs(NamedTuple):
 
 
 class RewardNetwork(nn.Module):
-    """
-    Reward of a transition, unknown up to scale.
+    """Reward of a transition, unknown up to scale.
 
     :param in_dim: Width of (s, a, s').
     :param net_arch: Widths of the hidden layers.
@@ -43,13 +42,16 @@ class RewardNetwork(nn.Module):
         self.mlp = MLP(in_dim, 1, net_arch, nn.Tanh)
 
     def forward(self, transitions: th.Tensor) -> th.Tensor:
-        """(..., in_dim + 1), the last entry 1, or 0 for what only fills up an episode that ended early -> (...)."""
+        """(..., in_dim + 1), the last entry 1, or 0 for what only fills up an episode that ended
+        early -> (...).
+        """
         return self.mlp(transitions[..., :-1]).squeeze(-1) * transitions[..., -1]
 
 
-def preference_loss(network: nn.Module, parameters: Parameters, pairs: PreferencePairs) -> th.Tensor:
-    """
-    Bradley-Terry cross-entropy of the sums of predicted rewards.
+def preference_loss(
+    network: nn.Module, parameters: Parameters, pairs: PreferencePairs
+) -> th.Tensor:
+    """Bradley-Terry cross-entropy of the sums of predicted rewards.
 
     :param network: A :class:`RewardNetwork`.
     :param parameters: Its parameters, by name.
@@ -62,12 +64,15 @@ def preference_loss(network: nn.Module, parameters: Parameters, pairs: Preferenc
 
 
 def adapt_parameters(
-    network: nn.Module, parameters: Parameters, pairs: PreferencePairs, learning_rate: float, steps: int
+    network: nn.Module,
+    parameters: Parameters,
+    pairs: PreferencePairs,
+    learning_rate: float,
+    steps: int,
 ) -> Parameters:
-    """
-    MAML's inner loop: gradient steps on one task's preferences. It can be differentiated, and mapped over tasks.
+    """MAML's inner loop: gradient steps on one task's preferences. It can be differentiated, and
+    mapped over tasks.
 
-    :param network: The network.
     :param parameters: Where to start.
     :param pairs: The task's preferences.
     :param learning_rate: Of the steps.
@@ -77,7 +82,9 @@ def adapt_parameters(
     slope = grad(preference_loss, argnums=1)
     for _ in range(steps):
         gradients = slope(network, parameters, pairs)
-        parameters = {name: value - learning_rate * gradients[name] for name, value in parameters.items()}
+        parameters = {
+            name: value - learning_rate * gradients[name] for name, value in parameters.items()
+        }
     return parameters
 
 
@@ -89,11 +96,9 @@ def maml_loss(
     learning_rate: float,
     steps: int,
 ) -> th.Tensor:
-    """
-    MAML's outer objective: how well the adapted networks predict other preferences of their tasks. Its gradient passes
-    through the inner loop.
+    """MAML's outer objective: how well the adapted networks predict other preferences of their
+    tasks. Its gradient passes through the inner loop.
 
-    :param network: The network.
     :param parameters: The common start.
     :param support: (tasks, pairs, ...) what each task adapts to.
     :param query: (tasks, pairs, ...) what it is judged by.
@@ -103,6 +108,8 @@ def maml_loss(
     """
 
     def task_loss(some: PreferencePairs, others: PreferencePairs) -> th.Tensor:
-        return preference_loss(network, adapt_parameters(network, parameters, some, learning_rate, steps), others)
+        return preference_loss(
+            network, adapt_parameters(network, parameters, some, learning_rate, steps), others
+        )
 
     return vmap(task_loss)(support, query).mean()

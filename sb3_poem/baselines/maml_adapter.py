@@ -29,10 +29,9 @@ if TYPE_CHECKING:
 
 
 class MAMLRewardModel:
-    """
-    A meta-trained reward with the face of a model. Its policies are SAC's after so many answers to some task; a "latent"
-    names one by its number, and says with its second entry, 1 or -1, with which sign exploration noise is added: so
-    two rollouts of one policy from equal seeds differ.
+    """A meta-trained reward with the face of a model. Its policies are SAC's after so many answers
+    to some task; a "latent" names one by its number, and says with its second entry, 1 or -1, with
+    which sign exploration noise is added: so two rollouts of one policy from equal seeds differ.
 
     :param reward: The meta-trained reward.
     :param model: The :class:`PEARLSAC` that it was meta-trained with, for spaces and horizon.
@@ -60,10 +59,13 @@ class MAMLRewardModel:
         return np.array([len(self.actors) - 1, 1.0])
 
     def predict(
-        self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
+        self,
+        observation: np.ndarray,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
     ) -> tuple[np.ndarray, Any]:
-        """
-        Act, as SB3's ``predict``.
+        """Act, as SB3's ``predict``.
 
         :param observation: (obs_dim,) or (n, obs_dim).
         :param state: (2,), or one for each observation (n, 2).
@@ -82,9 +84,16 @@ class MAMLRewardModel:
                 rows = np.flatnonzero(latents[:, 0] == number)
                 mean, log_std, _ = self.actors[number].get_action_dist_params(inputs[rows].cpu())
                 if not deterministic:
-                    mean = mean + th.as_tensor(latents[rows, 1:], dtype=th.float32) * log_std.exp() * noise[rows]
+                    mean = (
+                        mean
+                        + th.as_tensor(latents[rows, 1:], dtype=th.float32)
+                        * log_std.exp()
+                        * noise[rows]
+                    )
                 actions[rows] = mean.tanh().numpy()
-        actions = np.clip(policy.unscale_action(actions), self.action_space.low, self.action_space.high)
+        actions = np.clip(
+            policy.unscale_action(actions), self.action_space.low, self.action_space.high
+        )
         return (actions[0] if np.ndim(observation) == 1 else actions), state
 
 
@@ -109,14 +118,15 @@ class MAMLRewardOptions:
         if not 0.0 <= self.gamma <= 1.0:
             raise ValueError(f"`gamma` must lie in [0, 1], but is {self.gamma}")
 
-    def check(self, model: Any, vec_env: VecEnv, library: Sequence[Trajectory] | None = None) -> None:
-        """
-        Refuse what MAML-reward cannot run with.
+    def check(
+        self, model: Any, vec_env: VecEnv, library: Sequence[Trajectory] | None = None
+    ) -> None:
+        """Refuse what MAML-reward cannot run with.
 
-        :param model: The model.
         :param vec_env: The environment to adapt in.
         :param library: Not taken.
-        :raises ValueError: Without a meta-trained reward, and for a family whose tasks do not share their dynamics.
+        :raises ValueError: Without a meta-trained reward, and for a family whose tasks do not share
+            their dynamics.
         """
         if not isinstance(model, MAMLRewardModel):
             raise ValueError(
@@ -136,8 +146,7 @@ class MAMLRewardOptions:
     def make_inference(
         self, model: Any, rng: np.random.Generator, library: Sequence[Trajectory] | None = None
     ) -> MAMLRewardInference:
-        """
-        The inference that these options describe.
+        """The inference that these options describe.
 
         :param model: A :class:`MAMLRewardModel`.
         :param rng: Its generator.
@@ -152,8 +161,7 @@ class MAMLRewardOptions:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> MAMLRewardOptions:
-        """
-        Read what :meth:`to_dict` wrote.
+        """Read what :meth:`to_dict` wrote.
 
         :param data: The dictionary.
         :return: The options.
@@ -162,18 +170,18 @@ class MAMLRewardOptions:
 
 
 class MAMLRewardInference(LatentInference):
-    """
-    After each answer the reward is adapted anew from the meta-trained start to all answers, everything that was shown is
-    relabelled with it, and SAC goes on learning from that.
+    """After each answer the reward is adapted anew from the meta-trained start to all answers,
+    everything that was shown is relabelled with it, and SAC goes on learning from that.
 
-    What is learnt follows from the seed and the answers alone, so a saved adaptation keeps no networks: they are learnt again.
+    What is learnt follows from the seed and the answers alone, so a saved adaptation keeps no
+    networks: they are learnt again.
 
-    :param model: The model.
-    :param options: The options.
     :param rng: Seeds SAC.
     """
 
-    def __init__(self, model: MAMLRewardModel, options: MAMLRewardOptions, rng: np.random.Generator) -> None:
+    def __init__(
+        self, model: MAMLRewardModel, options: MAMLRewardOptions, rng: np.random.Generator
+    ) -> None:
         self.model = model
         self.options = options
         self.rng = rng
@@ -191,23 +199,28 @@ class MAMLRewardInference(LatentInference):
         return self.latent.copy(), self.latent * np.array([1.0, -1.0])
 
     def same_latents(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See :class:`LatentInference`: the current policy, which has another number here than in the file."""
+        """See :class:`LatentInference`: the current policy, which has another number here than in
+        the file.
+        """
         return self.ask_latents()
 
     def tell(self, preference: Preference, left: Shown, right: Shown) -> None:
-        """
-        See :class:`LatentInference`.
+        """See :class:`LatentInference`.
 
         :raises ValueError: If no trajectories are given.
         """
         if not (isinstance(left, Trajectory) and isinstance(right, Trajectory)):
-            raise ValueError("MAML-reward needs the two trajectories that were shown, not their latents alone")
+            raise ValueError(
+                "MAML-reward needs the two trajectories that were shown, not their latents alone"
+            )
         self.answers.append(Answer(preference, left, right))
         judged = [JudgedPair(a.preference, a.left, a.right) for a in self.answers]  # type: ignore[arg-type]
         parameters = self.model.reward.adapted(judged)
         shown = [trajectory for pair in judged for trajectory in (pair.left, pair.right)]
         rewards = [self.model.reward.rewards(parameters, trajectory) for trajectory in shown]
-        scale = max(float(np.concatenate(rewards).std()), 1e-6)  # preferences fix no unit; SAC's entropy needs one
+        scale = max(
+            float(np.concatenate(rewards).std()), 1e-6
+        )  # preferences fix no unit; SAC's entropy needs one
         with _seeded(self.seed + len(self.answers)):
             self._fill_buffer(shown, [row / scale for row in rewards])
             self.sac.train(self.options.gradient_steps, self.options.batch_size)
@@ -231,7 +244,9 @@ class MAMLRewardInference(LatentInference):
         buffer.reset()
         for trajectory, row in zip(shown, rewards, strict=True):
             with th.no_grad():
-                obs = policy.standardise(th.as_tensor(trajectory.observations, dtype=th.float32, device=policy.device))
+                obs = policy.standardise(
+                    th.as_tensor(trajectory.observations, dtype=th.float32, device=policy.device)
+                )
             obs, actions = obs.cpu().numpy(), policy.scale_action(trajectory.actions)
             # Nothing ends but by the time limit, unless an episode is shorter than that.
             ended = len(trajectory) < self.model.horizon
@@ -247,9 +262,9 @@ class MAMLRewardInference(LatentInference):
 
 
 class MAMLRewardAdapter(PreferenceAdapter):
-    """
-    Adapts by MAML-reward (Hejna & Sadigh 2023), with the face of :class:`PreferenceAdapter`: a meta-trained reward is adapted
-    to the answers, and SB3's SAC learns the policy on it from the trajectories that were shown, at most 2 K.
+    """Adapts by MAML-reward (Hejna & Sadigh 2023), with the face of :class:`PreferenceAdapter`: a
+    meta-trained reward is adapted to the answers, and SB3's SAC learns the policy on it from the
+    trajectories that were shown, at most 2 K.
 
     :param model: A :class:`MAMLRewardModel`.
     :param env: See :class:`PreferenceAdapter`.
@@ -284,8 +299,7 @@ class MAMLRewardAdapter(PreferenceAdapter):
 
     @classmethod
     def make_options(cls, oracle: Any = None, **options: Any) -> MAMLRewardOptions:
-        """
-        See :class:`PreferenceAdapter`.
+        """See :class:`PreferenceAdapter`.
 
         :param oracle: Not looked at.
         :param options: Those of the constructor.
@@ -306,7 +320,11 @@ def _make_sac(model: MAMLRewardModel, options: MAMLRewardOptions) -> SAC:
         device="cpu",
         _init_setup_model=False,
     )
-    sac.observation_space, sac.action_space, sac.n_envs = model.observation_space, model.action_space, 1
+    sac.observation_space, sac.action_space, sac.n_envs = (
+        model.observation_space,
+        model.action_space,
+        1,
+    )
     sac._setup_model()
     sac.set_logger(Logger(None, []))
     return sac

@@ -1,1 +1,3 @@
-"""The benchmark: the paper's comparisons and ablations as cells of declared suites, kept in one store."""
+"""The benchmark: the paper's comparisons and ablations as cells of declared suites, kept in one
+store.
+"""

@@ -11,9 +11,20 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_poem.adaptation import BoltzmannOracle, MistakeOracle, PreferenceAdapter, ReturnOracle, TaskOracle
+from sb3_poem.adaptation import (
+    BoltzmannOracle,
+    MistakeOracle,
+    PreferenceAdapter,
+    ReturnOracle,
+    TaskOracle,
+)
 from sb3_poem.adaptation.evaluation import evaluate_adaptation, known_task_return, preference_order
-from sb3_poem.baselines import ANOLEAdapter, MAMLRewardAdapter, RewardOracleAdapter, rollout_fragments
+from sb3_poem.baselines import (
+    ANOLEAdapter,
+    MAMLRewardAdapter,
+    RewardOracleAdapter,
+    rollout_fragments,
+)
 from sb3_poem.baselines.fragments import default_fragment_length
 from sb3_poem.benchmark.models import ModelLibrary, Say
 from sb3_poem.benchmark.provenance import provenance
@@ -34,10 +45,8 @@ DIGITS = 4  # of returns in the store
 
 
 def run_cell(cell: Cell, library: ModelLibrary, say: Say = print) -> Record:
-    """
-    Run one cell. Its model is trained first if it is missing.
+    """Run one cell. Its model is trained first if it is missing.
 
-    :param cell: The cell.
     :param library: The models.
     :param say: Takes a line of progress.
     :return: What to keep.
@@ -60,13 +69,24 @@ def run_cell(cell: Cell, library: ModelLibrary, say: Say = print) -> Record:
     result["training_samples"] = int(getattr(model, "num_timesteps", training.get("env_steps", 0)))
     result["updates"] = int(getattr(model, "_n_updates", training.get("updates", 0)))
     result["training_seconds"] = training.get("seconds")
-    about = {**provenance(), "device": library.workplace.device, "num_threads": library.workplace.num_threads}
-    return Record(cell.key, cell.family, cell.method, cell.seed, cell.identity(), result, {**about, "model": trained})
+    about = {
+        **provenance(),
+        "device": library.workplace.device,
+        "num_threads": library.workplace.num_threads,
+    }
+    return Record(
+        cell.key,
+        cell.family,
+        cell.method,
+        cell.seed,
+        cell.identity(),
+        result,
+        {**about, "model": trained},
+    )
 
 
 def make_oracle_factory(spec: OracleSpec) -> Callable[..., TaskOracle]:
-    """
-    What makes a task's oracle.
+    """What makes a task's oracle.
 
     :param spec: Who answers.
     :return: A function of ``env``, ``task`` and ``seed``.
@@ -78,11 +98,15 @@ def make_oracle_factory(spec: OracleSpec) -> Callable[..., TaskOracle]:
         return partial(BoltzmannOracle, spec.value)
     if spec.kind == "mistake" and spec.value is not None:
         return partial(MistakeOracle, spec.value)
-    raise ValueError(f"there is no oracle {spec}; there are return, boltzmann, and mistake with a rate")
+    raise ValueError(
+        f"there is no oracle {spec}; there are return, boltzmann, and mistake with a rate"
+    )
 
 
 def _episode_seed(cell: Cell) -> int:
-    """Task i takes what follows it by i, so that seeds lie further apart than there are tasks; 0 shares nothing with 1."""
+    """Task i takes what follows it by i, so that seeds lie further apart than there are tasks; 0
+    shares nothing with 1.
+    """
     return cell.budget.task_seed + SEED_STRIDE * cell.seed
 
 
@@ -93,7 +117,9 @@ def _measure_adaptation(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) 
         options.setdefault("fragment_length", default_fragment_length(model.horizon))
         if not _has_experience(model):
             settings = ANOLEAdapter.make_options(**options)
-            fragments = rollout_fragments(model, env, 2 * settings.n_pairs, options["fragment_length"], cell.seed)
+            fragments = rollout_fragments(
+                model, env, 2 * settings.n_pairs, options["fragment_length"], cell.seed
+            )
             options["library"] = fragments
     evaluation = evaluate_adaptation(
         model,
@@ -117,7 +143,9 @@ def _measure_adaptation(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) 
         "adaptation_trajectories": 0 if kind == "anole" else 2 * sum(map(len, answers)),
     }
     if kind == "anole":
-        data["fragments"] = "replay buffer" if fragments is None else "rollouts of the training tasks"
+        data["fragments"] = (
+            "replay buffer" if fragments is None else "rollouts of the training tasks"
+        )
         data["fragment_length"] = options["fragment_length"]
     if evaluation.successes is not None:
         data["task_success_rates"] = _rounded(evaluation.successes.mean(axis=2))
@@ -125,11 +153,18 @@ def _measure_adaptation(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) 
 
 
 def _measure_known(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) -> dict[str, Any]:
-    """What the model's policies could earn: returns of the best of them for each task, and the matrix J for the limits."""
+    """What the model's policies could earn: returns of the best of them for each task, and the
+    matrix J for the limits.
+    """
     budget = cell.budget
     episodes = min(budget.episodes, SELECTION_EPISODES)
     known = known_task_return(
-        model, env, tasks, n_episodes=budget.episodes, seed=_episode_seed(cell), selection_episodes=episodes
+        model,
+        env,
+        tasks,
+        n_episodes=budget.episodes,
+        seed=_episode_seed(cell),
+        selection_episodes=episodes,
     )
     data: dict[str, Any] = {
         "tasks": _rounded(tasks),

@@ -22,22 +22,24 @@ from sb3_poem.poem_sac import POEMSAC
 
 #: Seconds until a training's process has begun, and to save what it ends with
 PROCESS_SECONDS = 6.0
-# What follows is counted in gradient steps of the family's model, which grow with the machine's speed as it does.
+# What follows is counted in gradient steps of the family's model, which grow with the machine's
+# speed as it does.
 #: Of an iteration of MAML-reward's meta-training
 UPDATES_PER_META_ITERATION = 18
-#: Of what is computed for an answer and the next question, by inference rule or strategy; the others are quick
+#: Of what is computed for an answer and the next question, by inference rule or strategy; the
+#: others are quick
 UPDATES_PER_ANSWER = {"bayes": 0.7, "berlekamp": 2.0}
 #: Of the same with ANOLE's greedy strategy, for each step of a fragment
 UPDATES_PER_GREEDY_STEP = 0.65
 # MAML-reward adapts by SAC's gradient steps, which cost as much as the model's own.
-#: What the machine is tried with: copies that are stepped at once, steps of an episode, and gradient steps
+#: What the machine is tried with: copies that are stepped at once, steps of an episode, and
+#: gradient steps
 COPIES, STEPS, UPDATES = 20, 128, 20
 
 
 @dataclass(frozen=True)
 class Pace:
-    """
-    How fast a machine is on a family.
+    """How fast a machine is on a family.
 
     :param step: Seconds of an environment step of one copy, with the policy's action.
     :param update: Seconds of a gradient step.
@@ -49,8 +51,7 @@ class Pace:
 
 @cache
 def measure_pace(env_id: str, device: str = "cpu", num_threads: int = 1) -> Pace:
-    """
-    Train for two short epochs with the hyperparameters that ship, and look at the second.
+    """Train for two short epochs with the hyperparameters that ship, and look at the second.
 
     :param env_id: The family.
     :param device: As PyTorch names it.
@@ -61,7 +62,11 @@ def measure_pace(env_id: str, device: str = "cpu", num_threads: int = 1) -> Pace
     facts = family_facts(env_id)
     tasks, steps = min(COPIES, facts.n_tasks or COPIES), min(facts.horizon, STEPS)
     with contextlib.closing(make_task_vec_env(env_id, COPIES, max_episode_steps=steps)) as env:
-        changes: dict[str, Any] = {"env": env, "n_train_tasks": tasks, "trajectories_per_task": COPIES // tasks}
+        changes: dict[str, Any] = {
+            "env": env,
+            "n_train_tasks": tasks,
+            "trajectories_per_task": COPIES // tasks,
+        }
         changes |= {"gradient_steps": UPDATES, "device": device}
         try:
             model = POEMSAC.from_zoo(env_id, **changes)
@@ -73,30 +78,42 @@ def measure_pace(env_id: str, device: str = "cpu", num_threads: int = 1) -> Pace
 
 
 def training_seconds(key: ModelKey, pace: Pace) -> float:
-    """
-    Of a model's training from scratch; of one that is made from another's, what comes on top.
+    """Of a model's training from scratch; of one that is made from another's, what comes on top.
 
     :param key: The model.
     :param pace: On its family.
     """
     if VARIANTS[key.variant].base is not None:
-        return META_ITERATIONS_OF.get(key.family, META_ITERATIONS) * UPDATES_PER_META_ITERATION * pace.update
+        return (
+            META_ITERATIONS_OF.get(key.family, META_ITERATIONS)
+            * UPDATES_PER_META_ITERATION
+            * pace.update
+        )
     plan = training_plan(key)
     return PROCESS_SECONDS + plan.timesteps * pace.step + plan.updates * pace.update
 
 
 def cell_seconds(cell: Cell, pace: Pace) -> float:
-    """
-    Of a cell whose model is there.
+    """Of a cell whose model is there.
 
-    :param cell: The cell.
     :param pace: On its family.
     """
-    budget, facts, kind, options = cell.budget, family_facts(cell.env_id), cell.definition.kind, cell.options
+    budget, facts, kind, options = (
+        cell.budget,
+        family_facts(cell.env_id),
+        cell.definition.kind,
+        cell.options,
+    )
     queries = budget.record_at[-1]
     if kind == "known":
-        latents = LATENTS_WITH_SHARED_DYNAMICS if facts.shared_dynamics else LATENTS_WITH_OWN_DYNAMICS * budget.tasks
-        episodes = latents * min(budget.episodes, SELECTION_EPISODES) + budget.tasks * budget.episodes
+        latents = (
+            LATENTS_WITH_SHARED_DYNAMICS
+            if facts.shared_dynamics
+            else LATENTS_WITH_OWN_DYNAMICS * budget.tasks
+        )
+        episodes = (
+            latents * min(budget.episodes, SELECTION_EPISODES) + budget.tasks * budget.episodes
+        )
         return episodes * facts.horizon * pace.step
     episodes = budget.tasks * budget.episodes * len(budget.record_at)
     if kind != "anole":  # which asks about what there is

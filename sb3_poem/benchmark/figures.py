@@ -1,4 +1,6 @@
-"""Figures of a suite, as pure functions of what the store holds: return against queries, samples and tolerance."""
+"""Figures of a suite, as pure functions of what the store holds: return against queries, samples
+and tolerance.
+"""
 
 from __future__ import annotations
 
@@ -33,8 +35,7 @@ MARKERS = "osD^vPX*"
 
 
 def write_figures(selection: Selection, folder: Path) -> list[Path]:
-    """
-    Write all figures of a suite, each as PNG and PDF.
+    """Write all figures of a suite, each as PNG and PDF.
 
     :param selection: What there is.
     :param folder: Where.
@@ -45,22 +46,29 @@ def write_figures(selection: Selection, folder: Path) -> list[Path]:
         for suffix in SUFFIXES:
             path = folder / f"{name}{suffix}"
             # Without the time of writing the same store gives the same file.
-            figure.savefig(path, dpi=150, metadata={"CreationDate": None} if suffix == ".pdf" else {"Software": None})
+            figure.savefig(
+                path,
+                dpi=150,
+                metadata={"CreationDate": None} if suffix == ".pdf" else {"Software": None},
+            )
             files.append(path)
     return files
 
 
 def suite_figures(selection: Selection) -> dict[str, Figure]:
-    """
-    The figures of a suite, by name. Families stand side by side.
+    """The figures of a suite, by name. Families stand side by side.
 
     :param selection: What there is.
     :return: The figures.
     """
     figures = {}
     for entry in selection.suite.entries:
-        by_condition = {condition: selection.series(entry, condition) for condition in selection.conditions}
-        references = {condition: selection.references(condition) for condition in selection.conditions}
+        by_condition = {
+            condition: selection.series(entry, condition) for condition in selection.conditions
+        }
+        references = {
+            condition: selection.references(condition) for condition in selection.conditions
+        }
         base = f"{selection.suite.name}-{entry.name}"
         if entry.name == TOLERANCE:
             figure = _tolerance_figure(entry, by_condition)
@@ -108,42 +116,78 @@ def _figures_of(
 
 
 def _draw_queries(
-    axes: Axes, series: Sequence[Series], entry: Entry, oracle: OracleSpec, references: Sequence[Reference]
+    axes: Axes,
+    series: Sequence[Series],
+    entry: Entry,
+    oracle: OracleSpec,
+    references: Sequence[Reference],
 ) -> None:
     for one in series:
         if one.snapshot is None:
             _line(axes, one.queries, one.returns.mean(axis=1), entry, one.method, one.label)
     variants = {METHODS[one.method].variant for one in series}
-    shown = [reference for reference in references if METHODS[reference.method].variant == "poem" and "poem" in variants]
+    shown = [
+        reference
+        for reference in references
+        if METHODS[reference.method].variant == "poem" and "poem" in variants
+    ]
     for reference in shown:
         limits = [float(reference.limits(k, oracle).mean()) for k in entry.record_at]
-        axes.plot(entry.record_at, limits, color="0.25", linestyle="--", linewidth=1.2, label="limit (POEM's policies)")
+        axes.plot(
+            entry.record_at,
+            limits,
+            color="0.25",
+            linestyle="--",
+            linewidth=1.2,
+            label="limit (POEM's policies)",
+        )
         known = float(reference.known.mean())
-        axes.axhline(known, color="0.5", linestyle=":", linewidth=1.2, label="task known (POEM's policies)")
+        axes.axhline(
+            known, color="0.5", linestyle=":", linewidth=1.2, label="task known (POEM's policies)"
+        )
     axes.set_xlabel("preference queries")
-    axes.set_xticks([k for k in entry.record_at if k % (1 if len(entry.record_at) < 12 else 5) == 0])
+    axes.set_xticks(
+        [k for k in entry.record_at if k % (1 if len(entry.record_at) < 12 else 5) == 0]
+    )
 
 
 def _draw_samples(
-    axes: Axes, series: Sequence[Series], entry: Entry, oracle: OracleSpec, references: Sequence[Reference]
+    axes: Axes,
+    series: Sequence[Series],
+    entry: Entry,
+    oracle: OracleSpec,
+    references: Sequence[Reference],
 ) -> None:
     last = max(entry.record_at)
     for method in dict.fromkeys(one.method for one in series):
         mine = sorted(
-            (one for one in series if one.method == method and one.at(last) is not None), key=lambda one: one.samples
+            (one for one in series if one.method == method and one.at(last) is not None),
+            key=lambda one: one.samples,
         )
         if len(mine) == 1 and mine[0].snapshot is None:  # not measured along the training
             returns = mine[0].at(last)
             assert returns is not None
             level = float(returns.mean())
             axes.axhline(
-                level, color=_colour(entry, method), linestyle="-.", linewidth=1.4, label=f"{mine[0].label}, at the end"
+                level,
+                color=_colour(entry, method),
+                linestyle="-.",
+                linewidth=1.4,
+                label=f"{mine[0].label}, at the end",
             )
             continue
         points = [(one.samples, one.at(last)) for one in mine]
         means = [float(returns.mean()) for _, returns in points if returns is not None]
         deviations = [_deviation(returns) for _, returns in points if returns is not None]
-        _band(axes, [samples for samples, _ in points], np.array(means), np.array(deviations), entry, method, mine[0].label)
+        _band(
+            axes,
+            [samples for samples, _ in points],
+            np.array(means),
+            np.array(deviations),
+            entry,
+            method,
+            mine[0].label,
+        )
     axes.set_xlabel("environment steps of the training, thousands")
     axes.xaxis.set_major_formatter(lambda steps, position: f"{steps / 1000:g}")
 
@@ -159,12 +203,24 @@ def _tolerance_figure(entry: Entry, by_condition: dict[Condition, list[Series]])
             axes = panels[row][column]
             some = [one for one in series if one.oracle == oracle]
             for position, queries in enumerate((1, 5, 10)):
-                points = [(_epsilon(one), returns) for one in some if (returns := one.at(queries)) is not None]
+                points = [
+                    (_epsilon(one), returns)
+                    for one in some
+                    if (returns := one.at(queries)) is not None
+                ]
                 if points:
                     means = np.array([returns.mean() for _, returns in points])
                     deviations = np.array([_deviation(returns) for _, returns in points])
                     label = f"{queries} quer{'ies' if queries > 1 else 'y'}"
-                    _draw_band(axes, [e for e, _ in points], means, deviations, f"C{position}", MARKERS[position], label)
+                    _draw_band(
+                        axes,
+                        [e for e, _ in points],
+                        means,
+                        deviations,
+                        f"C{position}",
+                        MARKERS[position],
+                        label,
+                    )
             axes.set_xlabel("tolerance epsilon")
             _title(axes, condition, oracle.label)
     _finish(figure, panels, entry.title)
@@ -175,25 +231,47 @@ def _epsilon(series: Series) -> float:
     return float(METHODS[series.method].options.get("epsilon", 0.1))
 
 
-def _line(axes: Axes, x: Sequence[float], by_seed: np.ndarray, entry: Entry, method: str, label: str) -> None:
+def _line(
+    axes: Axes, x: Sequence[float], by_seed: np.ndarray, entry: Entry, method: str, label: str
+) -> None:
     """One line with the deviation over seeds; ``by_seed`` is (n_seeds, n_points)."""
     deviations = by_seed.std(axis=0, ddof=1) if len(by_seed) > 1 else np.zeros(by_seed.shape[1])
     _band(axes, x, by_seed.mean(axis=0), deviations, entry, method, label)
 
 
 def _band(
-    axes: Axes, x: Sequence[float], means: np.ndarray, deviations: np.ndarray, entry: Entry, method: str, label: str
+    axes: Axes,
+    x: Sequence[float],
+    means: np.ndarray,
+    deviations: np.ndarray,
+    entry: Entry,
+    method: str,
+    label: str,
 ) -> None:
-    names = list(dict.fromkeys(map(_change, entry.methods))) if entry.by_inference else list(entry.methods)
+    names = (
+        list(dict.fromkeys(map(_change, entry.methods)))
+        if entry.by_inference
+        else list(entry.methods)
+    )
     marker = MARKERS[names.index(_change(method) if entry.by_inference else method) % len(MARKERS)]
     _draw_band(axes, x, means, deviations, _colour(entry, method), marker, label)
 
 
 def _draw_band(
-    axes: Axes, x: Sequence[float], means: np.ndarray, deviations: np.ndarray, colour: str, marker: str, label: str
+    axes: Axes,
+    x: Sequence[float],
+    means: np.ndarray,
+    deviations: np.ndarray,
+    colour: str,
+    marker: str,
+    label: str,
 ) -> None:
-    axes.plot(x, means, color=colour, marker=marker, markersize=4, linewidth=1.6, label=label, zorder=3)
-    axes.fill_between(x, means - deviations, means + deviations, color=colour, alpha=0.1, linewidth=0)
+    axes.plot(
+        x, means, color=colour, marker=marker, markersize=4, linewidth=1.6, label=label, zorder=3
+    )
+    axes.fill_between(
+        x, means - deviations, means + deviations, color=colour, alpha=0.1, linewidth=0
+    )
 
 
 def _colour(entry: Entry, method: str) -> str:
@@ -218,11 +296,14 @@ def _deviation(returns: np.ndarray) -> float:
 
 
 def _grid(rows: int, columns: int) -> tuple[Figure, list[list[Axes]]]:
-    # The object interface: a figure of pyplot would stay in its global list, and choose a window system.
+    # The object interface: a figure of pyplot would stay in its global list, and choose a window
+    # system.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(max(6.0, PANEL_WIDTH * columns), PANEL_HEIGHT * rows + 1.2), layout="constrained")
+    figure = Figure(
+        figsize=(max(6.0, PANEL_WIDTH * columns), PANEL_HEIGHT * rows + 1.2), layout="constrained"
+    )
     FigureCanvasAgg(figure)
     panels: Any = figure.subplots(rows, columns, squeeze=False)
     return figure, panels.tolist()
@@ -248,7 +329,12 @@ def _finish(figure: Figure, panels: list[list[Axes]], title: str) -> None:
     figure.suptitle(title, fontsize=11)
     columns = 2 * len(panels[0]) + 1
     figure.legend(
-        entries.values(), entries.keys(), loc="outside lower center", ncols=min(columns, 4), frameon=False, fontsize=8
+        entries.values(),
+        entries.keys(),
+        loc="outside lower center",
+        ncols=min(columns, 4),
+        frameon=False,
+        fontsize=8,
     )
 
 

@@ -18,8 +18,7 @@ SAVES = 10
 
 @dataclass(frozen=True)
 class TrainingPlan:
-    """
-    A training, in figures.
+    """A training, in figures.
 
     :param algorithm: "poem_sac" or "pearl_sac".
     :param hyperparameters: All that differs from the algorithm's defaults.
@@ -47,8 +46,7 @@ class MissingEntryError(ValueError):
 
 
 def training_plan(key: ModelKey) -> TrainingPlan:
-    """
-    How a model is trained.
+    """How a model is trained.
 
     :param key: The model.
     :return: The plan.
@@ -65,13 +63,17 @@ def training_plan(key: ModelKey) -> TrainingPlan:
         )
     overrides = {**variant.hyperparameters, **dict(key.training.hyperparameters)}
     hyperparameters = {**entry, **overrides}
-    timesteps = int(hyperparameters["n_timesteps"] if key.training.timesteps is None else key.training.timesteps)
+    timesteps = int(
+        hyperparameters["n_timesteps"] if key.training.timesteps is None else key.training.timesteps
+    )
     hyperparameters["n_timesteps"] = timesteps
     epoch_steps = _epoch_steps(family_facts(key.env_id), hyperparameters)
     per_epoch = int(hyperparameters.get("gradient_steps", 1000))
     epochs = -(-timesteps // epoch_steps)
     updates = epochs * (epoch_steps if per_epoch < 0 else per_epoch)
-    return TrainingPlan(variant.algorithm, hyperparameters, overrides, timesteps, epoch_steps, updates)
+    return TrainingPlan(
+        variant.algorithm, hyperparameters, overrides, timesteps, epoch_steps, updates
+    )
 
 
 def _epoch_steps(facts: FamilyFacts, hyperparameters: dict[str, Any]) -> int:
@@ -79,5 +81,9 @@ def _epoch_steps(facts: FamilyFacts, hyperparameters: dict[str, Any]) -> int:
 
     tasks = hyperparameters.get("n_train_tasks")
     if tasks is None:
-        tasks = DEFAULT_TRAIN_TASKS if facts.n_tasks is None else min(DEFAULT_TRAIN_TASKS, facts.n_tasks)
+        tasks = (
+            DEFAULT_TRAIN_TASKS
+            if facts.n_tasks is None
+            else min(DEFAULT_TRAIN_TASKS, facts.n_tasks)
+        )
     return int(tasks) * int(hyperparameters.get("trajectories_per_task", 1)) * facts.horizon

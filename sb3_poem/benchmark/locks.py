@@ -11,12 +11,12 @@ from filelock import lock_descriptor
 
 @contextlib.contextmanager
 def locked(path: Path, on_wait: Callable[[], None] | None = None) -> Iterator[int]:
-    """
-    Hold a lock, after waiting for whoever holds it.
+    """Hold a lock, after waiting for whoever holds it.
 
     :param path: The lock's file; it stays behind, empty.
     :param on_wait: Called once, if there is a wait.
-    :return: A context whose value is the file's descriptor: a child process that inherits it holds the lock as well.
+    :return: A context whose value is the file's descriptor: a child process that inherits it holds
+        the lock as well.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a") as file:
@@ -29,8 +29,7 @@ def locked(path: Path, on_wait: Callable[[], None] | None = None) -> Iterator[in
 
 @contextlib.contextmanager
 def try_lock(path: Path) -> Iterator[bool]:
-    """
-    Hold a lock if nobody else does.
+    """Hold a lock if nobody else does.
 
     :param path: See :func:`locked`.
     :return: A context whose value is whether the lock is held here.

@@ -24,8 +24,7 @@ SHARED_DYNAMICS_REASONS = {
 
 @dataclass(frozen=True)
 class Variant:
-    """
-    A model to be trained.
+    """A model to be trained.
 
     :param name: Of the variant, and of its folder.
     :param algorithm: "poem_sac" or "pearl_sac".
@@ -41,13 +40,13 @@ class Variant:
 
 @dataclass(frozen=True)
 class Method:
-    """
-    A row of the tables.
+    """A row of the tables.
 
     :param name: As on the command line.
     :param label: As in tables and figures.
     :param variant: The model that it adapts.
-    :param kind: "preference", "anole", "maml", "oracle", or "known" for what the model's policies could earn.
+    :param kind: "preference", "anole", "maml", "oracle", or "known" for what the model's policies
+        could earn.
     :param options: Of the adapter.
     :param paper_row: Its row in Table 3 of Xu & Zhu 2025.
     """
@@ -60,8 +59,7 @@ class Method:
     paper_row: str | None = None
 
     def objection(self, shared_dynamics: bool) -> str | None:
-        """
-        Why the method cannot run on a family; None if it can.
+        """Why the method cannot run on a family; None if it can.
 
         :param shared_dynamics: Whether the family's tasks share their dynamics.
         :return: The reason.
@@ -88,8 +86,12 @@ def _methods() -> dict[str, Method]:
         Method("poem-bayes", "POEM (Bayes)", "poem", "preference", {"inference": "bayes"}, "POEM"),
         Method("poem-paper", "POEM (paper)", "poem", "preference", {"inference": "paper"}, "POEM"),
         Method("anole", "ANOLE", "pearl", "anole", {"strategy": "berlekamp"}, "ANOLE"),
-        Method("anole-greedy", "ANOLE-greedy", "pearl", "anole", {"strategy": "greedy"}, "ANOLE-greedy"),
-        Method("anole-random", "ANOLE-random", "pearl", "anole", {"strategy": "random"}, "ANOLE-random"),
+        Method(
+            "anole-greedy", "ANOLE-greedy", "pearl", "anole", {"strategy": "greedy"}, "ANOLE-greedy"
+        ),
+        Method(
+            "anole-random", "ANOLE-random", "pearl", "anole", {"strategy": "random"}, "ANOLE-random"
+        ),
         Method("maml-reward", "MAML-reward", "maml-reward", "maml", {}, "MAML-reward"),
         Method("reward-oracle", "reward oracle", "pearl", "oracle"),
         Method("known-task", "task known (POEM's policies)", "poem", "known"),
@@ -104,16 +106,36 @@ def _methods() -> dict[str, Method]:
         methods.append(Method(f"known-task-{variant}", f"task known ({label})", variant, "known"))
         for inference, prefix in INFERENCE_LABELS.items():
             options = {"inference": inference}
-            methods.append(Method(f"{variant}-{inference}", f"{prefix}, {label}", variant, "preference", options))
+            methods.append(
+                Method(
+                    f"{variant}-{inference}", f"{prefix}, {label}", variant, "preference", options
+                )
+            )
     for inference, prefix in INFERENCE_LABELS.items():
         for rule in QUERY_RULES:
             if rule != DEFAULT_QUERY_RULE[inference]:
                 asked = {"inference": inference, "query_rule": rule}
-                methods.append(Method(f"poem-{inference}-{rule}", f"{prefix}, {rule} queries", "poem", "preference", asked))
+                methods.append(
+                    Method(
+                        f"poem-{inference}-{rule}",
+                        f"{prefix}, {rule} queries",
+                        "poem",
+                        "preference",
+                        asked,
+                    )
+                )
     for epsilon in EPSILONS:
         # 0.1 is the default, and so the same cell as poem-paper.
         tolerant = {"inference": "paper", **({} if epsilon == 0.1 else {"epsilon": epsilon})}
-        methods.append(Method(f"poem-paper-epsilon-{epsilon:g}", f"epsilon = {epsilon:g}", "poem", "preference", tolerant))
+        methods.append(
+            Method(
+                f"poem-paper-epsilon-{epsilon:g}",
+                f"epsilon = {epsilon:g}",
+                "poem",
+                "preference",
+                tolerant,
+            )
+        )
     return {method.name: method for method in methods}
 
 
@@ -122,13 +144,13 @@ METHODS = _methods()
 
 
 def find_method(name: str) -> Method:
-    """
-    A method by its name.
+    """A method by its name.
 
-    :param name: The name.
     :return: The method.
     :raises ValueError: If there is none; the message lists all.
     """
     if name not in METHODS:
-        raise ValueError(f"--methods {name}: there is no such method; there are: {', '.join(METHODS)}")
+        raise ValueError(
+            f"--methods {name}: there is no such method; there are: {', '.join(METHODS)}"
+        )
     return METHODS[name]

@@ -15,7 +15,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-# A model that rl_zoo3 trained may hold its schedules. Importing it replaces Gymnasium's TimeLimit, so it comes first.
+# A model that rl_zoo3 trained may hold its schedules. Importing it replaces Gymnasium's TimeLimit,
+# so it comes first.
 import rl_zoo3  # noqa: F401
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -51,8 +52,7 @@ class TrainingError(RuntimeError):
 
 @dataclass(frozen=True)
 class Workplace:
-    """
-    Where models are kept, and how they are trained and run.
+    """Where models are kept, and how they are trained and run.
 
     :param runs: Folder of the trainings, and of locks.
     :param models: Folders with models that were handed over, see :meth:`ModelLibrary.given`.
@@ -73,8 +73,7 @@ class Workplace:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Workplace:
-        """
-        Read what :meth:`to_dict` wrote.
+        """Read what :meth:`to_dict` wrote.
 
         :param data: The dictionary.
         :return: The workplace.
@@ -84,11 +83,7 @@ class Workplace:
 
 
 class ModelLibrary:
-    """
-    The models of a workplace.
-
-    :param workplace: It.
-    """
+    """The models of a workplace."""
 
     def __init__(self, workplace: Workplace) -> None:
         self.workplace = workplace
@@ -103,9 +98,9 @@ class ModelLibrary:
         return self.runs / _place(key) / variant / f"seed{key.seed}"
 
     def given(self, key: ModelKey) -> Path | None:
-        """
-        The file or folder of a model that was handed over: one that was named; ``<Family>/<variant>/seed<seed>`` (a folder,
-        or with ``.zip`` a file) in a folder of models; or ``<Family>`` there, a pretrained model of that variant and seed.
+        """The file or folder of a model that was handed over: one that was named;
+        ``<Family>/<variant>/seed<seed>`` (a folder, or with ``.zip`` a file) in a folder of models;
+        or ``<Family>`` there, a pretrained model of that variant and seed.
 
         :param key: The model.
         :return: Its place; None if it was not handed over.
@@ -117,7 +112,9 @@ class ModelLibrary:
             if (family_id(family), variant, seed) == (key.env_id, key.variant, key.seed):
                 named = Path(path)
                 if not named.exists():
-                    raise ValueError(f"--model {family}:{variant}:{seed}={path}: there is no such file or folder")
+                    raise ValueError(
+                        f"--model {family}:{variant}:{seed}={path}: there is no such file or folder"
+                    )
                 if named.is_dir():
                     _find_content(named)
                 return named
@@ -132,8 +129,7 @@ class ModelLibrary:
         return None
 
     def state(self, key: ModelKey) -> str:
-        """
-        "handed over", "trained", "interrupted" or "missing".
+        """ "handed over", "trained", "interrupted" or "missing".
 
         :param key: The model.
         """
@@ -153,7 +149,9 @@ class ModelLibrary:
         return self.folder(key) / ".lock"
 
     def is_taken(self, key: ModelKey) -> bool:
-        """Whether the model, or one that it is made from, is missing and another process is training it."""
+        """Whether the model, or one that it is made from, is missing and another process is
+        training it.
+        """
         if self.given(key) is not None or (self.folder(key) / FINISHED).exists():
             return False
         base = VARIANTS[key.variant].base
@@ -163,8 +161,8 @@ class ModelLibrary:
             return not free
 
     def ensure(self, key: ModelKey, say: Say = print) -> dict[str, Any]:
-        """
-        Train the model if it is missing, or finish its training; another process that is at it is waited for.
+        """Train the model if it is missing, or finish its training; another process that is at it
+        is waited for.
 
         :param key: The model.
         :param say: Takes a line of progress.
@@ -179,20 +177,23 @@ class ModelLibrary:
             base = VARIANTS[key.variant].base
             if base is not None:
                 self.ensure(_other(key, base), say)
-            with locked(self.lock_file(key), lambda: say(f"waiting for another process that trains {key}")) as lock:
+            with locked(
+                self.lock_file(key), lambda: say(f"waiting for another process that trains {key}")
+            ) as lock:
                 if not (folder / FINISHED).exists():
                     self._derive(key, base) if base is not None else self._train(key, lock, say)
         return read_json(folder / FINISHED)
 
     def load(self, key: ModelKey, env: VecEnv, snapshot: float | None = None) -> Any:
-        """
-        A model that :meth:`ensure` has made sure of.
+        """A model that :meth:`ensure` has made sure of.
 
         :param key: The model.
         :param env: An environment of its family, which it gets.
         :param snapshot: The share of the training after which to take it; None: all.
-        :return: The model, or a :class:`MAMLRewardModel`; with its replay buffer where that was kept.
-        :raises ValueError: If a model that was handed over is another, or was not saved along its training.
+        :return: The model, or a :class:`MAMLRewardModel`; with its replay buffer where that was
+            kept.
+        :raises ValueError: If a model that was handed over is another, or was not saved along its
+            training.
         """
         base = VARIANTS[key.variant].base
         path = self.given(key)
@@ -214,8 +215,7 @@ class ModelLibrary:
         return algorithm.load(self._run(key) / f"{_file_name(key.env_id)}.zip", env, device=device)
 
     def snapshot_file(self, key: ModelKey, snapshot: float) -> Path:
-        """
-        The model that was saved nearest to a share of the training.
+        """The model that was saved nearest to a share of the training.
 
         :param key: The model.
         :param snapshot: The share.
@@ -224,13 +224,18 @@ class ModelLibrary:
         """
         plan = training_plan(key)
         wanted = snapshot * plan.timesteps
-        files = {int(re.findall(r"\d+", file.stem)[-1]): file for file in self.folder(key).glob("*/*/rl_model_*_steps.zip")}
+        files = {
+            int(re.findall(r"\d+", file.stem)[-1]): file
+            for file in self.folder(key).glob("*/*/rl_model_*_steps.zip")
+        }
         files = {
             steps: file for steps, file in files.items() if steps > plan.epoch_steps
         }  # the first epoch is not learnt from
         nearest = min(files, key=lambda steps: abs(steps - wanted), default=None)
         if nearest is None or abs(nearest - wanted) > plan.save_steps:
-            raise ValueError(f"{key} has no model that was saved near {wanted:,.0f} steps; there are: {sorted(files)}")
+            raise ValueError(
+                f"{key} has no model that was saved near {wanted:,.0f} steps; there are: {sorted(files)}"
+            )
         return files[nearest]
 
     def _run(self, key: ModelKey) -> Path:
@@ -242,14 +247,27 @@ class ModelLibrary:
         sessions = _begin_session(folder)
         arguments = _train_arguments(key, plan)
         state = "resuming" if len(sessions) > 1 else "training"
-        say(f"{state} {key}: {plan.timesteps:,} steps, {plan.updates:,} updates; log in {folder / LOG}")
-        others = ["-f", str(folder), "--resume", "--save-freq", str(plan.save_steps), "--device", self.workplace.device]
+        say(
+            f"{state} {key}: {plan.timesteps:,} steps, {plan.updates:,} updates; log in {folder / LOG}"
+        )
+        others = [
+            "-f",
+            str(folder),
+            "--resume",
+            "--save-freq",
+            str(plan.save_steps),
+            "--device",
+            self.workplace.device,
+        ]
         others += ["--num-threads", str(self.workplace.num_threads)]
         module = [sys.executable, "-m", "sb3_poem.benchmark.training_process", str(os.getpid())]
-        threads = {name: str(self.workplace.num_threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
+        threads = {
+            name: str(self.workplace.num_threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")
+        }
         with (folder / LOG).open("a") as log:
-            # In a session of its own an interrupt from the keyboard does not reach it: rl_zoo3 would save half a training as
-            # if it were whole. It inherits the lock, so that nobody else trains while it still ends.
+            # In a session of its own an interrupt from the keyboard does not reach it: rl_zoo3
+            # would save half a training as if it were whole. It inherits the lock, so that nobody
+            # else trains while it still ends.
             child = subprocess.Popen(
                 [*module, *arguments, *others],
                 stdin=subprocess.DEVNULL,
@@ -265,13 +283,19 @@ class ModelLibrary:
                 if child.poll() is None:
                     child.kill()
                     child.wait()
-        finished = sorted(folder.glob(f"*/*/{_file_name(key.env_id)}.zip"), key=lambda file: file.stat().st_mtime)
+        finished = sorted(
+            folder.glob(f"*/*/{_file_name(key.env_id)}.zip"), key=lambda file: file.stat().st_mtime
+        )
         if status != 0 or not finished:
             tail = "\n".join((folder / LOG).read_text(errors="replace").splitlines()[-LOG_LINES:])
-            raise TrainingError(f"the training of {key} ended with status {status}; the end of {folder / LOG}:\n{tail}")
+            raise TrainingError(
+                f"the training of {key} ended with status {status}; the end of {folder / LOG}:\n{tail}"
+            )
         model = ALGORITHMS[plan.algorithm].load(finished[-1], device="cpu")
         if model.num_timesteps < plan.timesteps:
-            raise TrainingError(f"{finished[-1]} stopped after {model.num_timesteps:,} of {plan.timesteps:,} steps; remove it")
+            raise TrainingError(
+                f"{finished[-1]} stopped after {model.num_timesteps:,} of {plan.timesteps:,} steps; remove it"
+            )
         sessions[-1]["seconds"] = time.time() - sessions[-1]["started"]
         write_json_atomically(folder / SESSIONS, {"sessions": sessions})
         info = {
@@ -326,7 +350,9 @@ def _other(key: ModelKey, variant: str) -> ModelKey:
 
 
 def _place(key: ModelKey) -> str:
-    """The folder of an environment's models: two families of one name, from other packages or of other versions, have two."""
+    """The folder of an environment's models: two families of one name, from other packages or of
+    other versions, have two.
+    """
     return _file_name(family_label(key.env_id))
 
 
@@ -336,7 +362,17 @@ def _file_name(env_id: str) -> str:
 
 def _train_arguments(key: ModelKey, plan: TrainingPlan) -> list[str]:
     """Those of ``sb3-poem`` that decide what comes out."""
-    arguments = ["train", "--algo", plan.algorithm, "--env", key.env_id, "--seed", str(key.seed), "--eval-freq", "-1"]
+    arguments = [
+        "train",
+        "--algo",
+        plan.algorithm,
+        "--env",
+        key.env_id,
+        "--seed",
+        str(key.seed),
+        "--eval-freq",
+        "-1",
+    ]
     if key.training.timesteps is not None:
         arguments += ["-n", str(plan.timesteps)]
     if plan.overrides:
@@ -345,11 +381,15 @@ def _train_arguments(key: ModelKey, plan: TrainingPlan) -> list[str]:
 
 
 def _begin_session(folder: Path) -> list[dict[str, float]]:
-    """Note that a training (again) begins. An earlier one that was interrupted counts up to its last checkpoint."""
+    """Note that a training (again) begins. An earlier one that was interrupted counts up to its
+    last checkpoint.
+    """
     file = folder / SESSIONS
     sessions: list[dict[str, float]] = read_json(file)["sessions"] if file.exists() else []
     if sessions and "seconds" not in sessions[-1]:
-        saved = max((path.stat().st_mtime for path in folder.glob(f"*/*/{CHECKPOINT}")), default=0.0)
+        saved = max(
+            (path.stat().st_mtime for path in folder.glob(f"*/*/{CHECKPOINT}")), default=0.0
+        )
         sessions[-1]["seconds"] = max(0.0, saved - sessions[-1]["started"])
     sessions.append({"started": time.time()})
     write_json_atomically(file, {"sessions": sessions})
@@ -365,7 +405,9 @@ def _content(folder: Path) -> Path | None:
 def _find_content(folder: Path) -> Path:
     file = _content(folder)
     if file is None:
-        raise ValueError(f"{folder} holds no model: neither {CHECKPOINT}, nor {MODEL}, nor {CONFIG}")
+        raise ValueError(
+            f"{folder} holds no model: neither {CHECKPOINT}, nor {MODEL}, nor {CONFIG}"
+        )
     return file
 
 
@@ -383,26 +425,42 @@ def _is_variant(config: dict[str, Any], key: ModelKey) -> bool:
     variant, arguments = VARIANTS[key.variant], config["arguments"]
     if variant.base is not None or config["algorithm"] != ALGORITHMS[variant.algorithm].__name__:
         return False
-    facts = _distinguishing(arguments.get("similarity"), arguments.get("context"), arguments["latent_dim"])
-    return (config["env_id"], arguments.get("seed"), facts) == (key.env_id, key.seed, _expected(key))
+    facts = _distinguishing(
+        arguments.get("similarity"), arguments.get("context"), arguments["latent_dim"]
+    )
+    return (config["env_id"], arguments.get("seed"), facts) == (
+        key.env_id,
+        key.seed,
+        _expected(key),
+    )
 
 
 def _check_variant(model: Any, key: ModelKey, path: Path) -> None:
     """Refuse a model that is not the one as which it was handed over."""
-    facts = _distinguishing(getattr(model, "similarity", None), getattr(model, "context", None), int(model.latent_dim))
+    facts = _distinguishing(
+        getattr(model, "similarity", None), getattr(model, "context", None), int(model.latent_dim)
+    )
     found, expected = (model.env_id, model.seed, facts), (key.env_id, key.seed, _expected(key))
     if found != expected:
         names = ("env_id", "seed", "(similarity, context, latent_dim)")
-        wrong = [f"{n} {f!r} instead of {e!r}" for n, f, e in zip(names, found, expected, strict=True) if f != e]
+        wrong = [
+            f"{n} {f!r} instead of {e!r}"
+            for n, f, e in zip(names, found, expected, strict=True)
+            if f != e
+        ]
         raise ValueError(f"{path} was handed over as {key}, but has {', '.join(wrong)}")
 
 
-def _distinguishing(similarity: str | None, context: str | None, latent_dim: int) -> tuple[str | None, str | None, int]:
+def _distinguishing(
+    similarity: str | None, context: str | None, latent_dim: int
+) -> tuple[str | None, str | None, int]:
     return similarity, context, latent_dim
 
 
 def _expected(key: ModelKey) -> tuple[str | None, str | None, int]:
-    """What a model of this key is like: as its family's entry would make it, or as the algorithm's defaults do without one."""
+    """What a model of this key is like: as its family's entry would make it, or as the algorithm's
+    defaults do without one.
+    """
     variant = VARIANTS[key.variant]
     hyperparameters = variant.hyperparameters
     with contextlib.suppress(MissingEntryError):  # a family that nothing is trained on here
@@ -410,7 +468,11 @@ def _expected(key: ModelKey) -> tuple[str | None, str | None, int]:
     dim = int(hyperparameters.get("latent_dim", 5))
     if variant.algorithm == "pearl_sac":
         return None, None, dim
-    return hyperparameters.get("similarity", "two-encoder"), hyperparameters.get("context", "optimal"), dim
+    return (
+        hyperparameters.get("similarity", "two-encoder"),
+        hyperparameters.get("context", "optimal"),
+        dim,
+    )
 
 
 def _describe_given(path: Path) -> dict[str, Any]:
@@ -421,7 +483,11 @@ def _describe_given(path: Path) -> dict[str, Any]:
     if file.name == CONFIG:
         config = read_config(path)
         card = {name: value for name, value in config["card"].items() if name != "results"}
-        info |= {"env_steps": config["num_timesteps"], "updates": config["n_updates"], "arguments": config["arguments"]}
+        info |= {
+            "env_steps": config["num_timesteps"],
+            "updates": config["n_updates"],
+            "arguments": config["arguments"],
+        }
         info |= {"seconds": card.get("wall_seconds"), "card": card}
         file = path / WEIGHTS
     info["sha256"] = hashlib.sha256(file.read_bytes()).hexdigest()

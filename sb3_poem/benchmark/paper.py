@@ -72,8 +72,7 @@ QUERIES = (1, 5, 10)
 
 
 def paper_figure(family: str, row: str | None, queries: int) -> tuple[float, float] | None:
-    """
-    What the paper reports.
+    """What the paper reports.
 
     :param family: The family's name.
     :param row: A row of the table.

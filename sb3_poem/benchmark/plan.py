@@ -1,4 +1,6 @@
-"""What a run will do: which cells are done, which are to do, which cannot be done, and what must be trained for them."""
+"""What a run will do: which cells are done, which are to do, which cannot be done, and what must be
+trained for them.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +18,7 @@ from sb3_poem.benchmark.suites import Budget, Cell, ModelKey, Suite, Training
 
 @dataclass
 class Plan:
-    """
-    A run.
+    """A run.
 
     :param todo: Cells to be run, in order.
     :param done: Cells that the store has.
@@ -29,7 +30,9 @@ class Plan:
     skipped: list[tuple[Cell, str]] = field(default_factory=list)
 
     def __str__(self) -> str:
-        return f"{len(self.done)} cells done, {len(self.todo)} to do, {len(self.skipped)} not possible"
+        return (
+            f"{len(self.done)} cells done, {len(self.todo)} to do, {len(self.skipped)} not possible"
+        )
 
     @property
     def models(self) -> list[ModelKey]:
@@ -55,20 +58,18 @@ def make_plan(
     training: Training,
     snapshots: int | None = None,
 ) -> Plan:
-    """
-    Look at what there is.
+    """Look at what there is.
 
-    :param suite: The suite.
     :param library: Models.
     :param store: Results; None: none yet.
     :param families: Names or ids; None: the suite's own.
     :param methods: Only these; None: all of the suite, without those that cannot run on a family.
-    :param seeds: Seeds.
     :param budget: Numbers of tasks and episodes.
     :param training: What differs from the hyperparameter files.
     :param snapshots: See :meth:`Suite.cells`.
     :return: The plan.
-    :raises ValueError: If a family or method does not exist, or a method that was named cannot run on a family.
+    :raises ValueError: If a family or method does not exist, or a method that was named cannot run
+        on a family.
     """
     plan = Plan()
     facts = {fact.env_id: fact for fact in map(family_facts, families or suite.families)}
@@ -82,7 +83,9 @@ def make_plan(
         elif objection is not None:
             plan.skipped.append((cell, f"{cell.method} cannot run on {cell.family}: {objection}"))
         elif cell.snapshot is not None and not library.has_snapshots(cell.model_key):
-            plan.skipped.append((cell, "the model was handed over, without those along its training"))
+            plan.skipped.append(
+                (cell, "the model was handed over, without those along its training")
+            )
         else:
             plan.todo.append(cell)
     for key in plan.models:  # refuses now what would fail after hours
@@ -93,10 +96,9 @@ def make_plan(
 
 
 def describe(plan: Plan, library: ModelLibrary) -> list[str]:
-    """
-    The plan in lines, with an estimate of its time on this machine, which takes a few seconds for each family.
+    """The plan in lines, with an estimate of its time on this machine, which takes a few seconds
+    for each family.
 
-    :param plan: The plan.
     :param library: Models.
     :return: Lines.
     """
@@ -125,7 +127,9 @@ def describe(plan: Plan, library: ModelLibrary) -> list[str]:
                 text += f", {training.timesteps:,} steps, {training.updates:,} updates"
             else:
                 text += f", from the experience of {base}"
-            text += f", about {_minutes(estimate)}" + (" if from scratch" if state == "interrupted" else "")
+            text += f", about {_minutes(estimate)}" + (
+                " if from scratch" if state == "interrupted" else ""
+            )
         elif state == "handed over":
             text += f" ({library.given(key)})"
         lines.append(text)
@@ -133,18 +137,29 @@ def describe(plan: Plan, library: ModelLibrary) -> list[str]:
         lines.append("cells:")
         lines += [f"  {cell}" for cell in plan.todo]
         seconds += sum(cell_seconds(cell, pace(cell.env_id)) for cell in plan.todo)
-        lines.append(f"about {_minutes(seconds)} in one process, if this machine stays as busy as it is")
+        lines.append(
+            f"about {_minutes(seconds)} in one process, if this machine stays as busy as it is"
+        )
     return lines
 
 
 def _in_order(cells: list[Cell]) -> list[Cell]:
-    """By family and seed as they come, then by model, its final cells before those along its training."""
+    """By family and seed as they come, then by model, its final cells before those along its
+    training.
+    """
     groups: dict[tuple[str, int], int] = {}
     models: dict[ModelKey, int] = {}
     for cell in cells:
         groups.setdefault((cell.env_id, cell.seed), len(groups))
         models.setdefault(cell.model_key, len(models))
-    return sorted(cells, key=lambda cell: (groups[cell.env_id, cell.seed], models[cell.model_key], cell.snapshot is not None))
+    return sorted(
+        cells,
+        key=lambda cell: (
+            groups[cell.env_id, cell.seed],
+            models[cell.model_key],
+            cell.snapshot is not None,
+        ),
+    )
 
 
 def _minutes(seconds: float) -> str:

@@ -23,8 +23,9 @@ def provenance() -> dict[str, Any]:
 
 
 def commit() -> str | None:
-    """The checkout's commit, with a plus sign if the code was changed since; None where this is no checkout. A copy of
-    the tree without its repository, as in a container, may name it by the environment variable ``SB3_POEM_COMMIT``.
+    """The checkout's commit, with a plus sign if the code was changed since; None where this is no
+    checkout. A copy of the tree without its repository, as in a container, may name it by the
+    environment variable ``SB3_POEM_COMMIT``.
     """
     if COMMIT_VARIABLE in os.environ:
         return os.environ[COMMIT_VARIABLE]
@@ -50,11 +51,17 @@ def versions() -> dict[str, str]:
 
 
 def machine() -> str:
-    """The processor by what it can do: cores that this process may use, architecture, vector instructions; and the GPU."""
+    """The processor by what it can do: cores that this process may use, architecture, vector
+    instructions; and the GPU.
+    """
     cpuinfo = Path("/proc/cpuinfo")
     flags: set[str] = set()
     if cpuinfo.exists():
-        flags = set(next((line for line in cpuinfo.read_text().splitlines() if line.startswith("flags")), "").split())
+        flags = set(
+            next(
+                (line for line in cpuinfo.read_text().splitlines() if line.startswith("flags")), ""
+            ).split()
+        )
     known = [name for name in INSTRUCTION_SETS if name in flags]
     words = [f"{available_cores()} of {os.cpu_count()} cores", platform.machine(), *known]
     import torch as th
@@ -66,7 +73,9 @@ def machine() -> str:
 
 def _git(folder: Path, *arguments: str) -> str | None:
     try:
-        done = subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            ["git", *arguments], cwd=folder, capture_output=True, text=True, check=True
+        )
     except (OSError, subprocess.CalledProcessError):
         return None
     return done.stdout.strip()

@@ -22,8 +22,7 @@ def make_report(
     out: Path | None = None,
     seeds: Sequence[int] | None = None,
 ) -> tuple[str, list[Path]]:
-    """
-    Tables as text and, in a folder, the figures beside them.
+    """Tables as text and, in a folder, the figures beside them.
 
     :param store: The results.
     :param suites: Names of suites; None: all of which there is something.
@@ -37,11 +36,16 @@ def make_report(
     records = [record for record in store.records() if seeds is None or record.seed in seeds]
     texts, files = [], []
     for name in suites or SUITES:
-        # A small family's cells belong to the suite that declares it, unless a suite is asked for by its name.
+        # A small family's cells belong to the suite that declares it, unless a suite is asked for
+        # by its name.
         own = SUITES[name].families if suites is None and families is None else families
         selection = Selection(SUITES[name], records, own)
         tables = suite_tables(selection)
-        if not any(selection.series(entry, c) for entry in selection.suite.entries for c in selection.conditions):
+        if not any(
+            selection.series(entry, c)
+            for entry in selection.suite.entries
+            for c in selection.conditions
+        ):
             if suites:
                 raise ValueError(f"--suite {name}: {store.path} holds no finished cell of it")
             continue
@@ -56,5 +60,7 @@ def make_report(
             files += [file, *write_figures(selection, out)]
     if not texts:
         of = [*(families or []), *(f"seed {seed}" for seed in seeds or [])]
-        raise ValueError(f"{store.path} holds no finished cell" + (f" of {', '.join(of)}" if of else ""))
+        raise ValueError(
+            f"{store.path} holds no finished cell" + (f" of {', '.join(of)}" if of else "")
+        )
     return "\n".join(texts), files

@@ -13,12 +13,13 @@ from sb3_poem.benchmark.store import Store
 from sb3_poem.benchmark.suites import Cell
 
 
-def run_cells(cells: Sequence[Cell], library: ModelLibrary, store: Store, say: Say = print) -> list[str]:
-    """
-    Run cells, and keep each as soon as it is finished. It may be interrupted at any moment; what another process is at, or
-    has finished, is left to it, and cells whose model another process is training come last.
+def run_cells(
+    cells: Sequence[Cell], library: ModelLibrary, store: Store, say: Say = print
+) -> list[str]:
+    """Run cells, and keep each as soon as it is finished. It may be interrupted at any moment; what
+    another process is at, or has finished, is left to it, and cells whose model another process is
+    training come last.
 
-    :param cells: The cells.
     :param library: The models.
     :param store: The results.
     :param say: Takes lines of progress.
@@ -34,13 +35,22 @@ def run_cells(cells: Sequence[Cell], library: ModelLibrary, store: Store, say: S
                 continue
             _run_one(cell, library, store, say, failures, broken, f"[{position}/{len(cells)}]")
     for cell in postponed:  # whoever has them, or trains for them, may have died
-        with locked(_lock_file(cell, library, store), lambda cell=cell: say(f"waiting for another process: {cell}")):  # type: ignore[misc]
+        with locked(
+            _lock_file(cell, library, store),
+            lambda cell=cell: say(f"waiting for another process: {cell}"),  # type: ignore[misc]
+        ):
             _run_one(cell, library, store, say, failures, broken, "[postponed]")
     return failures
 
 
 def _run_one(
-    cell: Cell, library: ModelLibrary, store: Store, say: Say, failures: list[str], broken: dict[object, str], place: str
+    cell: Cell,
+    library: ModelLibrary,
+    store: Store,
+    say: Say,
+    failures: list[str],
+    broken: dict[object, str],
+    place: str,
 ) -> None:
     if cell.key in store:
         return

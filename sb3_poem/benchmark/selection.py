@@ -13,13 +13,21 @@ from sb3_poem.adaptation.evaluation import KnownTaskReturn
 from sb3_poem.benchmark.cells import make_oracle_factory
 from sb3_poem.benchmark.methods import METHODS
 from sb3_poem.benchmark.store import Record
-from sb3_poem.benchmark.suites import Budget, Entry, OracleSpec, Suite, Training, family_label, family_name, hashable
+from sb3_poem.benchmark.suites import (
+    Budget,
+    Entry,
+    OracleSpec,
+    Suite,
+    Training,
+    family_label,
+    family_name,
+    hashable,
+)
 
 
 @dataclass(frozen=True)
 class Condition:
-    """
-    What must be equal for cells to stand in one table.
+    """What must be equal for cells to stand in one table.
 
     :param env_id: The family.
     :param tasks: Number of test tasks.
@@ -45,7 +53,9 @@ class Condition:
         return Budget(self.tasks, self.episodes, task_seed=self.task_seed)
 
     def __str__(self) -> str:
-        words = [f"{family_label(self.env_id)}: {self.tasks} test tasks, {self.episodes} episodes each"]
+        words = [
+            f"{family_label(self.env_id)}: {self.tasks} test tasks, {self.episodes} episodes each"
+        ]
         if self.training.timesteps is not None:
             words.append(f"trained for {self.training.timesteps:,} steps")
         words += [f"{name} = {value}" for name, value in self.training.hyperparameters]
@@ -54,8 +64,7 @@ class Condition:
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """
-    One method under one condition and one oracle, over seeds.
+    """One method under one condition and one oracle, over seeds.
 
     :param method: Its name.
     :param oracle: Who answered.
@@ -91,8 +100,7 @@ class Series:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """
-    What the policies of one kind of model could earn.
+    """What the policies of one kind of model could earn.
 
     :param method: Its name.
     :param records: Of the seeds.
@@ -112,8 +120,7 @@ class Reference:
         return np.array([np.mean(record.result["task_returns"]) for record in self.records])
 
     def limits(self, queries: int, oracle: OracleSpec) -> np.ndarray:
-        """
-        The information limit, (n_seeds,).
+        """The information limit, (n_seeds,).
 
         :param queries: How many answers.
         :param oracle: Who answers.
@@ -123,34 +130,38 @@ class Reference:
 
 
 class Selection:
-    """
-    What there is of a suite.
+    """What there is of a suite.
 
-    :param suite: The suite.
     :param records: Of a store.
     :param families: Only these; None: all.
     """
 
-    def __init__(self, suite: Suite, records: Iterable[Record], families: Sequence[str] | None = None) -> None:
+    def __init__(
+        self, suite: Suite, records: Iterable[Record], families: Sequence[str] | None = None
+    ) -> None:
         self.suite = suite
-        self.records = {record.key: record for record in records if families is None or record.family in families}
+        self.records = {
+            record.key: record
+            for record in records
+            if families is None or record.family in families
+        }
         self.conditions = sorted(
             {_condition(record.identity) for record in self.records.values()},
             key=lambda c: (_family_order(suite, c.family), c.env_id, str(c)),
         )
         self.seeds = sorted({record.seed for record in self.records.values()})
-        self._shares: dict[Condition, set[float]] = {condition: set() for condition in self.conditions}
+        self._shares: dict[Condition, set[float]] = {
+            condition: set() for condition in self.conditions
+        }
         for record in self.records.values():
             if record.identity["snapshot"] is not None:
                 self._shares[_condition(record.identity)].add(record.identity["snapshot"])
         self._references: dict[Condition, list[Reference]] = {}
 
     def series(self, entry: Entry, condition: Condition) -> list[Series]:
-        """
-        The finished cells of an entry under a condition, final models and those along the training.
+        """The finished cells of an entry under a condition, final models and those along the
+        training.
 
-        :param entry: The entry.
-        :param condition: The condition.
         :return: In the order of the entry.
         """
         found: dict[tuple[str, OracleSpec, float | None], list[Record]] = {}
@@ -158,10 +169,14 @@ class Selection:
             arguments = (condition.env_id, seed, condition.budget, condition.training)
             for cell in self.suite.entry_cells(entry, *arguments, sorted(self._shares[condition])):
                 if cell.key in self.records:
-                    found.setdefault((cell.method, cell.oracle, cell.snapshot), []).append(self.records[cell.key])
+                    found.setdefault((cell.method, cell.oracle, cell.snapshot), []).append(
+                        self.records[cell.key]
+                    )
         order = {name: position for position, name in enumerate(entry.methods)}
         result = []
-        for (method, oracle, snapshot), records in sorted(found.items(), key=lambda item: order[item[0][0]]):
+        for (method, oracle, snapshot), records in sorted(
+            found.items(), key=lambda item: order[item[0][0]]
+        ):
             returns = np.stack([np.array(record.result["task_returns"]) for record in records])
             seeds = tuple(record.seed for record in records)
             queries = tuple(records[0].result["queries"])
@@ -169,10 +184,8 @@ class Selection:
         return result
 
     def references(self, condition: Condition) -> list[Reference]:
-        """
-        What the models' policies could earn under a condition.
+        """What the models' policies could earn under a condition.
 
-        :param condition: The condition.
         :return: In the order of the suite.
         """
         if condition not in self._references:
@@ -183,10 +196,16 @@ class Selection:
         entry = Entry("references", "", self.suite.references)
         found: dict[str, list[Record]] = {}
         for seed in self.seeds:
-            for cell in self.suite.entry_cells(entry, condition.env_id, seed, condition.budget, condition.training):
+            for cell in self.suite.entry_cells(
+                entry, condition.env_id, seed, condition.budget, condition.training
+            ):
                 if cell.key in self.records:
                     found.setdefault(cell.method, []).append(self.records[cell.key])
-        return [Reference(method, tuple(found[method])) for method in self.suite.references if method in found]
+        return [
+            Reference(method, tuple(found[method]))
+            for method in self.suite.references
+            if method in found
+        ]
 
 
 @cache
@@ -197,14 +216,18 @@ def _limits(reference: Reference, queries: int, oracle: OracleSpec) -> tuple[flo
     for record in reference.records:
         returns = np.array(record.result["candidate_returns"])
         tasks, empty = np.array(record.result["tasks"]), np.empty((0, 0))
-        known = KnownTaskReturn(tasks, np.array(record.result["task_returns"])[:, None], empty, empty, returns)
+        known = KnownTaskReturn(
+            tasks, np.array(record.result["task_returns"])[:, None], empty, empty, returns
+        )
         limits.append(known.limit(queries, noise))
     return tuple(limits)
 
 
 def _condition(identity: dict[str, Any]) -> Condition:
     training = identity["training"]
-    hyperparameters = tuple(sorted((name, hashable(value)) for name, value in training["hyperparameters"].items()))
+    hyperparameters = tuple(
+        sorted((name, hashable(value)) for name, value in training["hyperparameters"].items())
+    )
     return Condition(
         identity["env_id"],
         identity["tasks"],

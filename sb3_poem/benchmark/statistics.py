@@ -15,8 +15,7 @@ BOOTSTRAP_SAMPLES = 2000
 
 @dataclass(frozen=True)
 class Summary:
-    """
-    What several seeds earned.
+    """What several seeds earned.
 
     :param n_seeds: How many.
     :param mean: Of the seeds' mean returns.
@@ -35,18 +34,20 @@ class Summary:
 
 
 def summarise(returns: np.ndarray, intervals: bool = True) -> list[Summary]:
-    """
-    Summarise one method on one family after several numbers of answers.
+    """Summarise one method on one family after several numbers of answers.
 
-    :param returns: (n_seeds, n_tasks, n_records) mean returns; column j is the same test task for all seeds.
+    :param returns: (n_seeds, n_tasks, n_records) mean returns; column j is the same test task for
+        all seeds.
     :param intervals: Whether intervals are wanted, which take about a second.
-    :return: A summary for each record. The intervals are rliable's: percentiles of stratified bootstrap samples, which draw
-        the seeds anew for every task.
+    :return: A summary for each record. The intervals are rliable's: percentiles of stratified
+        bootstrap samples, which draw the seeds anew for every task.
     :raises ValueError: If the shape is wrong, or a value not finite.
     """
     returns = np.asarray(returns, dtype=np.float64)
     if returns.ndim != 3 or 0 in returns.shape or not np.isfinite(returns).all():
-        raise ValueError(f"`returns` must be finite, (n_seeds, n_tasks, n_records), none 0, but has shape {returns.shape}")
+        raise ValueError(
+            f"`returns` must be finite, (n_seeds, n_tasks, n_records), none 0, but has shape {returns.shape}"
+        )
     seeds = returns.mean(axis=1)
     iqms = [float(metrics.aggregate_iqm(returns[:, :, i])) for i in range(returns.shape[2])]
     deviations = seeds.std(axis=0, ddof=1).tolist() if len(seeds) > 1 else [None] * len(iqms)
@@ -54,7 +55,9 @@ def summarise(returns: np.ndarray, intervals: bool = True) -> list[Summary]:
     high = low
     if intervals and len(seeds) > 1:
         with _seeded(0):
-            _, bounds = library.get_interval_estimates({"method": returns}, _iqms, reps=BOOTSTRAP_SAMPLES)
+            _, bounds = library.get_interval_estimates(
+                {"method": returns}, _iqms, reps=BOOTSTRAP_SAMPLES
+            )
         low, high = bounds["method"].tolist()
     figures = zip(seeds.mean(axis=0).tolist(), deviations, iqms, low, high, strict=True)
     return [Summary(len(returns), *figure) for figure in figures]
@@ -67,7 +70,9 @@ def _iqms(scores: np.ndarray) -> np.ndarray:
 
 @contextlib.contextmanager
 def _seeded(seed: int) -> Iterator[None]:
-    """rliable draws from the global generator: seed it, so that a report is the same twice, and hand it back as it was."""
+    """rliable draws from the global generator: seed it, so that a report is the same twice, and
+    hand it back as it was.
+    """
     state = np.random.get_state()  # noqa: NPY002
     np.random.seed(seed)  # noqa: NPY002
     try:

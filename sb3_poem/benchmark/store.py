@@ -37,7 +37,10 @@ class _Packed(sa.types.TypeDecorator[dict[str, Any]]):
 
 _METADATA = sa.MetaData()
 _ABOUT = sa.Table(
-    "about", _METADATA, sa.Column("name", sa.String, primary_key=True), sa.Column("value", sa.String, nullable=False)
+    "about",
+    _METADATA,
+    sa.Column("name", sa.String, primary_key=True),
+    sa.Column("value", sa.String, nullable=False),
 )
 _CELLS = sa.Table(
     "cells",
@@ -55,13 +58,11 @@ _CELLS = sa.Table(
 
 @dataclass(frozen=True)
 class Record:
-    """
-    A finished cell.
+    """A finished cell.
 
     :param key: :attr:`Cell.key`.
     :param family: The family's name.
     :param method: The method under whose name it was run first.
-    :param seed: Its seed.
     :param identity: :meth:`Cell.identity`.
     :param result: Every task's return after every recorded number of answers, samples and times.
     :param provenance: Commit, versions, machine, and how the model was trained.
@@ -83,9 +84,8 @@ class Record:
 
 
 class Store:
-    """
-    A store of finished cells. Several processes may use one file: every access is a transaction of its own, and a cell that
-    is there stays as it is.
+    """A store of finished cells. Several processes may use one file: every access is a transaction
+    of its own, and a cell that is there stays as it is.
 
     :param path: The file.
     :param create: Whether to make it where it is missing.
@@ -97,21 +97,29 @@ class Store:
         self.path = Path(path)
         if not self.path.exists():
             if not create:
-                raise FileNotFoundError(f"--store {path}: there is no such file; `sb3-poem benchmark run` makes it")
+                raise FileNotFoundError(
+                    f"--store {path}: there is no such file; `sb3-poem benchmark run` makes it"
+                )
             self.path.parent.mkdir(parents=True, exist_ok=True)
         arguments = {"timeout": BUSY_SECONDS}
-        self._engine = sa.create_engine(f"sqlite:///{self.path}", poolclass=NullPool, connect_args=arguments)
+        self._engine = sa.create_engine(
+            f"sqlite:///{self.path}", poolclass=NullPool, connect_args=arguments
+        )
         try:
             self._open(create)
         except sa.exc.DatabaseError as error:
-            raise ValueError(f"--store {path} cannot be used as a store of the benchmark: {error.orig}") from error
+            raise ValueError(
+                f"--store {path} cannot be used as a store of the benchmark: {error.orig}"
+            ) from error
 
     def _open(self, create: bool) -> None:
         with self._engine.connect() as connection:
             tables = set(sa.inspect(connection).get_table_names())
         if "about" not in tables:
             if tables or not create:
-                raise ValueError(f"--store {self.path} is a database of another program: it has no table `about`")
+                raise ValueError(
+                    f"--store {self.path} is a database of another program: it has no table `about`"
+                )
             self._create()
         about = self._about()
         if not about and create:  # another process is creating it, or was ended while it did
@@ -138,7 +146,12 @@ class Store:
     def __enter__(self) -> Store:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
         self.close()
 
     def close(self) -> None:
@@ -147,7 +160,10 @@ class Store:
 
     def __contains__(self, key: str) -> bool:
         with self._engine.connect() as connection:
-            return connection.execute(sa.select(_CELLS.c.key).where(_CELLS.c.key == key)).first() is not None
+            return (
+                connection.execute(sa.select(_CELLS.c.key).where(_CELLS.c.key == key)).first()
+                is not None
+            )
 
     def keys(self) -> set[str]:
         """Of all finished cells."""
@@ -155,10 +171,8 @@ class Store:
             return set(connection.execute(sa.select(_CELLS.c.key)).scalars())
 
     def add(self, record: Record) -> bool:
-        """
-        Keep a finished cell.
+        """Keep a finished cell.
 
-        :param record: It.
         :return: Whether it is new; if not, what is there stays.
         """
         row = record.to_dict()
@@ -167,8 +181,7 @@ class Store:
             return connection.execute(insert(_CELLS).on_conflict_do_nothing(), row).rowcount == 1
 
     def records(self, keys: Iterable[str] | None = None) -> Iterator[Record]:
-        """
-        Finished cells, in the order of their names.
+        """Finished cells, in the order of their names.
 
         :param keys: Only these; None: all.
         :return: The records.

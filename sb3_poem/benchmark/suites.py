@@ -23,17 +23,24 @@ PAPER_FAMILIES = (
 )
 CHEETAHS = PAPER_FAMILIES[:2]
 RECORD_AT = (0, 1, 2, 3, 5, 7, 10)
-TABLE_METHODS = ("poem-bayes", "poem-paper", "anole", "anole-greedy", "anole-random", "maml-reward", "reward-oracle")
+TABLE_METHODS = (
+    "poem-bayes",
+    "poem-paper",
+    "anole",
+    "anole-greedy",
+    "anole-random",
+    "maml-reward",
+    "reward-oracle",
+)
 TABLE_REFERENCES = ("known-task", "known-task-pearl")
-# MAML-reward trains a reward only, so its return does not depend on how long a policy was trained; greedy search takes as long
-# as all the others together, and lies beside ANOLE.
+# MAML-reward trains a reward only, so its return does not depend on how long a policy was trained;
+# greedy search takes as long as all the others together, and lies beside ANOLE.
 WITHOUT_CURVE = ("maml-reward", "anole-greedy")
 
 
 @dataclass(frozen=True)
 class OracleSpec:
-    """
-    Who answers.
+    """Who answers.
 
     :param kind: "return", "boltzmann" or "mistake".
     :param value: The Boltzmann oracle's beta (None is the paper's), or the rate of mistakes.
@@ -58,12 +65,12 @@ NOISES = (BOLTZMANN, OracleSpec("mistake", 0.1), OracleSpec("mistake", 0.2))
 
 @dataclass(frozen=True)
 class Budget:
-    """
-    What a cell may spend on evaluation.
+    """What a cell may spend on evaluation.
 
     :param tasks: Test tasks, drawn alike for all methods and seeds.
     :param episodes: Episodes per task and measurement.
-    :param record_at: Numbers of answers after which returns are measured; the largest is the number of questions.
+    :param record_at: Numbers of answers after which returns are measured; the largest is the number
+        of questions.
     :param task_seed: Of the test tasks.
     """
 
@@ -75,8 +82,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class Training:
-    """
-    What differs from the hyperparameter files, for all models of a run.
+    """What differs from the hyperparameter files, for all models of a run.
 
     :param timesteps: Environment steps; None takes those of the files.
     :param hyperparameters: Names and values, sorted by name.
@@ -97,8 +103,7 @@ class Training:
 
 @dataclass(frozen=True)
 class ModelKey:
-    """
-    Which trained model.
+    """Which trained model.
 
     :param env_id: The family.
     :param variant: A name of :data:`VARIANTS`.
@@ -122,8 +127,7 @@ class ModelKey:
 
 @dataclass(frozen=True)
 class Cell:
-    """
-    One entry of the store: a method with its settings on a family, with one seed.
+    """One entry of the store: a method with its settings on a family, with one seed.
 
     :param env_id: The family.
     :param method: A name of :data:`METHODS`.
@@ -165,7 +169,9 @@ class Cell:
         return {**self.definition.options, **dict(self.overrides)}
 
     def identity(self) -> dict[str, Any]:
-        """What makes two cells the same, JSON-ready. It names neither a suite nor where the model comes from."""
+        """What makes two cells the same, JSON-ready. It names neither a suite nor where the model
+        comes from.
+        """
         method = self.definition
         known = method.kind == "known"
         return {
@@ -202,8 +208,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Entry:
-    """
-    Methods that a suite compares under the same conditions: a table, and a figure.
+    """Methods that a suite compares under the same conditions: a table, and a figure.
 
     :param name: Of the comparison; part of its figures' names.
     :param title: As in reports.
@@ -225,17 +230,19 @@ class Entry:
 
 @dataclass(frozen=True)
 class Suite:
-    """
-    A declared set of cells.
+    """A declared set of cells.
 
     :param name: As on the command line.
     :param title: As in reports.
     :param families: What it runs on unless told otherwise.
     :param entries: What it compares.
-    :param references: Methods that say what the models' policies could earn, for the limits in the tables.
-    :param snapshots: In how many equal parts the training is cut for measurements along it; 1 measures its end only.
+    :param references: Methods that say what the models' policies could earn, for the limits in the
+        tables.
+    :param snapshots: In how many equal parts the training is cut for measurements along it; 1
+        measures its end only.
     :param budget: Unless told otherwise.
-    :param overrides: Options of adapters by kind of method, where the suite differs from their defaults.
+    :param overrides: Options of adapters by kind of method, where the suite differs from their
+        defaults.
     """
 
     name: str
@@ -250,7 +257,11 @@ class Suite:
     @property
     def methods(self) -> tuple[str, ...]:
         """All that it compares, each once."""
-        return tuple(dict.fromkeys([name for entry in self.entries for name in entry.methods] + [*self.references]))
+        return tuple(
+            dict.fromkeys(
+                [name for entry in self.entries for name in entry.methods] + [*self.references]
+            )
+        )
 
     def cells(
         self,
@@ -261,13 +272,12 @@ class Suite:
         training: Training | None = None,
         snapshots: int | None = None,
     ) -> list[Cell]:
-        """
-        The suite's cells, each once, in the order in which they should be run.
+        """The suite's cells, each once, in the order in which they should be run.
 
         :param env_ids: Families.
-        :param seeds: Seeds.
         :param methods: Only these; None: all.
-        :param budget: Numbers of tasks and episodes, if not the suite's own; ``record_at`` is the entries'.
+        :param budget: Numbers of tasks and episodes, if not the suite's own; ``record_at`` is the
+            entries'.
         :param training: See :class:`Training`.
         :param snapshots: See the class; None takes the suite's own.
         :return: The cells.
@@ -275,7 +285,9 @@ class Suite:
         """
         for name in methods or ():
             if find_method(name).name not in self.methods:
-                raise ValueError(f"--methods {name} is not in the suite {self.name!r}, which has: {', '.join(self.methods)}")
+                raise ValueError(
+                    f"--methods {name} is not in the suite {self.name!r}, which has: {', '.join(self.methods)}"
+                )
         budget, training = budget or self.budget, training or Training()
         parts = self.snapshots if snapshots is None else snapshots
         shares = [round(part / parts, 4) for part in range(1, parts)]
@@ -289,17 +301,21 @@ class Suite:
         return list(cells.values())
 
     def entry_cells(
-        self, entry: Entry, env_id: str, seed: int, budget: Budget, training: Training, shares: Sequence[float] = ()
+        self,
+        entry: Entry,
+        env_id: str,
+        seed: int,
+        budget: Budget,
+        training: Training,
+        shares: Sequence[float] = (),
     ) -> list[Cell]:
-        """
-        The cells of one entry, for one family and seed.
+        """The cells of one entry, for one family and seed.
 
-        :param entry: The entry.
         :param env_id: The family.
-        :param seed: The seed.
         :param budget: See :meth:`cells`.
         :param training: See :meth:`cells`.
-        :param shares: After which shares of the training the methods are measured too, where the entry has curves.
+        :param shares: After which shares of the training the methods are measured too, where the
+            entry has curves.
         :return: The cells.
         """
         cells = []
@@ -312,18 +328,23 @@ class Suite:
                     moments += [(share, entry.record_at[-1:]) for share in shares]
                 for share, record_at in moments:
                     spent = replace(budget, record_at=record_at)
-                    cells.append(Cell(env_id, name, seed, oracle, spent, training, share, overrides))
+                    cells.append(
+                        Cell(env_id, name, seed, oracle, spent, training, share, overrides)
+                    )
         return cells
 
 
 def hashable(value: Any) -> Any:
-    """A hyperparameter's value, with tuples for lists: a model is looked up by its hyperparameters, and JSON has no tuples.
+    """A hyperparameter's value, with tuples for lists: a model is looked up by its hyperparameters,
+    and JSON has no tuples.
 
     :param value: Of YAML or JSON
     :raises ValueError: if it is, or holds, a dictionary
     """
     if isinstance(value, dict):
-        raise ValueError(f'{value!r} is a dictionary; write it as text, as rl_zoo3\'s files do: "dict(...)"')
+        raise ValueError(
+            f'{value!r} is a dictionary; write it as text, as rl_zoo3\'s files do: "dict(...)"'
+        )
     return tuple(map(hashable, value)) if isinstance(value, (list, tuple)) else value
 
 
@@ -333,7 +354,9 @@ def family_name(env_id: str) -> str:
 
 
 def family_label(env_id: str) -> str:
-    """What no other environment is called: AntGoal for poem/AntGoal-v0; ids of other namespaces or versions stay."""
+    """What no other environment is called: AntGoal for poem/AntGoal-v0; ids of other namespaces or
+    versions stay.
+    """
     name = family_name(env_id)
     return name if env_id == family_id(name) else env_id
 
@@ -345,9 +368,20 @@ def family_id(name: str) -> str:
 
 _ABLATED = ("poem-inner", "poem-pearl-context", "poem-d2", "poem-d10")
 _BOTH = ("poem-bayes", "poem-paper")
-_DESIGNS = (*_BOTH, *(f"{variant}-{inference}" for variant in _ABLATED for inference in ("bayes", "paper")))
+_DESIGNS = (
+    *_BOTH,
+    *(f"{variant}-{inference}" for variant in _ABLATED for inference in ("bayes", "paper")),
+)
 # A rule's own way of asking has no name of its own.
-_RULES = (*_BOTH, *(name for i in ("bayes", "paper") for rule in QUERY_RULES if (name := f"poem-{i}-{rule}") in METHODS))
+_RULES = (
+    *_BOTH,
+    *(
+        name
+        for i in ("bayes", "paper")
+        for rule in QUERY_RULES
+        if (name := f"poem-{i}-{rule}") in METHODS
+    ),
+)
 _EPSILON_METHODS = tuple(f"poem-paper-epsilon-{epsilon:g}" for epsilon in EPSILONS)
 
 SUITES = {
@@ -372,9 +406,20 @@ SUITES = {
             "Ablations of POEM (figures 7, 12, 13)",
             CHEETAHS,
             (
-                Entry("design", "Similarity, context and latent dimension", _DESIGNS, curves=(EXACT,), by_inference=True),
+                Entry(
+                    "design",
+                    "Similarity, context and latent dimension",
+                    _DESIGNS,
+                    curves=(EXACT,),
+                    by_inference=True,
+                ),
                 Entry("rules", "Query rules", _RULES, by_inference=True),
-                Entry("queries", "Number of queries", ("poem-bayes", "poem-paper"), record_at=tuple(range(21))),
+                Entry(
+                    "queries",
+                    "Number of queries",
+                    ("poem-bayes", "poem-paper"),
+                    record_at=tuple(range(21)),
+                ),
             ),
             ("known-task", *(f"known-task-{variant}" for variant in _ABLATED)),
         ),

@@ -21,11 +21,8 @@ SHOWN_QUERIES = (1, 5, 10, 20)
 
 @dataclass(frozen=True)
 class Row:
-    """
-    A method, or a yardstick, after some number of answers; what CSV and JSON hold.
+    """A method, or a yardstick, after some number of answers; what CSV and JSON hold.
 
-    :param suite: The suite.
-    :param family: The family.
     :param condition: What all methods had to spend.
     :param entry: The comparison.
     :param oracle: Who answered.
@@ -68,8 +65,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """
-    A table to be printed.
+    """A table to be printed.
 
     :param title: Above it.
     :param header: Names of the columns.
@@ -84,8 +80,7 @@ class Table:
 
 
 def suite_rows(selection: Selection) -> list[Row]:
-    """
-    Everything of a suite in long form.
+    """Everything of a suite in long form.
 
     :param selection: What there is.
     :return: The rows.
@@ -100,14 +95,17 @@ def suite_rows(selection: Selection) -> list[Row]:
                 for one in some:
                     rows += _method_rows(selection.suite.name, condition, entry, one)
                 variants = {METHODS[one.method].variant for one in some}
-                own = [reference for reference in references if METHODS[reference.method].variant in variants]
+                own = [
+                    reference
+                    for reference in references
+                    if METHODS[reference.method].variant in variants
+                ]
                 rows += _reference_rows(selection.suite.name, condition, entry, oracle, own)
     return rows
 
 
 def suite_tables(selection: Selection) -> list[Table]:
-    """
-    A table for each family, comparison and oracle; and one of the models.
+    """A table for each family, comparison and oracle; and one of the models.
 
     :param selection: What there is.
     :return: The tables.
@@ -128,11 +126,9 @@ def suite_tables(selection: Selection) -> list[Table]:
 
 
 def format_tables(title: str, tables: Sequence[Table], kind: str) -> str:
-    """
-    Tables as text.
+    """Tables as text.
 
     :param title: Of the whole.
-    :param tables: The tables.
     :param kind: "md" or "latex".
     :return: The text.
     :raises ValueError: If the format is neither.
@@ -140,15 +136,15 @@ def format_tables(title: str, tables: Sequence[Table], kind: str) -> str:
     if kind == "md":
         return "\n\n".join([f"# {title}", *map(_markdown, tables)]) + "\n"
     if kind == "latex":
-        return "\n\n".join([f"% {title}; needs \\usepackage{{booktabs}}", *map(_latex, tables)]) + "\n"
+        return (
+            "\n\n".join([f"% {title}; needs \\usepackage{{booktabs}}", *map(_latex, tables)]) + "\n"
+        )
     raise ValueError(f"`kind` must be 'md' or 'latex', but is {kind!r}")
 
 
 def format_rows(rows: Iterable[Row], kind: str) -> str:
-    """
-    Rows as text.
+    """Rows as text.
 
-    :param rows: The rows.
     :param kind: "csv" or "json".
     :return: The text.
     :raises ValueError: If the format is neither.
@@ -199,20 +195,43 @@ def _figures(summary: Summary) -> tuple[float, float | None, float, float | None
 
 
 def _reference_rows(
-    suite: str, condition: Condition, entry: Entry, oracle: OracleSpec, references: Sequence[Reference]
+    suite: str,
+    condition: Condition,
+    entry: Entry,
+    oracle: OracleSpec,
+    references: Sequence[Reference],
 ) -> list[Row]:
     rows = []
     for reference in references:
-        place = (suite, condition.family, str(condition), entry.name, oracle.label, reference.method)
+        place = (
+            suite,
+            condition.family,
+            str(condition),
+            entry.name,
+            oracle.label,
+            reference.method,
+        )
         label = reference.label.replace("task known", "limit")
         for queries in entry.record_at:
             limits = reference.limits(queries, oracle)
             rows.append(
-                Row(*place, label, "limit", queries, None, None, len(limits), float(limits.mean()), _deviation(limits))
+                Row(
+                    *place,
+                    label,
+                    "limit",
+                    queries,
+                    None,
+                    None,
+                    len(limits),
+                    float(limits.mean()),
+                    _deviation(limits),
+                )
             )
         known = reference.known
         mean, deviation = float(known.mean()), _deviation(known)
-        rows.append(Row(*place, reference.label, "known", None, None, None, len(known), mean, deviation))
+        rows.append(
+            Row(*place, reference.label, "known", None, None, None, len(known), mean, deviation)
+        )
     return rows
 
 
@@ -220,8 +239,12 @@ def _deviation(values: np.ndarray) -> float | None:
     return float(values.std(ddof=1)) if len(values) > 1 else None
 
 
-def _comparison(condition: Condition, entry: Entry, oracle: OracleSpec, rows: Sequence[Row]) -> Table:
-    """Methods against numbers of answers: mean and deviation, interquartile mean and interval, the paper's figure."""
+def _comparison(
+    condition: Condition, entry: Entry, oracle: OracleSpec, rows: Sequence[Row]
+) -> Table:
+    """Methods against numbers of answers: mean and deviation, interquartile mean and interval, the
+    paper's figure.
+    """
     queries = [k for k in SHOWN_QUERIES if k in entry.record_at]
     has_paper = any(row.paper_mean is not None for row in rows)
     header = ["method", "seeds"]
@@ -236,19 +259,34 @@ def _comparison(condition: Condition, entry: Entry, oracle: OracleSpec, rows: Se
             cells = [label, str(next(iter(mine.values())).n_seeds)]
             for k in queries:
                 row = mine.get(k)
-                cells += ["", ""] if row is None else [_mean(row.mean, row.deviation), _interval(row)]
+                cells += (
+                    ["", ""] if row is None else [_mean(row.mean, row.deviation), _interval(row)]
+                )
                 if has_paper:
-                    cells.append("" if row is None or row.paper_mean is None else _mean(row.paper_mean, row.paper_deviation))
+                    cells.append(
+                        ""
+                        if row is None or row.paper_mean is None
+                        else _mean(row.paper_mean, row.paper_deviation)
+                    )
             body.append(tuple(cells))
-    known = [f"{row.label}: {_mean(row.mean, row.deviation)}" for row in final if row.kind == "known"]
-    notes = ["Mean and standard deviation over seeds; interquartile mean over seeds and tasks with its bootstrap interval."]
+    known = [
+        f"{row.label}: {_mean(row.mean, row.deviation)}" for row in final if row.kind == "known"
+    ]
+    notes = [
+        "Mean and standard deviation over seeds; interquartile mean over seeds and tasks with its bootstrap interval."
+    ]
     notes += known
     if any(row.kind == "limit" for row in rows):
         notes.append(
             "A limit is the most that so many of these answers allow with those policies, chosen with the test tasks in "
             "sight; it does not bind the reward oracle, which sees more than answers."
         )
-    return Table(f"{condition}; {entry.title.lower()}, {oracle.label}", tuple(header), tuple(body), tuple(notes))
+    return Table(
+        f"{condition}; {entry.title.lower()}, {oracle.label}",
+        tuple(header),
+        tuple(body),
+        tuple(notes),
+    )
 
 
 def _models(selection: Selection, condition: Condition) -> Table | None:
@@ -273,11 +311,30 @@ def _models(selection: Selection, condition: Condition) -> Table | None:
             )
     if not body:
         return None
-    header = ("model", "seed", "source", "samples", "updates", "seconds", "preference accuracy", "Kendall's tau", "commit")
-    machines = sorted(
-        {record.provenance["machine"] for reference in selection.references(condition) for record in reference.records}
+    header = (
+        "model",
+        "seed",
+        "source",
+        "samples",
+        "updates",
+        "seconds",
+        "preference accuracy",
+        "Kendall's tau",
+        "commit",
     )
-    return Table(f"{condition.family}: the models", header, tuple(body), (f"Measured on: {'; '.join(machines)}.",))
+    machines = sorted(
+        {
+            record.provenance["machine"]
+            for reference in selection.references(condition)
+            for record in reference.records
+        }
+    )
+    return Table(
+        f"{condition.family}: the models",
+        header,
+        tuple(body),
+        (f"Measured on: {'; '.join(machines)}.",),
+    )
 
 
 def _mean(mean: float, deviation: float | None) -> str:
@@ -290,7 +347,11 @@ def _interval(row: Row) -> str:
         return ""
     digits = 0 if abs(row.iqm) >= 1000 else 1
     text = f"{row.iqm:,.{digits}f}"
-    return text if row.iqm_low is None else f"{text} [{row.iqm_low:,.{digits}f}, {row.iqm_high:,.{digits}f}]"
+    return (
+        text
+        if row.iqm_low is None
+        else f"{text} [{row.iqm_low:,.{digits}f}, {row.iqm_high:,.{digits}f}]"
+    )
 
 
 def _markdown(table: Table) -> str:

@@ -1,5 +1,5 @@
-"""
-``python -m sb3_poem.benchmark.training_process train ...``: the command line's ``train`` as a child of the benchmark.
+"""``python -m sb3_poem.benchmark.training_process train ...``: the command line's ``train`` as a
+child of the benchmark.
 
 It ends with its parent: a benchmark that was killed leaves no training behind.
 """
@@ -15,8 +15,8 @@ PR_SET_PDEATHSIG = 1
 
 
 def end_with_parent(parent: int) -> None:
-    """
-    Ask the system to kill this process when its parent is gone; where it cannot, nothing happens.
+    """Ask the system to kill this process when its parent is gone; where it cannot, nothing
+    happens.
 
     :param parent: The parent's process id, which may be gone already.
     """

@@ -29,7 +29,14 @@ from sb3_poem.adaptation.evaluation import evaluation_seed
 from sb3_poem.cli import DEFAULT_STORE
 from sb3_poem.cli.outputs import check_output
 from sb3_poem.cli.report import Report, row_text
-from sb3_poem.cli.subject import COPIES, COPIES_FOR_ONE_TASK, POLICY_SUFFIX, Subject, describe_task, say
+from sb3_poem.cli.subject import (
+    COPIES,
+    COPIES_FOR_ONE_TASK,
+    POLICY_SUFFIX,
+    Subject,
+    describe_task,
+    say,
+)
 from sb3_poem.label import Store, StoreRecorder
 from sb3_poem.label.beliefs import belief
 
@@ -51,11 +58,15 @@ def run_adapt(arguments: argparse.Namespace) -> int:
     check_output("--save", arguments.save, (POLICY_SUFFIX,))
     n_tasks = _check_tasks(arguments)
     if arguments.record and max(arguments.record) > arguments.queries:
-        raise ValueError(f"--record {max(arguments.record)} is more than --queries {arguments.queries}")
+        raise ValueError(
+            f"--record {max(arguments.record)} is more than --queries {arguments.queries}"
+        )
     copies = COPIES_FOR_ONE_TASK if arguments.oracle == "human" else COPIES
     subject = Subject(arguments, Console(), n_tasks, copies)
     if subject.latent is not None:
-        raise ValueError(f"--model {arguments.model} is a policy that is adapted already; name the model instead")
+        raise ValueError(
+            f"--model {arguments.model} is a policy that is adapted already; name the model instead"
+        )
     adaptation = Adaptation(arguments, subject)
     try:
         return adaptation.ask_person() if arguments.oracle == "human" else adaptation.ask_oracle()
@@ -69,15 +80,23 @@ def _check_tasks(arguments: argparse.Namespace) -> int:
     if arguments.task is not None and arguments.tasks not in (None, 1):
         raise ValueError(f"--task is one task, but --tasks asks for {arguments.tasks}")
     if human and arguments.tasks not in (None, 1):
-        raise ValueError(f"--oracle human answers for one task, but --tasks asks for {arguments.tasks}")
+        raise ValueError(
+            f"--oracle human answers for one task, but --tasks asks for {arguments.tasks}"
+        )
     n_tasks: int = 1 if human or arguments.task is not None else arguments.tasks or DEFAULT_TASKS
     if arguments.save is not None and n_tasks > 1:
-        raise ValueError(f"--save keeps the policy of one task, but {n_tasks} are adapted: add --tasks 1, or --task X")
+        raise ValueError(
+            f"--save keeps the policy of one task, but {n_tasks} are adapted: add --tasks 1, or --task X"
+        )
     if human and arguments.task is None and arguments.plot is not None:
-        raise ValueError("--plot needs returns, and with --oracle human only --task says by which goal to measure them")
+        raise ValueError(
+            "--plot needs returns, and with --oracle human only --task says by which goal to measure them"
+        )
     for flag in ("store", "resume"):
         if getattr(arguments, flag) and not human:
-            raise ValueError(f"--{flag} is about a person's answers, but --oracle is {arguments.oracle}")
+            raise ValueError(
+                f"--{flag} is about a person's answers, but --oracle is {arguments.oracle}"
+            )
     return n_tasks
 
 
@@ -92,7 +111,10 @@ class Adaptation:
         self.arguments = arguments
         self.subject = subject
         self.seed = subject.seed
-        chosen = {name: getattr(arguments, name) for name in ("inference", "query_rule", "candidates", "n_candidates")}
+        chosen = {
+            name: getattr(arguments, name)
+            for name in ("inference", "query_rule", "candidates", "n_candidates")
+        }
         self.options = {name: value for name, value in chosen.items() if value is not None}
 
     def ask_oracle(self) -> int:
@@ -147,15 +169,28 @@ class Adaptation:
         """
         arguments, subject = self.arguments, self.subject
         folder = arguments.store or DEFAULT_STORE
-        about = (Path(arguments.model).name, subject.env_id, self.seed, self.options, arguments.queries)
+        about = (
+            Path(arguments.model).name,
+            subject.env_id,
+            self.seed,
+            self.options,
+            arguments.queries,
+        )
         recorder = StoreRecorder(Store(folder), *about, resume=arguments.resume)
         if arguments.resume:
-            found = "Going on with" if recorder.resumed else "There is nothing to go on with; beginning"
+            found = (
+                "Going on with" if recorder.resumed else "There is nothing to go on with; beginning"
+            )
             say(f"{found} session {recorder.session.id} of {folder}")
         oracle = HumanOracle(record=recorder)
         env = subject.make_env("rgb_array", show_task=False)
         adapter = PreferenceAdapter(
-            subject.model, env, oracle=oracle, n_queries=arguments.queries, seed=self.seed, **self.options
+            subject.model,
+            env,
+            oracle=oracle,
+            n_queries=arguments.queries,
+            seed=self.seed,
+            **self.options,
         )
         latents = [adapter.policy().latent]
         oracle.needs_frames = False
@@ -172,15 +207,21 @@ class Adaptation:
         except (EOFError, KeyboardInterrupt) as error:
             if not adapter.n_answers:
                 raise
-            stopped = "Interrupted" if isinstance(error, KeyboardInterrupt) else "Standard input ended"
+            stopped = (
+                "Interrupted" if isinstance(error, KeyboardInterrupt) else "Standard input ended"
+            )
         finally:
             env.close()
         return self._conclude(adapter, recorder, np.array(latents), stopped)
 
-    def _tell_again(self, adapter: PreferenceAdapter, kept: dict[str, Any], recorder: StoreRecorder) -> None:
+    def _tell_again(
+        self, adapter: PreferenceAdapter, kept: dict[str, Any], recorder: StoreRecorder
+    ) -> None:
         query = adapter.ask()
         for side in ("left", "right"):
-            if not np.allclose(getattr(query, side).latent, Trajectory.from_dict(kept[side]).latent):
+            if not np.allclose(
+                getattr(query, side).latent, Trajectory.from_dict(kept[side]).latent
+            ):
                 raise ValueError(
                     f"--resume: question {adapter.n_answers + 1} of session {recorder.session.id} was another "
                     f"one; was it asked with another model of the name {recorder.session.model}? "
@@ -188,7 +229,9 @@ class Adaptation:
                 )
         adapter.tell(kept["preference"])
 
-    def _conclude(self, adapter: PreferenceAdapter, recorder: StoreRecorder, latents: np.ndarray, stopped: str) -> int:
+    def _conclude(
+        self, adapter: PreferenceAdapter, recorder: StoreRecorder, latents: np.ndarray, stopped: str
+    ) -> int:
         """Write what was asked for, say what is believed, and how to go on.
 
         :param latents: (n_answers + 1, latent_dim), before and after each answer
@@ -212,12 +255,21 @@ class Adaptation:
             believed["sentence"] = f"It takes the policy of the latent ({describe_task(latent)})."
         say(believed["sentence"])
         say(f"The answers are in {recorder.store.folder}, session {recorder.session.id}. Next:")
-        again = shlex.join(["sb3-poem", *(word for word in arguments.given if word != "--resume"), "--resume"])
+        again = shlex.join(
+            ["sb3-poem", *(word for word in arguments.given if word != "--resume"), "--resume"]
+        )
         commands = [] if adapter.done else [("answer the rest", again)]
         if arguments.save is None:
             commands.append(("keep the policy", f"{again} --save policy{POLICY_SUFFIX}"))
         else:
-            watch = ["sb3-poem", "record-video", "--model", str(arguments.save), "--out", "policy.mp4"]
+            watch = [
+                "sb3-poem",
+                "record-video",
+                "--model",
+                str(arguments.save),
+                "--out",
+                "policy.mp4",
+            ]
             commands.append(("watch the policy", shlex.join(watch)))
         for what, command in commands:
             say(f"  {what + ':':<18}{command}")
@@ -229,16 +281,25 @@ class Adaptation:
         tasks = np.repeat(subject.tasks, len(latents), axis=0)
         with subject.console.status("Measuring the returns"):
             outcomes = evaluate_episodes(
-                subject.model, subject.env, latents, tasks, self.arguments.episodes, evaluation_seed(self.seed)
+                subject.model,
+                subject.env,
+                latents,
+                tasks,
+                self.arguments.episodes,
+                evaluation_seed(self.seed),
             )
         successes = None if outcomes.successes is None else outcomes.successes[None]
         answers = [answer.preference for answer in adapter.answers]
         records = tuple(range(len(latents)))
-        return AdaptationEvaluation(subject.tasks, records, latents[None], outcomes.returns[None], [answers], successes)
+        return AdaptationEvaluation(
+            subject.tasks, records, latents[None], outcomes.returns[None], [answers], successes
+        )
 
     def _known_task_return(self) -> KnownTaskReturn:
         subject = self.subject
-        with subject.console.status("Looking for the best policy of every task, as if it were known"):
+        with subject.console.status(
+            "Looking for the best policy of every task, as if it were known"
+        ):
             return subject.known_task_return(self.arguments.episodes)
 
     def _report(self, evaluation: AdaptationEvaluation, known: KnownTaskReturn | None) -> None:
@@ -259,10 +320,14 @@ class Adaptation:
         n_tasks = len(subject.tasks)
         title = f"{subject.env_id}, {n_tasks} task{'s' * (n_tasks > 1)}, {arguments.oracle} oracle"
         title += ", incomplete" * (known is None)
-        Report(title, settings, evaluation, known).write(subject.console, arguments.json, arguments.plot)
+        Report(title, settings, evaluation, known).write(
+            subject.console, arguments.json, arguments.plot
+        )
 
     def _film(self, latents: np.ndarray, answers: Sequence[int]) -> None:
-        """Film the policies after the fewest and the most answers; ``latents`` is (n_records, latent_dim)."""
+        """Film the policies after the fewest and the most answers; ``latents`` is (n_records,
+        latent_dim).
+        """
         captions = [f"after {n} answer{'s' * (n != 1)}" for n in (answers[0], answers[-1])]
         task_matters = self.arguments.oracle != "human" or self.arguments.task is not None
         self.subject.film([latents[0], latents[-1]], captions, self.arguments.video, task_matters)

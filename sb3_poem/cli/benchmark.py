@@ -5,14 +5,21 @@ from pathlib import Path
 from typing import Any
 
 from sb3_poem.benchmark.methods import VARIANTS
-from sb3_poem.benchmark.suites import SUITES, Budget, Training, family_id, family_label, family_name, hashable
+from sb3_poem.benchmark.suites import (
+    SUITES,
+    Budget,
+    Training,
+    family_id,
+    family_label,
+    family_name,
+    hashable,
+)
 from sb3_poem.cli.outputs import check_writable
 from sb3_poem.cli.packages import import_packages
 
 
 def run_benchmark(arguments: argparse.Namespace) -> int:
-    """
-    Run the command.
+    """Run the command.
 
     :param arguments: as ``sb3_poem.cli`` parsed them
     :return: the exit status: 1 if a cell failed
@@ -26,7 +33,9 @@ def _run(arguments: argparse.Namespace) -> int:
     try:
         from sb3_poem.benchmark.store import Store
     except ImportError as error:
-        raise ValueError(f"the benchmark's packages are missing: pip install 'sb3_poem[benchmark]' ({error})") from error
+        raise ValueError(
+            f"the benchmark's packages are missing: pip install 'sb3_poem[benchmark]' ({error})"
+        ) from error
     from sb3_poem.benchmark.models import ModelLibrary, Workplace
     from sb3_poem.benchmark.plan import describe, make_plan
     from sb3_poem.benchmark.runner import run_cells
@@ -34,7 +43,9 @@ def _run(arguments: argparse.Namespace) -> int:
     import_packages(arguments.gym_packages)
     training = Training(arguments.timesteps, tuple(sorted(_parse_params(arguments.params).items())))
     if not training.is_default and (arguments.models or arguments.model):
-        raise ValueError("--models and --model hand over models that were trained already: leave out --timesteps and --params")
+        raise ValueError(
+            "--models and --model hand over models that were trained already: leave out --timesteps and --params"
+        )
     _check_models(arguments)
     library = ModelLibrary(
         Workplace(
@@ -48,9 +59,19 @@ def _run(arguments: argparse.Namespace) -> int:
     store = Store(arguments.store) if not arguments.list or arguments.store.exists() else None
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     suite = SUITES[arguments.suite]
-    budget = Budget(arguments.tasks or suite.budget.tasks, arguments.episodes or suite.budget.episodes)
+    budget = Budget(
+        arguments.tasks or suite.budget.tasks, arguments.episodes or suite.budget.episodes
+    )
     plan = make_plan(
-        suite, library, store, arguments.families, arguments.methods, seeds, budget, training, arguments.snapshots
+        suite,
+        library,
+        store,
+        arguments.families,
+        arguments.methods,
+        seeds,
+        budget,
+        training,
+        arguments.snapshots,
     )
     if arguments.list:
         print("\n".join(describe(plan, library)))
@@ -61,14 +82,22 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.backend == "ray":
         from sb3_poem.benchmark.ray_backend import RayOptions, run_with_ray
 
-        options = RayOptions(arguments.address, arguments.cpus_per_trial, arguments.gpus_per_trial, arguments.max_failures)
+        options = RayOptions(
+            arguments.address,
+            arguments.cpus_per_trial,
+            arguments.gpus_per_trial,
+            arguments.max_failures,
+        )
         failures = run_with_ray(plan, library, store, options, _say)
     else:
         failures = run_cells(plan.todo, library, store, _say)
     for failure in failures:
         print(f"FAILED {failure}")
     left = len(failures)
-    print(f"{len(plan.todo) - left} cells run" + (f", {left} failed: the same command tries them again" if left else ""))
+    print(
+        f"{len(plan.todo) - left} cells run"
+        + (f", {left} failed: the same command tries them again" if left else "")
+    )
     return 1 if failures else 0
 
 
@@ -84,9 +113,13 @@ def _check_models(arguments: argparse.Namespace) -> None:
         family, _, seed, _ = _parse_named(text)
         if family not in families:
             known = ", ".join(sorted(map(family_label, families)))
-            raise ValueError(f"--model {text}: {family_label(family)} is none of the families of this run: {known}")
+            raise ValueError(
+                f"--model {text}: {family_label(family)} is none of the families of this run: {known}"
+            )
         if seed not in seeds:
-            raise ValueError(f"--model {text}: {seed} is none of the seeds of this run: {', '.join(map(str, seeds))}")
+            raise ValueError(
+                f"--model {text}: {seed} is none of the seeds of this run: {', '.join(map(str, seeds))}"
+            )
 
 
 def _report(arguments: argparse.Namespace) -> int:
@@ -94,13 +127,21 @@ def _report(arguments: argparse.Namespace) -> int:
         from sb3_poem.benchmark.report import make_report
         from sb3_poem.benchmark.store import Store
     except ImportError as error:
-        raise ValueError(f"the benchmark's packages are missing: pip install 'sb3_poem[benchmark]' ({error})") from error
+        raise ValueError(
+            f"the benchmark's packages are missing: pip install 'sb3_poem[benchmark]' ({error})"
+        ) from error
 
-    families = None if arguments.families is None else [family_name(family_id(name)) for name in arguments.families]
+    families = (
+        None
+        if arguments.families is None
+        else [family_name(family_id(name)) for name in arguments.families]
+    )
     if arguments.out is not None:
         check_writable(arguments.out)
     store = Store(arguments.store, create=False)
-    text, files = make_report(store, arguments.suite, families, arguments.format, arguments.out, arguments.seeds)
+    text, files = make_report(
+        store, arguments.suite, families, arguments.format, arguments.out, arguments.seeds
+    )
     if arguments.out is None:
         print(text)
     for file in files:
@@ -136,7 +177,9 @@ def _parse_named(text: str) -> tuple[str, str, int, str]:
         raise ValueError(f"--model {text}: must have the form FAMILY:VARIANT:SEED=PATH")
     family, variant, seed = parts
     if variant not in VARIANTS:
-        raise ValueError(f"--model {text}: there is no variant {variant!r}; there are: {', '.join(VARIANTS)}")
+        raise ValueError(
+            f"--model {text}: there is no variant {variant!r}; there are: {', '.join(VARIANTS)}"
+        )
     if not Path(path).exists():
         raise ValueError(f"--model {text}: there is no such file or folder")
     return family_id(family), variant, int(seed), path

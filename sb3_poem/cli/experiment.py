@@ -35,8 +35,7 @@ CHECKPOINT = "checkpoint.zip"
 
 
 class TrainingInterrupted(KeyboardInterrupt):
-    """
-    Training was interrupted, and what it had learned is saved.
+    """Training was interrupted, and what it had learned is saved.
 
     :param message: how far it came
     :param resumable: whether ``--resume`` finds a checkpoint of this run
@@ -49,9 +48,15 @@ class TrainingInterrupted(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def stopping_between_epochs(checkpoint: TrainingCheckpointCallback) -> Iterator[None]:
-    """Let the first Ctrl-C (or ``SIGTERM``) end training after the epoch at hand, and the second at once."""
+    """Let the first Ctrl-C (or ``SIGTERM``) end training after the epoch at hand, and the second at
+    once.
+    """
     signals = (signal.SIGINT, signal.SIGTERM)
-    before = {number: handler for number in signals if (handler := signal.getsignal(number)) is not signal.SIG_IGN}
+    before = {
+        number: handler
+        for number in signals
+        if (handler := signal.getsignal(number)) is not signal.SIG_IGN
+    }
 
     def restore() -> None:
         for number, handler in before.items():
@@ -71,15 +76,19 @@ def stopping_between_epochs(checkpoint: TrainingCheckpointCallback) -> Iterator[
         restore()
 
 
-def make_experiment(args: Any, algo: str, env_id: str, log_folder: str, *rest: Any, **kwargs: Any) -> ExperimentManager:
-    """
-    The experiment that fits the algorithm; takes what rl_zoo3's ``train`` gives to its ``ExperimentManager``.
+def make_experiment(
+    args: Any, algo: str, env_id: str, log_folder: str, *rest: Any, **kwargs: Any
+) -> ExperimentManager:
+    """The experiment that fits the algorithm; takes what rl_zoo3's ``train`` gives to its
+    ``ExperimentManager``.
 
-    :raises ValueError: if one of our algorithms is given an environment that is no task family, or for a number of steps or
-        a file of hyperparameters that cannot be
+    :raises ValueError: if one of our algorithms is given an environment that is no task family, or
+        for a number of steps or a file of hyperparameters that cannot be
     :raises OSError: if a folder that a flag names cannot be written
     """
-    if args.n_timesteps < 1 and args.n_timesteps != -1:  # which is rl_zoo3's default, and takes the entry's
+    if (
+        args.n_timesteps < 1 and args.n_timesteps != -1
+    ):  # which is rl_zoo3's default, and takes the entry's
         raise ValueError(f"-n/--n-timesteps must be at least 1, got {args.n_timesteps}")
     if args.conf_file is not None:
         check_config(args.conf_file)
@@ -91,32 +100,47 @@ def make_experiment(args: Any, algo: str, env_id: str, log_folder: str, *rest: A
 
 
 def is_task_family(env_id: str) -> bool | None:
-    """Whether an environment is a task family; None if its entry point is a function, which does not tell."""
+    """Whether an environment is a task family; None if its entry point is a function, which does
+    not tell.
+    """
     entry_point = gym.spec(env_id).entry_point
-    creator = gym.envs.registration.load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+    creator = (
+        gym.envs.registration.load_env_creator(entry_point)
+        if isinstance(entry_point, str)
+        else entry_point
+    )
     return issubclass(creator, TaskFamily) if inspect.isclass(creator) else None
 
 
 class FamilyExperiment(ExperimentManager):
-    """Steps all copies of a task family at once, whatever the algorithm, unless ``--vec-env subproc`` asks otherwise."""
+    """Steps all copies of a task family at once, whatever the algorithm, unless ``--vec-env
+    subproc`` asks otherwise.
+    """
 
     def __init__(self, args: Any, algo: str, env_id: str, *rest: Any, **kwargs: Any) -> None:
         super().__init__(args, algo, env_id, *rest, **kwargs)
-        if args.vec_env == "dummy" and is_task_family(env_id) and gym.spec(env_id).vector_entry_point is not None:
+        if (
+            args.vec_env == "dummy"
+            and is_task_family(env_id)
+            and gym.spec(env_id).vector_entry_point is not None
+        ):
             self.vec_env_class = TaskVecEnv
 
 
 class PoemExperiment(FamilyExperiment):
-    """
-    A meta-training run: with our hyperparameter files, evaluated by adaptation to held-out tasks, and resumable.
+    """A meta-training run: with our hyperparameter files, evaluated by adaptation to held-out
+    tasks, and resumable.
 
-    ``--eval-freq`` and ``--eval-episodes`` set up an :class:`AdaptationEvalCallback`. ``checkpoint.zip``, from which
-    ``--resume`` continues bit for bit, is written as often as it costs little, or with the models of ``--save-freq``.
+    ``--eval-freq`` and ``--eval-episodes`` set up an :class:`AdaptationEvalCallback`.
+    ``checkpoint.zip``, from which ``--resume`` continues bit for bit, is written as often as it
+    costs little, or with the models of ``--save-freq``.
     """
 
     def __init__(self, args: Any, algo: str, env_id: str, *rest: Any, **kwargs: Any) -> None:
         if is_task_family(env_id) is False:
-            raise ValueError(f"--env {env_id} is no task family (a poem_envs.TaskFamily), and {algo} needs one")
+            raise ValueError(
+                f"--env {env_id} is no task family (a poem_envs.TaskFamily), and {algo} needs one"
+            )
         kwargs["config"] = kwargs.get("config") or str(config_file(algo))
         super().__init__(args, algo, env_id, *rest, **kwargs)
         self.steps_per_evaluation = self.eval_freq
@@ -129,12 +153,19 @@ class PoemExperiment(FamilyExperiment):
         try:
             hyperparams, saved = super().read_hyperparameters()
         except yaml.YAMLError as error:
-            raise ValueError(f"{self.config} is not valid YAML: {' '.join(str(error).split())}") from error
+            raise ValueError(
+                f"{self.config} is not valid YAML: {' '.join(str(error).split())}"
+            ) from error
         except (AttributeError, TypeError) as error:
-            raise ValueError(f"{self.config} must hold a mapping of hyperparameters for each environment id") from error
+            raise ValueError(
+                f"{self.config} must hold a mapping of hyperparameters for each environment id"
+            ) from error
         source = f"{self.config}, entry {self.env_name.gym_id!r}"
         custom = self.custom_hyperparams or {}
-        for given, place in (custom, "-params"), ({k: v for k, v in hyperparams.items() if k not in custom}, source):
+        for given, place in (
+            (custom, "-params"),
+            ({k: v for k, v in hyperparams.items() if k not in custom}, source),
+        ):
             check_keys(sorted(given), self.algo, place)
             check_numbers(given, self.algo, place)
         for key in ("n_timesteps", "policy"):
@@ -143,7 +174,8 @@ class PoemExperiment(FamilyExperiment):
         return hyperparams, saved
 
     def create_envs(self, *args: Any, **kwargs: Any) -> VecEnv:
-        # Ctrl-C reaches the processes of --vec-env subproc too, which must last until the epoch ends
+        # Ctrl-C reaches the processes of --vec-env subproc too, which must last until the epoch
+        # ends
         before = signal.signal(signal.SIGINT, signal.SIG_IGN)
         try:
             return super().create_envs(*args, **kwargs)
@@ -169,7 +201,11 @@ class PoemExperiment(FamilyExperiment):
                     verbose=self.verbose,
                 )
             )
-        every = self._epochs(model, self.steps_per_checkpoint) if self.steps_per_checkpoint > 0 else None
+        every = (
+            self._epochs(model, self.steps_per_checkpoint)
+            if self.steps_per_checkpoint > 0
+            else None
+        )
         self.checkpoint = TrainingCheckpointCallback(Path(self.save_path) / CHECKPOINT, every)
         self.callbacks.append(self.checkpoint)
 
@@ -177,7 +213,9 @@ class PoemExperiment(FamilyExperiment):
     def _epochs(model: PEARLSAC, steps: int) -> int:
         """How many epochs take about so many environment steps, at least 1."""
         assert model.horizon is not None
-        return max(1, round(steps / (len(model.train_tasks) * model.trajectories_per_task * model.horizon)))
+        return max(
+            1, round(steps / (len(model.train_tasks) * model.trajectories_per_task * model.horizon))
+        )
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> Any:
         if not is_checkpoint(self.trained_agent):
@@ -185,7 +223,9 @@ class PoemExperiment(FamilyExperiment):
         model = ALGORITHMS[self.algo].load_checkpoint(self.trained_agent, env, device=self.device)
         model.tensorboard_log, model.verbose = self.tensorboard_log, self.verbose
         self.resumes = True
-        print(f"Resuming {self.trained_agent} after {model.num_timesteps} steps, with its own hyperparameters")
+        print(
+            f"Resuming {self.trained_agent} after {model.num_timesteps} steps, with its own hyperparameters"
+        )
         return model
 
     def learn(self, model: Any) -> None:
@@ -206,10 +246,22 @@ class PoemExperiment(FamilyExperiment):
 
     def save_trained_model(self, model: Any) -> None:
         super().save_trained_model(model)
-        done, total, saved = model.num_timesteps, model._total_timesteps, self.checkpoint.saved_steps
+        done, total, saved = (
+            model.num_timesteps,
+            model._total_timesteps,
+            self.checkpoint.saved_steps,
+        )
         if done < total and self.is_interrupted:
-            kept = "" if saved == done else ", before the first checkpoint" if saved is None else f", saved at {saved:,}"
-            raise TrainingInterrupted(f"Interrupted at {done:,} of {total:,} steps{kept}", saved is not None)
+            kept = (
+                ""
+                if saved == done
+                else ", before the first checkpoint"
+                if saved is None
+                else f", saved at {saved:,}"
+            )
+            raise TrainingInterrupted(
+                f"Interrupted at {done:,} of {total:,} steps{kept}", saved is not None
+            )
         if done >= total and self.steps_per_checkpoint <= 0:
             self.checkpoint.path.unlink(missing_ok=True)
 
@@ -230,22 +282,31 @@ class PoemExperiment(FamilyExperiment):
             optuna.create_study = create_study
 
     def objective(self, trial: optuna.Trial) -> float:
-        """
-        What ``-optimize`` maximises: the return on held-out tasks after the most answers.
+        """What ``-optimize`` maximises: the return on held-out tasks after the most answers.
 
-        :raises optuna.TrialPruned: if the trial is not worth finishing, or its hyperparameters made it fail
+        :raises optuna.TrialPruned: if the trial is not worth finishing, or its hyperparameters made
+            it fail
         """
         arguments = {"entry": self._hyperparams}
-        sampled = self._preprocess_schedules(HYPERPARAMS_SAMPLER[self.algo](trial, self.n_actions, self.n_envs, arguments))
+        sampled = self._preprocess_schedules(
+            HYPERPARAMS_SAMPLER[self.algo](trial, self.n_actions, self.n_envs, arguments)
+        )
         env = self.create_envs(self.n_envs, no_log=True)
         if not FamilyView(env).shared_dynamics:
-            sampled["relabel_fraction"] = 0.0  # a reward of another task needs a transition that could be of it
+            sampled["relabel_fraction"] = (
+                0.0  # a reward of another task needs a transition that could be of it
+            )
         try:
-            model = ALGORITHMS[self.algo](env=env, device=self.device, **{**self._hyperparams, **sampled})
+            model = ALGORITHMS[self.algo](
+                env=env, device=self.device, **{**self._hyperparams, **sampled}
+            )
         except Exception:
             env.close()
             raise
-        folder = self.optimization_log_path and Path(self.optimization_log_path) / f"trial_{trial.number}"
+        folder = (
+            self.optimization_log_path
+            and Path(self.optimization_log_path) / f"trial_{trial.number}"
+        )
         evaluation = TrialAdaptationCallback(
             trial,
             every=self._epochs(model, self.n_timesteps // self.n_evaluations),
@@ -254,7 +315,10 @@ class PoemExperiment(FamilyExperiment):
             env_kwargs=self._eval_env_kwargs_args,
         )
         try:
-            model.learn(self.n_timesteps, [*get_callback_list({"callback": self.specified_callbacks}), evaluation])
+            model.learn(
+                self.n_timesteps,
+                [*get_callback_list({"callback": self.specified_callbacks}), evaluation],
+            )
         except ValueError as error:
             # Some random hyperparameters diverge, which the model reports.
             print(f"Trial {trial.number} failed: {error}")
@@ -268,10 +332,9 @@ class PoemExperiment(FamilyExperiment):
 
 
 class TrialAdaptationCallback(AdaptationEvalCallback):
-    """
-    Reports each evaluation to Optuna, and ends the training of a trial that is not worth finishing.
+    """Reports each evaluation to Optuna, and ends the training of a trial that is not worth
+    finishing.
 
-    :param trial: the trial
     :param kwargs: see :class:`AdaptationEvalCallback`
     """
 

@@ -24,13 +24,13 @@ FLAG_OF_KEY = {
 
 
 def check_keys(keys: Sequence[str], algorithm: str, source: str) -> None:
-    """
-    Compare the keys of an entry of hyperparameters with what rl_zoo3 and the algorithm take.
+    """Compare the keys of an entry of hyperparameters with what rl_zoo3 and the algorithm take.
 
     :param keys: the entry's keys
     :param algorithm: name of the algorithm
     :param source: where the keys were read, for the message
-    :raises ValueError: at the first key that neither takes; the message names it and what resembles it
+    :raises ValueError: at the first key that neither takes; the message names it and what resembles
+        it
     """
     arguments = set(inspect.signature(ALGORITHMS[algorithm]).parameters) - {"unsupported"}
     known = ZOO_KEYS | {name for name in arguments if not name.startswith("_")}
@@ -41,16 +41,22 @@ def check_keys(keys: Sequence[str], algorithm: str, source: str) -> None:
             raise ValueError(f"{key!r} in {source} is not for {algorithm}: {UNSUPPORTED[key]}")
         if key not in known:
             close = difflib.get_close_matches(key, known - set(FLAG_OF_KEY), n=3)
-            hint = f"did you mean {' or '.join(map(repr, close))}?" if close else "nor anything like it."
-            raise ValueError(f"Unknown key {key!r} in {source}: {algorithm} has no such hyperparameter, {hint}")
+            hint = (
+                f"did you mean {' or '.join(map(repr, close))}?"
+                if close
+                else "nor anything like it."
+            )
+            raise ValueError(
+                f"Unknown key {key!r} in {source}: {algorithm} has no such hyperparameter, {hint}"
+            )
 
 
 def check_numbers(entry: dict[str, Any], algorithm: str, source: str) -> None:
-    """
-    :param entry: hyperparameters
+    """:param entry: hyperparameters
     :param algorithm: name of the algorithm
     :param source: where they were read, for the message
-    :raises ValueError: if a number is none, or was read as text, as YAML reads 1e-3 (but 1.0e-3 as a number)
+    :raises ValueError: if a number is none, or was read as text, as YAML reads 1e-3 (but 1.0e-3 as
+        a number)
     """
     parameters = inspect.signature(ALGORITHMS[algorithm]).parameters
     for key, value in entry.items():
@@ -76,14 +82,15 @@ def _number(text: str) -> float | None:
 
 
 def check_config(config: str) -> None:
-    """
-    :param config: what ``-c`` names: a file, or a Python module as rl_zoo3 takes it
+    """:param config: what ``-c`` names: a file, or a Python module as rl_zoo3 takes it
     :raises ValueError: if there is neither
     """
     if not config.endswith((".yml", ".yaml", ".py")):
         with contextlib.suppress(ImportError, ValueError):
             if importlib.util.find_spec(config) is not None:
                 return
-        raise ValueError(f"-c {config}: there is no such module; the name of a file ends in .yml, .yaml or .py")
+        raise ValueError(
+            f"-c {config}: there is no such module; the name of a file ends in .yml, .yaml or .py"
+        )
     if not os.path.isfile(config):
         raise ValueError(f"-c {config}: there is no such file")

@@ -1,4 +1,6 @@
-"""``sb3-poem label``: the page on which people answer, the data set of their answers, and what others make of these."""
+"""``sb3-poem label``: the page on which people answer, the data set of their answers, and what
+others make of these.
+"""
 
 import argparse
 import os
@@ -17,8 +19,7 @@ AUTH_VARIABLE = "SB3_POEM_AUTH"
 
 
 def run_label(arguments: argparse.Namespace) -> None:
-    """
-    Run the command.
+    """Run the command.
 
     :param arguments: as ``sb3_poem.cli`` parsed them
     :raises ValueError: if they do not fit
@@ -56,21 +57,28 @@ def run_page(arguments: argparse.Namespace) -> None:
     import_packages(arguments.gym_packages)
     options = {"inference": arguments.inference, "mistake_rate": arguments.mistake_rate}
     adapter_options(options)  # says now what is out of range
-    catalogue = read_catalogue(arguments.model, arguments.env, parse_env_kwargs(arguments.env_kwargs))
+    catalogue = read_catalogue(
+        arguments.model, arguments.env, parse_env_kwargs(arguments.env_kwargs)
+    )
     listener = bind(arguments.host, arguments.port)
     port = listener.getsockname()[1]
     store = Store(arguments.store)
     store.remove_orphans()
     conversations = Conversations(
         store,
-        Workshop(arguments.workers, lambda: process_pool(arguments.workers, catalogue, arguments.gym_packages)),
+        Workshop(
+            arguments.workers,
+            lambda: process_pool(arguments.workers, catalogue, arguments.gym_packages),
+        ),
         catalogue,
         options,
         arguments.queries,
         arguments.max_sessions,
         arguments.seed,
     )
-    hosts = frozenset((*LOOPBACK, arguments.host.lower(), *(name.lower() for name in arguments.allow_host)))
+    hosts = frozenset(
+        (*LOOPBACK, arguments.host.lower(), *(name.lower() for name in arguments.allow_host))
+    )
     app = make_app(conversations, Access(user, password, token, hosts))
     query = "" if token is None else f"/?token={token}"
     name = link_host(listener, arguments.host)
@@ -94,8 +102,7 @@ def run_page(arguments: argparse.Namespace) -> None:
 
 
 def read_password(auth: str | None, file: Path | None) -> tuple[str | None, str | None]:
-    """
-    Read ``USER:PASSWORD`` from the flag, else from the file, else from the environment.
+    """Read ``USER:PASSWORD`` from the flag, else from the file, else from the environment.
 
     :raises ValueError: if it has another form, or the password is short
     :raises OSError: if there is no such file
@@ -111,7 +118,9 @@ def read_password(auth: str | None, file: Path | None) -> tuple[str | None, str 
     if not user or not colon:
         raise ValueError(f"{source} must have the form USER:PASSWORD")
     if len(password) < SHORTEST_PASSWORD:
-        raise ValueError(f"{source}: the password must have at least {SHORTEST_PASSWORD} characters, but has {len(password)}")
+        raise ValueError(
+            f"{source}: the password must have at least {SHORTEST_PASSWORD} characters, but has {len(password)}"
+        )
     return user, password
 
 
@@ -159,7 +168,9 @@ def run_replay(arguments: argparse.Namespace) -> None:
                 )
                 continue
             # the store knows a model by its folder's name
-            is_own = arguments.model is None or Path(arguments.model).resolve().name == session.model
+            is_own = (
+                arguments.model is None or Path(arguments.model).resolve().name == session.model
+            )
             result = replay(store, session, model, options, arguments.seed or 0, is_own)
         results.append(result)
         console.print(
@@ -170,21 +181,26 @@ def run_replay(arguments: argparse.Namespace) -> None:
     if not results and not left_out:
         raise ValueError(f"--store {arguments.store} holds no answers")
     if not results:
-        raise ValueError("no session could be replayed: name the model that they were recorded with by --model")
+        raise ValueError(
+            "no session could be replayed: name the model that they were recorded with by --model"
+        )
     if arguments.json is not None:
-        write_json_atomically(arguments.json, {"model": arguments.model, "options": options, "sessions": results})
+        write_json_atomically(
+            arguments.json, {"model": arguments.model, "options": options, "sessions": results}
+        )
         console.print(f"Wrote {arguments.json}", highlight=False)
     store.close()
 
 
 def open_store(arguments: argparse.Namespace):  # type: ignore[no-untyped-def]
-    """
-    The store that was named.
+    """The store that was named.
 
     :raises ValueError: if there is none
     """
     from sb3_poem.label.store import Store
 
     if not (arguments.store / "answers.sqlite").is_file():
-        raise ValueError(f"--store {arguments.store}: there are no answers there (no answers.sqlite)")
+        raise ValueError(
+            f"--store {arguments.store}: there are no answers there (no answers.sqlite)"
+        )
     return Store(arguments.store)

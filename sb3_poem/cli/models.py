@@ -14,13 +14,23 @@ def run_models(_: Any) -> None:
     rows = [HEADER, *(_row(name, pretrained_folder(name)) for name in pretrained_names())]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
-        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
-    print("\nReturns are means over 30 unseen tasks, by the rule `bayes`; each model's card has all figures.")
+        print(
+            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        )
+    print(
+        "\nReturns are means over 30 unseen tasks, by the rule `bayes`; each model's card has all figures."
+    )
 
 
 def _row(name: str, folder: Path) -> tuple[str, ...]:
     config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
-    return name, config["env_id"], config["algorithm"], f"{config['num_timesteps']:,}", _returns(config["card"])
+    return (
+        name,
+        config["env_id"],
+        config["algorithm"],
+        f"{config['num_timesteps']:,}",
+        _returns(config["card"]),
+    )
 
 
 def _returns(card: dict[str, Any]) -> str:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 
 def check_writable(folder: str | Path) -> None:
-    """
-    Make a folder and a file in it, so that a run does not find out at its end that it cannot save.
+    """Make a folder and a file in it, so that a run does not find out at its end that it cannot
+    save.
 
     :param folder: where something will be written
     :raises OSError: if that fails; the message names the folder
@@ -18,12 +18,13 @@ def check_writable(folder: str | Path) -> None:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise OSError(f"cannot write to the folder {str(folder)!r}: {error.strerror or error}") from error
+        raise OSError(
+            f"cannot write to the folder {str(folder)!r}: {error.strerror or error}"
+        ) from error
 
 
 def check_output(flag: str, path: Path | None, suffixes: Sequence[str]) -> None:
-    """
-    Check a file that a flag named, if it did.
+    """Check a file that a flag named, if it did.
 
     :param flag: the flag, for the message
     :param path: the file
@@ -49,4 +50,6 @@ def check_device(name: str) -> None:
     try:
         th.device("cpu" if name == "auto" else name)
     except RuntimeError as error:
-        raise ValueError(f"--device {name}: there is no such device; there are auto, cpu and cuda") from error
+        raise ValueError(
+            f"--device {name}: there is no such device; there are auto, cpu and cuda"
+        ) from error

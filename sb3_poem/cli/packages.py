@@ -7,8 +7,7 @@ from collections.abc import Sequence
 
 
 def import_packages(names: Sequence[str]) -> None:
-    """
-    Import modules, which may lie in the working folder.
+    """Import modules, which may lie in the working folder.
 
     :param names: of modules
     :raises ValueError: if there is no such module

@@ -20,8 +20,7 @@ TABLE_WIDTH = 76
 
 @dataclass(frozen=True)
 class Report:
-    """
-    The outcome of adapting a model.
+    """The outcome of adapting a model.
 
     :param title: of the table and the plot
     :param settings: JSON-ready: the model, the environment, who answered and how it was asked
@@ -37,19 +36,33 @@ class Report:
     @property
     def limits(self) -> list[float] | None:
         """What the best 2^k of the policies that were tried earn on these tasks, (n_records,)."""
-        return None if self.known is None else [self.known.limit(n) for n in self.evaluation.record_at]
+        return (
+            None if self.known is None else [self.known.limit(n) for n in self.evaluation.record_at]
+        )
 
     def table(self) -> Table:
-        """Return, its standard error over tasks, the limit and, where a family has it, the success rate after each answer."""
+        """Return, its standard error over tasks, the limit and, where a family has it, the success
+        rate after each answer.
+        """
         known, limits = self.known, self.limits
         rates = self.evaluation.success_rates
-        table = Table(title=self.title, caption=self._caption(), caption_justify="left", min_width=TABLE_WIDTH)
-        for name in ("answers", "return", "std. error", "limit", *(() if rates is None else ("success rate",))):
+        table = Table(
+            title=self.title, caption=self._caption(), caption_justify="left", min_width=TABLE_WIDTH
+        )
+        for name in (
+            "answers",
+            "return",
+            "std. error",
+            "limit",
+            *(() if rates is None else ("success rate",)),
+        ):
             table.add_column(name, justify="right")
         for row, (n, mean, error) in enumerate(_means(self.evaluation)):
             limit = "" if limits is None else f"{limits[row]:.1f}"
             rate = [] if rates is None else [f"{rates[row]:.2f}"]
-            table.add_row(str(n), f"{mean:.1f}", "" if np.isnan(error) else f"{error:.1f}", limit, *rate)
+            table.add_row(
+                str(n), f"{mean:.1f}", "" if np.isnan(error) else f"{error:.1f}", limit, *rate
+            )
         if known is not None:
             table.add_section()
             rate = [] if known.success_rate is None else [f"{known.success_rate:.2f}"]
@@ -68,7 +81,9 @@ class Report:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-ready: every task's return after every answer, the limit, the known-task return, and how it came about."""
+        """JSON-ready: every task's return after every answer, the limit, the known-task return, and
+        how it came about.
+        """
         return {
             "command": " ".join(sys.orig_argv),
             "versions": versions(),
@@ -89,8 +104,7 @@ class Report:
         }
 
     def write(self, console: Console, json_file: Path | None, plot_file: Path | None) -> None:
-        """
-        Print the table and write the files that were asked for.
+        """Print the table and write the files that were asked for.
 
         :param console: where to print
         :param json_file: for :meth:`to_dict`
@@ -126,5 +140,9 @@ def row_text(evaluation: AdaptationEvaluation) -> str:
 def _means(evaluation: AdaptationEvaluation) -> Iterator[tuple[int, float, float]]:
     """Number of answers, mean return over tasks, its standard error (NaN for one task): a row each."""
     returns = evaluation.task_returns
-    errors = returns.std(axis=0, ddof=1) / np.sqrt(len(returns)) if len(returns) > 1 else np.full(returns.shape[1], np.nan)
+    errors = (
+        returns.std(axis=0, ddof=1) / np.sqrt(len(returns))
+        if len(returns) > 1
+        else np.full(returns.shape[1], np.nan)
+    )
     return zip(evaluation.record_at, returns.mean(axis=0), errors, strict=True)

@@ -14,9 +14,9 @@ from sb3_poem.cli.experiment import CHECKPOINT
 
 
 def resumed(arguments: Sequence[str]) -> list[str] | None:
-    """
-    Replace ``--resume`` by what it means: ``-i CHECKPOINT`` of the last run of the same algorithm, environment and seed, or
-    nothing, and a word about it, where no such run has left a checkpoint.
+    """Replace ``--resume`` by what it means: ``-i CHECKPOINT`` of the last run of the same
+    algorithm, environment and seed, or nothing, and a word about it, where no such run has left a
+    checkpoint.
 
     :param arguments: those of ``train``, ``--algo`` among them
     :return: arguments for rl_zoo3; None if that run has finished already
@@ -30,7 +30,9 @@ def resumed(arguments: Sequence[str]) -> list[str] | None:
     parser.add_argument("-i", "--trained-agent", default="")
     given, _ = parser.parse_known_args(arguments)
     if given.trained_agent:
-        raise ValueError("--resume finds the checkpoint by itself: leave out either --resume or -i/--trained-agent")
+        raise ValueError(
+            "--resume finds the checkpoint by itself: leave out either --resume or -i/--trained-agent"
+        )
     rest = [argument for argument in arguments if argument != "--resume"]
     folder, env_name = Path(given.log_folder) / given.algo, given.env.replace("/", "-")
     run = last_run(folder, env_name, given.seed)
@@ -39,14 +41,15 @@ def resumed(arguments: Sequence[str]) -> list[str] | None:
         print(f"--resume: {folder} has no checkpoint of {which}; training begins from zero")
         return rest
     if is_complete(run / f"{env_name}.zip"):
-        print(f"{run} has finished already; start another run without --resume, or train it further with -i")
+        print(
+            f"{run} has finished already; start another run without --resume, or train it further with -i"
+        )
         return None
     return [*rest, "-i", str(run / CHECKPOINT)]
 
 
 def resume_command(arguments: Sequence[str]) -> str:
-    """
-    The command that goes on with a run of which a checkpoint is left.
+    """The command that goes on with a run of which a checkpoint is left.
 
     :param arguments: those that the run was given
     """
@@ -57,8 +60,8 @@ def resume_command(arguments: Sequence[str]) -> str:
 
 
 def is_complete(model: Path) -> bool:
-    """
-    Whether a training made all its steps. rl_zoo3 saves a model too when an interrupt from the keyboard stops it.
+    """Whether a training made all its steps. rl_zoo3 saves a model too when an interrupt from the
+    keyboard stops it.
 
     :param model: the file that it saved last, or would have
     :raises ValueError: if the file is no model
@@ -70,18 +73,22 @@ def is_complete(model: Path) -> bool:
             data = json.loads(archive.read("data"))
         return int(data["num_timesteps"]) >= int(data["_total_timesteps"])
     except (zipfile.BadZipFile, KeyError, ValueError) as error:
-        raise ValueError(f"{model} is truncated, or no model: {error}; remove it to train anew") from error
+        raise ValueError(
+            f"{model} is truncated, or no model: {error}; remove it to train anew"
+        ) from error
 
 
 def last_run(folder: Path, env_name: str, seed: int) -> Path | None:
-    """
-    The newest run that can be continued, or is done.
+    """The newest run that can be continued, or is done.
 
     :param folder: of the algorithm's runs
     :param env_name: environment id with - in place of /
     :param seed: as given to the run; negative: any
     """
-    runs = sorted(folder.glob(f"{env_name}_*"), key=lambda run: int(run.name.removeprefix(env_name).split("_")[1]))
+    runs = sorted(
+        folder.glob(f"{env_name}_*"),
+        key=lambda run: int(run.name.removeprefix(env_name).split("_")[1]),
+    )
     for run in reversed(runs):
         if seed >= 0 and _arguments(run / env_name / "args.yml").get("seed") != seed:
             continue

@@ -28,13 +28,17 @@ def run_enjoy(arguments: argparse.Namespace) -> None:
         raise OSError(f"there is no display to draw on: film it by `{film}`, or add --no-render")
     shown = Shown(arguments)
     with_window = not arguments.no_render
-    env = shown.subject.make_env("human" if with_window else None, show_task=with_window and shown.has_task)
+    env = shown.subject.make_env(
+        "human" if with_window else None, show_task=with_window and shown.has_task
+    )
     steps = arguments.n_timesteps
     episodes = arguments.episodes if steps is None else ceil(steps / shown.subject.model.horizon)
     try:
         for number in range(episodes):
             episode = shown.subject.roll_out(env, shown.latents[-1], number)
-            earned = f"return {shown.subject.true_return(episode):.1f} in " if shown.has_task else ""
+            earned = (
+                f"return {shown.subject.true_return(episode):.1f} in " if shown.has_task else ""
+            )
             say(f"Episode {number + 1}: {earned}{len(episode)} steps")
     finally:
         env.close()
@@ -69,7 +73,9 @@ class Shown:
         self.subject = subject = Subject(arguments, Console(), 1, COPIES_FOR_ONE_TASK)
         self.has_task = subject.latent is None or arguments.task is not None
         if subject.latent is not None and arguments.known_task:
-            raise ValueError(f"--known-task chooses a policy of a model, but --model {arguments.model} is a policy")
+            raise ValueError(
+                f"--known-task chooses a policy of a model, but --model {arguments.model} is a policy"
+            )
         self.latents: list[np.ndarray] = []
         self.captions: list[str] = []
         if self.has_task:
@@ -88,7 +94,9 @@ class Shown:
             known = subject.known_task_return(arguments.episodes)
         self.latents = [known.latents[0]]
         n = len(known.candidate_latents)
-        say(f"Policy of {arguments.model}: the best of {n} for this task; return {known.mean_return:.1f}")
+        say(
+            f"Policy of {arguments.model}: the best of {n} for this task; return {known.mean_return:.1f}"
+        )
 
     def _adapt(self, arguments: argparse.Namespace) -> None:
         subject = self.subject
@@ -103,17 +111,28 @@ class Shown:
             )
         self.latents = list(measured.latents[0])
         self.captions = [f"after {n} answer{'s' * (n != 1)}" for n in measured.record_at]
-        returns = [f"return {earned:.1f} {when}" for earned, when in zip(measured.mean_returns, self.captions, strict=True)]
-        say(f"Policy of {arguments.model}, adapted by the oracle that knows the return: {', '.join(returns)}")
+        returns = [
+            f"return {earned:.1f} {when}"
+            for earned, when in zip(measured.mean_returns, self.captions, strict=True)
+        ]
+        say(
+            f"Policy of {arguments.model}, adapted by the oracle that knows the return: {', '.join(returns)}"
+        )
 
 
 def _last_run(arguments: argparse.Namespace) -> str:
     """The file with the model of the last run, or its checkpoint if it has not finished."""
     if arguments.env is None:
-        raise ValueError("name a model by --model, or by --env the environment whose last run in --folder is shown")
+        raise ValueError(
+            "name a model by --model, or by --env the environment whose last run in --folder is shown"
+        )
     name = arguments.env.replace("/", "-")
     folder = Path(arguments.folder) / arguments.algo
-    run = folder / f"{name}_{arguments.exp_id}" if arguments.exp_id else last_run(folder, name, seed=-1)
+    run = (
+        folder / f"{name}_{arguments.exp_id}"
+        if arguments.exp_id
+        else last_run(folder, name, seed=-1)
+    )
     if run is None or not run.is_dir():
         number = f" {arguments.exp_id}" if arguments.exp_id else ""
         raise FileNotFoundError(

@@ -72,7 +72,9 @@ class Subject:
     :raises OSError: if the model cannot be read
     """
 
-    def __init__(self, arguments: argparse.Namespace, console: Console, n_tasks: int, copies: int) -> None:
+    def __init__(
+        self, arguments: argparse.Namespace, console: Console, n_tasks: int, copies: int
+    ) -> None:
         self.console = console
         self.seed: int = arguments.seed
         check_device(arguments.device)
@@ -105,7 +107,9 @@ class Subject:
         if task is None:
             return self.family.test_tasks(n_tasks, self.seed)
         if len(task) != self.family.task_dim:
-            raise ValueError(f"--task needs {self.family.task_dim} numbers for {self.env_id}, got {len(task)}")
+            raise ValueError(
+                f"--task needs {self.family.task_dim} numbers for {self.env_id}, got {len(task)}"
+            )
         return np.array([task], dtype=np.float64)
 
     def known_task_return(self, n_episodes: int) -> KnownTaskReturn:
@@ -115,7 +119,12 @@ class Subject:
         """
         selection = min(n_episodes, SELECTION_EPISODES)
         return known_task_return(
-            self.model, self.env, self.tasks, n_episodes=n_episodes, seed=self.seed, selection_episodes=selection
+            self.model,
+            self.env,
+            self.tasks,
+            n_episodes=n_episodes,
+            seed=self.seed,
+            selection_episodes=selection,
         )
 
     def make_env(self, render_mode: str | None, show_task: bool) -> DummyVecEnv:
@@ -130,7 +139,9 @@ class Subject:
         FamilyView(env).set_tasks(self.tasks[:1])
         return env
 
-    def roll_out(self, env: DummyVecEnv, latent: np.ndarray, episode: int = 0, frames: bool = False) -> Trajectory:
+    def roll_out(
+        self, env: DummyVecEnv, latent: np.ndarray, episode: int = 0, frames: bool = False
+    ) -> Trajectory:
         """An episode of a policy on the first task.
 
         :param env: What :meth:`make_env` made
@@ -139,14 +150,18 @@ class Subject:
         :param frames: Whether to keep its frames
         """
         seed = evaluation_seed(self.seed) + episode
-        return rollout_latents(self.model, env, latent[None], self.tasks[:1], [seed], frames=frames)[0]
+        return rollout_latents(
+            self.model, env, latent[None], self.tasks[:1], [seed], frames=frames
+        )[0]
 
     def true_return(self, episode: Trajectory) -> float:
         """What an episode earns on the first task."""
         assert episode.reward_features is not None
         return float(self.family.compute_rewards(self.tasks[0], episode.reward_features).sum())
 
-    def film(self, latents: Sequence[np.ndarray], captions: Sequence[str], path: Path, show_task: bool) -> None:
+    def film(
+        self, latents: Sequence[np.ndarray], captions: Sequence[str], path: Path, show_task: bool
+    ) -> None:
         """Film one policy on the first task, or two side by side from the same start.
 
         :param latents: One or two, (latent_dim,) each
@@ -160,7 +175,9 @@ class Subject:
             frames = clips[0].frames or []
             if len(clips) > 1:
                 earned = [f": {self.true_return(clip):.1f}" if show_task else "" for clip in clips]
-                left, right = (caption + words for caption, words in zip(captions, earned, strict=True))
+                left, right = (
+                    caption + words for caption, words in zip(captions, earned, strict=True)
+                )
                 frames = side_by_side(frames, clips[1].frames or [], (left, right))
             write_video(frames, path, float(FamilyView(env).render_fps))
         env.close()

@@ -41,9 +41,13 @@ def register_algorithms() -> None:
 
 
 class CheckedPairs(StoreDict):
-    """rl_zoo3's ``KEY:VALUE`` arguments, whose values are Python, with an error that names what is none."""
+    """rl_zoo3's ``KEY:VALUE`` arguments, whose values are Python, with an error that names what is
+    none.
+    """
 
-    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+    def __call__(
+        self, parser: Any, namespace: Any, values: Any, option_string: str | None = None
+    ) -> None:
         for pair in values:
             key, _, text = pair.partition(":")
             try:
@@ -56,12 +60,11 @@ class CheckedPairs(StoreDict):
 
 
 def check_arguments(command: str, arguments: Sequence[str]) -> None:
-    """
-    Refuse what rl_zoo3 would stumble over, and import what ``--gym-packages`` names.
+    """Refuse what rl_zoo3 would stumble over, and import what ``--gym-packages`` names.
 
     :param command: ``"train"`` or ``"enjoy"``
-    :param arguments: its arguments
-    :raises ValueError: if a value is no Python, or a module, the environment, the device or the model does not exist
+    :raises ValueError: if a value is no Python, or a module, the environment, the device or the
+        model does not exist
     """
     parser = argparse.ArgumentParser(f"sb3-poem {command}", add_help=False, allow_abbrev=False)
     for flags in (("-params", "--hyperparams"), ("--env-kwargs",), ("--eval-env-kwargs",)):
@@ -76,33 +79,45 @@ def check_arguments(command: str, arguments: Sequence[str]) -> None:
     check_device(given.device)
     if given.trained_agent:
         if not given.trained_agent.endswith(".zip") or not Path(given.trained_agent).is_file():
-            raise ValueError(f"-i {given.trained_agent}: there is no such file of a model, which ends in .zip")
+            raise ValueError(
+                f"-i {given.trained_agent}: there is no such file of a model, which ends in .zip"
+            )
         if given.algo in ALGORITHMS and not is_checkpoint(given.trained_agent):
             ALGORITHMS[given.algo].load(given.trained_agent, device="cpu")
     if given.env not in gym.registry:
         names = {name: env_id for env_id in gym.registry for name in (env_id, family_label(env_id))}
         close = difflib.get_close_matches(given.env, names, n=1)
-        hint = f"did you mean {names[close[0]]}?" if close else "name the module that registers it by --gym-packages"
+        hint = (
+            f"did you mean {names[close[0]]}?"
+            if close
+            else "name the module that registers it by --gym-packages"
+        )
         raise ValueError(f"--env {given.env}: there is no such environment; {hint}")
 
 
 def run_zoo(command: str, arguments: Sequence[str]) -> None:
-    """
-    Run rl_zoo3's program with our algorithms registered; ``logs`` is the default folder.
-    Training evaluates by adaptation, which takes a while, and so less often and on fewer episodes than rl_zoo3's default.
+    """Run rl_zoo3's program with our algorithms registered; ``logs`` is the default folder.
+    Training evaluates by adaptation, which takes a while, and so less often and on fewer episodes
+    than rl_zoo3's default.
 
     :param command: ``"train"`` or ``"enjoy"``
     :param arguments: its own arguments, as its ``--help`` lists them
     """
     register_algorithms()
     defaults = DEFAULTS[command]
-    if command == "enjoy" and not has_display() and not {"--no-render", "-h", "--help"} & set(arguments):
+    if (
+        command == "enjoy"
+        and not has_display()
+        and not {"--no-render", "-h", "--help"} & set(arguments)
+    ):
         raise OSError("there is no display to draw on: add --no-render")
 
     if {"-h", "--help"} & set(arguments):
         print(f"Defaults here: {' '.join(defaults)}")
         if command == "train":
-            print("--resume: go on with the last run of the same algorithm, environment and seed, if it did not finish")
+            print(
+                "--resume: go on with the last run of the same algorithm, environment and seed, if it did not finish"
+            )
         print()
 
     resumes = command == "train" and "--resume" in arguments
@@ -117,7 +132,11 @@ def run_zoo(command: str, arguments: Sequence[str]) -> None:
     try:
         zoo_train.train() if command == "train" else zoo_enjoy.enjoy()
     except TrainingInterrupted as stop:
-        again = f"go on with: {resume_command(arguments)}" if stop.resumable else "the same command begins again"
+        again = (
+            f"go on with: {resume_command(arguments)}"
+            if stop.resumable
+            else "the same command begins again"
+        )
         raise KeyboardInterrupt(f"{stop}; {again}") from None
     except AssertionError as error:
         # rl_zoo3 asserts on what the user gave; an assertion without words is a defect.

@@ -43,9 +43,9 @@ class Segment:
 class TaskBatch(NamedTuple):
     """Transitions of several tasks.
 
-    observations (tasks, batch, obs_dim), actions (tasks, batch, action_dim), next_observations (tasks, batch, obs_dim),
-    rewards (tasks, batch), terminated (tasks, batch), features (tasks, batch, feat_dim), ended (tasks, batch): whether the
-    episode or its recording ends there.
+    observations (tasks, batch, obs_dim), actions (tasks, batch, action_dim), next_observations
+    (tasks, batch, obs_dim), rewards (tasks, batch), terminated (tasks, batch), features (tasks,
+    batch, feat_dim), ended (tasks, batch): whether the episode or its recording ends there.
     """
 
     observations: th.Tensor
@@ -60,9 +60,10 @@ class TaskBatch(NamedTuple):
 class TaskReplayBuffer(ReplayBuffer):
     """Replay buffer with a ring of transitions for every training task.
 
-    A transition's next observation is, but at the end of an episode or of a segment, the observation of the row that follows.
-    So it is stored once; a batch of any tasks is still a single gather, of rows that reach into their successors. What
-    follows an end is kept apart. Actions are stored in 16 bits (to within 1.6e-5 of their range from -1 to 1), all else as
+    A transition's next observation is, but at the end of an episode or of a segment, the
+    observation of the row that follows. So it is stored once; a batch of any tasks is still a
+    single gather, of rows that reach into their successors. What follows an end is kept apart.
+    Actions are stored in 16 bits (to within 1.6e-5 of their range from -1 to 1), all else as
     float32. Memory is taken as it fills.
 
     :param buffer_size: Transitions kept per task
@@ -84,7 +85,9 @@ class TaskReplayBuffer(ReplayBuffer):
         n_tasks: int = 1,
         feature_dim: int = 1,
     ) -> None:
-        BaseBuffer.__init__(self, buffer_size, observation_space, action_space, get_device(device), n_envs=n_tasks)
+        BaseBuffer.__init__(
+            self, buffer_size, observation_space, action_space, get_device(device), n_envs=n_tasks
+        )
         self.n_tasks = n_tasks
         self.optimize_memory_usage = False
         self.handle_timeout_termination = True
@@ -102,7 +105,8 @@ class TaskReplayBuffer(ReplayBuffer):
         self.counts = np.zeros(self.n_tasks, dtype=np.int64)
         self.positions = np.zeros(self.n_tasks, dtype=np.int64)
         self._counts_on_device = th.zeros(self.n_tasks, device=self.device)
-        # Observations after an end. A row's mark is the number of its own, negative if the episode terminated; 0 is no end.
+        # Observations after an end. A row's mark is the number of its own, negative if the episode
+        # terminated; 0 is no end.
         self.ends = th.zeros(1, self.obs_dim, device=self.device)
         self._free_ends = np.zeros(0, dtype=np.int32)
 
@@ -143,7 +147,8 @@ class TaskReplayBuffer(ReplayBuffer):
         self.full = bool((self.counts == self.buffer_size).all())
 
     def draw_slots(self, source_tasks: th.Tensor, generator: th.Generator) -> th.Tensor:
-        """Draw one stored transition for each entry, uniformly from its task's own: its slot, for :meth:`at`.
+        """Draw one stored transition for each entry, uniformly from its task's own: its slot, for
+        :meth:`at`.
 
         :param source_tasks: (tasks, batch) indices of the tasks to draw from
         :param generator: torch generator on this buffer's device
@@ -156,8 +161,8 @@ class TaskReplayBuffer(ReplayBuffer):
         return self.at(source_tasks, self.draw_slots(source_tasks, generator))
 
     def at(self, tasks: th.Tensor, slots: th.Tensor) -> TaskBatch:
-        """The transitions in some slots. The next slot, round the ring, holds the next step, but where an episode or its
-        recording ended.
+        """The transitions in some slots. The next slot, round the ring, holds the next step, but
+        where an episode or its recording ended.
 
         :param tasks: (...) indices of tasks
         :param slots: (...), below the tasks' ``counts``
@@ -165,11 +170,14 @@ class TaskReplayBuffer(ReplayBuffer):
         return self._gather(tasks * self.rows.shape[1] + slots)
 
     def transitions(self, task: int) -> TaskBatch:
-        """All transitions of a task, in the order of their slots: those of :class:`TaskBatch`, each (1, count, ...).
+        """All transitions of a task, in the order of their slots: those of :class:`TaskBatch`, each
+        (1, count, ...).
 
         :param task: Index of the task
         """
-        return self._gather(task * self.rows.shape[1] + th.arange(int(self.counts[task]), device=self.device)[None])
+        return self._gather(
+            task * self.rows.shape[1] + th.arange(int(self.counts[task]), device=self.device)[None]
+        )
 
     def state(self) -> dict[str, Any]:
         """Everything needed to continue, without unused room."""
@@ -195,7 +203,8 @@ class TaskReplayBuffer(ReplayBuffer):
             self.rows[:, -1] = self.rows[:, 0]
         # a file gives tensors back where there were arrays
         self.counts, self.positions, self._free_ends = (
-            th.as_tensor(state[name]).numpy().copy() for name in ("counts", "positions", "free_ends")
+            th.as_tensor(state[name]).numpy().copy()
+            for name in ("counts", "positions", "free_ends")
         )
         self.ends = state["ends"].to(self.device, copy=True)
         self._counts_on_device = th.as_tensor(self.counts, dtype=th.float32, device=self.device)
@@ -206,7 +215,9 @@ class TaskReplayBuffer(ReplayBuffer):
         return sum(self.widths[:3])
 
     def _pack(self, segment: Segment, steps: int) -> tuple[th.Tensor, np.ndarray, np.ndarray]:
-        """Rows (copies, steps, words) without marks; which are ends, and which of these terminated, (copies, steps)."""
+        """Rows (copies, steps, words) without marks; which are ends, and which of these terminated,
+        (copies, steps).
+        """
         obs = segment.observations[:, -steps:].astype(np.float32, copy=False)
         next_obs = segment.next_observations[:, -steps:].astype(np.float32, copy=False)
         terminated = segment.terminated[:, -steps:] > 0
@@ -219,21 +230,34 @@ class TaskReplayBuffer(ReplayBuffer):
         floats[..., self.obs_dim : mark - 1] = segment.features[:, -steps:]
         floats[..., mark - 1] = segment.rewards[:, -steps:]
         actions = packed.view(np.int16)[..., 2 * (mark + 1) :][..., : self.action_dim]
-        np.rint(np.clip(segment.actions[:, -steps:], -1.0, 1.0) * ACTION_UNITS, out=actions, casting="unsafe")
+        np.rint(
+            np.clip(segment.actions[:, -steps:], -1.0, 1.0) * ACTION_UNITS,
+            out=actions,
+            casting="unsafe",
+        )
         return th.from_numpy(packed).to(self.device), is_end, terminated
 
     def _gather(self, flat: th.Tensor) -> TaskBatch:
         """Transitions (...) at row numbers (...) over all tasks."""
-        words, (all_rows, obs_dim) = sum(self.widths), (self.rows.shape[0] * self.rows.shape[1], self.obs_dim)
+        words, (all_rows, obs_dim) = (
+            sum(self.widths),
+            (self.rows.shape[0] * self.rows.shape[1], self.obs_dim),
+        )
         # the very last row repeats another and is never drawn, so that every row has a successor
         with_successor = self.rows.as_strided((all_rows - 1, words + obs_dim), (words, 1))
         rows = with_successor.index_select(0, flat.reshape(-1))
         floats, mark = rows.view(th.float32), self._mark
-        marks = rows[:, mark].contiguous()  # what is dense is converted and searched several times as fast
+        marks = rows[
+            :, mark
+        ].contiguous()  # what is dense is converted and searched several times as fast
         ends = marks.nonzero().view(-1)
-        floats[:, words:].index_copy_(0, ends, self.ends.index_select(0, marks.index_select(0, ends).abs()))
+        floats[:, words:].index_copy_(
+            0, ends, self.ends.index_select(0, marks.index_select(0, ends).abs())
+        )
         ended, terminated = marks != 0, (marks < 0).float()
-        actions = (rows[:, mark + 1 : words].contiguous().view(th.int16) * (1.0 / ACTION_UNITS))[:, : self.action_dim]
+        actions = (rows[:, mark + 1 : words].contiguous().view(th.int16) * (1.0 / ACTION_UNITS))[
+            :, : self.action_dim
+        ]
         floats, shape = floats.unflatten(0, flat.shape), flat.shape
         return TaskBatch(
             floats[..., :obs_dim],
@@ -248,9 +272,17 @@ class TaskReplayBuffer(ReplayBuffer):
     def _reserve(self, rows_per_task: int) -> None:
         capacity = self.capacity
         if rows_per_task > capacity:
-            new_capacity = min(self.buffer_size, max(INITIAL_ROWS_PER_TASK, 2 * capacity, rows_per_task))
+            new_capacity = min(
+                self.buffer_size, max(INITIAL_ROWS_PER_TASK, 2 * capacity, rows_per_task)
+            )
             # not zeros: the system gives pages that nobody writes to no memory
-            grown = th.empty(self.n_tasks, new_capacity + 1, self.rows.shape[2], dtype=th.int32, device=self.device)
+            grown = th.empty(
+                self.n_tasks,
+                new_capacity + 1,
+                self.rows.shape[2],
+                dtype=th.int32,
+                device=self.device,
+            )
             grown[:, :capacity] = self.rows[:, :capacity]
             self.rows = grown
 
@@ -265,19 +297,25 @@ class TaskReplayBuffer(ReplayBuffer):
             used = len(self.ends)
             added = max(missing, used // 4, INITIAL_ROWS_PER_TASK)
             self.ends = th.cat([self.ends, self.ends.new_zeros(added, self.obs_dim)])
-            self._free_ends = np.concatenate([self._free_ends, np.arange(used, used + added, dtype=np.int32)])
+            self._free_ends = np.concatenate(
+                [self._free_ends, np.arange(used, used + added, dtype=np.int32)]
+            )
         numbers, self._free_ends = np.split(self._free_ends, [len(observations)])
-        self.ends[th.from_numpy(numbers).to(self.device)] = th.as_tensor(observations, dtype=th.float32, device=self.device)
+        self.ends[th.from_numpy(numbers).to(self.device)] = th.as_tensor(
+            observations, dtype=th.float32, device=self.device
+        )
         return numbers
 
 
 @dataclass
 class ContextStore:
-    """What the last epoch collected: the encoder's contexts and the preference labels. Replaced every epoch.
+    """What the last epoch collected: the encoder's contexts and the preference labels. Replaced
+    every epoch.
 
     :param transitions: (tasks, steps, context_dim) standardised (s, a, s', r[, Q])
     :param rewards: (tasks, steps) in the environment's units
-    :param returns: (tasks, tasks), J[i, j] of task j's policy on task i; NaN where it was not measured
+    :param returns: (tasks, tasks), J[i, j] of task j's policy on task i; NaN where it was not
+        measured
     :param features: (tasks, steps, feat_dim) reward features, where contexts are relabelled
     """
 

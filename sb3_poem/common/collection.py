@@ -11,11 +11,15 @@ from sb3_poem.common.family_view import FamilyView
 OnStep = Callable[[dict[str, Any]], bool]
 
 
-def check_finite(name: str, values: np.ndarray, task_ids: np.ndarray, episodes: np.ndarray, step: int) -> None:
+def check_finite(
+    name: str, values: np.ndarray, task_ids: np.ndarray, episodes: np.ndarray, step: int
+) -> None:
+    """:raises ValueError: if any copy's values are NaN or infinite; names the copy, its task and its
+    episode
     """
-    :raises ValueError: if any copy's values are NaN or infinite; names the copy, its task and its episode
-    """
-    if np.isfinite(values.sum()):  # then all are; the sum of large finite values may overflow, which the lines below sort out
+    if np.isfinite(
+        values.sum()
+    ):  # then all are; the sum of large finite values may overflow, which the lines below sort out
         return
     finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
     if not finite.all():
@@ -36,10 +40,12 @@ def collect_segment(
     episode_counts: np.ndarray,
     on_step: OnStep,
 ) -> Segment | None:
-    """Run every copy for one horizon on its task; an episode that ends early is followed by another of the same task.
+    """Run every copy for one horizon on its task; an episode that ends early is followed by another
+    of the same task.
 
     :param family: The environment
-    :param act: Maps observations (copies, obs_dim) to actions in the environment's units and in [-1, 1]
+    :param act: Maps observations (copies, obs_dim) to actions in the environment's units and in
+        [-1, 1]
     :param task_ids: (copies,) index of each copy's task
     :param tasks: (copies, task_dim)
     :param latents: (copies, latent_dim), noted in the segment
@@ -81,12 +87,18 @@ def collect_segment(
                 next_obs[copy] = infos[copy]["terminal_observation"]
                 segment.terminated[copy, step] = not infos[copy].get("TimeLimit.truncated", False)
         features = family.features_of(infos)
-        for name, values in (("observations", next_obs), ("rewards", rewards), ("reward features", features)):
+        for name, values in (
+            ("observations", next_obs),
+            ("rewards", rewards),
+            ("reward features", features),
+        ):
             check_finite(name, values, task_ids, episode_counts, step)
         segment.observations[:, step] = obs
         segment.actions[:, step] = scaled_actions
         segment.next_observations[:, step] = next_obs
-        segment.rewards[:, step] = rewards.astype(np.float32)  # as most VecEnvs give them; SubprocVecEnv does not round
+        segment.rewards[:, step] = rewards.astype(
+            np.float32
+        )  # as most VecEnvs give them; SubprocVecEnv does not round
         segment.features[:, step] = features
         segment.first_episode[:, step] = in_first_episode
         in_first_episode &= ~dones
@@ -111,6 +123,8 @@ def relabelled_returns(
     :return: (tasks, trajectories)
     """
     returns = np.empty((len(tasks), len(features)))
-    for index, task in enumerate(tasks):  # one row at a time bounds the memory at trajectories x steps
+    for index, task in enumerate(
+        tasks
+    ):  # one row at a time bounds the memory at trajectories x steps
         returns[index] = (compute_rewards(task, features) * mask).sum(axis=1)
     return returns

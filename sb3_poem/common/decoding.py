@@ -6,7 +6,8 @@ import torch as th
 
 from sb3_poem.common.networks import MLP
 
-# Rows of hidden values that are computed together: enough to pay for a call, few enough to stay in a core's cache.
+# Rows of hidden values that are computed together: enough to pay for a call, few enough to stay in
+# a core's cache.
 BLOCK_ROWS = 2000
 
 
@@ -29,25 +30,34 @@ def decoded_sums(
     first, start, rows = 0, 0, 0
     for index, length in enumerate(lengths):
         if rows and rows + length > BLOCK_ROWS:
-            sums[:, first:index] = _group_sums(mlp, transitions[start : start + rows], lengths[first:index], embeddings, dtype)
+            sums[:, first:index] = _group_sums(
+                mlp, transitions[start : start + rows], lengths[first:index], embeddings, dtype
+            )
             first, start, rows = index, start + rows, 0
         rows += length
     sums[:, first:] = _group_sums(mlp, transitions[start:], lengths[first:], embeddings, dtype)
     return sums
 
 
-def _group_sums(mlp: MLP, transitions: th.Tensor, lengths: Sequence[int], embeddings: th.Tensor, dtype: th.dtype) -> th.Tensor:
+def _group_sums(
+    mlp: MLP, transitions: th.Tensor, lengths: Sequence[int], embeddings: th.Tensor, dtype: th.dtype
+) -> th.Tensor:
     first, *others = [*mlp.hidden, mlp.output]
     assert isinstance(first, th.nn.Linear)
-    of_transitions, of_embeddings = first.weight.split([transitions.shape[-1], embeddings.shape[-1]], dim=1)
+    of_transitions, of_embeddings = first.weight.split(
+        [transitions.shape[-1], embeddings.shape[-1]], dim=1
+    )
     base = (transitions @ of_transitions.T + first.bias).to(dtype)  # (rows, width)
     shifts = (embeddings @ of_embeddings.T).to(dtype)  # (m, width)
     middle = [(layer.weight.T.to(dtype), layer.bias.to(dtype)) for layer in others[:-1]]  # type: ignore[union-attr, operator]
     last = mlp.output.weight[0].to(dtype)
     block = max(1, BLOCK_ROWS // len(base))
-    # the same memory for every block: to get new pages from the system takes longer than to fill them
+    # the same memory for every block: to get new pages from the system takes longer than to fill
+    # them
     rows = min(block, len(shifts)) * len(base)
-    buffers = [base.new_empty(rows, len(bias)) for bias in [first.bias, *(bias for _, bias in middle)]]
+    buffers = [
+        base.new_empty(rows, len(bias)) for bias in [first.bias, *(bias for _, bias in middle)]
+    ]
     sums = []
     for some in shifts.split(block):
         rows = len(some) * len(base)
@@ -58,6 +68,8 @@ def _group_sums(mlp: MLP, transitions: th.Tensor, lengths: Sequence[int], embedd
         if others:
             x = mlp.activation(x) @ last
         values = x.view(len(some), -1).float()
-        sums.append(th.stack([part.sum(dim=1) for part in values.split(list(lengths), dim=1)], dim=1))
+        sums.append(
+            th.stack([part.sum(dim=1) for part in values.split(list(lengths), dim=1)], dim=1)
+        )
     result = th.cat(sums)
     return result + mlp.output.bias * result.new_tensor(lengths) if others else result

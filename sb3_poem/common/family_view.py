@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 # Arguments that change how an environment is drawn, not what it is.
 DRAWING_ARGUMENTS = {"render_mode", "render_task"}
-#: Test tasks come from a stream of their own, so that no seed gives the tasks that a model was trained on
+#: Test tasks come from a stream of their own, so that no seed gives the tasks that a model was
+#: trained on
 TEST_TASK_STREAM = 0x7E57
 #: Steps by which it is seen whether a wrapper changes a family
 COMPARED_STEPS = 10
@@ -71,13 +72,15 @@ class FamilyView:
 
     @classmethod
     def for_training(cls, env: VecEnv, horizon: int | None = None) -> FamilyView:
-        """The same of what can be trained on: spaces fit, no wrapper changes it, an episode's length is known.
+        """The same of what can be trained on: spaces fit, no wrapper changes it, an episode's
+        length is known.
 
         Wrappers that change what is seen, done or paid are refused: those of Gymnasium and SB3 by
         name, others by the first experience, see :meth:`check_experience`.
 
         :param env: As for the class
-        :param horizon: Steps of an episode; None reads the time limit of the environment's registration
+        :param horizon: Steps of an episode; None reads the time limit of the environment's
+            registration
         :raises ValueError: if not
         """
         from sb3_poem.common.wrappers import unknown_wrappers
@@ -96,9 +99,13 @@ class FamilyView:
             limit = self._get("max_episode_steps")
         steps = horizon if limit is None else limit
         if steps is None:
-            raise ValueError("horizon is unknown: register the environment with max_episode_steps, or pass horizon=<steps>")
+            raise ValueError(
+                "horizon is unknown: register the environment with max_episode_steps, or pass horizon=<steps>"
+            )
         if horizon is not None and horizon != steps:
-            raise ValueError(f"horizon is {horizon}, but the environment ends episodes after {limit} steps; they must agree")
+            raise ValueError(
+                f"horizon is {horizon}, but the environment ends episodes after {limit} steps; they must agree"
+            )
         if steps < 1:
             raise ValueError(f"horizon must be at least 1 step, got {steps}")
         return int(steps)
@@ -117,12 +124,13 @@ class FamilyView:
         return {
             name: value
             for name, value in self.spec.kwargs.items()
-            if name not in DRAWING_ARGUMENTS and not (name in registered and _equal(registered[name], value))
+            if name not in DRAWING_ARGUMENTS
+            and not (name in registered and _equal(registered[name], value))
         }
 
     def check_experience(self, tasks: np.ndarray, seed: int, segment: Segment) -> None:
-        """Whether rewards are :meth:`compute_rewards`'s, and unknown wrappers leave the family as it is.
-        The first call looks, and the others take its word.
+        """Whether rewards are :meth:`compute_rewards`'s, and unknown wrappers leave the family as
+        it is. The first call looks, and the others take its word.
 
         :param tasks: (copies, task_dim), those of the segment
         :param seed: Of the reset that it began with
@@ -193,7 +201,9 @@ class FamilyView:
         """(task_dim,), the one in effect in the first copy."""
         task = self._get("task")
         if task is None:
-            raise RuntimeError("the environment has no task before its first reset(): reset it, or give the oracle its `task`")
+            raise RuntimeError(
+                "the environment has no task before its first reset(): reset it, or give the oracle its `task`"
+            )
         return np.asarray(task, dtype=np.float64)
 
     @property
@@ -206,7 +216,9 @@ class FamilyView:
 
     def sample_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draw (n, task_dim) tasks from the family's distribution."""
-        return np.asarray(self.env.env_method("sample_tasks", n, rng, indices=[0])[0], dtype=np.float64)
+        return np.asarray(
+            self.env.env_method("sample_tasks", n, rng, indices=[0])[0], dtype=np.float64
+        )
 
     def test_tasks(self, n: int, seed: int) -> np.ndarray:
         """(n, task_dim) tasks that no seed gives a model to train on. Those of a finite family are
@@ -219,7 +231,10 @@ class FamilyView:
 
     def compute_rewards(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
         """Rewards (...) of reward features (..., feat_dim) under tasks (..., task_dim)."""
-        return np.asarray(self.env.env_method("compute_rewards", tasks, features, indices=[0])[0], dtype=np.float64)
+        return np.asarray(
+            self.env.env_method("compute_rewards", tasks, features, indices=[0])[0],
+            dtype=np.float64,
+        )
 
     @property
     def has_potential(self) -> bool:
@@ -228,7 +243,9 @@ class FamilyView:
 
     def compute_potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
         """Potentials (...) of observations (..., obs_dim) under tasks (..., task_dim)."""
-        return np.asarray(self.env.env_method("compute_potential", tasks, observations, indices=[0])[0])
+        return np.asarray(
+            self.env.env_method("compute_potential", tasks, observations, indices=[0])[0]
+        )
 
     def set_tasks(self, tasks: np.ndarray) -> None:
         """Give copy i the task ``tasks[i]``, from its next reset on."""
@@ -242,12 +259,12 @@ class FamilyView:
     def seed_episodes(self, seeds: Sequence[int]) -> None:
         """Seed every copy's next episode without touching its task.
 
-        A task family that was never given a task draws one whenever it is reset with a seed; a reset
-        without a seed keeps the task. So a family's generators are replaced, and its next reset needs
-        no seed: the episode is the same as after a seeded reset, and the task stays. Nobody looks at
-        the task for that, except where copies have no generators to replace (``TaskVecEnv``): it is
-        told to keep them. A task that was chosen for the next reset is the one that stays, and seeds
-        that are pending are used up first.
+        A task family that was never given a task draws one whenever it is reset with a seed; a
+        reset without a seed keeps the task. So a family's generators are replaced, and its next
+        reset needs no seed: the episode is the same as after a seeded reset, and the task stays.
+        Nobody looks at the task for that, except where copies have no generators to replace
+        (``TaskVecEnv``): it is told to keep them. A task that was chosen for the next reset is the
+        one that stays, and seeds that are pending are used up first.
 
         :param seeds: One a copy
         """
@@ -265,7 +282,9 @@ class FamilyView:
         seed_copies(env, seeds)
 
     def reset(self, tasks: np.ndarray, seed: int) -> np.ndarray:
-        """Start an episode of ``tasks[i]`` in each copy i, reproducibly; returns observations (num_envs, obs_dim)."""
+        """Start an episode of ``tasks[i]`` in each copy i, reproducibly; returns observations
+        (num_envs, obs_dim).
+        """
         self.set_tasks(tasks)
         self.env.seed(seed)
         obs = self.env.reset()
@@ -280,9 +299,7 @@ class FamilyView:
         return np.stack([info["reward_features"] for info in infos])
 
     def check_same_family(self, task_space: spaces.Box, reward_feature_dim: int) -> None:
-        """
-        :raises ValueError: if a model that was made for another family is given this environment
-        """
+        """:raises ValueError: if a model that was made for another family is given this environment"""
         if self.task_space != task_space or self.reward_feature_dim != reward_feature_dim:
             raise ValueError(
                 f"the model was trained for tasks in {task_space} with {reward_feature_dim} reward features, but "
@@ -292,16 +309,17 @@ class FamilyView:
 
 
 def seed_copies(vec_env: VecEnv, seeds: Sequence[int]) -> None:
-    """
-    Seed every copy's next reset by itself. ``VecEnv.seed(s)`` can only give copy i the seed s + i, and two rollouts that
-    are compared should start alike.
+    """Seed every copy's next reset by itself. ``VecEnv.seed(s)`` can only give copy i the seed s +
+    i, and two rollouts that are compared should start alike.
 
     :param vec_env: Any SB3 vector environment.
     :param seeds: One a copy.
     """
     base = vec_env.unwrapped
     base.seed(seeds[0])
-    base._seeds = list(seeds)  # SB3's own list of "seeds to be used in the next call to env.reset()"
+    base._seeds = list(
+        seeds
+    )  # SB3's own list of "seeds to be used in the next call to env.reset()"
 
 
 def vectorised(env: gym.Env | VecEnv) -> VecEnv:

@@ -8,8 +8,11 @@ from pathlib import Path
 from typing import BinaryIO
 
 
-def write_atomically(path: str | Path, content: bytes | memoryview | Callable[[BinaryIO], object]) -> None:
-    """Write a file completely or not at all: a crash, a kill or a full disk leaves the previous file whole.
+def write_atomically(
+    path: str | Path, content: bytes | memoryview | Callable[[BinaryIO], object]
+) -> None:
+    """Write a file completely or not at all: a crash, a kill or a full disk leaves the previous
+    file whole.
 
     :param path: Where; missing folders are made
     :param content: What, or a function that writes it to an open file
@@ -28,7 +31,8 @@ def write_atomically(path: str | Path, content: bytes | memoryview | Callable[[B
         temporary = None
     except OSError as error:
         raise OSError(
-            error.errno, f"could not write {path} ({error.strerror}); what was there before, if anything, is untouched"
+            error.errno,
+            f"could not write {path} ({error.strerror}); what was there before, if anything, is untouched",
         ) from error
     finally:  # an interrupt from the keyboard leaves nothing behind either
         if temporary is not None:

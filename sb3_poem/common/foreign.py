@@ -17,8 +17,15 @@ from sb3_poem.common.family_view import DRAWING_ARGUMENTS
 
 PLAIN_ID = re.compile(r"\w[\w.-]{0,99}(/\w[\w.-]{0,99})?", re.ASCII)
 WORD = re.compile(r"[\w-]{0,100}", re.ASCII)
-#: Which an image depends on; of a family of one's own they may mean something else, which only its user knows
-IMAGE_ARGUMENTS = DRAWING_ARGUMENTS | {"width", "height", "render_quality", "max_geom", "visual_options"}
+#: Which an image depends on; of a family of one's own they may mean something else, which only its
+#: user knows
+IMAGE_ARGUMENTS = DRAWING_ARGUMENTS | {
+    "width",
+    "height",
+    "render_quality",
+    "max_geom",
+    "visual_options",
+}
 IMAGE_ARGUMENTS |= {"camera_id", "camera_name", "default_camera_config"}
 # How far an argument may be from its default, and how many numbers it may hold.
 TIMES_DEFAULT, LONGEST = 100, 64
@@ -59,7 +66,9 @@ def environment_of(
     given_kwargs = given_kwargs or {}
     chosen = given_id or env_id
     if chosen is None:
-        raise ValueError(f"--env is needed: {source} does not say on which environment it was trained")
+        raise ValueError(
+            f"--env is needed: {source} does not say on which environment it was trained"
+        )
     if chosen != env_id:
         return chosen, dict(given_kwargs)
     check_env_id(env_id, source)
@@ -115,13 +124,22 @@ def _objection(name: str, value: Any, defaults: dict[str, Any]) -> str | None:
 
 def _fits(value: Any, default: Any) -> bool:
     """Whether a value is of its default's kind (None: of any), and in proportion to it."""
-    if isinstance(default, list | tuple | np.ndarray) or (default is None and isinstance(value, list)):
+    if isinstance(default, list | tuple | np.ndarray) or (
+        default is None and isinstance(value, list)
+    ):
         kinds = [None] if default is None else np.ravel(default).tolist()
         items = value if isinstance(value, list) and len(value) <= LONGEST else [[]]
-        return all(not isinstance(item, list) and any(_fits(item, kind) for kind in kinds) for item in items)
+        return all(
+            not isinstance(item, list) and any(_fits(item, kind) for kind in kinds)
+            for item in items
+        )
     for kind in (bool, str):
         if isinstance(value, kind) or isinstance(default, kind):
-            return isinstance(value, kind) and isinstance(default, kind | None) and WORD.fullmatch(str(value)) is not None
+            return (
+                isinstance(value, kind)
+                and isinstance(default, kind | None)
+                and WORD.fullmatch(str(value)) is not None
+            )
     if not isinstance(value, int | float) or not isinstance(default, int | float | None):
         return False
     if type(default) is int and not isinstance(value, int):

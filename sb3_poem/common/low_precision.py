@@ -1,9 +1,9 @@
 """A perceptron with its hidden layers in bfloat16, as one node of the graph.
 
-Three things make it faster than a cast around every operation. Bias and ReLU ride on the matrix product, where oneDNN offers
-it. Layers are padded to widths that matrix units like; a spare unit is held at 1, so that the product which gives the
-gradient of the weights gives the bias's too. And no value is cast twice. Layers that are normalised before the ReLU have only
-the last of these.
+Three things make it faster than a cast around every operation. Bias and ReLU ride on the matrix
+product, where oneDNN offers it. Layers are padded to widths that matrix units like; a spare unit is
+held at 1, so that the product which gives the gradient of the weights gives the bias's too. And no
+value is cast twice. Layers that are normalised before the ReLU have only the last of these.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,8 @@ ALIGNMENT = 16
 
 
 class LowPrecisionMLP:
-    """Copies of a perceptron's hidden layers in another arithmetic; the output layer stays the perceptron's own, in float32.
+    """Copies of a perceptron's hidden layers in another arithmetic; the output layer stays the
+    perceptron's own, in float32.
 
     :param hidden: Hidden layers, each followed by a ReLU
     :param output: Output layer
@@ -26,7 +27,13 @@ class LowPrecisionMLP:
     :param layer_norm: Whether hidden layers are normalised before the ReLU
     """
 
-    def __init__(self, hidden: Sequence[nn.Linear], output: nn.Linear, dtype: th.dtype, layer_norm: bool = False) -> None:
+    def __init__(
+        self,
+        hidden: Sequence[nn.Linear],
+        output: nn.Linear,
+        dtype: th.dtype,
+        layer_norm: bool = False,
+    ) -> None:
         self.output = output
         self.layer_norm = layer_norm
         alignment = 1 if layer_norm else ALIGNMENT
@@ -34,12 +41,16 @@ class LowPrecisionMLP:
         widths = [layer.in_features for layer in hidden] + [self.width]
         padded = [-(-width // alignment) * alignment for width in widths]
         #: Column of each layer's input that is constantly 1, None without padding
-        self.ones = [width if width < room else None for width, room in zip(widths, padded, strict=True)]
+        self.ones = [
+            width if width < room else None for width, room in zip(widths, padded, strict=True)
+        ]
         self.parameters: list[th.Tensor] = []
         #: The float32 parameters and where their copies are
         self.pairs: list[tuple[th.Tensor, th.Tensor, tuple[slice, ...]]] = []
         for index, layer in enumerate(hidden):
-            weight = th.zeros(padded[index + 1], padded[index], dtype=dtype, device=layer.weight.device)
+            weight = th.zeros(
+                padded[index + 1], padded[index], dtype=dtype, device=layer.weight.device
+            )
             bias = th.zeros(padded[index + 1], dtype=dtype, device=layer.weight.device)
             spare = self.ones[index + 1]
             if spare is not None:
@@ -65,11 +76,17 @@ class LowPrecisionMLP:
         if frozen:
             parameters = [parameter.detach() for parameter in parameters]
         rows = x.reshape(-1, x.shape[-1])
-        out = _normalised_perceptron(rows, *parameters) if self.layer_norm else _Perceptron.apply(rows, self.ones, *parameters)
+        out = (
+            _normalised_perceptron(rows, *parameters)
+            if self.layer_norm
+            else _Perceptron.apply(rows, self.ones, *parameters)
+        )
         return out.view(*x.shape[:-1], -1)
 
 
-def _normalised_perceptron(x: th.Tensor, out_weight: th.Tensor, out_bias: th.Tensor, *hidden: th.Tensor) -> th.Tensor:
+def _normalised_perceptron(
+    x: th.Tensor, out_weight: th.Tensor, out_bias: th.Tensor, *hidden: th.Tensor
+) -> th.Tensor:
     for weight, bias in zip(hidden[::2], hidden[1::2], strict=True):
         x = th.relu_(nn.functional.layer_norm(linear(x, weight, bias), bias.shape))
     return linear(x.float(), out_weight, out_bias)
@@ -78,7 +95,12 @@ def _normalised_perceptron(x: th.Tensor, out_weight: th.Tensor, out_bias: th.Ten
 class _Perceptron(th.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, x: th.Tensor, ones: list[int | None], out_weight: th.Tensor, out_bias: th.Tensor, *hidden: th.Tensor
+        ctx: Any,
+        x: th.Tensor,
+        ones: list[int | None],
+        out_weight: th.Tensor,
+        out_bias: th.Tensor,
+        *hidden: th.Tensor,
     ) -> th.Tensor:
         weights, biases = hidden[::2], hidden[1::2]
         values = [x]
@@ -99,7 +121,10 @@ class _Perceptron(th.autograd.Function):
         of_parameters: list[th.Tensor | None] = [None] * (2 + 2 * n_layers)
         trained = ctx.needs_input_grad[2]
         if trained:
-            of_parameters[0], of_parameters[1] = (values[-1].t() @ low)[:width].t().float(), grad.sum(dim=0)
+            of_parameters[0], of_parameters[1] = (
+                (values[-1].t() @ low)[:width].t().float(),
+                grad.sum(dim=0),
+            )
         g = low @ nn.functional.pad(out_weight.to(low.dtype), (0, room - width))
         for index in reversed(range(n_layers)):
             g = th.ops.aten.threshold_backward(g, values[index + 1], 0)

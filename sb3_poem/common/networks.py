@@ -1,7 +1,7 @@
 """Networks that PEARLSAC and POEMSAC are made of.
 
-Hidden layers may run in bfloat16 (see :mod:`sb3_poem.common.precision`); every output layer runs in float32, because values
-in the hundreds lose their differences in eight bits of mantissa.
+Hidden layers may run in bfloat16 (see :mod:`sb3_poem.common.precision`); every output layer runs in
+float32, because values in the hundreds lose their differences in eight bits of mantissa.
 """
 
 import itertools
@@ -25,9 +25,8 @@ LOG_DENSITY_CONSTANT = 0.5 * math.log(2.0 * math.pi) + 2.0 * math.log(2.0)
 
 
 class Normalised(nn.Module):
-    """An activation of values that are normalised over their layer (Ba, Kiros & Hinton, 2016), without gain and bias.
-
-    :param activation: The activation
+    """An activation of values that are normalised over their layer (Ba, Kiros & Hinton, 2016),
+    without gain and bias.
     """
 
     def __init__(self, activation: nn.Module) -> None:
@@ -103,7 +102,9 @@ class MLP(nn.Module):
         widths = [in_dim, *net_arch]
         activation = nn.ReLU(inplace=True) if activation_fn is nn.ReLU else activation_fn()
         self.activation = Normalised(activation) if layer_norm else activation
-        self.hidden = nn.ModuleList(nn.Linear(width, next_width) for width, next_width in itertools.pairwise(widths))
+        self.hidden = nn.ModuleList(
+            nn.Linear(width, next_width) for width, next_width in itertools.pairwise(widths)
+        )
         self.output = nn.Linear(widths[-1], out_dim)
         #: The hidden layers in another arithmetic, while :class:`MixedPrecision` holds
         self.low_precision: LowPrecisionMLP | None = None
@@ -126,7 +127,9 @@ class MLP(nn.Module):
         """:meth:`forward` of an input that :meth:`inputs` has put together."""
         if self.low_precision is not None:
             return self.low_precision.evaluate(x, frozen)
-        h = x.reshape(-1, x.shape[-1])  # a product of two dimensions is no view, so that activations may work in place
+        h = x.reshape(
+            -1, x.shape[-1]
+        )  # a product of two dimensions is no view, so that activations may work in place
         for layer in self.hidden:
             h = self.activation(_linear(h, layer, frozen))
         return _linear(h, self.output, frozen).view(*x.shape[:-1], -1)
@@ -138,8 +141,8 @@ def _linear(x: th.Tensor, layer: nn.Module, frozen: bool) -> th.Tensor:
 
 
 class _GaussianProduct(th.autograd.Function):
-    """Mean and variance, (..., d), of the normalised product of Gaussian factors, (..., factors, 2 d): their means, then what
-    softplus makes their variances.
+    """Mean and variance, (..., d), of the normalised product of Gaussian factors, (..., factors, 2
+    d): their means, then what softplus makes their variances.
     """
 
     @staticmethod
@@ -157,7 +160,11 @@ class _GaussianProduct(th.autograd.Function):
     def backward(ctx: Any, of_mean: th.Tensor, of_variance: th.Tensor) -> th.Tensor:  # type: ignore[override]
         means, variances, precisions, mean, variance = ctx.saved_tensors
         by_sum = (of_mean * variance).unsqueeze(-2)
-        of_precisions = (means - mean.unsqueeze(-2)).mul_(by_sum).sub_((of_variance * variance.square()).unsqueeze(-2))
+        of_precisions = (
+            (means - mean.unsqueeze(-2))
+            .mul_(by_sum)
+            .sub_((of_variance * variance.square()).unsqueeze(-2))
+        )
         # the slope of softplus(x) = y is 1 - exp(-y); a factor at the least variance has none
         slope = th.expm1(-variances).mul_(variances >= MIN_FACTOR_VARIANCE)
         of_variances = of_precisions.mul_(precisions.square()).mul_(slope)
@@ -167,15 +174,17 @@ class _GaussianProduct(th.autograd.Function):
 class ContextEncoder(nn.Module):
     """Probabilistic, permutation-invariant task encoder q_phi(z | c).
 
-    Each transition of the context gives one Gaussian factor; their normalised product is the posterior, as in
-    Rakelly et al. (2019), which section 5.3 of Xu & Zhu (2025) takes over.
+    Each transition of the context gives one Gaussian factor; their normalised product is the
+    posterior, as in Rakelly et al. (2019), which section 5.3 of Xu & Zhu (2025) takes over.
 
     :param in_dim: Width of one context transition
     :param latent_dim: Dimension d of the latent
     :param net_arch: Widths of the hidden layers
     """
 
-    def __init__(self, in_dim: int, latent_dim: int, net_arch: Sequence[int] = (200, 200, 200)) -> None:
+    def __init__(
+        self, in_dim: int, latent_dim: int, net_arch: Sequence[int] = (200, 200, 200)
+    ) -> None:
         super().__init__()
         self.latent_dim = latent_dim
         self.mlp = MLP(in_dim, 2 * latent_dim, net_arch)
@@ -190,7 +199,9 @@ class ContextEncoder(nn.Module):
 
 
 class _SquashedGaussian(th.autograd.Function):
-    """Actions and their log-probability from means and log standard deviations, (..., 2 * action_dim), and noise."""
+    """Actions and their log-probability from means and log standard deviations, (..., 2 *
+    action_dim), and noise.
+    """
 
     @staticmethod
     def forward(ctx: Any, raw: th.Tensor, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
@@ -199,7 +210,13 @@ class _SquashedGaussian(th.autograd.Function):
         shift = log_std.exp().mul_(noise)
         pre_tanh = mean + shift
         # log(1 - tanh(x)^2) = 2 (log 2 - x - softplus(-2 x)) does not saturate
-        terms = softplus(pre_tanh * -2.0).add_(pre_tanh).mul_(2.0).sub_(log_std).addcmul_(noise, noise, value=-0.5)
+        terms = (
+            softplus(pre_tanh * -2.0)
+            .add_(pre_tanh)
+            .mul_(2.0)
+            .sub_(log_std)
+            .addcmul_(noise, noise, value=-0.5)
+        )
         actions = pre_tanh.tanh_()
         ctx.save_for_backward(actions, shift, raw_log_std)
         return actions, terms.sum(dim=-1).sub_(noise.shape[-1] * LOG_DENSITY_CONSTANT)
@@ -209,8 +226,11 @@ class _SquashedGaussian(th.autograd.Function):
     def backward(ctx: Any, of_actions: th.Tensor, of_log_prob: th.Tensor) -> tuple[th.Tensor, None]:  # type: ignore[override]
         actions, shift, raw_log_std = ctx.saved_tensors
         of_log_prob = of_log_prob.unsqueeze(-1)
-        # tanh' = 1 - tanh^2, and the log-probability's derivative by the value before squashing is 2 tanh
-        of_mean = of_actions.addcmul(of_actions * actions, actions, value=-1.0).addcmul_(actions, of_log_prob, value=2.0)
+        # tanh' = 1 - tanh^2, and the log-probability's derivative by the value before squashing is
+        # 2 tanh
+        of_mean = of_actions.addcmul(of_actions * actions, actions, value=-1.0).addcmul_(
+            actions, of_log_prob, value=2.0
+        )
         of_log_std = (of_mean * shift).sub_(of_log_prob)
         inside = raw_log_std.clamp(LOG_STD_MIN, LOG_STD_MAX) == raw_log_std
         return th.cat([of_mean, of_log_std.mul_(inside)], dim=-1), None
@@ -284,9 +304,13 @@ class LatentCritic(nn.Module):
     ) -> None:
         super().__init__()
         in_dim = obs_dim + action_dim + latent_dim
-        self.members = nn.ModuleList(MLP(in_dim, 1, net_arch, activation_fn, layer_norm) for _ in range(n_critics))
+        self.members = nn.ModuleList(
+            MLP(in_dim, 1, net_arch, activation_fn, layer_norm) for _ in range(n_critics)
+        )
 
-    def forward(self, obs: th.Tensor, actions: th.Tensor, latents: th.Tensor, frozen: bool = False) -> th.Tensor:
+    def forward(
+        self, obs: th.Tensor, actions: th.Tensor, latents: th.Tensor, frozen: bool = False
+    ) -> th.Tensor:
         """Values of (..., obs_dim), (..., action_dim), (..., latent_dim) -> (n_critics, ...).
 
         :param frozen: Do not build a graph to the parameters; gradients still reach the inputs
@@ -317,8 +341,12 @@ class RewardDecoder(nn.Module):
         layer_norm: bool = False,
     ) -> None:
         super().__init__()
-        self.mlp = MLP(2 * obs_dim + action_dim + latent_dim, 1, net_arch, activation_fn, layer_norm)
+        self.mlp = MLP(
+            2 * obs_dim + action_dim + latent_dim, 1, net_arch, activation_fn, layer_norm
+        )
 
-    def forward(self, obs: th.Tensor, actions: th.Tensor, next_obs: th.Tensor, embedding: th.Tensor) -> th.Tensor:
+    def forward(
+        self, obs: th.Tensor, actions: th.Tensor, next_obs: th.Tensor, embedding: th.Tensor
+    ) -> th.Tensor:
         """Predicted standardised rewards (...) of transitions (..., dim)."""
         return self.mlp(obs, actions, next_obs, embedding).squeeze(-1)

@@ -24,7 +24,9 @@ def hidden_dtype(precision: str, device_type: str) -> th.dtype:
     :raises ValueError: for another name
     """
     if precision not in PRECISIONS:
-        raise ValueError(f"precision must be one of {', '.join(map(repr, PRECISIONS))}, got {precision!r}")
+        raise ValueError(
+            f"precision must be one of {', '.join(map(repr, PRECISIONS))}, got {precision!r}"
+        )
     if precision == "auto":
         supported = th.cuda.is_bf16_supported() if device_type == "cuda" else cpu_has_bfloat16()
         return th.bfloat16 if supported else th.float32
@@ -32,16 +34,21 @@ def hidden_dtype(precision: str, device_type: str) -> th.dtype:
 
 
 def _is_rectified(activation: nn.Module) -> bool:
-    return isinstance(activation.activation if isinstance(activation, Normalised) else activation, nn.ReLU)
+    return isinstance(
+        activation.activation if isinstance(activation, Normalised) else activation, nn.ReLU
+    )
 
 
 class MixedPrecision:
-    """Runs the hidden layers of all rectified perceptrons of a module in another arithmetic, on weights that stay float32.
+    """Runs the hidden layers of all rectified perceptrons of a module in another arithmetic, on
+    weights that stay float32.
 
-    Within the context, copies of the layers compute; :meth:`refresh` brings them up to date, and :meth:`collect_gradients`
-    takes their gradients back to the float32 weights, each for all layers at once.
+    Within the context, copies of the layers compute; :meth:`refresh` brings them up to date, and
+    :meth:`collect_gradients` takes their gradients back to the float32 weights, each for all layers
+    at once.
 
-    :param module: Module that holds the perceptrons; those with another activation than ReLU stay float32
+    :param module: Module that holds the perceptrons; those with another activation than ReLU stay
+        float32
     :param dtype: Arithmetic of their hidden layers; float32 changes nothing
     """
 
@@ -49,7 +56,15 @@ class MixedPrecision:
         self._networks: list[tuple[MLP, LowPrecisionMLP]] = []
         if dtype != th.float32:
             self._networks = [
-                (part, LowPrecisionMLP(list(part.hidden), part.output, dtype, isinstance(part.activation, Normalised)))  # type: ignore[arg-type]
+                (
+                    part,
+                    LowPrecisionMLP(
+                        list(part.hidden),  # type: ignore[arg-type]
+                        part.output,
+                        dtype,
+                        isinstance(part.activation, Normalised),
+                    ),
+                )
                 for part in module.modules()
                 if isinstance(part, MLP) and _is_rectified(part.activation) and len(part.hidden)
             ]

@@ -37,7 +37,11 @@ class Generators:
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.numpy = np.random.default_rng()
         self.numpy.bit_generator.state = state["numpy"]
-        device = state["device"] if th.device(state["device"]).type != "cuda" or th.cuda.is_available() else "cpu"
+        device = (
+            state["device"]
+            if th.device(state["device"]).type != "cuda" or th.cuda.is_available()
+            else "cpu"
+        )
         self.torch = th.Generator(device)
         if device == state["device"]:
             self.torch.set_state(th.from_numpy(np.array(state["torch"], dtype=np.uint8)))
@@ -45,7 +49,9 @@ class Generators:
             self.torch.manual_seed(int(self.numpy.integers(2**63 - 1)))
 
     def to(self, device: th.device | str) -> "Generators":
-        """Move the torch generator to another kind of device; its stream is then a new one, seeded by the old."""
+        """Move the torch generator to another kind of device; its stream is then a new one, seeded
+        by the old.
+        """
         device = th.device(device)
         if device.type != self.torch.device.type:
             torch_generator = th.Generator(device)

@@ -1,4 +1,6 @@
-"""SB3's face of a vectorised task family: all copies step in one call, infos are as with ``DummyVecEnv`` and ``Monitor``."""
+"""SB3's face of a vectorised task family: all copies step in one call, infos are as with
+``DummyVecEnv`` and ``Monitor``.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,12 @@ import numpy.typing as npt
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
-from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
+from stable_baselines3.common.vec_env.base_vec_env import (
+    VecEnv,
+    VecEnvIndices,
+    VecEnvObs,
+    VecEnvStepReturn,
+)
 
 from poem_envs.family import TaskFamily
 from poem_envs.registration import plain_id
@@ -24,34 +31,46 @@ from poem_envs.vector import TaskFamilyVector
 from sb3_poem.common.family_view import no_family
 
 # What these do, the vectorised environment or TaskVecEnv does itself.
-ABSORBED_WRAPPERS: tuple[type[gym.Wrapper], ...] = (TimeLimit, OrderEnforcing, PassiveEnvChecker, Monitor)
+ABSORBED_WRAPPERS: tuple[type[gym.Wrapper], ...] = (
+    TimeLimit,
+    OrderEnforcing,
+    PassiveEnvChecker,
+    Monitor,
+)
 MAKE_VEC_ARGUMENTS = frozenset({"max_episode_steps", "nthread", "num_envs", "vectorization_mode"})
 
 
 class TaskVecEnv(VecEnv):
+    """Vectorised environment for task families that have a vectorised version
+    (``vector_entry_point``).
+
+    It takes the place of ``DummyVecEnv`` where a class can be given: ``make_vec_env(id, n,
+    vec_env_cls=TaskVecEnv)``, rl_zoo3. It steps all copies at once, and gives the same
+    observations, rewards and infos. ``infos[i]`` holds ``"reward_features"``, and as ``Monitor``
+    and ``DummyVecEnv`` have them ``"TimeLimit.truncated"``, ``"terminal_observation"`` and
+    ``"episode"``. ``get_attr`` and ``env_method`` see each copy as a single
+    :class:`poem_envs.TaskFamily`. What else the family's infos hold, such as ``"is_success"``, is
+    there too.
+
+    :param env_fns: One function a copy that returns an environment. Only the first is called: all
+        copies are made alike, from its registration and arguments. If its ``Monitor`` has a file,
+        the episodes of all copies are written to that file.
+    :param nthread: Number of threads (or processes, as the family has it) to step with; None for
+        the family's default (all cores).
+    :raises ValueError: If the environment is no task family, has no vectorised version, was not
+        made by ``gym.make``, was given a task already, or is inside a wrapper other than
+        ``TimeLimit``, ``OrderEnforcing``, ``PassiveEnvChecker`` and ``Monitor``.
     """
-    Vectorised environment for task families that have a vectorised version (``vector_entry_point``).
 
-    It takes the place of ``DummyVecEnv`` where a class can be given: ``make_vec_env(id, n, vec_env_cls=TaskVecEnv)``, rl_zoo3.
-    It steps all copies at once, and gives the same observations, rewards and infos. ``infos[i]`` holds
-    ``"reward_features"``, and as ``Monitor`` and ``DummyVecEnv`` have them ``"TimeLimit.truncated"``,
-    ``"terminal_observation"`` and ``"episode"``. ``get_attr`` and ``env_method`` see each copy as a single
-    :class:`poem_envs.TaskFamily`. What else the family's infos hold, such as ``"is_success"``, is there too.
-
-    :param env_fns: One function a copy that returns an environment. Only the first is called: all copies are made alike, from
-        its registration and arguments. If its ``Monitor`` has a file, the episodes of all copies are written to that file.
-    :param nthread: Number of threads (or processes, as the family has it) to step with; None for the family's default (all
-        cores).
-    :raises ValueError: If the environment is no task family, has no vectorised version, was not made by ``gym.make``, was
-        given a task already, or is inside a wrapper other than ``TimeLimit``, ``OrderEnforcing``, ``PassiveEnvChecker`` and
-        ``Monitor``.
-    """
-
-    def __init__(self, env_fns: Sequence[Callable[[], gym.Env]], nthread: int | None = None) -> None:
+    def __init__(
+        self, env_fns: Sequence[Callable[[], gym.Env]], nthread: int | None = None
+    ) -> None:
         if len(env_fns) < 1:
             raise ValueError("env_fns is empty; pass one function for each copy")
         if not callable(env_fns[0]):
-            raise TypeError(f"env_fns must hold functions that make an environment, but holds {env_fns[0]!r}")
+            raise TypeError(
+                f"env_fns must hold functions that make an environment, but holds {env_fns[0]!r}"
+            )
         env = env_fns[0]()
         wrappers = _wrappers(env)
         vector_env = _vectorised(env, wrappers, len(env_fns), nthread)
@@ -74,9 +93,10 @@ class TaskVecEnv(VecEnv):
         self._start_time = time.time() if self._monitor is None else self._monitor.t_start
 
     @classmethod
-    def from_id(cls, env_id: str, n_envs: int, nthread: int | None = None, **env_kwargs: Any) -> TaskVecEnv:
-        """
-        Make the copies of a registered family.
+    def from_id(
+        cls, env_id: str, n_envs: int, nthread: int | None = None, **env_kwargs: Any
+    ) -> TaskVecEnv:
+        """Make the copies of a registered family.
 
         :param env_id: As for ``gym.make``
         :param n_envs: Number of copies
@@ -87,13 +107,14 @@ class TaskVecEnv(VecEnv):
 
     @classmethod
     def from_vector_env(cls, vector_env: TaskFamilyVector) -> TaskVecEnv:
-        """
-        The face of a vectorised family that there is.
+        """The face of a vectorised family that there is.
 
         :param vector_env: As ``gym.make_vec`` makes it
         """
         env, spec = cls.__new__(cls), vector_env.spec
-        if spec is not None:  # a single environment's: make_vec's own adds what gym.make does not take
+        if (
+            spec is not None
+        ):  # a single environment's: make_vec's own adds what gym.make does not take
             kwargs = {key: spec.kwargs[key] for key in spec.kwargs.keys() - MAKE_VEC_ARGUMENTS}
             limit = vector_env.max_episode_steps
             vector_env.spec = dataclasses.replace(spec, kwargs=kwargs, max_episode_steps=limit)
@@ -111,8 +132,7 @@ class TaskVecEnv(VecEnv):
         return self._last_reward_features
 
     def set_tasks(self, tasks: npt.ArrayLike) -> None:
-        """
-        Choose each copy's task, from its next reset on.
+        """Choose each copy's task, from its next reset on.
 
         :param tasks: ``(num_envs, task_dim)``
         :raises ValueError: As :meth:`poem_envs.TaskFamilyVector.set_tasks`
@@ -128,7 +148,9 @@ class TaskVecEnv(VecEnv):
             if options:
                 unknown = set(options) - {"task"}
                 if unknown:
-                    raise ValueError(f"options={options!r} of reset holds unknown keys {sorted(unknown)}, known is 'task'")
+                    raise ValueError(
+                        f"options={options!r} of reset holds unknown keys {sorted(unknown)}, known is 'task'"
+                    )
                 self.vector_env.set_tasks([options["task"]], copies=[index])
         observations, _ = self.vector_env.reset(seed=self._seeds)
         self._reset_seeds()
@@ -145,16 +167,23 @@ class TaskVecEnv(VecEnv):
         if self._actions is None:
             raise RuntimeError("step_wait() was called without step_async(actions)")
         actions, self._actions = self._actions, None
-        observations, rewards, terminations, truncations, vector_infos = self.vector_env.step(actions)
+        observations, rewards, terminations, truncations, vector_infos = self.vector_env.step(
+            actions
+        )
         features = vector_infos["reward_features"]
         self._last_reward_features = features
         self._returns += rewards
         self._lengths += 1
         cut_short = truncations & ~terminations
         infos: list[dict[str, Any]] = [
-            {"reward_features": row, "TimeLimit.truncated": cut} for row, cut in zip(features, cut_short.tolist(), strict=True)
+            {"reward_features": row, "TimeLimit.truncated": cut}
+            for row, cut in zip(features, cut_short.tolist(), strict=True)
         ]
-        for key in vector_infos.keys() - {"reward_features", "final_obs", "_final_obs"}:  # "success" and the like
+        for key in vector_infos.keys() - {
+            "reward_features",
+            "final_obs",
+            "_final_obs",
+        }:  # "success" and the like
             for info, value in zip(infos, vector_infos[key], strict=True):
                 info[key] = value
         dones = terminations | truncations
@@ -194,21 +223,32 @@ class TaskVecEnv(VecEnv):
                 f"indices={indices!r}: copies share their attributes, so {attr_name!r} can only be set for all of them"
             )
         if attr_name in ("task", "tasks"):
-            raise AttributeError(f"{attr_name!r} cannot be set; use set_tasks(tasks), which takes effect at the next reset")
+            raise AttributeError(
+                f"{attr_name!r} cannot be set; use set_tasks(tasks), which takes effect at the next reset"
+            )
         self.vector_env.set_attribute(attr_name, value)
 
     def env_method(
-        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+        self,
+        method_name: str,
+        *method_args: Any,
+        indices: VecEnvIndices = None,
+        **method_kwargs: Any,
     ) -> list[Any]:
         return [
-            getattr(self._views[index], method_name)(*method_args, **method_kwargs) for index in self._get_indices(indices)
+            getattr(self._views[index], method_name)(*method_args, **method_kwargs)
+            for index in self._get_indices(indices)
         ]
 
-    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
+    def env_is_wrapped(
+        self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None
+    ) -> list[bool]:
+        """Whether the copies do what a wrapper does: those that the first environment was inside,
+        and ``Monitor`` always.
         """
-        Whether the copies do what a wrapper does: those that the first environment was inside, and ``Monitor`` always.
-        """
-        wrapped = issubclass(Monitor, wrapper_class) or any(issubclass(kind, wrapper_class) for kind in self._wrapper_types)
+        wrapped = issubclass(Monitor, wrapper_class) or any(
+            issubclass(kind, wrapper_class) for kind in self._wrapper_types
+        )
         return [wrapped for _ in self._get_indices(indices)]
 
     def _episode_info(self, index: int, info: dict[str, Any]) -> dict[str, Any]:
@@ -225,8 +265,7 @@ class TaskVecEnv(VecEnv):
 
 
 def as_task_vec_env(vector_env: gym.vector.VectorEnv) -> VecEnv:
-    """
-    Gymnasium's vectorised environment of a task family as one of SB3.
+    """Gymnasium's vectorised environment of a task family as one of SB3.
 
     :param vector_env: As ``gym.make_vec`` makes it
     :raises ValueError: If it is of no task family, or in a wrapper, or in Gymnasium's processes
@@ -242,9 +281,11 @@ def as_task_vec_env(vector_env: gym.vector.VectorEnv) -> VecEnv:
     )
 
 
-def make_task_vec_env(env_id: str, n_envs: int, max_sequential: int = 8, **env_kwargs: Any) -> VecEnv:
-    """
-    Copies of a registered family: a :class:`TaskVecEnv`, or a ``DummyVecEnv`` of a family without a vectorised version.
+def make_task_vec_env(
+    env_id: str, n_envs: int, max_sequential: int = 8, **env_kwargs: Any
+) -> VecEnv:
+    """Copies of a registered family: a :class:`TaskVecEnv`, or a ``DummyVecEnv`` of a family
+    without a vectorised version.
 
     :param env_id: As for ``gym.make``
     :param n_envs: Number of copies
@@ -254,12 +295,13 @@ def make_task_vec_env(env_id: str, n_envs: int, max_sequential: int = 8, **env_k
     env_id = plain_id(env_id)
     if gym.spec(env_id).vector_entry_point is not None:
         return TaskVecEnv.from_id(env_id, n_envs, **env_kwargs)
-    return DummyVecEnv([lambda: Monitor(gym.make(env_id, **env_kwargs))] * min(n_envs, max_sequential))
+    return DummyVecEnv(
+        [lambda: Monitor(gym.make(env_id, **env_kwargs))] * min(n_envs, max_sequential)
+    )
 
 
 def make_shown_env(env_id: str, render_mode: str | None, **env_kwargs: Any) -> gym.Env:
-    """
-    A single environment, to be looked at.
+    """A single environment, to be looked at.
 
     :param env_id: As for ``gym.make``
     :param render_mode: None draws nothing
@@ -275,7 +317,8 @@ def make_shown_env(env_id: str, render_mode: str | None, **env_kwargs: Any) -> g
 class _CopyView:
     """One copy of a vectorised task family, with the attributes and methods of a single one."""
 
-    # What a vectorised environment has for all copies together must not pass for an attribute of one copy.
+    # What a vectorised environment has for all copies together must not pass for an attribute of
+    # one copy.
     _HIDDEN = frozenset(
         {
             "tasks",
@@ -356,12 +399,15 @@ def _wrappers(env: gym.Env) -> list[gym.Wrapper]:
 
 def _is_absorbed(wrapper: gym.Wrapper) -> bool:
     """Whether the vectorised version does itself what the wrapper does."""
-    # An import of rl_zoo3 replaces Gymnasium's TimeLimit, for environments that are made later, by a subclass of its own.
+    # An import of rl_zoo3 replaces Gymnasium's TimeLimit, for environments that are made later, by
+    # a subclass of its own.
     patched = isinstance(wrapper, TimeLimit) and type(wrapper).__module__ == "rl_zoo3.gym_patches"
     return patched or type(wrapper) in ABSORBED_WRAPPERS
 
 
-def _vectorised(env: gym.Env, wrappers: list[gym.Wrapper], num_envs: int, nthread: int | None) -> TaskFamilyVector:
+def _vectorised(
+    env: gym.Env, wrappers: list[gym.Wrapper], num_envs: int, nthread: int | None
+) -> TaskFamilyVector:
     """The vectorised version of a single environment, from its registration and arguments."""
     bare, instead = env.unwrapped, "use DummyVecEnv instead of TaskVecEnv"
     if not isinstance(bare, TaskFamily):
@@ -373,20 +419,32 @@ def _vectorised(env: gym.Env, wrappers: list[gym.Wrapper], num_envs: int, nthrea
             f"the environment is wrapped in {', '.join(foreign)}, but only {allowed} can be vectorised; {instead}"
         )
     for monitor in wrappers:
-        if isinstance(monitor, Monitor) and (monitor.reset_keywords or not monitor.allow_early_resets):
-            raise ValueError(f"Monitor's reset_keywords and allow_early_resets=False are not supported; {instead}")
+        if isinstance(monitor, Monitor) and (
+            monitor.reset_keywords or not monitor.allow_early_resets
+        ):
+            raise ValueError(
+                f"Monitor's reset_keywords and allow_early_resets=False are not supported; {instead}"
+            )
     if bare.spec is None:
-        raise ValueError(f"{bare} was not made by gym.make, so that its arguments are unknown; register it, or {instead}")
+        raise ValueError(
+            f"{bare} was not made by gym.make, so that its arguments are unknown; register it, or {instead}"
+        )
     if bare.spec.vector_entry_point is None:
         raise ValueError(f"{bare.spec.id} is registered without a vector_entry_point; {instead}")
     if bare._next_task is not None:
-        raise ValueError("the environment was given a task, which its copies would not get; call set_tasks on the TaskVecEnv")
+        raise ValueError(
+            "the environment was given a task, which its copies would not get; call set_tasks on the TaskVecEnv"
+        )
     limits = [wrapper._max_episode_steps for wrapper in wrappers if isinstance(wrapper, TimeLimit)]
     spec = copy.deepcopy(bare.spec)
     spec.max_episode_steps = min(limits, default=None)
     kwargs: dict[str, Any] = {} if nthread is None else {"nthread": nthread}
     vector_env = gym.make_vec(spec, num_envs, "vector_entry_point", **kwargs)
     if not isinstance(vector_env, TaskFamilyVector):
-        raise ValueError(f"the vector_entry_point of {spec.id} is no poem_envs.TaskFamilyVector; {instead}")
-    vector_env.spec = spec  # a single environment's: make_vec's own adds what gym.make does not take
+        raise ValueError(
+            f"the vector_entry_point of {spec.id} is no poem_envs.TaskFamilyVector; {instead}"
+        )
+    vector_env.spec = (
+        spec  # a single environment's: make_vec's own adds what gym.make does not take
+    )
     return vector_env

@@ -16,8 +16,7 @@ def _even(frame: Frame) -> Frame:
 
 
 def write_video(frames: Sequence[Frame], path: str | Path, fps: float = 20.0) -> Path:
-    """
-    Write frames as MP4 (H.264) or GIF, by the file's suffix. Missing folders are made.
+    """Write frames as MP4 (H.264) or GIF, by the file's suffix. Missing folders are made.
 
     :param frames: (height, width, 3) uint8 each, all of one size
     :param path: a file that ends in ``.mp4`` or ``.gif``
@@ -38,14 +37,16 @@ def write_video(frames: Sequence[Frame], path: str | Path, fps: float = 20.0) ->
 
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".gif":
-        # Delays are whole hundredths of a second, and browsers slow those below two down: leave frames out, and spread the
-        # rounding.
+        # Delays are whole hundredths of a second, and browsers slow those below two down: leave
+        # frames out, and spread the rounding.
         step = int(np.ceil(fps / 50))
         kept: list[Any] = [np.asarray(frame) for frame in frames[::step]]
         ends = np.round(100.0 * step * np.arange(len(kept) + 1) / fps)
         imageio.mimwrite(path, kept, duration=(10.0 * np.diff(ends)).tolist(), loop=0)
     else:
-        imageio.mimwrite(path, [_even(frame) for frame in frames], fps=fps, codec="libx264", macro_block_size=2)
+        imageio.mimwrite(
+            path, [_even(frame) for frame in frames], fps=fps, codec="libx264", macro_block_size=2
+        )
     return path
 
 
@@ -55,24 +56,34 @@ def _with_captions(clips: Sequence[Sequence[Frame]], captions: Sequence[str]) ->
 
     width = min(clip[0].shape[1] for clip in clips)
     size = max(10, width // 20)
-    while size > 8 and max(ImageFont.load_default(size).getlength(caption) for caption in captions) > width:
+    while (
+        size > 8
+        and max(ImageFont.load_default(size).getlength(caption) for caption in captions) > width
+    ):
         size -= 1
     font = ImageFont.load_default(size)
 
     def captioned(frame: Frame, caption: str) -> Frame:
         image = Image.new("RGB", (frame.shape[1], frame.shape[0] + 2 * size), "white")
         image.paste(Image.fromarray(frame), (0, 2 * size))
-        ImageDraw.Draw(image).text((frame.shape[1] / 2, size), caption, fill="black", anchor="mm", font=font)
+        ImageDraw.Draw(image).text(
+            (frame.shape[1] / 2, size), caption, fill="black", anchor="mm", font=font
+        )
         return np.asarray(image)
 
-    return [[captioned(frame, caption) for frame in clip] for clip, caption in zip(clips, captions, strict=True)]
+    return [
+        [captioned(frame, caption) for frame in clip]
+        for clip, caption in zip(clips, captions, strict=True)
+    ]
 
 
 def side_by_side(
-    left: Sequence[Frame], right: Sequence[Frame], captions: tuple[str, str] | None = None, gap: int = 4
+    left: Sequence[Frame],
+    right: Sequence[Frame],
+    captions: tuple[str, str] | None = None,
+    gap: int = 4,
 ) -> list[Frame]:
-    """
-    Two clips beside each other; the shorter one holds its last frame.
+    """Two clips beside each other; the shorter one holds its last frame.
 
     :param left: (height, width, 3) uint8 each
     :param right: frames of the same height
@@ -84,7 +95,9 @@ def side_by_side(
     if len(left) == 0 or len(right) == 0:
         raise ValueError(f"both clips need frames, got {len(left)} and {len(right)}")
     if left[0].shape[0] != right[0].shape[0]:
-        raise ValueError(f"both clips need the same height, got {left[0].shape[0]} and {right[0].shape[0]}")
+        raise ValueError(
+            f"both clips need the same height, got {left[0].shape[0]} and {right[0].shape[0]}"
+        )
     if captions is not None:
         left, right = _with_captions((left, right), captions)
     bar = np.full((left[0].shape[0], gap, 3), 255, dtype=np.uint8)

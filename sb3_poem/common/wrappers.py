@@ -20,10 +20,7 @@ CHANGING_KINDS = (gym.ObservationWrapper, gym.RewardWrapper, gym.ActionWrapper)
 
 
 class WrapperError(ValueError):
-    """Something stands between a family and the model, and changes what is seen, done or paid.
-
-    :param what: It
-    """
+    """Something stands between a family and the model, and changes what is seen, done or paid."""
 
     def __init__(self, what: str) -> None:
         super().__init__(
@@ -55,7 +52,9 @@ def unknown_wrappers(env: VecEnv) -> list[str]:
     changing = [name for name in names if name in CHANGING]
     changing += [kind.__name__ for kind in CHANGING_KINDS if any(env.env_is_wrapped(kind))]
     if changing:
-        raise WrapperError(f"env must not be wrapped in {changing[0]} (its wrappers: {', '.join(names)})")
+        raise WrapperError(
+            f"env must not be wrapped in {changing[0]} (its wrappers: {', '.join(names)})"
+        )
     unknown = [name for name in names if name not in HARMLESS]
     for space in ("observation_space", "action_space") if unknown else ():
         own = getattr(env.get_attr("unwrapped", indices=[0])[0], space)

@@ -1,4 +1,6 @@
-"""Who gets in, and with how much: host names, passwords, cross-site requests, sizes, and what a browser may do with a page."""
+"""Who gets in, and with how much: host names, passwords, cross-site requests, sizes, and what a
+browser may do with a page.
+"""
 
 from __future__ import annotations
 
@@ -35,14 +37,13 @@ CONTENT_POLICY = (
 
 @dataclass(frozen=True)
 class Access:
-    """
-    Who gets in.
+    """Who gets in.
 
     :param user: With ``password``, the name that a browser asks for.
     :param password: See there.
     :param token: What the first address must carry as ``?token=``; a cookie remembers it.
-    :param hosts: Host names under which the server answers when neither is asked for, so that no foreign page can reach it
-        by a name of its own (DNS rebinding).
+    :param hosts: Host names under which the server answers when neither is asked for, so that no
+        foreign page can reach it by a name of its own (DNS rebinding).
     :param embedded: Whether pages of other origins may show this one in a frame (a notebook does).
     """
 
@@ -59,8 +60,7 @@ class Access:
 
 
 def is_loopback(host: str) -> bool:
-    """
-    Whether only this machine can reach an address.
+    """Whether only this machine can reach an address.
 
     :param host: A name or an address.
     :return: Whether it is loopback.
@@ -74,8 +74,7 @@ def is_loopback(host: str) -> bool:
 
 
 class Gate:
-    """
-    ASGI middleware in front of everything.
+    """ASGI middleware in front of everything.
 
     :param app: What is behind it.
     :param access: Who gets in.
@@ -87,7 +86,10 @@ class Gate:
         self.access = access
         self.max_body = max_body
         ancestors = "*" if access.embedded else "'none'"
-        self._headers = {**HEADERS, "Content-Security-Policy": CONTENT_POLICY.format(ancestors=ancestors)}
+        self._headers = {
+            **HEADERS,
+            "Content-Security-Policy": CONTENT_POLICY.format(ancestors=ancestors),
+        }
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """See ASGI."""
@@ -125,7 +127,10 @@ class Gate:
         await self.app(scope, receive_body, send_with_headers)
 
     async def _refusal(self, scope: Scope, headers: Headers) -> Response | None:
-        if not self.access.is_guarded and _host_name(headers.get("host", "")) not in self.access.hosts:
+        if (
+            not self.access.is_guarded
+            and _host_name(headers.get("host", "")) not in self.access.hosts
+        ):
             return PlainTextResponse("this server does not answer under this host name\n", 421)
         if scope["method"] not in ("GET", "HEAD") and _is_cross_site(headers):
             return PlainTextResponse("requests from other sites are refused\n", 403)
@@ -135,7 +140,9 @@ class Gate:
 
     async def _ask_who(self, scope: Scope, headers: Headers) -> Response | None:
         access, authorization = self.access, headers.get("authorization", "")
-        if access.password is not None and _has_password(authorization, access.user or "", access.password):
+        if access.password is not None and _has_password(
+            authorization, access.user or "", access.password
+        ):
             return None
         given = cookies = None
         if access.token is not None:
@@ -147,19 +154,29 @@ class Gate:
             if _same(given, access.token):
                 # One slash: what follows two is another host.
                 response = RedirectResponse("/" + scope["path"].lstrip("/"), 303)
-                # Not "strict": a link that is clicked in somebody's mail would not be let in. Requests of other sites that
-                # write are refused in any case.
-                response.set_cookie(name, access.token, httponly=True, samesite="lax", max_age=30 * 86400)
+                # Not "strict": a link that is clicked in somebody's mail would not be let in.
+                # Requests of other sites that write are refused in any case.
+                response.set_cookie(
+                    name, access.token, httponly=True, samesite="lax", max_age=30 * 86400
+                )
                 return response
         if authorization or cookies or given:
             await asyncio.sleep(PAUSE_AFTER_WRONG_PASSWORD)
-        asks = {"WWW-Authenticate": 'Basic realm="sb3-poem", charset="UTF-8"'} if access.password is not None else {}
+        asks = (
+            {"WWW-Authenticate": 'Basic realm="sb3-poem", charset="UTF-8"'}
+            if access.password is not None
+            else {}
+        )
         return PlainTextResponse(
-            "this page needs the link with its token, or the password, of whoever started it\n", 401, asks
+            "this page needs the link with its token, or the password, of whoever started it\n",
+            401,
+            asks,
         )
 
     async def _body(self, headers: Headers, receive: Receive) -> bytes | Response | None:
-        """The body; a refusal where it is too large, of which no more than the limit is read; None of who has left."""
+        """The body; a refusal where it is too large, of which no more than the limit is read; None
+        of who has left.
+        """
         too_large = PlainTextResponse(f"a request may hold {self.max_body} bytes at most\n", 413)
         length = headers.get("content-length", "0")
         if not re.fullmatch("[0-9]{1,9}", length) or int(length) > self.max_body:
@@ -177,7 +194,11 @@ class Gate:
 
 
 def _host_name(host: str) -> str:
-    return (host[: host.index("]") + 1] if host.startswith("[") and "]" in host else host.partition(":")[0]).lower()
+    return (
+        host[: host.index("]") + 1]
+        if host.startswith("[") and "]" in host
+        else host.partition(":")[0]
+    ).lower()
 
 
 def _is_cross_site(headers: Headers) -> bool:
@@ -185,7 +206,9 @@ def _is_cross_site(headers: Headers) -> bool:
     if site is not None:
         return site not in ("same-origin", "none")
     origin = headers.get("origin")
-    return origin is not None and origin.partition("://")[2].lower() != headers.get("host", "").lower()
+    return (
+        origin is not None and origin.partition("://")[2].lower() != headers.get("host", "").lower()
+    )
 
 
 def _has_password(authorization: str, user: str, password: str) -> bool:

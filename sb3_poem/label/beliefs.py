@@ -1,4 +1,6 @@
-"""What the system believes, as a picture and a sentence for people: the posterior over latents, seen as tasks."""
+"""What the system believes, as a picture and a sentence for people: the posterior over latents,
+seen as tasks.
+"""
 
 from __future__ import annotations
 
@@ -15,13 +17,13 @@ SHARE = 0.8
 
 
 def belief(adapter: Any, env_id: str) -> dict[str, Any]:
-    """
-    The posterior of an adapter, ready to draw.
+    """The posterior of an adapter, ready to draw.
 
     :param adapter: A ``PreferenceAdapter``.
     :param env_id: The environment's id, which says how tasks are drawn.
-    :return: JSON-ready: ``picture`` ("place", "speed", "direction" or "projection"), ``points`` (n, 1 or 2), ``weights`` (n,)
-        summing to one, ``estimate`` (the point of the policy that would be taken now), ``extent``, ``unit`` and ``sentence``.
+    :return: JSON-ready: ``picture`` ("place", "speed", "direction" or "projection"), ``points`` (n,
+        1 or 2), ``weights`` (n,) summing to one, ``estimate`` (the point of the policy that would
+        be taken now), ``extent``, ``unit`` and ``sentence``.
     """
     latents, weights = posterior(adapter.inference)
     everything = np.concatenate([latents, adapter.inference.estimate()[None, :]])
@@ -31,7 +33,10 @@ def belief(adapter: Any, env_id: str) -> dict[str, Any]:
     if picture == "projection":
         points, extent = _projection(adapter.model, everything)
     else:
-        points, extent = _points_of(adapter.model, everything, as_points(env_id, tasks)), description.extent
+        points, extent = (
+            _points_of(adapter.model, everything, as_points(env_id, tasks)),
+            description.extent,
+        )
     points, estimate = points[:-1], points[-1]
     return {
         "picture": picture,
@@ -45,8 +50,7 @@ def belief(adapter: Any, env_id: str) -> dict[str, Any]:
 
 
 def posterior(inference: Any) -> tuple[np.ndarray, np.ndarray]:
-    """
-    The latents that are still possible.
+    """The latents that are still possible.
 
     :param inference: A ``LatentInference``.
     :return: Latents (n, d), and weights (n,) summing to one.
@@ -57,9 +61,11 @@ def posterior(inference: Any) -> tuple[np.ndarray, np.ndarray]:
     return candidates, np.full(len(candidates), 1.0 / len(candidates))
 
 
-def sentence(picture: str, points: np.ndarray, weights: np.ndarray, estimate: np.ndarray, unit: str) -> str:
-    """
-    The posterior in words, for those who cannot see the picture, and those who would rather read.
+def sentence(
+    picture: str, points: np.ndarray, weights: np.ndarray, estimate: np.ndarray, unit: str
+) -> str:
+    """The posterior in words, for those who cannot see the picture, and those who would rather
+    read.
 
     :param picture: How it is drawn.
     :param points: (n, 1 or 2).
@@ -85,9 +91,10 @@ def sentence(picture: str, points: np.ndarray, weights: np.ndarray, estimate: np
     return "Each dot is a behaviour that still fits your answers; the closer together they lie, the surer it is."
 
 
-def weighted_quantiles(values: np.ndarray, weights: np.ndarray, shares: tuple[float, ...]) -> list[float]:
-    """
-    Quantiles of a weighted sample.
+def weighted_quantiles(
+    values: np.ndarray, weights: np.ndarray, shares: tuple[float, ...]
+) -> list[float]:
+    """Quantiles of a weighted sample.
 
     :param values: (n,).
     :param weights: (n,) summing to one.
@@ -109,16 +116,28 @@ def _direction_sentence(points: np.ndarray, weights: np.ndarray) -> str:
     angle = np.arctan2(y, x)
     away = np.abs(np.angle(np.exp(1j * (np.arctan2(points[:, 1], points[:, 0]) - angle))))
     spread = np.degrees(weighted_quantiles(away, weights, (SHARE,))[0])
-    names = ("right", "far right", "away from you", "far left", "left", "near left", "towards you", "near right")
+    names = (
+        "right",
+        "far right",
+        "away from you",
+        "far left",
+        "left",
+        "near left",
+        "towards you",
+        "near right",
+    )
     name = names[round(angle / (np.pi / 4)) % 8]
     return f"It believes that you mean the direction {name} in the video, give or take {spread:.0f} degrees."
 
 
 def _points_of(model: Any, latents: np.ndarray, train_points: np.ndarray) -> np.ndarray:
-    """(m, 1 or 2) the tasks of latents (m, d): the mean of the nearest training tasks', the nearer the heavier."""
+    """(m, 1 or 2) the tasks of latents (m, d): the mean of the nearest training tasks', the nearer
+    the heavier.
+    """
     means, variances = model.train_tasks.latent_means, model.train_tasks.latent_variances
     spread = means.var(axis=0)
-    # What training has left unused says nothing of the task; there the prior's spread would drown the rest.
+    # What training has left unused says nothing of the task; there the prior's spread would drown
+    # the rest.
     scale = np.sqrt(spread / np.maximum(spread + variances.mean(axis=0), 1e-12))
     distances = np.linalg.norm((latents[:, None, :] - means[None, :, :]) * scale, axis=2)
     nearest = np.argsort(distances, axis=1)[:, : min(NEIGHBOURS, len(means))]
@@ -128,7 +147,9 @@ def _points_of(model: Any, latents: np.ndarray, train_points: np.ndarray) -> np.
 
 
 def _projection(model: Any, latents: np.ndarray) -> tuple[np.ndarray, float]:
-    """(m, 2) latents on the plane in which the training tasks' latents differ most, and half the picture's width."""
+    """(m, 2) latents on the plane in which the training tasks' latents differ most, and half the
+    picture's width.
+    """
     means = model.train_tasks.latent_means
     centre = means.mean(axis=0)
     axes = np.linalg.svd(means - centre, full_matrices=False)[2][:2]

@@ -1,4 +1,6 @@
-"""Which trained models a person may choose from. The browser names one of them; it never names a file."""
+"""Which trained models a person may choose from. The browser names one of them; it never names a
+file.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +16,7 @@ from sb3_poem.resources import find_folder, shipped_folder
 
 @dataclass(frozen=True)
 class Choice:
-    """
-    A trained model.
+    """A trained model.
 
     :param name: What it is called; unique in a catalogue.
     :param folder: Where it is.
@@ -39,11 +40,10 @@ class Choice:
 def read_catalogue(
     model: str | None = None, env_id: str | None = None, env_kwargs: dict[str, Any] | None = None
 ) -> list[Choice]:
-    """
-    The models of a folder.
+    """The models of a folder.
 
-    :param model: A pretrained model's folder, a folder of such folders, or the name of a shipped model; None takes all that
-        are shipped.
+    :param model: A pretrained model's folder, a folder of such folders, or the name of a shipped
+        model; None takes all that are shipped.
     :param env_id: The environment in which they are shown; None takes each model's own.
     :param env_kwargs: Arguments of the environment, over those that each model was trained with.
     :return: The models, by name.
@@ -51,15 +51,27 @@ def read_catalogue(
     :raises ValueError: If a model is broken, or does not say its environment.
     """
     folder = shipped_folder("pretrained") if model is None else find_folder(model)
-    folders = [folder] if (folder / CONFIG).is_file() else sorted(file.parent for file in folder.glob(f"*/{CONFIG}"))
+    folders = (
+        [folder]
+        if (folder / CONFIG).is_file()
+        else sorted(file.parent for file in folder.glob(f"*/{CONFIG}"))
+    )
     if not folders:
-        raise FileNotFoundError(f"--model {model}: {folder} holds no pretrained model (a folder with {CONFIG})")
+        raise FileNotFoundError(
+            f"--model {model}: {folder} holds no pretrained model (a folder with {CONFIG})"
+        )
     choices = []
     for one in folders:
         config = read_config(one)
         own = config["env_id"], config["env_kwargs"]
         chosen, arguments = environment_of(str(one), *own, env_id, env_kwargs)
         choices.append(
-            Choice(one.resolve().name, one.resolve(), config["algorithm"], chosen, tuple(sorted(arguments.items())))
+            Choice(
+                one.resolve().name,
+                one.resolve(),
+                config["algorithm"],
+                chosen,
+                tuple(sorted(arguments.items())),
+            )
         )
     return choices

@@ -24,12 +24,13 @@ TOO_SLOW = (
 
 
 class Connection(H11Protocol):
-    """
-    A connection that ends when the server has waited too long for its client: for the rest of a request, for another one, or
-    for an answer to be taken. Where there are too many, the one that was waited for longest ends, and none whose answer is
-    being made: whoever sends a whole request at once is served, whatever else comes from their address.
+    """A connection that ends when the server has waited too long for its client: for the rest of a
+    request, for another one, or for an answer to be taken. Where there are too many, the one that
+    was waited for longest ends, and none whose answer is being made: whoever sends a whole request
+    at once is served, whatever else comes from their address.
 
-    :param deadline: Seconds for a request, and between two; of an answer some must be taken within thrice as many.
+    :param deadline: Seconds for a request, and between two; of an answer some must be taken within
+        thrice as many.
     :param options: See uvicorn.
     """
 
@@ -90,7 +91,9 @@ class Connection(H11Protocol):
         if self.conn.their_state is h11.SEND_BODY:
             return "request"
         if self.conn.their_state is h11.IDLE:
-            return "request" if self.cycle is None or self.conn.trailing_data[0] else "another request"
+            return (
+                "request" if self.cycle is None or self.conn.trailing_data[0] else "another request"
+            )
         return None
 
     def _watch(self) -> None:
@@ -108,7 +111,9 @@ class Connection(H11Protocol):
 
     def _start_timer(self) -> None:
         self._untaken = self.transport.get_write_buffer_size()
-        self._timer = self.loop.call_later(self.deadline * (3 if self._untaken else 1), self._too_late)
+        self._timer = self.loop.call_later(
+            self.deadline * (3 if self._untaken else 1), self._too_late
+        )
 
     def _too_late(self) -> None:
         if self._awaited_from_client() != self.awaited:  # an answer that was taken without a word
@@ -140,8 +145,7 @@ class Connection(H11Protocol):
 
 
 def network_of(host: str) -> str:
-    """
-    What counts as one address.
+    """What counts as one address.
 
     :param host: A client's address.
     :return: It; of IPv6 the network of 64 bits that one household is given.

@@ -15,16 +15,37 @@ from sb3_poem.label.store import Session, Store
 
 #: What an answer's record holds, beside the trajectories where these are asked for.
 FIELDS = (
-    *("session", "source", "model", "env_id", "seed", "number", "preference", "undone", "wish", "verdict"),
-    *("asked", "shown", "answered", "seconds", "video", "fps", "frames", "left_latent", "right_latent"),
+    *(
+        "session",
+        "source",
+        "model",
+        "env_id",
+        "seed",
+        "number",
+        "preference",
+        "undone",
+        "wish",
+        "verdict",
+    ),
+    *(
+        "asked",
+        "shown",
+        "answered",
+        "seconds",
+        "video",
+        "fps",
+        "frames",
+        "left_latent",
+        "right_latent",
+    ),
 )
 
 
-def records(store: Store, trajectories: bool = False, undone: bool = False) -> Iterator[dict[str, Any]]:
-    """
-    The answers of all sessions.
+def records(
+    store: Store, trajectories: bool = False, undone: bool = False
+) -> Iterator[dict[str, Any]]:
+    """The answers of all sessions.
 
-    :param store: The store.
     :param trajectories: Whether observations, actions and reward features are in them.
     :param undone: Whether answers that were taken back are among them.
     :return: A JSON-ready record for each, in the order in which they were given.
@@ -35,30 +56,31 @@ def records(store: Store, trajectories: bool = False, undone: bool = False) -> I
 
 
 def session_record(store: Store, session: Session) -> dict[str, Any]:
-    """
-    One session, as its person downloads it.
+    """One session, as its person downloads it.
 
-    :param store: The store.
-    :param session: The session.
     :return: JSON-ready; it names no file of the server.
     """
     own = [record for record in records(store) if record["session"] == session.id]
-    common = {name: getattr(session, name) for name in ("model", "env_id", "seed", "options", "wish")}
+    common = {
+        name: getattr(session, name) for name in ("model", "env_id", "seed", "options", "wish")
+    }
     left_out = {"session", "source", "video", *common}
     return {
         "format": "sb3_poem answers 1",
         **common,
         "started": _time(session.created),
-        "answers": [{name: value for name, value in record.items() if name not in left_out} for record in own],
+        "answers": [
+            {name: value for name, value in record.items() if name not in left_out}
+            for record in own
+        ],
     }
 
 
 def export(store: Store, path: Path, trajectories: bool = False, undone: bool = False) -> int:
-    """
-    Write all answers.
+    """Write all answers.
 
-    :param store: The store.
-    :param path: The file, by whose suffix they become JSON Lines (``.jsonl``) or Parquet (``.parquet``).
+    :param path: The file, by whose suffix they become JSON Lines (``.jsonl``) or Parquet
+        (``.parquet``).
     :param trajectories: See :func:`records`.
     :param undone: See :func:`records`.
     :return: How many.
@@ -66,7 +88,9 @@ def export(store: Store, path: Path, trajectories: bool = False, undone: bool = 
     """
     rows = list(records(store, trajectories, undone))
     if path.suffix == ".jsonl":
-        write_atomically(path, "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows).encode())
+        write_atomically(
+            path, "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows).encode()
+        )
     elif path.suffix == ".parquet":
         write_atomically(path, _parquet(rows, trajectories))
     else:
@@ -75,10 +99,16 @@ def export(store: Store, path: Path, trajectories: bool = False, undone: bool = 
 
 
 def _record(row: sqlite3.Row, videos: Path, trajectories: bool) -> dict[str, Any]:
-    shown = {side: Trajectory.from_dict(json.loads(row[f"{side}_trajectory"])) for side in ("left", "right")}
+    shown = {
+        side: Trajectory.from_dict(json.loads(row[f"{side}_trajectory"]))
+        for side in ("left", "right")
+    }
     begun = row["shown"] or row["asked"]
     record = {
-        **{name: row[name] for name in ("session", "source", "model", "env_id", "seed", "number", "preference")},
+        **{
+            name: row[name]
+            for name in ("session", "source", "model", "env_id", "seed", "number", "preference")
+        },
         "undone": row["undone"] is not None,
         "wish": row["wish"],
         "verdict": row["verdict"],
@@ -107,7 +137,9 @@ def _parquet(rows: list[dict[str, Any]], trajectories: bool) -> bytes:
         import pyarrow as pa
         from pyarrow import parquet
     except ImportError:
-        raise ValueError("Parquet needs pyarrow: pip install 'sb3_poem[label]', or export to .jsonl") from None
+        raise ValueError(
+            "Parquet needs pyarrow: pip install 'sb3_poem[label]', or export to .jsonl"
+        ) from None
     numbers, table = pa.list_(pa.float64()), pa.list_(pa.list_(pa.float64()))
     types = {name: pa.string() for name in FIELDS}
     types |= dict.fromkeys(("session", "seed", "number", "frames"), pa.int64())

@@ -20,8 +20,7 @@ ELSEWHERE = {socket.AF_INET: "192.0.2.1", socket.AF_INET6: "2001:db8::1"}
 
 
 def make_server(app: Starlette, host: str, port: int, deadline: float = DEADLINE) -> uvicorn.Server:
-    """
-    A server, not yet running.
+    """A server, not yet running.
 
     :param app: What it serves.
     :param host: Its address.
@@ -46,8 +45,7 @@ def make_server(app: Starlette, host: str, port: int, deadline: float = DEADLINE
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """
-    Take a port before anything else is started.
+    """Take a port before anything else is started.
 
     :param host: The address.
     :param port: The port; 0 takes a free one.
@@ -70,12 +68,12 @@ def bind(host: str, port: int) -> socket.socket:
 
 
 def link_host(listener: socket.socket, host: str) -> str:
-    """
-    The host of a link to a server.
+    """The host of a link to a server.
 
     :param listener: Where it listens.
     :param host: The address that was asked for.
-    :return: It; for one that stands for all of this machine's, such as ``0.0.0.0``, one at which the machine is reached.
+    :return: It; for one that stands for all of this machine's, such as ``0.0.0.0``, one at which
+        the machine is reached.
     """
     if not ipaddress.ip_address(listener.getsockname()[0]).is_unspecified:
         return host.strip("[]")
@@ -87,8 +85,7 @@ def link_host(listener: socket.socket, host: str) -> str:
 
 
 class BackgroundServer:
-    """
-    A server on loopback in a thread of its own.
+    """A server on loopback in a thread of its own.
 
     :param app: What it serves.
     :param port: Its port; 0 takes a free one.

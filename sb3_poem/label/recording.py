@@ -11,18 +11,16 @@ from sb3_poem.label.turns import Turn
 
 
 class StoreRecorder:
-    """
-    Keeps what a ``HumanOracle`` is told: ``HumanOracle(record=StoreRecorder(...))``.
+    """Keeps what a ``HumanOracle`` is told: ``HumanOracle(record=StoreRecorder(...))``.
 
-    :param store: The store.
     :param model: The model's name.
     :param env_id: The environment's id.
     :param seed: Of the adaptation.
     :param options: Of the adaptation, JSON-ready.
     :param n_queries: How many answers there will be at most.
     :param wish: What the person wants, in their own words.
-    :param resume: Whether to go on with the last terminal session that has answers and agrees in all
-        of this, if there is one. The adapter must be told first what :meth:`kept` gives.
+    :param resume: Whether to go on with the last terminal session that has answers and agrees in
+        all of this, if there is one. The adapter must be told first what :meth:`kept` gives.
     """
 
     def __init__(
@@ -59,16 +57,23 @@ class StoreRecorder:
         return self.store.conversation(self.session.id, self._count)
 
     def __call__(self, answer: HumanAnswer) -> None:
-        """
-        Keep an answer; it is on the disk when this returns.
-
-        :param answer: It.
-        """
+        """Keep an answer; it is on the disk when this returns."""
         name = f"{self.session.id}-terminal-{self._count + 1:03d}{answer.video.suffix}"
         shutil.copyfile(answer.video, self.store.videos / name)
         frames = max(len(answer.left.frames or ()), len(answer.right.frames or ()))
-        turn = Turn(None, answer.left.to_dict(), answer.right.to_dict(), None, None, answer.fps, frames)
-        self.store.add_turn(self.session.id, "question", self._count, self._last, turn, name, answer.asked, answer.shown)
+        turn = Turn(
+            None, answer.left.to_dict(), answer.right.to_dict(), None, None, answer.fps, frames
+        )
+        self.store.add_turn(
+            self.session.id,
+            "question",
+            self._count,
+            self._last,
+            turn,
+            name,
+            answer.asked,
+            answer.shown,
+        )
         question = self.store.turn(self.session.id, "question", self._count)
         assert question is not None
         self._last = self.store.add_answer(self.session.id, question["id"], answer.preference.value)

@@ -29,26 +29,33 @@ class _Replayed:
 
 
 def replay(
-    store: Store, session: Session, model: Any, options: dict[str, Any] | None = None, seed: int = 0, is_own: bool = True
+    store: Store,
+    session: Session,
+    model: Any,
+    options: dict[str, Any] | None = None,
+    seed: int = 0,
+    is_own: bool = True,
 ) -> dict[str, Any]:
-    """
-    Feed a session's answers to a model.
+    """Feed a session's answers to a model.
 
-    Before each answer the model foretells it: the side of larger predicted return for the policy that it would take so far.
+    Before each answer the model foretells it: the side of larger predicted return for the policy
+    that it would take so far.
 
-    :param store: The store.
-    :param session: The session.
     :param model: A model whose observations and actions are those of the recorded trajectories.
     :param options: Of the adaptation, as a session's; ``mistake_rate`` stands for the noise model.
     :param seed: Of the inference.
-    :param is_own: Whether the session was recorded with this very model. If not, the latents that were shown are not this
-        model's: in their place come those of its own latents that act most alike.
-    :return: JSON-ready: ``session``, ``foretold`` of ``decided`` answers (those that are not "equal"), ``latents`` after 0,
-        1, ... answers, ``sentence`` (the belief in words) and ``action_error``, the root mean squared difference of the
-        actions of such latents from those recorded (None where no latents had to be replaced).
+    :param is_own: Whether the session was recorded with this very model. If not, the latents that
+        were shown are not this model's: in their place come those of its own latents that act most
+        alike.
+    :return: JSON-ready: ``session``, ``foretold`` of ``decided`` answers (those that are not
+        "equal"), ``latents`` after 0, 1, ... answers, ``sentence`` (the belief in words) and
+        ``action_error``, the root mean squared difference of the actions of such latents from those
+        recorded (None where no latents had to be replaced).
     :raises ValueError: If the model does not fit the recorded trajectories.
     """
-    made: AdaptationOptions = PreferenceAdapter.make_options(n_queries=1, **adapter_options(options or {}))
+    made: AdaptationOptions = PreferenceAdapter.make_options(
+        n_queries=1, **adapter_options(options or {})
+    )
     inference = made.make_inference(model, inference_rng(seed))
     translator = None if is_own else _Translator(model, np.random.default_rng([seed, 1]))
     latents, errors, foretold, decided = [inference.estimate()], [], 0, 0
@@ -82,20 +89,33 @@ class _Translator:
     def __init__(self, model: Any, rng: np.random.Generator) -> None:
         self.model = model
         training = np.asarray(model.task_latents, dtype=np.float64)
-        self.latents = np.concatenate([training, model.sample_latents(N_CANDIDATES, rng, source="aggregate")])
+        self.latents = np.concatenate(
+            [training, model.sample_latents(N_CANDIDATES, rng, source="aggregate")]
+        )
 
     def __call__(self, trajectory: Trajectory) -> tuple[Trajectory, float]:
         observations = trajectory.observations[:-1]
         errors = [
-            float(np.sqrt(np.mean(np.square(self._actions(observations, latent) - trajectory.actions))))
+            float(
+                np.sqrt(
+                    np.mean(np.square(self._actions(observations, latent) - trajectory.actions))
+                )
+            )
             for latent in self.latents
         ]
         best = int(np.argmin(errors))
-        moved = Trajectory(trajectory.observations, trajectory.actions, self.latents[best].copy(), trajectory.reward_features)
+        moved = Trajectory(
+            trajectory.observations,
+            trajectory.actions,
+            self.latents[best].copy(),
+            trajectory.reward_features,
+        )
         return moved, errors[best]
 
     def _actions(self, observations: np.ndarray, latent: np.ndarray) -> np.ndarray:
-        return policy_actions(self.model, observations, np.tile(latent, (len(observations), 1)), deterministic=True)
+        return policy_actions(
+            self.model, observations, np.tile(latent, (len(observations), 1)), deterministic=True
+        )
 
 
 def _check_fits(model: Any, trajectory: Trajectory) -> None:

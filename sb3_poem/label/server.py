@@ -17,7 +17,14 @@ from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, HTMLResponse, JSONResponse, PlainTextResponse, RedirectResponse, Response
+from starlette.responses import (
+    FileResponse,
+    HTMLResponse,
+    JSONResponse,
+    PlainTextResponse,
+    RedirectResponse,
+    Response,
+)
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
@@ -42,8 +49,7 @@ LARGEST = 2**63 - 1
 
 
 def make_app(conversations: Conversations, access: Access | None = None) -> Starlette:
-    """
-    The application.
+    """The application.
 
     :param conversations: The sessions that it serves; they are closed with it.
     :param access: Who gets in; None lets in who reaches the server by a name of this machine.
@@ -76,7 +82,9 @@ class _Pages:
         app = Starlette(
             routes=routes,
             middleware=[Middleware(Gate, access=access)],
-            exception_handlers=dict.fromkeys((HTTPException, RefusedError, FullError, StorageError), _say),
+            exception_handlers=dict.fromkeys(
+                (HTTPException, RefusedError, FullError, StorageError), _say
+            ),
             lifespan=self.lifespan,
         )
         app.router.redirect_slashes = False  # to http://, behind a proxy with TLS
@@ -99,9 +107,13 @@ class _Pages:
 
     async def page(self, request: Request) -> Response:
         session = await self._find(request)
-        return self._html("session.html", session=session, description=describe(session.env_id), max_wish=MAX_WISH)
+        return self._html(
+            "session.html", session=session, description=describe(session.env_id), max_wish=MAX_WISH
+        )
 
-    def session(self, handler: Callable[[Request, Session], Awaitable[Response]]) -> Callable[[Request], Awaitable[Response]]:
+    def session(
+        self, handler: Callable[[Request, Session], Awaitable[Response]]
+    ) -> Callable[[Request], Awaitable[Response]]:
         """A handler of requests that belong to the session of the address's token."""
 
         async def handle(request: Request) -> Response:
@@ -131,7 +143,9 @@ class _Pages:
         data = await _fields(request, result=int, verdict=str)
         if data["verdict"] not in ("yes", "not quite"):
             raise RefusedError('a verdict must be "yes" or "not quite"')
-        await asyncio.to_thread(self.conversations.store.judge, session.id, data["result"], data["verdict"])
+        await asyncio.to_thread(
+            self.conversations.store.judge, session.id, data["result"], data["verdict"]
+        )
         return JSONResponse(await self.conversations.view(session))
 
     async def wish(self, request: Request, session: Session) -> Response:
@@ -143,11 +157,19 @@ class _Pages:
 
     async def video(self, request: Request, session: Session) -> Response:
         number = re.fullmatch("[0-9]{1,18}", request.path_params["number"])
-        path = None if number is None else await asyncio.to_thread(self.conversations.video, session, int(number[0]))
+        path = (
+            None
+            if number is None
+            else await asyncio.to_thread(self.conversations.video, session, int(number[0]))
+        )
         if path is None:
             raise HTTPException(404)
         # What a turn shows never changes, and only this browser may keep it.
-        return FileResponse(path, media_type="video/mp4", headers={"Cache-Control": "private, max-age=86400, immutable"})
+        return FileResponse(
+            path,
+            media_type="video/mp4",
+            headers={"Cache-Control": "private, max-age=86400, immutable"},
+        )
 
     async def answers(self, _: Request, session: Session) -> Response:
         record = await asyncio.to_thread(session_record, self.conversations.store, session)
@@ -168,7 +190,9 @@ class _Pages:
         choice = self.conversations.catalogue.get(session.model)
         if turn is None or choice is None:
             raise RefusedError("the policy can be downloaded once its result is shown")
-        return AdaptedPolicy(self.conversations.load(choice), json.loads(turn["latent"]), answered).to_bytes()
+        return AdaptedPolicy(
+            self.conversations.load(choice), json.loads(turn["latent"]), answered
+        ).to_bytes()
 
     async def _find(self, request: Request) -> Session:
         token = request.path_params["token"]
@@ -191,10 +215,14 @@ async def _fields(request: Request, **kinds: type) -> dict[str, Any]:
     except (ValueError, RecursionError):
         raise HTTPException(400, "the request is not JSON") from None
     if not isinstance(data, dict) or set(data) != set(kinds):
-        raise HTTPException(400, f"the request must be a JSON object with {', '.join(kinds) or 'no fields'}")
+        raise HTTPException(
+            400, f"the request must be a JSON object with {', '.join(kinds) or 'no fields'}"
+        )
     for name, kind in kinds.items():
         if type(data[name]) is not kind or (kind is int and not 0 <= data[name] <= LARGEST):
-            raise HTTPException(400, f"`{name}` must be {'a whole number' if kind is int else 'a text'}")
+            raise HTTPException(
+                400, f"`{name}` must be {'a whole number' if kind is int else 'a text'}"
+            )
         if kind is str and any("\ud800" <= character <= "\udfff" for character in data[name]):
             raise HTTPException(400, f"`{name}` holds half a character (a lone surrogate)")
     return data

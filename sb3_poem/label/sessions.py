@@ -1,4 +1,6 @@
-"""Conversations: which question is next, what is rendered ahead, and what a page needs to know of it all."""
+"""Conversations: which question is next, what is rendered ahead, and what a page needs to know of
+it all.
+"""
 
 from __future__ import annotations
 
@@ -24,9 +26,11 @@ _logger = logging.getLogger(__name__)
 PREFERENCES = ("left", "right", "equal")
 # A person who has not been heard of for so long has gone, and makes room for another.
 GONE_AFTER_SECONDS = 600.0
-# A person who watches is heard of at least so often: the page asks for its state when it is shown and when it answers.
+# A person who watches is heard of at least so often: the page asks for its state when it is shown
+# and when it answers.
 AT_WORK_SECONDS = 60.0
-# While more people are at work than turns can be made at a time, films show every second step: half the work.
+# While more people are at work than turns can be made at a time, films show every second step: half
+# the work.
 CROWDED_FILM_EVERY = 2
 # Errors that say in words why a turn could not be made.
 TOLD = (RefusedError, OtherModelError, StorageError)
@@ -43,7 +47,8 @@ class _Presence:
     """What is known of a session between requests; all of it can be made again from the store."""
 
     seen: float
-    #: (number of the question's turn or None at the start, preference, kind) -> the turn that follows.
+    #: (number of the question's turn or None at the start, preference, kind) -> the turn that
+    #: follows.
     jobs: dict[tuple[int | None, str | None, str], Job] = field(default_factory=dict)
     task: asyncio.Task[None] | None = None
     failed: Exception | None = None
@@ -51,8 +56,7 @@ class _Presence:
 
 
 class Conversations:
-    """
-    All sessions of a server. Its methods belong to one event loop.
+    """All sessions of a server. Its methods belong to one event loop.
 
     :param store: Where they are kept.
     :param workshop: Where turns are made.
@@ -86,8 +90,7 @@ class Conversations:
         self._present: dict[int, _Presence] = {}
 
     async def begin(self, model: str) -> str:
-        """
-        Begin a conversation.
+        """Begin a conversation.
 
         :param model: The name of a model in the catalogue.
         :return: The token of its link.
@@ -100,16 +103,19 @@ class Conversations:
         self._make_room()
         seed = secrets.randbelow(2**31) if self._seed is None else self._seed
         session, token = await asyncio.to_thread(
-            self.store.create_session, choice.name, choice.env_id, seed, self.options, self.n_queries
+            self.store.create_session,
+            choice.name,
+            choice.env_id,
+            seed,
+            self.options,
+            self.n_queries,
         )
         self._presence(session)
         return token
 
     async def find(self, token: str) -> Session | None:
-        """
-        The session of a link.
+        """The session of a link.
 
-        :param token: Its token.
         :return: The session, or None.
         :raises FullError: If its person is not at work and too many others are.
         """
@@ -119,10 +125,8 @@ class Conversations:
         return session
 
     async def view(self, session: Session) -> dict[str, Any]:
-        """
-        All that the page shows. What is missing for it is begun.
+        """All that the page shows. What is missing for it is begun.
 
-        :param session: The session.
         :return: JSON-ready.
         :raises StorageError: If it cannot be kept.
         """
@@ -153,29 +157,32 @@ class Conversations:
         if turn["shown"] is None:
             await asyncio.to_thread(self.store.mark_shown, turn["id"])
         view["phase"] = wanted
-        view["turn"] = {"id": turn["id"], "fps": turn["fps"], "frames": turn["frames"], "verdict": turn["verdict"]}
+        view["turn"] = {
+            "id": turn["id"],
+            "fps": turn["fps"],
+            "frames": turn["frames"],
+            "verdict": turn["verdict"],
+        }
         if wanted == "question":
             self._render_ahead(session, answered, turn["id"])
         return view
 
     async def answer(self, session: Session, question: int, preference: str) -> None:
-        """
-        Keep an answer; it is on the disk when this returns.
+        """Keep an answer; it is on the disk when this returns.
 
-        :param session: The session.
         :param question: The number of the question's turn.
         :param preference: "left", "right" or "equal".
         :raises RefusedError: If it is no answer, or that question is not the one that waits.
         """
         if preference not in PREFERENCES:
-            raise RefusedError(f'an answer must be "left", "right" or "equal", but is {preference[:20]!r}')
+            raise RefusedError(
+                f'an answer must be "left", "right" or "equal", but is {preference[:20]!r}'
+            )
         await asyncio.to_thread(self.store.add_answer, session.id, question, preference)
 
     def video(self, session: Session, number: int) -> Path | None:
-        """
-        The file of a turn's video.
+        """The file of a turn's video.
 
-        :param session: The session.
         :param number: The turn's number.
         :return: The file; None if the session has no such turn, or the file is gone.
         """
@@ -185,11 +192,11 @@ class Conversations:
         path = self.store.videos / turn["video"]
         return path if path.is_file() else None
 
-    def request(self, session: Session, number: int, preference: str | None, wanted: str) -> Request:
-        """
-        What a turn is made from.
+    def request(
+        self, session: Session, number: int, preference: str | None, wanted: str
+    ) -> Request:
+        """What a turn is made from.
 
-        :param session: The session.
         :param number: Answers before the question from which it follows.
         :param preference: The answer to that question; None at the start.
         :param wanted: "question" or "result".
@@ -204,25 +211,45 @@ class Conversations:
         film_every = CROWDED_FILM_EVERY if self._is_crowded() else 1
         video = self.store.videos / f"{session.id}-{secrets.token_hex(12)}.mp4"
         if preference is None:
-            return Request(choice, session.seed, session.options, wanted, video, film_every=film_every)
+            return Request(
+                choice, session.seed, session.options, wanted, video, film_every=film_every
+            )
         row = self.store.turn(session.id, "question", number)
         question = None if row is None else self.store.whole_turn(row["id"])
         if question is None:
             raise RefusedError("the question before is missing")
-        pending = {"left": json.loads(question["left_trajectory"]), "right": json.loads(question["right_trajectory"])}
+        pending = {
+            "left": json.loads(question["left_trajectory"]),
+            "right": json.loads(question["right_trajectory"]),
+        }
         answers = self.store.conversation(session.id, number)
         state = json.loads(question["state"])
-        return Request(choice, session.seed, session.options, wanted, video, state, answers, pending, preference, film_every)
+        return Request(
+            choice,
+            session.seed,
+            session.options,
+            wanted,
+            video,
+            state,
+            answers,
+            pending,
+            preference,
+            film_every,
+        )
 
     def _look(self, number: int) -> tuple[Session, int, Any, Any]:
-        """The session as it is now, its answers, the turn that should be shown, and the question before it."""
+        """The session as it is now, its answers, the turn that should be shown, and the question
+        before it.
+        """
         session = self.store.session(number)
         answered = len(self.store.answers(number))
         kind = "result" if session.stopped or answered >= session.target else "question"
         turn = self.store.turn(number, kind, answered)
         before = None
         if turn is None:
-            before = self.store.turn(number, "question", answered) or self.store.turn(number, "question", answered - 1)
+            before = self.store.turn(number, "question", answered) or self.store.turn(
+                number, "question", answered - 1
+            )
         return session, answered, turn, before
 
     def _presence(self, session: Session) -> _Presence:
@@ -235,7 +262,10 @@ class Conversations:
 
     def _is_crowded(self) -> bool:
         since = time.monotonic() - AT_WORK_SECONDS
-        return sum(presence.seen > since for presence in list(self._present.values())) > self.workshop.n_workers
+        return (
+            sum(presence.seen > since for presence in list(self._present.values()))
+            > self.workshop.n_workers
+        )
 
     def _make_room(self) -> None:
         now = time.monotonic()
@@ -255,28 +285,44 @@ class Conversations:
             return
         if presence.failed is not None and time.monotonic() - presence.failed_at < RETRY_SECONDS:
             return
-        presence.task = asyncio.get_running_loop().create_task(self._make_turn(session, answered, wanted))
+        presence.task = asyncio.get_running_loop().create_task(
+            self._make_turn(session, answered, wanted)
+        )
 
     async def _make_turn(self, session: Session, answered: int, wanted: str) -> None:
-        """Have the turn made that the page waits for, or take the one that was rendered ahead, and keep it."""
+        """Have the turn made that the page waits for, or take the one that was rendered ahead, and
+        keep it.
+        """
         presence = self._present[session.id]
         try:
             answers = await asyncio.to_thread(self.store.answers, session.id)
             if len(answers) != answered:
                 return
             last = answers[-1] if answers else None
-            key = (last["question"], last["preference"], wanted) if last is not None else (None, None, wanted)
+            key = (
+                (last["question"], last["preference"], wanted)
+                if last is not None
+                else (None, None, wanted)
+            )
             job = presence.jobs.get(key)
             self._keep_only(presence, None if last is None else last["question"], key)
-            if job is None or job.done.cancelled() or (job.done.done() and job.done.exception() is not None):
+            if (
+                job is None
+                or job.done.cancelled()
+                or (job.done.done() and job.done.exception() is not None)
+            ):
                 preference = None if last is None else last["preference"]
-                request = await asyncio.to_thread(self.request, session, answered - 1, preference, wanted)
+                request = await asyncio.to_thread(
+                    self.request, session, answered - 1, preference, wanted
+                )
                 job = presence.jobs[key] = self.workshop.submit(request, WAITED_FOR)
             self.workshop.hurry(job)
             made = await asyncio.shield(job.done)
             last_answer = None if last is None else last["id"]
             video = job.request.video
-            kept = await asyncio.to_thread(self.store.add_turn, session.id, wanted, answered, last_answer, made, video.name)
+            kept = await asyncio.to_thread(
+                self.store.add_turn, session.id, wanted, answered, last_answer, made, video.name
+            )
             presence.jobs.pop(key, None)
             if not kept:
                 await asyncio.to_thread(self._put_back, session, answered, wanted, video, made)
@@ -290,11 +336,17 @@ class Conversations:
             presence.failed = error
             presence.failed_at = time.monotonic()
 
-    def _put_back(self, session: Session, answered: int, wanted: str, video: Path, made: Turn) -> None:
-        """Of a turn that is kept already, the video takes the place of one that somebody deleted; else it is not needed."""
+    def _put_back(
+        self, session: Session, answered: int, wanted: str, video: Path, made: Turn
+    ) -> None:
+        """Of a turn that is kept already, the video takes the place of one that somebody deleted;
+        else it is not needed.
+        """
         turn = self.store.turn(session.id, wanted, answered)
         if turn is not None and not (self.store.videos / turn["video"]).is_file():
-            self.store.note_film(turn["id"], made.fps, made.frames)  # first: whoever finds the film finds what it is
+            self.store.note_film(
+                turn["id"], made.fps, made.frames
+            )  # first: whoever finds the film finds what it is
             video.replace(self.store.videos / turn["video"])
         else:
             video.unlink(missing_ok=True)
@@ -304,7 +356,11 @@ class Conversations:
         presence = self._present[session.id]
         kind = "result" if answered + 1 >= session.target else "question"
         self._keep_only(presence, question)
-        missing = [preference for preference in PREFERENCES if (question, preference, kind) not in presence.jobs]
+        missing = [
+            preference
+            for preference in PREFERENCES
+            if (question, preference, kind) not in presence.jobs
+        ]
         if not missing:
             return
         try:
@@ -316,9 +372,14 @@ class Conversations:
             presence.jobs[question, preference, kind] = self.workshop.submit(request, urgency)
 
     def _keep_only(
-        self, presence: _Presence, question: int | None, wanted: tuple[int | None, str | None, str] | None = None
+        self,
+        presence: _Presence,
+        question: int | None,
+        wanted: tuple[int | None, str | None, str] | None = None,
     ) -> None:
-        """Drop jobs that follow from other questions, or, once the answer is known, from other answers."""
+        """Drop jobs that follow from other questions, or, once the answer is known, from other
+        answers.
+        """
         for key in list(presence.jobs):
             if key[0] != question or (wanted is not None and key != wanted):
                 self.workshop.discard(presence.jobs.pop(key))

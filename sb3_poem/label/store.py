@@ -1,4 +1,6 @@
-"""Where sessions, questions and answers are kept: SQLite, so that a kill at any moment loses nothing that was answered."""
+"""Where sessions, questions and answers are kept: SQLite, so that a kill at any moment loses
+nothing that was answered.
+"""
 
 from __future__ import annotations
 
@@ -67,13 +69,14 @@ CREATE UNIQUE INDEX one_answer ON answers(session, number) WHERE undone IS NULL;
 
 
 class RefusedError(ValueError):
-    """What was asked for does not fit the session as it now is: an answer out of order, say. Nothing was changed."""
+    """What was asked for does not fit the session as it now is: an answer out of order, say.
+    Nothing was changed.
+    """
 
 
 @dataclass(frozen=True)
 class Session:
-    """
-    A person's conversation.
+    """A person's conversation.
 
     :param id: Its number.
     :param source: "page", "notebook" or "terminal".
@@ -102,13 +105,13 @@ class Session:
 
 
 class Store:
-    """
-    The store. One connection, used by one thread at a time; several processes may open the same file.
+    """The store. One connection, used by one thread at a time; several processes may open the same
+    file.
 
     Each method raises :class:`~sb3_poem.label.videos.StorageError` if the disk is full or broken.
 
-    :param folder: Where; it is made if missing, for its owner alone. ``answers.sqlite`` is the store, ``videos/`` holds the
-        videos.
+    :param folder: Where; it is made if missing, for its owner alone. ``answers.sqlite`` is the
+        store, ``videos/`` holds the videos.
     :raises ValueError: If the store is of another version.
     """
 
@@ -120,7 +123,9 @@ class Store:
         self.path = self.folder / "answers.sqlite"
         self._lock = threading.RLock()
         with self._speaking():
-            self._connection = sqlite3.connect(self.path, timeout=30.0, isolation_level=None, check_same_thread=False)
+            self._connection = sqlite3.connect(
+                self.path, timeout=30.0, isolation_level=None, check_same_thread=False
+            )
             self._connection.row_factory = sqlite3.Row
             self.path.chmod(0o600)
             for setting in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON"):
@@ -133,10 +138,15 @@ class Store:
             self._connection.close()
 
     def create_session(
-        self, model: str, env_id: str, seed: int, options: dict[str, Any], step: int = 10, source: str = "page"
+        self,
+        model: str,
+        env_id: str,
+        seed: int,
+        options: dict[str, Any],
+        step: int = 10,
+        source: str = "page",
     ) -> tuple[Session, str]:
-        """
-        Begin a conversation.
+        """Begin a conversation.
 
         :param model: The model's name.
         :param env_id: The environment's id.
@@ -147,16 +157,27 @@ class Store:
         :return: The session, and the token of its link, of which only a hash is kept.
         """
         token = secrets.token_urlsafe(32)
-        row = (_hash(token), source, model, env_id, seed, json.dumps(options), step, step, time.time())
+        row = (
+            _hash(token),
+            source,
+            model,
+            env_id,
+            seed,
+            json.dumps(options),
+            step,
+            step,
+            time.time(),
+        )
         columns = "token_hash, source, model, env_id, seed, options, step, target, created"
         with self._transaction() as connection:
-            cursor = connection.execute(f"INSERT INTO sessions ({columns}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", row)
+            cursor = connection.execute(
+                f"INSERT INTO sessions ({columns}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", row
+            )
         assert cursor.lastrowid is not None
         return self.session(cursor.lastrowid), token
 
     def find(self, token: str) -> Session | None:
-        """
-        The session of a link.
+        """The session of a link.
 
         :param token: The link's token.
         :return: The session, or None.
@@ -165,10 +186,8 @@ class Store:
         return None if row is None else _session(row)
 
     def session(self, number: int) -> Session:
-        """
-        A session.
+        """A session.
 
-        :param number: Its number.
         :return: The session.
         :raises KeyError: If there is none.
         """
@@ -182,30 +201,31 @@ class Store:
         return [_session(row) for row in self._all("SELECT * FROM sessions ORDER BY id")]
 
     def answers(self, session: int) -> list[sqlite3.Row]:
-        """
-        The answers in force, in order.
+        """The answers in force, in order.
 
         :param session: The session's number.
         :return: Rows of ``answers``.
         """
-        return self._all("SELECT * FROM answers WHERE session = ? AND undone IS NULL ORDER BY number", session)
+        return self._all(
+            "SELECT * FROM answers WHERE session = ? AND undone IS NULL ORDER BY number", session
+        )
 
     def turn(self, session: int, kind: str, number: int) -> sqlite3.Row | None:
-        """
-        A turn that counts, without what is large.
+        """A turn that counts, without what is large.
 
         :param session: The session's number.
         :param kind: "question" or "result".
         :param number: Answers before it.
         :return: The row, or None.
         """
-        columns = "id, session, kind, number, belief, latent, video, fps, frames, created, shown, verdict"
+        columns = (
+            "id, session, kind, number, belief, latent, video, fps, frames, created, shown, verdict"
+        )
         query = f"SELECT {columns} FROM turns WHERE session = ? AND kind = ? AND number = ? AND dropped IS NULL"
         return self._one(query, session, kind, number)
 
     def whole_turn(self, turn: int) -> sqlite3.Row | None:
-        """
-        All of a turn, whether it counts or not.
+        """All of a turn, whether it counts or not.
 
         :param turn: Its number.
         :return: The row, or None.
@@ -213,8 +233,7 @@ class Store:
         return self._one("SELECT * FROM turns WHERE id = ?", turn)
 
     def conversation(self, session: int, before: int) -> list[dict[str, Any]]:
-        """
-        The first answers with their trajectories, as an adapter's dictionary holds them.
+        """The first answers with their trajectories, as an adapter's dictionary holds them.
 
         :param session: The session's number.
         :param before: How many.
@@ -239,58 +258,71 @@ class Store:
         created: float | None = None,
         shown: float | None = None,
     ) -> bool:
-        """
-        Keep a turn, if the conversation still is where it was made for, and it has not been kept already.
+        """Keep a turn, if the conversation still is where it was made for, and it has not been kept
+        already.
 
         :param session: The session's number.
         :param kind: "question" or "result".
         :param number: Answers before it.
         :param last_answer: The number in the store of the last of these; None at the start.
-        :param turn: The turn.
         :param video: Its file's name within ``videos/``.
         :param created: When it was made, seconds since 1970; None is now.
         :param shown: When it was shown; None is not yet.
         :return: Whether it was kept.
         """
-        columns = (
-            "session, kind, number, state, left_trajectory, right_trajectory, belief, latent, video, fps, frames, created"
-        )
+        columns = "session, kind, number, state, left_trajectory, right_trajectory, belief, latent, video, fps, frames, created"
         columns += ", shown"
         contents = map(_json, (turn.state, turn.left, turn.right, turn.belief, turn.latent))
         made = time.time() if created is None else created
-        row: tuple[Any, ...] = (session, kind, number, *contents, video, turn.fps, turn.frames, made, shown)
+        row: tuple[Any, ...] = (
+            session,
+            kind,
+            number,
+            *contents,
+            video,
+            turn.fps,
+            turn.frames,
+            made,
+            shown,
+        )
         with self._transaction() as connection:
             here = [answer["id"] for answer in self.answers(session)]
-            if (here[number - 1] if 0 < number <= len(here) else None) != last_answer or number > len(here):
+            if (
+                here[number - 1] if 0 < number <= len(here) else None
+            ) != last_answer or number > len(here):
                 return False
             if self.turn(session, kind, number) is not None:
                 return False
-            connection.execute(f"INSERT INTO turns ({columns}) VALUES ({', '.join('?' * len(row))})", row)
+            connection.execute(
+                f"INSERT INTO turns ({columns}) VALUES ({', '.join('?' * len(row))})", row
+            )
         return True
 
     def mark_shown(self, turn: int) -> None:
-        """
-        Note that a turn has been shown, the first time.
+        """Note that a turn has been shown, the first time.
 
         :param turn: Its number.
         """
         with self._transaction() as connection:
-            connection.execute("UPDATE turns SET shown = ? WHERE id = ? AND shown IS NULL", (time.time(), turn))
+            connection.execute(
+                "UPDATE turns SET shown = ? WHERE id = ? AND shown IS NULL", (time.time(), turn)
+            )
 
     def note_film(self, turn: int, fps: float, frames: int) -> None:
-        """
-        Note how a turn's video moves that was filmed again.
+        """Note how a turn's video moves that was filmed again.
 
         :param turn: Its number.
         :param fps: Frames per second.
         :param frames: How many.
         """
         with self._transaction() as connection:
-            connection.execute("UPDATE turns SET fps = ?, frames = ? WHERE id = ?", (fps, frames, turn))
+            connection.execute(
+                "UPDATE turns SET fps = ?, frames = ? WHERE id = ?", (fps, frames, turn)
+            )
 
     def add_answer(self, session: int, question: int, preference: str) -> int:
-        """
-        Keep an answer. Once this returns, it is on the disk. The same answer again is no second one.
+        """Keep an answer. Once this returns, it is on the disk. The same answer again is no second
+        one.
 
         :param session: The session's number.
         :param question: The number of the question's turn.
@@ -305,7 +337,9 @@ class Store:
                     return int(answer["id"])
             current = self.turn(session, "question", len(answers))
             if current is None or current["id"] != question:
-                raise RefusedError("this question is not the one that waits for an answer; look again at the page")
+                raise RefusedError(
+                    "this question is not the one that waits for an answer; look again at the page"
+                )
             about = self.session(session)
             if about.stopped or len(answers) >= about.target:
                 raise RefusedError("the questions are over for now; the result is shown")
@@ -317,12 +351,13 @@ class Store:
         return cursor.lastrowid
 
     def undo(self, session: int, answered: int) -> None:
-        """
-        Take the last answer back; or, after an early stop, go back to the question that waited.
+        """Take the last answer back; or, after an early stop, go back to the question that waited.
 
         :param session: The session's number.
-        :param answered: How many answers there were where the undo was asked for; so that a repeated one takes back no more.
-        :raises RefusedError: If there is nothing to take back, or the conversation is somewhere else by now.
+        :param answered: How many answers there were where the undo was asked for; so that a
+            repeated one takes back no more.
+        :raises RefusedError: If there is nothing to take back, or the conversation is somewhere
+            else by now.
         """
         with self._transaction() as connection:
             answers = self.answers(session)
@@ -334,14 +369,16 @@ class Store:
             if not answers:
                 raise RefusedError("there is no answer to take back")
             now = time.time()
-            connection.execute("UPDATE answers SET undone = ? WHERE id = ?", (now, answers[-1]["id"]))
             connection.execute(
-                "UPDATE turns SET dropped = ? WHERE session = ? AND number >= ? AND dropped IS NULL", (now, session, answered)
+                "UPDATE answers SET undone = ? WHERE id = ?", (now, answers[-1]["id"])
+            )
+            connection.execute(
+                "UPDATE turns SET dropped = ? WHERE session = ? AND number >= ? AND dropped IS NULL",
+                (now, session, answered),
             )
 
     def stop(self, session: int) -> None:
-        """
-        Show the result after the answers so far.
+        """Show the result after the answers so far.
 
         :param session: The session's number.
         """
@@ -349,8 +386,8 @@ class Store:
             connection.execute("UPDATE sessions SET stopped = 1 WHERE id = ?", (session,))
 
     def judge(self, session: int, result: int, verdict: str) -> None:
-        """
-        Keep what the person says of a result; "not quite" asks for more questions. The same verdict again changes nothing.
+        """Keep what the person says of a result; "not quite" asks for more questions. The same
+        verdict again changes nothing.
 
         :param session: The session's number.
         :param result: The number of the result's turn.
@@ -360,17 +397,26 @@ class Store:
         with self._transaction() as connection:
             about, answered = self.session(session), len(self.answers(session))
             current = self.turn(session, "result", answered)
-            if current is None or current["id"] != result or not (about.stopped or answered >= about.target):
-                raise RefusedError("this result is not the one that is shown; look again at the page")
-            connection.execute("UPDATE turns SET verdict = ?, verdict_time = ? WHERE id = ?", (verdict, time.time(), result))
+            if (
+                current is None
+                or current["id"] != result
+                or not (about.stopped or answered >= about.target)
+            ):
+                raise RefusedError(
+                    "this result is not the one that is shown; look again at the page"
+                )
+            connection.execute(
+                "UPDATE turns SET verdict = ?, verdict_time = ? WHERE id = ?",
+                (verdict, time.time(), result),
+            )
             if verdict == "not quite":
                 connection.execute(
-                    "UPDATE sessions SET stopped = 0, target = ? WHERE id = ?", (answered + about.step, session)
+                    "UPDATE sessions SET stopped = 0, target = ? WHERE id = ?",
+                    (answered + about.step, session),
                 )
 
     def set_wish(self, session: int, wish: str) -> None:
-        """
-        Keep what the person wants, in their own words.
+        """Keep what the person wants, in their own words.
 
         :param session: The session's number.
         :param wish: The words.
@@ -379,7 +425,9 @@ class Store:
             connection.execute("UPDATE sessions SET wish = ? WHERE id = ?", (wish, session))
 
     def records(self) -> Iterator[sqlite3.Row]:
-        """All answers of all sessions with their questions, those that were taken back too, in the order of time."""
+        """All answers of all sessions with their questions, those that were taken back too, in the
+        order of time.
+        """
         query = """SELECT sessions.id AS session, sessions.source, sessions.model, sessions.env_id, sessions.seed,
             sessions.options, sessions.wish, answers.number, answers.preference, answers.created AS answered,
             answers.undone, turns.created AS asked, turns.shown, turns.video, turns.fps, turns.frames,
@@ -391,13 +439,15 @@ class Store:
         yield from self._all(query)
 
     def remove_orphans(self) -> int:
-        """
-        Delete videos that no turn names: rendered ahead for an answer that was not given, or cut short by a kill.
+        """Delete videos that no turn names: rendered ahead for an answer that was not given, or cut
+        short by a kill.
 
         :return: How many.
         """
         kept = {row["video"] for row in self._all("SELECT video FROM turns")}
-        orphans = [file for file in self.videos.iterdir() if file.is_file() and file.name not in kept]
+        orphans = [
+            file for file in self.videos.iterdir() if file.is_file() and file.name not in kept
+        ]
         for file in orphans:
             file.unlink(missing_ok=True)
         return len(orphans)
@@ -410,7 +460,9 @@ class Store:
                 yield
             except sqlite3.DatabaseError as error:
                 hint = " (is the disk full?)" if "disk I/O" in str(error) else ""
-                raise StorageError(f"{self.path} cannot be read or written: {error}{hint}") from error
+                raise StorageError(
+                    f"{self.path} cannot be read or written: {error}{hint}"
+                ) from error
 
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
@@ -427,7 +479,9 @@ class Store:
         with self._transaction() as connection:
             version = connection.execute("PRAGMA user_version").fetchone()[0]
             if version not in (0, SCHEMA_VERSION):
-                raise ValueError(f"{self.path} is a store of version {version}; this program reads {SCHEMA_VERSION}")
+                raise ValueError(
+                    f"{self.path} is a store of version {version}; this program reads {SCHEMA_VERSION}"
+                )
             if version == 0:
                 for statement in SCHEMA.split(";"):
                     connection.execute(statement)
@@ -452,4 +506,8 @@ def _json(value: Any) -> str | None:
 
 def _session(row: sqlite3.Row) -> Session:
     names = ("id", "source", "model", "env_id", "seed", "step", "target", "wish", "created")
-    return Session(**{name: row[name] for name in names}, options=json.loads(row["options"]), stopped=bool(row["stopped"]))
+    return Session(
+        **{name: row[name] for name in names},
+        options=json.loads(row["options"]),
+        stopped=bool(row["stopped"]),
+    )

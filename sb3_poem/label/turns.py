@@ -1,8 +1,8 @@
-"""
-One turn of a conversation, as a pure function: the state before, and the answer, give the state after and its video.
+"""One turn of a conversation, as a pure function: the state before, and the answer, give the state
+after and its video.
 
-Nothing is remembered between turns but models and environments, so any process may compute any turn of any session, ahead of
-time or again; the same input always gives the same turn, bit for bit.
+Nothing is remembered between turns but models and environments, so any process may compute any turn
+of any session, ahead of time or again; the same input always gives the same turn, bit for bit.
 """
 
 from __future__ import annotations
@@ -30,11 +30,13 @@ from sb3_poem.label.videos import HEIGHT, WIDTH, fit, pair, write_clip
 
 # The result's rollout starts as no question's does.
 RESULT_ROLLOUT = 1_000_000
-# The hidden task of the environment, of which the person knows nothing, comes from a stream of its own.
+# The hidden task of the environment, of which the person knows nothing, comes from a stream of its
+# own.
 TASK_STREAM = 0x1ABE1
 # Frames per second that a film should not fall below.
 SMOOTH_FPS = 8.0
-# Frames per second of a film otherwise; where a family is drawn more often, some steps are left out.
+# Frames per second of a film otherwise; where a family is drawn more often, some steps are left
+# out.
 FILM_FPS = 20.0
 #: Models that a process keeps.
 BENCHES = 4
@@ -44,8 +46,7 @@ CONVERSATION = ("answers", "pending")
 
 @dataclass(frozen=True)
 class Request:
-    """
-    What a turn is made from.
+    """What a turn is made from.
 
     :param choice: The model and its environment.
     :param seed: Of the adaptation.
@@ -56,7 +57,8 @@ class Request:
     :param answers: The answers before that turn: ``preference``, ``left``, ``right``.
     :param pending: That turn's question: ``left``, ``right``.
     :param preference: The answer to it; None at the start, and to film the question again.
-    :param film_every: How many steps lie between two frames of the video, if it moves smoothly enough then.
+    :param film_every: How many steps lie between two frames of the video, if it moves smoothly
+        enough then.
     """
 
     choice: Choice
@@ -82,11 +84,10 @@ class NotWantedError(Exception):
 
 @dataclass(frozen=True)
 class Turn:
-    """
-    A question, or a result, and what is believed there.
+    """A question, or a result, and what is believed there.
 
-    :param state: What the next turn is made from, beside the conversation; None where none follows (at a terminal), as then
-        are belief and latent.
+    :param state: What the next turn is made from, beside the conversation; None where none follows
+        (at a terminal), as then are belief and latent.
     :param left: The question's left trajectory; None in a result.
     :param right: The right one.
     :param belief: As :func:`sb3_poem.label.beliefs.belief` gives it.
@@ -105,8 +106,7 @@ class Turn:
 
 
 class _Watches:
-    """
-    Stands for the person where the adapter asks who answers: somebody who needs to see.
+    """Stands for the person where the adapter asks who answers: somebody who needs to see.
 
     :param film_every: See :class:`Request`.
     """
@@ -120,25 +120,23 @@ class _Watches:
 
 
 class Bench:
-    """
-    A model and its environment, which renders.
+    """A model and its environment, which renders.
 
-    :param model: The model.
     :param env: An SB3 ``VecEnv`` that renders RGB images.
-    :param env_id: Its id.
     """
 
     def __init__(self, model: Any, env: Any, env_id: str) -> None:
         if env.render_mode != "rgb_array":
-            raise ValueError(f'`env` must be made with render_mode="rgb_array" to be shown, but has {env.render_mode!r}')
+            raise ValueError(
+                f'`env` must be made with render_mode="rgb_array" to be shown, but has {env.render_mode!r}'
+            )
         self.model = model
         self.env = env
         self.env_id = env_id
         self.fps = FamilyView(env).render_fps
 
     def turn(self, request: Request) -> Turn:
-        """
-        Make a turn, and write its video.
+        """Make a turn, and write its video.
 
         :param request: What it is made from.
         :return: The turn.
@@ -157,7 +155,9 @@ class Bench:
         data = adapter.to_dict()
         pending = data["pending"] or {"left": None, "right": None}
         state = {name: value for name, value in data.items() if name not in CONVERSATION}
-        return Turn(state, pending["left"], pending["right"], believed, latent.tolist(), fps, len(frames))
+        return Turn(
+            state, pending["left"], pending["right"], believed, latent.tolist(), fps, len(frames)
+        )
 
     def warm_up(self) -> None:
         """Do once what only the first time is slow: the first image, the first action."""
@@ -165,8 +165,7 @@ class Bench:
         rollout_latents(self.model, self.env, latent, None, [0], frames=True, max_steps=2)
 
     def adapter(self, request: Request) -> PreferenceAdapter:
-        """
-        The adapter as it was before the answer.
+        """The adapter as it was before the answer.
 
         :param request: What a turn is made from.
         :return: The adapter.
@@ -184,23 +183,38 @@ class Bench:
             )
         state = {**request.state, "options": {**request.state["options"], "n_queries": n_queries}}
         data = {**state, "answers": list(request.answers), "pending": request.pending}
-        return PreferenceAdapter.from_dict(data, self.model, self.env, oracle=_Watches(self._film_every(request)))
+        return PreferenceAdapter.from_dict(
+            data, self.model, self.env, oracle=_Watches(self._film_every(request))
+        )
 
     def _film_every(self, request: Request) -> int:
-        every = max(1, int(self.fps / FILM_FPS))  # of what moves faster than films do not all steps are filmed
-        return every * request.film_every if self.fps / (every * request.film_every) >= SMOOTH_FPS else every
+        every = max(
+            1, int(self.fps / FILM_FPS)
+        )  # of what moves faster than films do not all steps are filmed
+        return (
+            every * request.film_every
+            if self.fps / (every * request.film_every) >= SMOOTH_FPS
+            else every
+        )
 
-    def _film(self, adapter: PreferenceAdapter, latent: np.ndarray, film_every: int) -> list[np.ndarray]:
+    def _film(
+        self, adapter: PreferenceAdapter, latent: np.ndarray, film_every: int
+    ) -> list[np.ndarray]:
         seed = rollout_seed(adapter.seed, RESULT_ROLLOUT)
         clip = rollout_latents(
-            self.model, self.env, latent[None, :], None, [seed], adapter.options.deterministic, frames=film_every
+            self.model,
+            self.env,
+            latent[None, :],
+            None,
+            [seed],
+            adapter.options.deterministic,
+            frames=film_every,
         )[0]
         return [fit(frame) for frame in clip.frames or []]
 
 
 def adapter_options(options: dict[str, Any]) -> dict[str, Any]:
-    """
-    Options of a session as the adapter's.
+    """Options of a session as the adapter's.
 
     :param options: JSON-ready; ``mistake_rate`` stands for the noise model.
     :return: Keyword arguments of ``PreferenceAdapter``.
@@ -210,8 +224,7 @@ def adapter_options(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def make_turn(request: Request) -> Turn:
-    """
-    Make a turn in this process, which keeps models and environments that it has used.
+    """Make a turn in this process, which keeps models and environments that it has used.
 
     :param request: What it is made from.
     :return: The turn.
@@ -226,28 +239,31 @@ def make_turn(request: Request) -> Turn:
 
 @lru_cache(maxsize=BENCHES)
 def bench_of(choice: Choice) -> Bench:
-    """
-    Load a model and make its environment.
+    """Load a model and make its environment.
 
     :param choice: Which.
     :return: Both, ready.
     """
     from stable_baselines3.common.vec_env import DummyVecEnv
 
-    env = DummyVecEnv([lambda: _RendersWhileWanted(make_env(choice.env_id, dict(choice.env_kwargs)))])
+    env = DummyVecEnv(
+        [lambda: _RendersWhileWanted(make_env(choice.env_id, dict(choice.env_kwargs)))]
+    )
     return Bench(load_choice(choice), env, choice.env_id)
 
 
 class _RendersWhileWanted(gym.Wrapper):
-    """Rendering is what takes long in a turn, so there it is looked whether the turn is still wanted."""
+    """Rendering is what takes long in a turn, so there it is looked whether the turn is still
+    wanted.
+    """
 
     _marker: Path | None = None
 
     def render_while(self, marker: Path | None) -> None:
-        """
-        From now on.
+        """From now on.
 
-        :param marker: A file without which rendering raises :class:`NotWantedError`; None renders always.
+        :param marker: A file without which rendering raises :class:`NotWantedError`; None renders
+            always.
         """
         self._marker = marker
 
@@ -259,8 +275,7 @@ class _RendersWhileWanted(gym.Wrapper):
 
 
 def load_choice(choice: Choice) -> Any:
-    """
-    Load a model.
+    """Load a model.
 
     :param choice: Which.
     :return: The model.
@@ -273,10 +288,8 @@ def load_choice(choice: Choice) -> Any:
 
 
 def make_env(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env:
-    """
-    An environment that renders, small and fast where it can.
+    """An environment that renders, small and fast where it can.
 
-    :param env_id: Its id.
     :param env_kwargs: Its arguments.
     :return: The environment.
     :raises ValueError: If it cannot render RGB images.

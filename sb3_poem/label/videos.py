@@ -1,4 +1,6 @@
-"""Video files of questions and results: small, quick to encode, and to the frame seekable in every browser."""
+"""Video files of questions and results: small, quick to encode, and to the frame seekable in every
+browser.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +26,7 @@ class StorageError(OSError):
 
 
 def write_clip(frames: Sequence[np.ndarray], path: Path, fps: float) -> None:
-    """
-    Write frames as MP4 (H.264), completely or not at all.
+    """Write frames as MP4 (H.264), completely or not at all.
 
     :param frames: (height, width, 3) uint8 each, of one size.
     :param path: The file, which must end in ``.mp4``; its folder must exist.
@@ -35,7 +36,18 @@ def write_clip(frames: Sequence[np.ndarray], path: Path, fps: float) -> None:
     from imageio_ffmpeg import get_ffmpeg_exe
 
     height, width = frames[0].shape[:2]
-    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:.02f}", "-i", "-"]
+    source = [
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "rgb24",
+        "-s",
+        f"{width}x{height}",
+        "-r",
+        f"{fps:.02f}",
+        "-i",
+        "-",
+    ]
     temporary = path.with_name(f".writing-{path.name}")
     command = [get_ffmpeg_exe(), "-y", "-v", "error", *source, *ENCODER, str(temporary)]
     try:
@@ -55,8 +67,8 @@ def write_clip(frames: Sequence[np.ndarray], path: Path, fps: float) -> None:
 
 
 def pair(left: Sequence[np.ndarray], right: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """
-    Two clips beside each other, each :data:`WIDTH` x :data:`HEIGHT`: one file, so that they cannot fall out of step.
+    """Two clips beside each other, each :data:`WIDTH` x :data:`HEIGHT`: one file, so that they
+    cannot fall out of step.
 
     :param left: Frames.
     :param right: Frames.
@@ -70,8 +82,8 @@ def pair(left: Sequence[np.ndarray], right: Sequence[np.ndarray]) -> list[np.nda
 
 
 def fit(frame: np.ndarray) -> np.ndarray:
-    """
-    A frame in the page's size, whole, with bars of its corner's colour where its shape is another.
+    """A frame in the page's size, whole, with bars of its corner's colour where its shape is
+    another.
 
     :param frame: (height, width, 3) uint8.
     :return: (:data:`HEIGHT`, :data:`WIDTH`, 3) uint8.

@@ -23,8 +23,8 @@ from sb3_poem.label.workshop import Workshop
 
 
 class LabelWidget:
-    """
-    The page on which a person answers, for an adapter in a notebook: the last expression of a cell shows it.
+    """The page on which a person answers, for an adapter in a notebook: the last expression of a
+    cell shows it.
 
     .. code-block:: python
 
@@ -33,19 +33,30 @@ class LabelWidget:
         widget                      # answer in the page below the cell
         policy = widget.policy()    # in a later cell
 
-    The server runs in this process, on loopback: the browser must run on the same machine, or its port be forwarded.
+    The server runs in this process, on loopback: the browser must run on the same machine, or its
+    port be forwarded.
 
-    :param adapter: The adapter; its environment must have been made with ``render_mode="rgb_array"``. Do not use the adapter
-        or its environment elsewhere meanwhile; :meth:`sync` brings it to where the person stands.
+    :param adapter: The adapter; its environment must have been made with
+        ``render_mode="rgb_array"``. Do not use the adapter or its environment elsewhere meanwhile;
+        :meth:`sync` brings it to where the person stands.
     :param store: The folder of the store; None takes a temporary one, which ends with the widget.
     :param height: Of the page in the notebook, pixels.
     :param port: The server's port; 0 takes a free one.
-    :raises ValueError: If the environment does not render, or the adapter has answers already or asks from a library.
+    :raises ValueError: If the environment does not render, or the adapter has answers already or
+        asks from a library.
     """
 
-    def __init__(self, adapter: PreferenceAdapter, store: str | Path | None = None, height: int = 900, port: int = 0) -> None:
+    def __init__(
+        self,
+        adapter: PreferenceAdapter,
+        store: str | Path | None = None,
+        height: int = 900,
+        port: int = 0,
+    ) -> None:
         if not isinstance(adapter, PreferenceAdapter):
-            raise TypeError(f"`adapter` must be a PreferenceAdapter, but is a {type(adapter).__name__}")
+            raise TypeError(
+                f"`adapter` must be a PreferenceAdapter, but is a {type(adapter).__name__}"
+            )
         if adapter.answers or adapter.pending is not None:
             raise ValueError("`adapter` has been asked already; give the widget a fresh one")
         if adapter.library is not None:
@@ -53,10 +64,14 @@ class LabelWidget:
         self.adapter = adapter
         self.height = height
         env_id = getattr(adapter.model, "env_id", None) or "?"
-        self._start = {name: value for name, value in adapter.to_dict().items() if name not in CONVERSATION}
+        self._start = {
+            name: value for name, value in adapter.to_dict().items() if name not in CONVERSATION
+        }
         bench = _AdaptersBench(adapter.model, adapter.env, env_id, self._start)
         self._temporary = tempfile.TemporaryDirectory() if store is None else None
-        self._store = Store(Path(self._temporary.name) if self._temporary is not None else Path(store or "."))
+        self._store = Store(
+            Path(self._temporary.name) if self._temporary is not None else Path(store or ".")
+        )
         release_graphics()  # the environment may have rendered in this thread
         # One thread: a graphics context belongs to one at a time.
         self._thread = ThreadPoolExecutor(1)
@@ -64,7 +79,13 @@ class LabelWidget:
         choice = Choice("notebook", Path(), type(adapter.model).__name__, env_id)
         options = {**adapter.options.to_dict(), "notebook": True}
         self._conversations = Conversations(
-            self._store, workshop, [choice], options, adapter.options.n_queries, 1, load=lambda _: adapter.model
+            self._store,
+            workshop,
+            [choice],
+            options,
+            adapter.options.n_queries,
+            1,
+            load=lambda _: adapter.model,
         )
         self._session, token = self._store.create_session(
             choice.name, env_id, adapter.seed, options, adapter.options.n_queries, source="notebook"
@@ -78,8 +99,7 @@ class LabelWidget:
         return self._store.session(self._session.id)
 
     def sync(self) -> PreferenceAdapter:
-        """
-        Bring the adapter to where the person stands.
+        """Bring the adapter to where the person stands.
 
         :return: It.
         """
@@ -89,19 +109,23 @@ class LabelWidget:
         for kind in ("question", "result"):
             turn = turn or self._store.turn(number, kind, answered)
         if turn is None:
-            raise RuntimeError("the page is still preparing what follows from the last answer; try again in a moment")
+            raise RuntimeError(
+                "the page is still preparing what follows from the last answer; try again in a moment"
+            )
         row = self._store.whole_turn(turn["id"])
         assert row is not None
         pending = None
         if row["left_trajectory"] is not None:
-            pending = {"left": json.loads(row["left_trajectory"]), "right": json.loads(row["right_trajectory"])}
+            pending = {
+                "left": json.loads(row["left_trajectory"]),
+                "right": json.loads(row["right_trajectory"]),
+            }
         answers = self._store.conversation(number, answered)
         self.adapter.restore({**json.loads(row["state"]), "answers": answers, "pending": pending})
         return self.adapter
 
     def policy(self) -> Any:
-        """
-        The policy for the person's answers so far.
+        """The policy for the person's answers so far.
 
         :return: An :class:`~sb3_poem.adaptation.AdaptedPolicy`.
         """

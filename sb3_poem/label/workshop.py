@@ -1,4 +1,6 @@
-"""Where turns are made: a few workers, what somebody waits for first, what may be wanted next in the time that is left."""
+"""Where turns are made: a few workers, what somebody waits for first, what may be wanted next in
+the time that is left.
+"""
 
 from __future__ import annotations
 
@@ -27,8 +29,7 @@ ATTEMPTS = 2
 
 @dataclass(eq=False)
 class Job:
-    """
-    A turn that is being made, or will be.
+    """A turn that is being made, or will be.
 
     :param request: What from.
     :param urgency: The smaller, the sooner.
@@ -38,14 +39,16 @@ class Job:
     request: Request
     urgency: int
     order: int
-    done: asyncio.Future[Turn] = field(default_factory=lambda: asyncio.get_running_loop().create_future())
+    done: asyncio.Future[Turn] = field(
+        default_factory=lambda: asyncio.get_running_loop().create_future()
+    )
     running: bool = False
     discarded: bool = False
 
 
 class Workshop:
-    """
-    Makes turns on an executor, in the order of their urgency. All methods belong to one event loop.
+    """Makes turns on an executor, in the order of their urgency. All methods belong to one event
+    loop.
 
     :param n_workers: How many turns are made at a time.
     :param make_executor: Makes the executor; None takes processes.
@@ -75,8 +78,7 @@ class Workshop:
             self._executor.submit(_nothing)
 
     def submit(self, request: Request, urgency: int) -> Job:
-        """
-        Have a turn made.
+        """Have a turn made.
 
         :param request: What from.
         :param urgency: See above.
@@ -88,19 +90,11 @@ class Workshop:
         return job
 
     def hurry(self, job: Job) -> None:
-        """
-        Somebody waits for a job now.
-
-        :param job: The job.
-        """
+        """Somebody waits for a job now."""
         job.urgency = WAITED_FOR
 
     def discard(self, job: Job) -> None:
-        """
-        Nobody will want a job's turn: do not start it, or stop it soon, and delete its video.
-
-        :param job: The job.
-        """
+        """Nobody will want a job's turn: do not start it, or stop it soon, and delete its video."""
         job.discarded = True
         if job in self._waiting:
             self._waiting.remove(job)
@@ -150,7 +144,12 @@ class Workshop:
             job.done.cancel()
             return
         except Exception as error:
-            _logger.error("a %s of %s could not be made: %r", job.request.wanted, job.request.choice.name, error)
+            _logger.error(
+                "a %s of %s could not be made: %r",
+                job.request.wanted,
+                job.request.choice.name,
+                error,
+            )
             if not job.done.done():
                 job.done.set_exception(error)
                 job.done.exception()  # somebody may wait for it or not
@@ -168,7 +167,9 @@ class Workshop:
                 self._executor = self._make_executor()
             executor = self._executor
             try:
-                return await asyncio.get_running_loop().run_in_executor(executor, self._make, request)
+                return await asyncio.get_running_loop().run_in_executor(
+                    executor, self._make, request
+                )
             except BrokenProcessPool:
                 if self._executor is executor:
                     self._executor = None
@@ -178,9 +179,10 @@ class Workshop:
         raise AssertionError("unreachable")
 
 
-def process_pool(n_workers: int, choices: Sequence[Choice] = (), packages: Sequence[str] = ()) -> ProcessPoolExecutor:
-    """
-    Worker processes that end with this one, even if it is killed.
+def process_pool(
+    n_workers: int, choices: Sequence[Choice] = (), packages: Sequence[str] = ()
+) -> ProcessPoolExecutor:
+    """Worker processes that end with this one, even if it is killed.
 
     :param n_workers: How many.
     :param choices: Models that they load at once.
@@ -189,7 +191,9 @@ def process_pool(n_workers: int, choices: Sequence[Choice] = (), packages: Seque
     """
     context: Any = multiprocessing.get_context("spawn")
     arguments = (tuple(choices), tuple(packages))
-    return ProcessPoolExecutor(n_workers, mp_context=context, initializer=_begin_worker, initargs=arguments)
+    return ProcessPoolExecutor(
+        n_workers, mp_context=context, initializer=_begin_worker, initargs=arguments
+    )
 
 
 def _nothing() -> None:

@@ -10,7 +10,8 @@ from sb3_poem.pearl_sac.pearl_sac import PEARLSAC
 
 
 class EpochCallback(BaseCallback):
-    """Calls :meth:`_on_epoch` between two epochs: after the gradient steps of one, before the collection of the next.
+    """Calls :meth:`_on_epoch` between two epochs: after the gradient steps of one, before the
+    collection of the next.
 
     :param every: Epochs between two calls; the end of training is always one
     :param verbose: 0 no output, 1 info
@@ -56,7 +57,8 @@ class EpochCallback(BaseCallback):
 
 
 class TrainingCheckpointCallback(EpochCallback):
-    """Writes a checkpoint from which ``load_checkpoint`` and ``resume`` continue bit for bit, always to the same file.
+    """Writes a checkpoint from which ``load_checkpoint`` and ``resume`` continue bit for bit,
+    always to the same file.
 
     A handler of Ctrl-C may call :meth:`stop`, so that nothing of what was learned is lost::
 
@@ -66,8 +68,9 @@ class TrainingCheckpointCallback(EpochCallback):
         POEMSAC.load_checkpoint("checkpoint.zip", env).resume()  # later
 
     :param path: The file; it is replaced atomically
-    :param every: Epochs between two checkpoints; None: at most every 50 times as long as writing one takes, and training
-        goes on where it cannot be written. The end of training writes one too, unless it was stopped within an epoch
+    :param every: Epochs between two checkpoints; None: at most every 50 times as long as writing
+        one takes, and training goes on where it cannot be written. The end of training writes one
+        too, unless it was stopped within an epoch
     :param verbose: 1 reports each write
     """
 
@@ -107,7 +110,9 @@ class TrainingCheckpointCallback(EpochCallback):
         except OSError as error:
             if not self._paced:
                 raise
-            warnings.warn(f"no checkpoint of {self.model.num_timesteps} steps: {error}", stacklevel=2)
+            warnings.warn(
+                f"no checkpoint of {self.model.num_timesteps} steps: {error}", stacklevel=2
+            )
         else:
             self.saved_steps = self.model.num_timesteps
             if self.verbose > 0:

@@ -43,7 +43,8 @@ class EpochCollector:
     on_step: OnStep
 
     def collect(self) -> list[Segment] | None:
-        """One epoch: ``trajectories_per_task`` horizons of every task, one segment for each wave of copies.
+        """One epoch: ``trajectories_per_task`` horizons of every task, one segment for each wave of
+        copies.
 
         :return: The waves, or None if ``on_step`` ended the collection
         """
@@ -57,7 +58,8 @@ class EpochCollector:
         return waves
 
     def roll_out(self, task_ids: np.ndarray, latents: np.ndarray) -> Segment | None:
-        """One horizon of each copy under a latent of its own; what happens goes to the buffer as well.
+        """One horizon of each copy under a latent of its own; what happens goes to the buffer as
+        well.
 
         :param task_ids: (copies,)
         :param latents: (copies, latent_dim)
@@ -76,7 +78,9 @@ class EpochCollector:
 
         episodes = np.full(self.family.num_envs, self.episode_count())
         seed, tasks = self.generators.integer_seed(), self.tasks.tasks[task_ids]
-        segment = collect_segment(self.family, act, task_ids, tasks, latents, seed, episodes, self.on_step)
+        segment = collect_segment(
+            self.family, act, task_ids, tasks, latents, seed, episodes, self.on_step
+        )
         if segment is not None:
             self.buffer.extend(segment)
         return segment
@@ -88,13 +92,15 @@ class EpochCollector:
             while True:
                 yield th.randn(shape, generator=self.generators.torch, device=device)
         steps = max(2, self.family.horizon)
-        noise = powerlaw_psd_gaussian(self.noise_color, (*shape, steps), random_state=self.generators.numpy)
+        noise = powerlaw_psd_gaussian(
+            self.noise_color, (*shape, steps), random_state=self.generators.numpy
+        )
         yield from th.as_tensor(noise, dtype=th.float32, device=device).movedim(-1, 0)
 
 
 def in_waves(rows: np.ndarray, n_envs: int) -> np.ndarray:
-    """Rows in order, (waves, n_envs, ...): the last wave is filled up from the start, as its copies are
-    stepped anyway.
+    """Rows in order, (waves, n_envs, ...): the last wave is filled up from the start, as its copies
+    are stepped anyway.
     """
     count = -(-len(rows) // n_envs) * n_envs
     return rows[np.arange(count) % len(rows)].reshape(-1, n_envs, *rows.shape[1:])
@@ -103,5 +109,8 @@ def in_waves(rows: np.ndarray, n_envs: int) -> np.ndarray:
 def concatenate(segments: list[Segment], n: int) -> Segment:
     """The first ``n`` copies of all waves as one segment."""
     return Segment(
-        **{name: np.concatenate([getattr(segment, name) for segment in segments])[:n] for name in Segment.__dataclass_fields__}
+        **{
+            name: np.concatenate([getattr(segment, name) for segment in segments])[:n]
+            for name in Segment.__dataclass_fields__
+        }
     )

@@ -19,9 +19,10 @@ def vectorise(
     n_train_tasks: int | None = None,
     trajectories_per_task: int = 1,
 ) -> GymEnv | None:
-    """An environment as SB3 takes it. A registered id becomes ``n_copies``: unless given, one for each
-    trajectory of an epoch, up to one per task or :data:`DEFAULT_TRAIN_TASKS`, whichever is more; of a family
-    without a vectorised version, as many as :func:`make_task_vec_env` steps in turn.
+    """An environment as SB3 takes it. A registered id becomes ``n_copies``: unless given, one for
+    each trajectory of an epoch, up to one per task or :data:`DEFAULT_TRAIN_TASKS`, whichever is
+    more; of a family without a vectorised version, as many as :func:`make_task_vec_env` steps in
+    turn.
 
     :param n_train_tasks: Training tasks; None takes :func:`default_train_tasks`
     :param trajectories_per_task: Horizons of each in an epoch

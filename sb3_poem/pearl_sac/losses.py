@@ -14,8 +14,8 @@ from sb3_poem.pearl_sac.policies import LatentPolicy
 class Bootstraps(NamedTuple):
     """What the critics' targets are made of where they look some steps ahead.
 
-    rewards (tasks, batch), their discounted sum until then; observations (tasks, batch, obs_dim) after it; discounts
-    (tasks, batch) of the value there, 0 where the episode terminated.
+    rewards (tasks, batch), their discounted sum until then; observations (tasks, batch, obs_dim)
+    after it; discounts (tasks, batch) of the value there, 0 where the episode terminated.
     """
 
     rewards: th.Tensor
@@ -26,10 +26,11 @@ class Bootstraps(NamedTuple):
 class MetaBatch(NamedTuple):
     """What one gradient step sees of a meta-batch of tasks.
 
-    task_ids (tasks,), transitions: a :class:`TaskBatch` (tasks, batch, ...), context (tasks, context_size, context_dim),
-    context_rewards (tasks, context_size), returns (tasks, tasks): J[i, j], NaN where unknown; standard normal draws for the
-    latents (tasks, latent_dim), the actions and the next actions (tasks, batch, action_dim); bootstraps, None where targets
-    look one step ahead, which ``transitions`` tell.
+    task_ids (tasks,), transitions: a :class:`TaskBatch` (tasks, batch, ...), context (tasks,
+    context_size, context_dim), context_rewards (tasks, context_size), returns (tasks, tasks): J[i,
+    j], NaN where unknown; standard normal draws for the latents (tasks, latent_dim), the actions
+    and the next actions (tasks, batch, action_dim); bootstraps, None where targets look one step
+    ahead, which ``transitions`` tell.
     """
 
     task_ids: th.Tensor
@@ -44,7 +45,9 @@ class MetaBatch(NamedTuple):
 
 
 class TaskEmbeddings(NamedTuple):
-    """Latents z of the tasks of a meta-batch, and what actor and decoder see of them; each (tasks, latent_dim)."""
+    """Latents z of the tasks of a meta-batch, and what actor and decoder see of them; each (tasks,
+    latent_dim).
+    """
 
     latents: th.Tensor
     policy: th.Tensor
@@ -71,25 +74,35 @@ def critic_loss(
     noise: th.Tensor,
     bootstraps: Bootstraps | None = None,
 ) -> th.Tensor:
-    """Half the squared soft Bellman error, summed over the critics; it trains the encoder too, as in PEARL.
+    """Half the squared soft Bellman error, summed over the critics; it trains the encoder too, as
+    in PEARL.
 
     :param noise: (tasks, batch, action_dim) standard normal draws for the next actions
     :param bootstraps: Where targets look further ahead than one step
     """
     n = batch.rewards.shape[1]
     if bootstraps is None:
-        bootstraps = Bootstraps(batch.rewards, batch.next_observations, gamma * (1.0 - batch.terminated))
+        bootstraps = Bootstraps(
+            batch.rewards, batch.next_observations, gamma * (1.0 - batch.terminated)
+        )
     with th.no_grad():
         next_obs, z = bootstraps.observations, embeddings.latents
         next_actions, next_log_prob = policy.actor(next_obs, rows(embeddings.policy, n), noise)
-        next_values = policy.critic_target(next_obs, next_actions, rows(z, n)).amin(dim=0) - alpha * next_log_prob
+        next_values = (
+            policy.critic_target(next_obs, next_actions, rows(z, n)).amin(dim=0)
+            - alpha * next_log_prob
+        )
         targets = reward_scale * bootstraps.rewards + bootstraps.discounts * next_values
     values = policy.critic(batch.observations, batch.actions, rows(embeddings.latents, n))
     return 0.5 * len(values) * (values - targets).pow(2).mean()
 
 
 def actor_loss(
-    policy: LatentPolicy, batch: TaskBatch, embeddings: TaskEmbeddings, alpha: th.Tensor, noise: th.Tensor
+    policy: LatentPolicy,
+    batch: TaskBatch,
+    embeddings: TaskEmbeddings,
+    alpha: th.Tensor,
+    noise: th.Tensor,
 ) -> tuple[th.Tensor, th.Tensor]:
     """Soft policy improvement: the loss, and the mean log-probability of the actions.
 
@@ -113,6 +126,10 @@ def decoder_loss(
     embedding: th.Tensor,
     variance: th.Tensor,
 ) -> th.Tensor:
-    """Squared error of the decoder on transitions (tasks, n, ...), relative to ``variance`` (eq. 4)."""
-    error = policy.decode_rewards(obs, actions, next_obs, rows(embedding, rewards.shape[1])) - rewards
+    """Squared error of the decoder on transitions (tasks, n, ...), relative to ``variance`` (eq.
+    4).
+    """
+    error = (
+        policy.decode_rewards(obs, actions, next_obs, rows(embedding, rewards.shape[1])) - rewards
+    )
     return error.pow(2).mean() / variance

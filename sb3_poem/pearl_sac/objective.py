@@ -20,8 +20,8 @@ class Objective:
     :param gamma: Discount factor
     :param reward_scale: Factor on the rewards that the critics learn
     :param reward_variance: By which the decoder's squared error is divided
-    :param decodes_replay: Whether the decoder learns on transitions of the replay buffer, which hold
-        other tasks' policies too, as adaptation asks it about; else on contexts
+    :param decodes_replay: Whether the decoder learns on transitions of the replay buffer, which
+        hold other tasks' policies too, as adaptation asks it about; else on contexts
     :param kl_coef: Weight of the posteriors' KL to the prior
     :param reward_coef: Weight of the decoder's loss
     :param policy_coef: Weight of the actor's loss
@@ -36,7 +36,9 @@ class Objective:
     reward_coef: float
     policy_coef: float
 
-    def loss(self, batch: MetaBatch, alpha: th.Tensor, whole: bool = True) -> tuple[th.Tensor, Metrics]:
+    def loss(
+        self, batch: MetaBatch, alpha: th.Tensor, whole: bool = True
+    ) -> tuple[th.Tensor, Metrics]:
         """Sum of the losses of a meta-batch, and what to log of them.
 
         :param alpha: Entropy coefficient
@@ -49,11 +51,17 @@ class Objective:
         loss, metrics = critic_loss + self.kl_coef * kl, {"critic_loss": critic_loss, "kl": kl}
         if not whole:
             return loss, metrics
-        actor_loss, log_prob = losses.actor_loss(self.policy, transitions, embeddings, alpha, batch.action_noise)
+        actor_loss, log_prob = losses.actor_loss(
+            self.policy, transitions, embeddings, alpha, batch.action_noise
+        )
         decoder_loss = self.decoder_loss(batch, transitions, embeddings)
         embedding_loss, embedding_metrics = self.embedding_loss(batch, embeddings)
         loss = (
-            critic_loss + self.policy_coef * actor_loss + self.reward_coef * decoder_loss + self.kl_coef * kl + embedding_loss
+            critic_loss
+            + self.policy_coef * actor_loss
+            + self.reward_coef * decoder_loss
+            + self.kl_coef * kl
+            + embedding_loss
         )
         metrics |= {
             "actor_loss": actor_loss,
@@ -65,23 +73,31 @@ class Objective:
         return loss, metrics
 
     def encode(self, batch: MetaBatch) -> tuple[th.Tensor, th.Tensor]:
-        """Latents (tasks, latent_dim) by reparameterisation, and the mean KL of their posteriors to N(0, I)."""
+        """Latents (tasks, latent_dim) by reparameterisation, and the mean KL of their posteriors to
+        N(0, I).
+        """
         mean, variance = self.policy.encoder(batch.context)
         latents = mean + variance.sqrt() * batch.latent_noise
         return latents, losses.kl_to_prior(mean, variance).mean()
 
     def embed(self, latents: th.Tensor) -> TaskEmbeddings:
-        """What actor and decoder see of latents (tasks, latent_dim). PEARL's encoder learns nothing from
-        the actor.
+        """What actor and decoder see of latents (tasks, latent_dim). PEARL's encoder learns nothing
+        from the actor.
         """
         policy = self.policy
-        return TaskEmbeddings(latents, policy.policy_embedding(latents.detach()), policy.reward_embedding(latents))
+        return TaskEmbeddings(
+            latents, policy.policy_embedding(latents.detach()), policy.reward_embedding(latents)
+        )
 
-    def embedding_loss(self, batch: MetaBatch, embeddings: TaskEmbeddings) -> tuple[th.Tensor | float, Metrics]:
+    def embedding_loss(
+        self, batch: MetaBatch, embeddings: TaskEmbeddings
+    ) -> tuple[th.Tensor | float, Metrics]:
         """A further, weighted demand on the latents, and what to log of it; PEARL has none."""
         return 0.0, {}
 
-    def critic_loss(self, batch: MetaBatch, transitions: TaskBatch, embeddings: TaskEmbeddings, alpha: th.Tensor) -> th.Tensor:
+    def critic_loss(
+        self, batch: MetaBatch, transitions: TaskBatch, embeddings: TaskEmbeddings, alpha: th.Tensor
+    ) -> th.Tensor:
         bootstraps = batch.bootstraps
         if bootstraps is not None:
             ahead = self.policy.standardise(bootstraps.observations)
@@ -97,7 +113,9 @@ class Objective:
             bootstraps,
         )
 
-    def decoder_loss(self, batch: MetaBatch, transitions: TaskBatch, embeddings: TaskEmbeddings) -> th.Tensor:
+    def decoder_loss(
+        self, batch: MetaBatch, transitions: TaskBatch, embeddings: TaskEmbeddings
+    ) -> th.Tensor:
         if self.decodes_replay:
             inputs = transitions.observations, transitions.actions, transitions.next_observations
             rewards = transitions.rewards
@@ -106,7 +124,9 @@ class Objective:
             widths = [obs_dim, action_dim, obs_dim]
             inputs = batch.context[..., : sum(widths)].split(widths, dim=-1)
             rewards = batch.context_rewards
-        return losses.decoder_loss(self.policy, *inputs, rewards, embeddings.reward, self.reward_variance)
+        return losses.decoder_loss(
+            self.policy, *inputs, rewards, embeddings.reward, self.reward_variance
+        )
 
     def standardised(self, batch: TaskBatch) -> TaskBatch:
         standardise = self.policy.standardise

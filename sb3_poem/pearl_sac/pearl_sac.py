@@ -49,26 +49,29 @@ MIN_STD = RunningNorm.MIN_STD
 class PEARLSAC(SAC):
     """Context-based meta-RL on soft actor-critic (PEARL, https://arxiv.org/abs/1903.08254).
 
-    Training alternates between an epoch's collection, in which every training task is rolled out under its own latest
-    latent, and gradient steps on meta-batches of tasks. It keeps a replay buffer for every task and the contexts of the last
-    epoch, and learns a context encoder, a latent-conditioned actor and critics, and a reward decoder together.
-    Observations are standardised by the mean and deviation of all that were collected.
+    Training alternates between an epoch's collection, in which every training task is rolled out
+    under its own latest latent, and gradient steps on meta-batches of tasks. It keeps a replay
+    buffer for every task and the contexts of the last epoch, and learns a context encoder, a
+    latent-conditioned actor and critics, and a reward decoder together. Observations are
+    standardised by the mean and deviation of all that were collected.
 
     :param policy: The policy model to use: "MlpPolicy", or a subclass of its class
     :param env: A task family: an environment, a vectorised one of SB3 or Gymnasium, or a registered
         id (which is then vectorised)
-    :param learning_rate: Learning rate of all networks, a float or a schedule of the remaining progress
+    :param learning_rate: Learning rate of all networks, a float or a schedule of the remaining
+        progress
     :param buffer_size: Transitions kept for each training task
     :param learning_starts: Environment steps with uniformly random actions before learning
     :param batch_size: Transitions of each task in a gradient step
     :param tau: Soft update coefficient of the target critics
     :param gamma: Discount factor
-    :param gradient_steps: Gradient steps after each epoch's collection; -1: as many as environment steps
+    :param gradient_steps: Gradient steps after each epoch's collection; -1: as many as environment
+        steps
     :param ent_coef: Entropy coefficient; "auto" learns it, "auto_0.1" from 0.1 on
     :param target_update_interval: Gradient steps between updates of the target critics
     :param target_entropy: Target entropy when learning ``ent_coef``
-    :param n_train_tasks: Training tasks, drawn once from the family with the model's seed; None: 120, or all of a
-        smaller finite family
+    :param n_train_tasks: Training tasks, drawn once from the family with the model's seed; None:
+        120, or all of a smaller finite family
     :param meta_batch_size: Tasks in a gradient step (all, if there are fewer)
     :param context_size: Transitions in a context
     :param trajectories_per_task: Horizons that every task collects in an epoch
@@ -76,26 +79,32 @@ class PEARLSAC(SAC):
     :param kl_coef: Weight of KL(q(z | c) || N(0, I))
     :param reward_coef: Weight of the decoder's loss (eq. 4)
     :param policy_coef: Weight of the actor's loss
-    :param relabel_fraction: Share of each task's batch that comes from other tasks' buffers, with rewards relabelled. Needs
-        a family with shared dynamics
-    :param context_relabel_fraction: Share of the contexts in a gradient step that hold other tasks' transitions, with rewards
-        relabelled. Without any, the encoder may read a task from what its policy does rather than from the rewards, and is
-        then at a loss when it sees a new task's first rollouts. Needs a family with shared dynamics
-    :param reward_scale: Factor on the rewards that the critics learn; "auto" divides by the deviation of the first epoch's
-    :param n_steps: Steps of rewards in the critics' targets before the value takes over; more carry rewards back faster, and
-        rely more on what older policies, and with ``relabel_fraction`` other tasks', did
-    :param shaping_coef: From 0 to 1, how far the critics learn what is gained beyond staying where one is: their rewards are
-        shaped (Ng, Harada & Russell, ICML 1999) with this share of the family's potential over 1 - ``gamma``. Which policies
-        are best stays as it is; where an action changes values by a small part of their spread, as on the way to a place,
-        they are learned sooner. Action values, those in POEM's contexts too, are then without that share. Needs a family with
-        a potential
-    :param mirror_fraction: Share of each task's batch that is seen in a symmetry of the family's dynamics, drawn among those
-        that it names, with rewards computed for what is then seen. What a robot learned to do in one direction, it then has
-        examples of in others. Needs a family with symmetries, and with shared dynamics
-    :param noise_color: Exponent b of the power spectrum 1 / f^b of the policy's noise in training rollouts: 0 white, as in
-        SAC; 1 pink, 2 red (Eberhard et al., ICLR 2023). Noise that keeps a direction for some steps moves a robot farther
-    :param policy_delay: Gradient steps of critics and encoder for each of everything else, that is the actor, the decoder, the
-        embeddings and the entropy coefficient (as in TD3)
+    :param relabel_fraction: Share of each task's batch that comes from other tasks' buffers, with
+        rewards relabelled. Needs a family with shared dynamics
+    :param context_relabel_fraction: Share of the contexts in a gradient step that hold other tasks'
+        transitions, with rewards relabelled. Without any, the encoder may read a task from what its
+        policy does rather than from the rewards, and is then at a loss when it sees a new task's
+        first rollouts. Needs a family with shared dynamics
+    :param reward_scale: Factor on the rewards that the critics learn; "auto" divides by the
+        deviation of the first epoch's
+    :param n_steps: Steps of rewards in the critics' targets before the value takes over; more carry
+        rewards back faster, and rely more on what older policies, and with ``relabel_fraction``
+        other tasks', did
+    :param shaping_coef: From 0 to 1, how far the critics learn what is gained beyond staying where
+        one is: their rewards are shaped (Ng, Harada & Russell, ICML 1999) with this share of the
+        family's potential over 1 - ``gamma``. Which policies are best stays as it is; where an
+        action changes values by a small part of their spread, as on the way to a place, they are
+        learned sooner. Action values, those in POEM's contexts too, are then without that share.
+        Needs a family with a potential
+    :param mirror_fraction: Share of each task's batch that is seen in a symmetry of the family's
+        dynamics, drawn among those that it names, with rewards computed for what is then seen. What
+        a robot learned to do in one direction, it then has examples of in others. Needs a family
+        with symmetries, and with shared dynamics
+    :param noise_color: Exponent b of the power spectrum 1 / f^b of the policy's noise in training
+        rollouts: 0 white, as in SAC; 1 pink, 2 red (Eberhard et al., ICLR 2023). Noise that keeps a
+        direction for some steps moves a robot farther
+    :param policy_delay: Gradient steps of critics and encoder for each of everything else, that is
+        the actor, the decoder, the embeddings and the entropy coefficient (as in TD3)
     :param horizon: Steps of an episode; None takes the environment's time limit
     :param precision: "auto" (bfloat16 where the processor has it), "bf16", or "fp32"
     :param stats_window_size: Episodes that the rollout logging averages over
@@ -106,7 +115,8 @@ class PEARLSAC(SAC):
     :param device: "auto", "cpu", "cuda"
     :param _init_setup_model: Whether to build the networks at creation
     :param unsupported: Nothing: what SB3's SAC takes beyond these is refused
-    :raises ValueError: for an environment that is no task family, and for arguments outside their range
+    :raises ValueError: for an environment that is no task family, and for arguments outside their
+        range
     :raises TypeError: for arguments that only SB3's SAC takes; the message says what to do instead
     """
 
@@ -164,7 +174,9 @@ class PEARLSAC(SAC):
     ) -> None:
         refuse_unknown(unsupported, type(self))
         if not isinstance(policy_kwargs, dict | None):
-            raise TypeError(f"policy_kwargs must be a dictionary of the policy's arguments, but is {policy_kwargs!r}")
+            raise TypeError(
+                f"policy_kwargs must be a dictionary of the policy's arguments, but is {policy_kwargs!r}"
+            )
         refuse_unsupported(policy_kwargs or (), f"{type(self).__name__}'s policy")
         for name, value, least in (
             ("batch_size", batch_size, 1),
@@ -198,11 +210,20 @@ class PEARLSAC(SAC):
             check_number(name, number, 0.0, high)
         check_number_or_auto("ent_coef", ent_coef, 0.0)
         check_number_or_auto("target_entropy", target_entropy)
-        if reward_scale != "auto" and not (isinstance(reward_scale, (int, float)) and reward_scale > 0):
-            raise ValueError(f'reward_scale must be a positive number or "auto", got {reward_scale!r}')
+        if reward_scale != "auto" and not (
+            isinstance(reward_scale, (int, float)) and reward_scale > 0
+        ):
+            raise ValueError(
+                f'reward_scale must be a positive number or "auto", got {reward_scale!r}'
+            )
         hidden_dtype(precision, "cpu")  # refuses an unknown name now rather than at the first step
-        if str(device).startswith("cuda") and not th.cuda.is_available():  # which SB3 says nothing of
-            warnings.warn(f"device is {device!r}, but torch sees no CUDA device: the CPU is used", stacklevel=2)
+        if (
+            str(device).startswith("cuda") and not th.cuda.is_available()
+        ):  # which SB3 says nothing of
+            warnings.warn(
+                f"device is {device!r}, but torch sees no CUDA device: the CPU is used",
+                stacklevel=2,
+            )
         self.n_train_tasks = n_train_tasks
         self.meta_batch_size = meta_batch_size
         self.context_size = context_size
@@ -215,7 +236,9 @@ class PEARLSAC(SAC):
         self.context_relabel_fraction = context_relabel_fraction
         self.reward_scale = reward_scale
         if shaping_coef > 0 and gamma == 1:
-            raise ValueError("shaping_coef must be 0 with gamma=1: staying somewhere has no finite value then")
+            raise ValueError(
+                "shaping_coef must be 0 with gamma=1: staying somewhere has no finite value then"
+            )
         self.shaping_coef = shaping_coef
         self.mirror_fraction = mirror_fraction
         self.noise_color = noise_color
@@ -282,10 +305,14 @@ class PEARLSAC(SAC):
         if not len(self.train_tasks):
             self._draw_tasks()
         self._complete_policy_kwargs()
-        self.replay_buffer_kwargs = {"n_tasks": len(self.train_tasks), "feature_dim": self.reward_feature_dim}
+        self.replay_buffer_kwargs = {
+            "n_tasks": len(self.train_tasks),
+            "feature_dim": self.reward_feature_dim,
+        }
         generators = self.generators
         with warnings.catch_warnings():
-            # SB3 says that it ignores n_steps with another replay buffer than its own; our sampler does not
+            # SB3 says that it ignores n_steps with another replay buffer than its own; our sampler
+            # does not
             warnings.filterwarnings("ignore", "`n_steps=")
             super()._setup_model()
         self.generators = generators  # a model that is loaded goes on with its own
@@ -351,7 +378,9 @@ class PEARLSAC(SAC):
         """
         if self._family is None:
             if self.env is None:
-                raise ValueError("the model has no environment; give it one with set_env, or load it with env=...")
+                raise ValueError(
+                    "the model has no environment; give it one with set_env, or load it with env=..."
+                )
             self._family = self._family_of(self.env)
         return self._family
 
@@ -364,12 +393,12 @@ class PEARLSAC(SAC):
         return family
 
     def _check_family(self, family: FamilyView) -> None:
-        """
-        :raises ValueError: if the model's arguments need what the family does not have
-        """
+        """:raises ValueError: if the model's arguments need what the family does not have"""
         for name in ("relabel_fraction", "context_relabel_fraction", "mirror_fraction"):
             if getattr(self, name) > 0 and not family.shared_dynamics:
-                raise ValueError(f"{name} must be 0: the tasks of {family.env_id} do not share dynamics")
+                raise ValueError(
+                    f"{name} must be 0: the tasks of {family.env_id} do not share dynamics"
+                )
         if self.shaping_coef > 0 and not family.has_potential:
             raise ValueError(
                 f"shaping_coef must be 0: {family.env_id} has no potential; a family defines one by "
@@ -382,8 +411,8 @@ class PEARLSAC(SAC):
             )
 
     def set_env(self, env: GivenEnv, force_reset: bool = True) -> None:
-        """Change the environment, to one of the same family with any number of copies; a registered id
-        gets as many as the model has.
+        """Change the environment, to one of the same family with any number of copies; a registered
+        id gets as many as the model has.
 
         :raises ValueError: if the environment is of another family; the model then keeps its own
         """
@@ -426,11 +455,12 @@ class PEARLSAC(SAC):
     def predicted_returns(
         self, latents: np.ndarray, trajectories: Iterable[Trajectory], max_steps: int | None = None
     ) -> np.ndarray:
-        """Returns that the reward decoder predicts for trajectories, if each latent were the task's.
+        """Returns that the reward decoder predicts for trajectories, if each latent were the
+        task's.
 
         :param latents: (m, latent_dim)
-        :param max_steps: Of a longer trajectory only so many steps are decoded, evenly spaced, and the sum
-            is scaled up; None decodes all
+        :param max_steps: Of a longer trajectory only so many steps are decoded, evenly spaced, and
+            the sum is scaled up; None decodes all
         :return: (m, number of trajectories)
         """
         return self.policy.predicted_returns(latents, trajectories, max_steps, self.hidden_dtype)
@@ -465,7 +495,11 @@ class PEARLSAC(SAC):
         """
         total_timesteps = self._checked_steps(total_timesteps, callback)
         total_timesteps, callback = self._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
+            total_timesteps,
+            callback,
+            reset_num_timesteps,
+            tb_log_name or type(self).__name__,
+            progress_bar,
         )
         callback.on_training_start(locals(), globals())
         while self.num_timesteps < total_timesteps and self._run_epoch(callback, log_interval):
@@ -484,7 +518,9 @@ class PEARLSAC(SAC):
             )
         check_number("total_timesteps", total_timesteps, 0)
         if isinstance(callback, type):
-            raise TypeError(f"callback is the class {callback.__name__}, but must be an object: {callback.__name__}(...)")
+            raise TypeError(
+                f"callback is the class {callback.__name__}, but must be an object: {callback.__name__}(...)"
+            )
         if self.verbose > 0:
             epoch, updates = self.epoch_steps, self.gradient_steps
             print(
@@ -511,8 +547,8 @@ class PEARLSAC(SAC):
         return True
 
     def _collect_epoch(self, callback: BaseCallback) -> bool:
-        """Roll out every training task under a latent of its own, and replace the contexts (Algorithm 1,
-        lines 4 to 8); False if a callback ended it.
+        """Roll out every training task under a latent of its own, and replace the contexts
+        (Algorithm 1, lines 4 to 8); False if a callback ended it.
         """
         started, steps_before = time.perf_counter(), self.num_timesteps
         collector = self.make_collector(callback)
@@ -534,8 +570,8 @@ class PEARLSAC(SAC):
         return True
 
     def train(self, gradient_steps: int, batch_size: int = 128) -> None:
-        """Gradient steps on meta-batches, then a refresh of every training task's posterior (Algorithm 1,
-        lines 9 to 14).
+        """Gradient steps on meta-batches, then a refresh of every training task's posterior
+        (Algorithm 1, lines 9 to 14).
         """
         self.policy.set_training_mode(True)
         coefficient = self.entropy_coefficient
@@ -548,9 +584,13 @@ class PEARLSAC(SAC):
                     for name, value in updater.step(batch).items():
                         history.setdefault(name, []).append(value)
                     self._n_updates = updater.n_updates
-                updater.check_finite(history["gradient_norm"][-len(block) :], updater.n_updates - len(block))
+                updater.check_finite(
+                    history["gradient_norm"][-len(block) :], updater.n_updates - len(block)
+                )
         self._refresh_posteriors()
-        self.logger.record("time/updates_per_second", gradient_steps / max(time.perf_counter() - started, 1e-9))
+        self.logger.record(
+            "time/updates_per_second", gradient_steps / max(time.perf_counter() - started, 1e-9)
+        )
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         for name, values in history.items():
             self.logger.record(f"train/{name}", th.stack(values).mean().item())
@@ -615,7 +655,9 @@ class PEARLSAC(SAC):
         return Objective(
             self.policy,
             self.gamma,
-            1.0 / self.policy.reward_norm.std if self.reward_scale == "auto" else float(self.reward_scale),
+            1.0 / self.policy.reward_norm.std
+            if self.reward_scale == "auto"
+            else float(self.reward_scale),
             rewards.var().clamp(min=MIN_STD**2),
             self.relabel_fraction > 0,
             self.kl_coef,
@@ -650,13 +692,16 @@ class PEARLSAC(SAC):
     @property
     def _known_context(self) -> ContextStore:
         if self.epoch_context is None:
-            raise ValueError("the model has no contexts before it has collected an epoch: call learn")
+            raise ValueError(
+                "the model has no contexts before it has collected an epoch: call learn"
+            )
         return self.epoch_context
 
     # ------------------------------------------------------------------ an epoch's steps
 
     def measure_returns(self, epoch: Segment, collector: EpochCollector) -> np.ndarray | None:
-        """J[i, j]: the return of task j's policy on task i, (n_train_tasks, n_train_tasks); NaN where unknown.
+        """J[i, j]: the return of task j's policy on task i, (n_train_tasks, n_train_tasks); NaN
+        where unknown.
 
         :param epoch: Rollouts of the tasks under their own policies
         :param collector: For further rollouts
@@ -679,11 +724,18 @@ class PEARLSAC(SAC):
             self.logger.record("train/clipped_observations", beyond.item())
             actions = th.as_tensor(epoch.actions, device=self.device)
             rewards = th.as_tensor(epoch.rewards, dtype=th.float32, device=self.device)
-            self.context_reward_statistics = (float(rewards.mean()), max(float(rewards.std()), MIN_STD))
+            self.context_reward_statistics = (
+                float(rewards.mean()),
+                max(float(rewards.std()), MIN_STD),
+            )
             parts = [obs, actions, next_obs, _standardised(rewards)[..., None]]
             if policy.context_has_value:  # eq. 8; 0 before the first update (Algorithm 1, line 2)
                 known = self._n_updates > 0
-                values = policy.action_values(obs, actions, epoch.latents) if known else th.zeros_like(rewards)
+                values = (
+                    policy.action_values(obs, actions, epoch.latents)
+                    if known
+                    else th.zeros_like(rewards)
+                )
                 parts.append(_standardised(values)[..., None])
             transitions = th.cat(parts, dim=-1)
         features = None
@@ -698,18 +750,25 @@ class PEARLSAC(SAC):
         )
 
     def _refresh_posteriors(self) -> None:
-        """Posterior of every training task from its latest context: next epoch's latents, and the aggregate."""
+        """Posterior of every training task from its latest context: next epoch's latents, and the
+        aggregate.
+        """
         self.policy.set_training_mode(False)
         transitions = self._known_context.transitions
         with th.no_grad():
             steps = transitions.shape[1]
-            picks = th.randperm(steps, generator=self.generators.torch, device=self.device)[: self.context_size]
+            picks = th.randperm(steps, generator=self.generators.torch, device=self.device)[
+                : self.context_size
+            ]
             mean, variance = self.policy.encoder(transitions[:, picks])
-        self.train_tasks.set_posteriors(mean.double().cpu().numpy(), variance.double().cpu().numpy())
+        self.train_tasks.set_posteriors(
+            mean.double().cpu().numpy(), variance.double().cpu().numpy()
+        )
 
     def _measure_decoder(self) -> None:
-        """Residual deviation of the decoder, per step, on transitions of all training policies, in units of reward. Where
-        tasks do not share their dynamics it stays unknown: the decoder has seen no rewards for what others' policies do.
+        """Residual deviation of the decoder, per step, on transitions of all training policies, in
+        units of reward. Where tasks do not share their dynamics it stays unknown: the decoder has
+        seen no rewards for what others' policies do.
         """
         if not self.family.shared_dynamics:
             return
@@ -720,7 +779,10 @@ class PEARLSAC(SAC):
         rewards = self.family.compute_rewards(tasks[:, None, :], data.features.cpu().numpy())
         with th.no_grad():
             latents = th.as_tensor(self.task_latents, dtype=th.float32, device=device)
-            obs, next_obs = policy.standardise(data.observations), policy.standardise(data.next_observations)
+            obs, next_obs = (
+                policy.standardise(data.observations),
+                policy.standardise(data.next_observations),
+            )
             embedding = losses.rows(policy.reward_embedding(latents), MEASURED_PER_TASK)
             predicted = policy.decode_rewards(obs, data.actions, next_obs, embedding).cpu().numpy()
         self.predicted_rewards_error = float(np.sqrt(np.mean((predicted - rewards) ** 2)))
@@ -733,16 +795,27 @@ class PEARLSAC(SAC):
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         """The last epoch may overshoot the total; a schedule must not turn negative there."""
-        super()._update_current_progress_remaining(min(num_timesteps, total_timesteps), total_timesteps)
+        super()._update_current_progress_remaining(
+            min(num_timesteps, total_timesteps), total_timesteps
+        )
 
     def resume(
-        self: SelfPEARLSAC, callback: MaybeCallback = None, log_interval: int | None = 1, progress_bar: bool = False
+        self: SelfPEARLSAC,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 1,
+        progress_bar: bool = False,
     ) -> SelfPEARLSAC:
         """Finish the ``learn`` that a checkpoint interrupted, up to its own ``total_timesteps``."""
         remaining = self._total_timesteps - self.num_timesteps
         if remaining <= 0:
             return self
-        return self.learn(remaining, callback, log_interval=log_interval, reset_num_timesteps=False, progress_bar=progress_bar)
+        return self.learn(
+            remaining,
+            callback,
+            log_interval=log_interval,
+            reset_num_timesteps=False,
+            progress_bar=progress_bar,
+        )
 
     # ------------------------------------------------------------------ files
 
@@ -772,29 +845,34 @@ class PEARLSAC(SAC):
         force_reset: bool = True,
         **kwargs: Any,
     ) -> SelfPEARLSAC:
-        """As SB3's. ``env`` may be a registered id too: it becomes as many copies as the model was trained with. Further
-        arguments are the constructor's; a ``seed`` begins new random streams.
+        """As SB3's. ``env`` may be a registered id too: it becomes as many copies as the model was
+        trained with. Further arguments are the constructor's; a ``seed`` begins new random streams.
 
-        :raises ValueError: if it is a folder, the file is truncated or holds another algorithm's model, env is of another
-            family, or an argument would change what the networks are
+        :raises ValueError: if it is a folder, the file is truncated or holds another algorithm's
+            model, env is of another family, or an argument would change what the networks are
         """
         refuse_unknown(kwargs.keys() - inspect.signature(cls).parameters.keys(), cls)
         data = saving.read_archive(path, cls, kwargs)
         if env is not None:
             env = vectorise(env, data["n_envs"])
-        model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        model = super().load(
+            path, env, device, custom_objects, print_system_info, force_reset, **kwargs
+        )
         if kwargs.get("seed") is not None:
             model.set_random_seed(kwargs["seed"])
         return model
 
     def save_checkpoint(self, path: str | pathlib.Path) -> None:
-        """Write everything to one file, from which :meth:`load_checkpoint` continues bit for bit. Between two epochs only.
+        """Write everything to one file, from which :meth:`load_checkpoint` continues bit for bit.
+        Between two epochs only.
 
         :raises OSError: if it cannot be written; a previous checkpoint stays whole
         """
         archive = io.BytesIO()
         self.save(archive)
-        saving.write_checkpoint(path, self.algorithm, archive.getvalue(), self.replay_buffer, self.epoch_context)
+        saving.write_checkpoint(
+            path, self.algorithm, archive.getvalue(), self.replay_buffer, self.epoch_context
+        )
 
     @classmethod
     def load_checkpoint(
@@ -805,10 +883,12 @@ class PEARLSAC(SAC):
     ) -> SelfPEARLSAC:
         """Read a checkpoint; :meth:`resume` then continues the run.
 
-        :param path: A file that :meth:`save_checkpoint` or :class:`TrainingCheckpointCallback` wrote
+        :param path: A file that :meth:`save_checkpoint` or :class:`TrainingCheckpointCallback`
+            wrote
         :param env: An environment like the run's own: the same family and number of copies
         :param device: "auto", "cpu", "cuda"
-        :raises ValueError: if the file is truncated or holds another algorithm's run, or env is of another family
+        :raises ValueError: if the file is truncated or holds another algorithm's run, or env is of
+            another family
         """
         state = saving.read_checkpoint(path, cls.__name__)
         model = cls.load(io.BytesIO(state["model"].numpy().tobytes()), env, device)
@@ -818,8 +898,12 @@ class PEARLSAC(SAC):
             model.epoch_context = ContextStore(**stored)
         return model
 
-    def save_pretrained(self, folder: str | pathlib.Path, card: dict[str, Any] | None = None) -> None:
-        """Write safetensors, JSON and a model card; see :func:`sb3_poem.pearl_sac.saving.save_pretrained`."""
+    def save_pretrained(
+        self, folder: str | pathlib.Path, card: dict[str, Any] | None = None
+    ) -> None:
+        """Write safetensors, JSON and a model card; see
+        :func:`sb3_poem.pearl_sac.saving.save_pretrained`.
+        """
         saving.save_pretrained(self, folder, card)
 
     @classmethod
@@ -833,7 +917,8 @@ class PEARLSAC(SAC):
 
         :param env: An environment of the model's family, if it shall be trained on
         :raises FileNotFoundError: if the folder does not hold a model
-        :raises ValueError: if a file is truncated or foreign, the model is of another algorithm, or env of another family
+        :raises ValueError: if a file is truncated or foreign, the model is of another algorithm, or
+            env of another family
         """
         model = saving.from_pretrained(cls, folder, device)
         if env is not None:

@@ -1,4 +1,6 @@
-"""Policy of PEARLSAC: an actor, critics, a context encoder and a reward decoder that share one latent."""
+"""Policy of PEARLSAC: an actor, critics, a context encoder and a reward decoder that share one
+latent.
+"""
 
 import warnings
 from collections.abc import Callable, Iterable, Sequence
@@ -29,17 +31,18 @@ OBSERVATION_CLIP = 10.0
 class LatentPolicy(SACPolicy):
     """Networks conditioned on a task latent z, with the statistics that standardise their inputs.
 
-    ``predict(obs, state=z)`` acts for latent ``z``; SB3's ``state`` slot carries it from step to step. Without a state the
-    prior's mean acts.
+    ``predict(obs, state=z)`` acts for latent ``z``; SB3's ``state`` slot carries it from step to
+    step. Without a state the prior's mean acts.
 
     :param observation_space: Flat Box
     :param action_space: Bounded Box
     :param lr_schedule: Learning rate schedule
-    :param net_arch: Hidden widths of actor and critics, or a dict with keys ``pi``, ``qf``, ``encoder``, ``decoder``,
-        ``embedding`` for each
+    :param net_arch: Hidden widths of actor and critics, or a dict with keys ``pi``, ``qf``,
+        ``encoder``, ``decoder``, ``embedding`` for each
     :param activation_fn: Activation of actor, critics and decoder
-    :param layer_norm: Whether actor, critics and decoder normalise their hidden layers before the activation (Ba, Kiros &
-        Hinton, 2016; without gain and bias). It steadies critics of robots with many observations
+    :param layer_norm: Whether actor, critics and decoder normalise their hidden layers before the
+        activation (Ba, Kiros & Hinton, 2016; without gain and bias). It steadies critics of robots
+        with many observations
     :param latent_dim: Dimension d of the latent
     :param context_has_value: Whether a context transition carries Q(s, a)
     :param n_critics: Number of critics
@@ -69,7 +72,9 @@ class LatentPolicy(SACPolicy):
         optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
         if not (isinstance(activation_fn, type) and issubclass(activation_fn, nn.Module)):
-            raise TypeError(f"activation_fn must be a class of torch.nn, as nn.ReLU, but is {activation_fn!r}")
+            raise TypeError(
+                f"activation_fn must be a class of torch.nn, as nn.ReLU, but is {activation_fn!r}"
+            )
         BasePolicy.__init__(
             self,
             observation_space,
@@ -90,7 +95,9 @@ class LatentPolicy(SACPolicy):
         self._build(lr_schedule)
 
     @staticmethod
-    def _complete_net_arch(net_arch: Sequence[int] | dict[str, Sequence[int]] | None) -> dict[str, list[int]]:
+    def _complete_net_arch(
+        net_arch: Sequence[int] | dict[str, Sequence[int]] | None,
+    ) -> dict[str, list[int]]:
         defaults: dict[str, Sequence[int]] = {
             "pi": (256, 256),
             "qf": (256, 256),
@@ -106,7 +113,9 @@ class LatentPolicy(SACPolicy):
             given = {"pi": net_arch, "qf": net_arch}
         unknown = set(given) - set(defaults)
         if unknown:
-            raise ValueError(f"net_arch has unknown keys {sorted(unknown)}; known are {sorted(defaults)}")
+            raise ValueError(
+                f"net_arch has unknown keys {sorted(unknown)}; known are {sorted(defaults)}"
+            )
         return {key: list(given.get(key, default)) for key, default in defaults.items()}
 
     def _build(self, lr_schedule: Schedule) -> None:
@@ -118,9 +127,21 @@ class LatentPolicy(SACPolicy):
         self.encoder = ContextEncoder(context_dim, self.latent_dim, arch["encoder"])
         self._build_embeddings(arch["embedding"])
         activation_fn, layer_norm = self.activation_fn, self.layer_norm
-        self.decoder = RewardDecoder(obs_dim, action_dim, self.latent_dim, arch["decoder"], activation_fn, layer_norm)
-        self.actor = LatentActor(obs_dim, self.latent_dim, action_dim, arch["pi"], activation_fn, layer_norm)
-        critic_args = (obs_dim, action_dim, self.latent_dim, arch["qf"], activation_fn, layer_norm, self.n_critics)
+        self.decoder = RewardDecoder(
+            obs_dim, action_dim, self.latent_dim, arch["decoder"], activation_fn, layer_norm
+        )
+        self.actor = LatentActor(
+            obs_dim, self.latent_dim, action_dim, arch["pi"], activation_fn, layer_norm
+        )
+        critic_args = (
+            obs_dim,
+            action_dim,
+            self.latent_dim,
+            arch["qf"],
+            activation_fn,
+            layer_norm,
+            self.n_critics,
+        )
         self.critic = LatentCritic(*critic_args)
         self.critic_target = LatentCritic(*critic_args)
         self.critic_target.load_state_dict(self.critic.state_dict())
@@ -144,11 +165,13 @@ class LatentPolicy(SACPolicy):
         return self.obs_norm(obs)
 
     def update_statistics(self, segments: Sequence[Segment]) -> None:
-        """Standardise by the mean and deviation of all observations so far: a robot that has learned to run
-        is far from what the first epoch's random actions showed. Rewards keep the first epoch's, in whose
-        units the critics learn.
+        """Standardise by the mean and deviation of all observations so far: a robot that has
+        learned to run is far from what the first epoch's random actions showed. Rewards keep the
+        first epoch's, in whose units the critics learn.
         """
-        obs = [segment.observations.reshape(-1, segment.observations.shape[-1]) for segment in segments]
+        obs = [
+            segment.observations.reshape(-1, segment.observations.shape[-1]) for segment in segments
+        ]
         self.obs_norm.update(np.concatenate(obs))
         if self.reward_norm.count == 0:
             rewards = [segment.rewards.reshape(-1, 1) for segment in segments]
@@ -163,7 +186,8 @@ class LatentPolicy(SACPolicy):
         """
         z = th.as_tensor(latents, dtype=th.float32, device=self.device)
         values = [
-            self.critic(o, a, own.expand(o.shape[0], -1)).min(dim=0).values for o, a, own in zip(obs, actions, z, strict=True)
+            self.critic(o, a, own.expand(o.shape[0], -1)).min(dim=0).values
+            for o, a, own in zip(obs, actions, z, strict=True)
         ]
         return th.stack(values)
 
@@ -177,7 +201,8 @@ class LatentPolicy(SACPolicy):
     ) -> np.ndarray:
         """Returns (m, trajectories) that the decoder predicts under latents (m, latent_dim).
 
-        :param max_steps: Steps that are decoded of each trajectory, see :meth:`PEARLSAC.predicted_returns`
+        :param max_steps: Steps that are decoded of each trajectory, see
+            :meth:`PEARLSAC.predicted_returns`
         :param dtype: Of the hidden layers' arithmetic
         """
         device = self.device
@@ -188,7 +213,9 @@ class LatentPolicy(SACPolicy):
             total = len(trajectory.actions)
             steps = _evenly_spaced(total, max_steps)
             obs, next_obs = (
-                self.standardise(th.as_tensor(trajectory.observations[at], dtype=th.float32, device=device))
+                self.standardise(
+                    th.as_tensor(trajectory.observations[at], dtype=th.float32, device=device)
+                )
                 for at in (steps, steps + 1)
             )
             actions = th.as_tensor(trajectory.actions[steps], dtype=th.float32, device=device)
@@ -220,7 +247,9 @@ class LatentPolicy(SACPolicy):
         """
         return self.reward_norm.inverse(self.decoder(obs, actions, next_obs, reward_embedding))
 
-    def act(self, obs: np.ndarray, latents: np.ndarray, noise: th.Tensor | None = None) -> np.ndarray:
+    def act(
+        self, obs: np.ndarray, latents: np.ndarray, noise: th.Tensor | None = None
+    ) -> np.ndarray:
         """Actions in [-1, 1] for a batch.
 
         :param obs: (n, obs_dim)
@@ -229,15 +258,20 @@ class LatentPolicy(SACPolicy):
         """
         return self.acting_on(latents)(obs, noise)
 
-    def acting_on(self, latents: np.ndarray) -> Callable[[np.ndarray, th.Tensor | None], np.ndarray]:
-        """:meth:`act` for latents that stay the same over many steps: what depends on them alone is computed once.
+    def acting_on(
+        self, latents: np.ndarray
+    ) -> Callable[[np.ndarray, th.Tensor | None], np.ndarray]:
+        """:meth:`act` for latents that stay the same over many steps: what depends on them alone is
+        computed once.
 
         :param latents: (n, latent_dim)
         :return: A function of ``obs`` and ``noise``
         """
         device = self.device
         with th.no_grad():
-            embedding = self.policy_embedding(th.as_tensor(latents, dtype=th.float32, device=device))
+            embedding = self.policy_embedding(
+                th.as_tensor(latents, dtype=th.float32, device=device)
+            )
 
         def act(obs: np.ndarray, noise: th.Tensor | None) -> np.ndarray:
             with th.no_grad():
@@ -271,9 +305,13 @@ class LatentPolicy(SACPolicy):
         single = obs.ndim == 1
         obs = np.atleast_2d(obs)
         if obs.shape[1:] != self.observation_space.shape:
-            raise ValueError(f"observation has shape {obs.shape[1:]}, but the policy takes {self.observation_space.shape}")
+            raise ValueError(
+                f"observation has shape {obs.shape[1:]}, but the policy takes {self.observation_space.shape}"
+            )
         if not np.all(np.isfinite(obs)):
-            raise ValueError(f"observation {int(np.argwhere(~np.isfinite(obs))[0, 0])} holds NaN or infinity")
+            raise ValueError(
+                f"observation {int(np.argwhere(~np.isfinite(obs))[0, 0])} holds NaN or infinity"
+            )
         if state is None and not self._warned_of_no_latent:
             self._warned_of_no_latent = True
             warnings.warn(
@@ -282,8 +320,14 @@ class LatentPolicy(SACPolicy):
                 "gives a policy for a task; AdaptationEvalCallback evaluates such policies in training",
                 stacklevel=3,
             )
-        latents = np.zeros(self.latent_dim) if state is None else np.asarray(state, dtype=np.float64)
-        if latents.shape not in ((self.latent_dim,), (obs.shape[0], self.latent_dim), (1, self.latent_dim)):
+        latents = (
+            np.zeros(self.latent_dim) if state is None else np.asarray(state, dtype=np.float64)
+        )
+        if latents.shape not in (
+            (self.latent_dim,),
+            (obs.shape[0], self.latent_dim),
+            (1, self.latent_dim),
+        ):
             raise ValueError(
                 f"state has shape {latents.shape}, but a latent is ({self.latent_dim},), "
                 f"or ({obs.shape[0]}, {self.latent_dim}) for these observations"
@@ -293,7 +337,9 @@ class LatentPolicy(SACPolicy):
         latents = np.array(np.broadcast_to(latents, (obs.shape[0], self.latent_dim)))
         noise = None
         if not deterministic:
-            noise = th.randn(obs.shape[0], int(np.prod(self.action_space.shape)), device=self.device)
+            noise = th.randn(
+                obs.shape[0], int(np.prod(self.action_space.shape)), device=self.device
+            )
         actions = self.unscale_action(self.act(obs, latents, noise))
         actions = np.clip(actions, self.action_space.low, self.action_space.high)
         return (actions[0] if single else actions), latents
@@ -301,7 +347,11 @@ class LatentPolicy(SACPolicy):
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         assert isinstance(observation, th.Tensor)
         latents = np.zeros((observation.shape[0], self.latent_dim))
-        noise = None if deterministic else th.randn(observation.shape[0], *self.action_space.shape, device=self.device)
+        noise = (
+            None
+            if deterministic
+            else th.randn(observation.shape[0], *self.action_space.shape, device=self.device)
+        )
         return th.as_tensor(self.act(observation.cpu().numpy(), latents, noise), device=self.device)
 
     def set_training_mode(self, mode: bool) -> None:

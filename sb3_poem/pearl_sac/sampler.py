@@ -64,7 +64,9 @@ class MetaBatchSampler:
         return self.buffer.device
 
     def blocks(self, n: int, batch_size: int) -> Iterator[list[MetaBatch]]:
-        """``n`` meta-batches of ``batch_size`` transitions a task, in blocks that are drawn at once."""
+        """``n`` meta-batches of ``batch_size`` transitions a task, in blocks that are drawn at
+        once.
+        """
         step_bytes = self.meta_batch_size * batch_size * 4 * sum(self.buffer.widths)
         at_once = max(1, BYTES_AT_ONCE.get(self.device.type, BYTES_AT_ONCE["cpu"]) // step_bytes)
         for start in range(0, n, at_once):
@@ -116,14 +118,18 @@ class MetaBatchSampler:
         return batches
 
     def choose_tasks(self) -> np.ndarray:
-        """Indices of a meta-batch, without repetition: a task twice would be a pair without a difference."""
+        """Indices of a meta-batch, without repetition: a task twice would be a pair without a
+        difference.
+        """
         size = min(self.meta_batch_size, len(self.tasks))
         return self.generators.numpy.choice(len(self.tasks), size=size, replace=False)
 
-    def _transitions(self, task_ids: th.Tensor, chosen: np.ndarray, batch_size: int) -> tuple[TaskBatch, Bootstraps | None]:
-        """``batch_size`` transitions for each task, ``relabel_fraction`` of them other tasks' with the
-        task's own rewards and ``mirror_fraction`` seen in a symmetry; and what the critics' targets are
-        made of, if that is more than these.
+    def _transitions(
+        self, task_ids: th.Tensor, chosen: np.ndarray, batch_size: int
+    ) -> tuple[TaskBatch, Bootstraps | None]:
+        """``batch_size`` transitions for each task, ``relabel_fraction`` of them other tasks' with
+        the task's own rewards and ``mirror_fraction`` seen in a symmetry; and what the critics'
+        targets are made of, if that is more than these.
         """
         generator, buffer = self.generators.torch, self.buffer
         sources = task_ids[:, None].expand(-1, batch_size)
@@ -159,8 +165,8 @@ class MetaBatchSampler:
         return transitions, Bootstraps(rewards, last.next_observations, discounts)
 
     def _draw_mirror(self, shape: th.Size) -> Callable[[TaskBatch], TaskBatch]:
-        """A function that sees ``mirror_fraction`` of transitions (tasks, batch) in a symmetry, each always
-        in the same; their rewards stay as they were.
+        """A function that sees ``mirror_fraction`` of transitions (tasks, batch) in a symmetry,
+        each always in the same; their rewards stay as they were.
         """
         generator, device, symmetries = self.generators.torch, self.device, self.family.symmetries
         which = th.randint(1, len(symmetries) + 1, shape, generator=generator, device=device)
@@ -239,5 +245,7 @@ class MetaBatchSampler:
         n_tasks, picked = len(self.tasks), (n, self.context_size)
         pool = th.randint(n_tasks, (n, FOREIGN_SOURCES), generator=generator, device=device)
         picks = th.randint(FOREIGN_SOURCES, picked, generator=generator, device=device)
-        foreign = th.rand((n, 1), generator=generator, device=device) < self.context_relabel_fraction
+        foreign = (
+            th.rand((n, 1), generator=generator, device=device) < self.context_relabel_fraction
+        )
         return th.where(foreign, pool.gather(1, picks), task_ids[:, None])

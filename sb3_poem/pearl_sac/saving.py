@@ -1,7 +1,8 @@
-"""How models and training runs are written and read: SB3's zip, checkpoints, and pretrained folders.
+"""How models and training runs are written and read: SB3's zip, checkpoints, and pretrained
+folders.
 
-A checkpoint holds all of a training run, so that it continues bit for bit. A pretrained folder holds
-safetensors, JSON and a model card: nothing in it can run code.
+A checkpoint holds all of a training run, so that it continues bit for bit. A pretrained folder
+holds safetensors, JSON and a model card: nothing in it can run code.
 """
 
 import inspect
@@ -36,7 +37,11 @@ CHECKPOINT_FORMAT = "sb3_poem checkpoint 2"
 FORMAT = "sb3_poem pretrained 2"
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
 SPACES = ("observation_space", "action_space", "task_space")
-ARRAYS = {"train_tasks": "tasks", "latent_means": "latent_means", "latent_variances": "latent_variances"}
+ARRAYS = {
+    "train_tasks": "tasks",
+    "latent_means": "latent_means",
+    "latent_variances": "latent_variances",
+}
 # rebuilt from the critics: half of their size for nothing otherwise
 DERIVED = "critic_target."
 #: Arguments that decide what the networks are; a trained model has them for good
@@ -49,7 +54,12 @@ NOT_KEPT = {
     *("verbose", "device", "_init_setup_model", "unsupported"),
 }
 #: The most that a file may ask for, of whole numbers
-LARGEST = {"n_envs": 10_000, "horizon": 100_000, "reward_feature_dim": 10_000, "buffer_size": 100_000_000}
+LARGEST = {
+    "n_envs": 10_000,
+    "horizon": 100_000,
+    "reward_feature_dim": 10_000,
+    "buffer_size": 100_000_000,
+}
 LARGEST_OF_OTHERS = 1_000_000
 
 
@@ -97,22 +107,28 @@ def kept_arguments(algorithm: type) -> list[str]:
 # ---------------------------------------------------------------------- SB3's zip
 
 
-def read_archive(path: str | Path | io.BufferedIOBase, algorithm: type, changes: Mapping[str, Any]) -> dict[str, Any]:
+def read_archive(
+    path: str | Path | io.BufferedIOBase, algorithm: type, changes: Mapping[str, Any]
+) -> dict[str, Any]:
     """The attributes in a zip that ``save`` wrote.
 
     :param algorithm: Whose zip it must be
     :param changes: Arguments of the constructor that shall differ
-    :raises ValueError: if it is a folder, the file is truncated or holds another algorithm's model, or a
-        change is of what the networks are
+    :raises ValueError: if it is a folder, the file is truncated or holds another algorithm's model,
+        or a change is of what the networks are
     """
     if not isinstance(path, io.BufferedIOBase):
         _check_is_file(Path(path), algorithm)
     try:
         data, _, _ = load_from_zip_file(path, device="cpu", load_data=True)
     except (zipfile.BadZipFile, RuntimeError, EOFError, ValueError) as error:
-        raise ValueError(f"{path} is truncated, or no model saved by {algorithm.__name__}: {error}") from error
+        raise ValueError(
+            f"{path} is truncated, or no model saved by {algorithm.__name__}: {error}"
+        ) from error
     if data is None:
-        raise ValueError(f"{path} is truncated, or no model saved by {algorithm.__name__}: it holds no data of a model")
+        raise ValueError(
+            f"{path} is truncated, or no model saved by {algorithm.__name__}: it holds no data of a model"
+        )
     if data.get("algorithm") != algorithm.__name__:
         raise ValueError(f"{path} holds a model of another algorithm, not of {algorithm.__name__}")
     if isinstance(path, io.BufferedIOBase):
@@ -121,7 +137,9 @@ def read_archive(path: str | Path | io.BufferedIOBase, algorithm: type, changes:
     for name, value in changes.items():
         fixed = name in FIXED or (name == "n_train_tasks" and value is not None)
         if fixed and value != found.get(name):
-            raise ValueError(f"{name} is {found.get(name)!r} in {path}, and cannot become {value!r}")
+            raise ValueError(
+                f"{name} is {found.get(name)!r} in {path}, and cannot become {value!r}"
+            )
     learns = str(data["ent_coef"]).startswith("auto")
     if "ent_coef" in changes and str(changes["ent_coef"]).startswith("auto") != learns:
         raise ValueError(
@@ -142,19 +160,23 @@ def algorithm_of(archive: Path) -> str:
 
 
 def _check_is_file(path: Path, algorithm: type) -> None:
-    """
-    :raises ValueError: if it is a checkpoint, a folder or a shipped model's name, for which there are other methods
+    """:raises ValueError: if it is a checkpoint, a folder or a shipped model's name, for which there
+    are other methods
     """
     if path.is_file():
         if is_checkpoint(path):
-            raise ValueError(f"{path} is a checkpoint: use {algorithm.__name__}.load_checkpoint({str(path)!r})")
+            raise ValueError(
+                f"{path} is a checkpoint: use {algorithm.__name__}.load_checkpoint({str(path)!r})"
+            )
         return
     if not path.is_dir() and path.with_name(f"{path.name}.zip").is_file():
         return
     is_shipped = not path.exists() and str(path) in pretrained_names()
     if path.is_dir() or is_shipped:
         what = "the name of a model that ships" if is_shipped else "a folder"
-        raise ValueError(f"{path} is {what}: use {algorithm.__name__}.from_pretrained({str(path)!r})")
+        raise ValueError(
+            f"{path} is {what}: use {algorithm.__name__}.from_pretrained({str(path)!r})"
+        )
 
 
 # ---------------------------------------------------------------------- checkpoints
@@ -177,7 +199,9 @@ def write_checkpoint(
         "format": CHECKPOINT_FORMAT,
         "algorithm": algorithm,
         "model": th.frombuffer(bytearray(archive), dtype=th.uint8),
-        "replay_buffer": {name: th.as_tensor(value).cpu() for name, value in replay_buffer.state().items()},
+        "replay_buffer": {
+            name: th.as_tensor(value).cpu() for name, value in replay_buffer.state().items()
+        },
         "context": None if context is None else _tensors(context),
     }
 
@@ -211,9 +235,13 @@ def read_checkpoint(path: str | Path, algorithm: str | None = None) -> dict[str,
     except Exception as error:  # what unpickling foreign bytes may raise is no closed list
         raise ValueError(f"{path} is truncated, or no checkpoint of sb3_poem: {error}") from error
     if not isinstance(state, dict) or state.get("format") != CHECKPOINT_FORMAT:
-        raise ValueError(f"{path} is no checkpoint of this version of sb3_poem (expected {CHECKPOINT_FORMAT!r})")
+        raise ValueError(
+            f"{path} is no checkpoint of this version of sb3_poem (expected {CHECKPOINT_FORMAT!r})"
+        )
     if algorithm not in (None, state["algorithm"]):
-        raise ValueError(f"{path} holds a {state['algorithm']}; load it with {state['algorithm']}.load_checkpoint")
+        raise ValueError(
+            f"{path} holds a {state['algorithm']}; load it with {state['algorithm']}.load_checkpoint"
+        )
     return state
 
 
@@ -224,21 +252,27 @@ def is_checkpoint(path: str | Path) -> bool:
     with zipfile.ZipFile(path) as archive:
         entries = archive.infolist()
     # a model's file that is cut short may end with one of its parts, which looks the same
-    return any(Path(entry.filename).name == "data.pkl" for entry in entries) and entries[0].header_offset == 0
+    return (
+        any(Path(entry.filename).name == "data.pkl" for entry in entries)
+        and entries[0].header_offset == 0
+    )
 
 
 # ---------------------------------------------------------------------- pretrained folders
 
 
-def save_pretrained(model: SavedModel, folder: str | Path, card: dict[str, Any] | None = None) -> None:
+def save_pretrained(
+    model: SavedModel, folder: str | Path, card: dict[str, Any] | None = None
+) -> None:
     """Write a model so that :func:`from_pretrained` can read it.
 
     :param model: A trained model
     :param folder: Where; made if missing
-    :param card: What the card should say: ``command``, ``seed``, ``commit``, ``machine``, ``note``, ``results``: any JSON
+    :param card: What the card should say: ``command``, ``seed``, ``commit``, ``machine``, ``note``,
+        ``results``: any JSON
     :raises OSError: if the folder cannot be written
-    :raises ValueError: if the policy's activation is none of torch.nn's or its optimiser none of torch.optim's, which JSON
-        could not name
+    :raises ValueError: if the policy's activation is none of torch.nn's or its optimiser none of
+        torch.optim's, which JSON could not name
     """
     folder = Path(folder)
     config, tensors = model_contents(model, card)
@@ -251,7 +285,9 @@ def save_pretrained(model: SavedModel, folder: str | Path, card: dict[str, Any] 
         write_atomically(folder / name, content)
 
 
-def model_contents(model: SavedModel, card: dict[str, Any] | None = None) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
+def model_contents(
+    model: SavedModel, card: dict[str, Any] | None = None
+) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
     """What a model is made of, from which :func:`build_model` makes it again.
 
     :param model: A trained model
@@ -260,12 +296,23 @@ def model_contents(model: SavedModel, card: dict[str, Any] | None = None) -> tup
     :raises ValueError: see :func:`save_pretrained`
     """
     activation, optimizer = model.policy.activation_fn, model.policy.optimizer_class
-    for argument, value, module in (("activation_fn", activation, nn), ("optimizer_class", optimizer, th.optim)):
+    for argument, value, module in (
+        ("activation_fn", activation, nn),
+        ("optimizer_class", optimizer, th.optim),
+    ):
         if getattr(module, value.__name__, None) is not value:
-            raise ValueError(f"{argument} must be one of {module.__name__} to be saved by its name, got {value}")
+            raise ValueError(
+                f"{argument} must be one of {module.__name__} to be saved by its name, got {value}"
+            )
     error = model.predicted_rewards_error
-    tensors = {f"policy.{name}": value for name, value in model.policy.state_dict().items() if not name.startswith(DERIVED)}
-    tensors |= {name: th.as_tensor(getattr(model.train_tasks, field)) for name, field in ARRAYS.items()}
+    tensors = {
+        f"policy.{name}": value
+        for name, value in model.policy.state_dict().items()
+        if not name.startswith(DERIVED)
+    }
+    tensors |= {
+        name: th.as_tensor(getattr(model.train_tasks, field)) for name, field in ARRAYS.items()
+    }
     config: dict[str, Any] = {
         "format": FORMAT,
         "algorithm": model.algorithm,
@@ -288,7 +335,10 @@ def model_contents(model: SavedModel, card: dict[str, Any] | None = None) -> tup
     }
     for name in SPACES:
         space = getattr(model, name)
-        tensors[f"{name}.low"], tensors[f"{name}.high"] = th.as_tensor(space.low), th.as_tensor(space.high)
+        tensors[f"{name}.low"], tensors[f"{name}.high"] = (
+            th.as_tensor(space.low),
+            th.as_tensor(space.high),
+        )
         config[name] = {"dtype": str(space.dtype)}
     return config, {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
 
@@ -302,7 +352,9 @@ def config_text(config: dict[str, Any]) -> str:
 
 
 def _arguments(model: SavedModel) -> dict[str, Any]:
-    """Arguments of the constructor with which training goes on as it stopped; a schedule's place takes its default."""
+    """Arguments of the constructor with which training goes on as it stopped; a schedule's place
+    takes its default.
+    """
     arguments = {name: getattr(model, name) for name in kept_arguments(type(model))}
     arguments["target_entropy"] = model.target_entropy
     arguments["ent_coef"] = model.ent_coef
@@ -338,7 +390,14 @@ def _card_text(config: dict[str, Any]) -> str:
     if "note" in card:
         lines.append(f"- {card['note']}")
     if "results" in card:
-        lines += ["", "Results:", "", "```json", json.dumps(card["results"], indent=2, default=_to_json), "```"]
+        lines += [
+            "",
+            "Results:",
+            "",
+            "```json",
+            json.dumps(card["results"], indent=2, default=_to_json),
+            "```",
+        ]
     return "\n".join(lines) + "\n"
 
 
@@ -365,14 +424,20 @@ def parse_config(text: str | bytes, source: str) -> dict[str, Any]:
     try:
         config = json.loads(text)
     except (ValueError, RecursionError) as error:  # of thousands of brackets
-        raise ValueError(f"{source} is truncated, or no configuration of sb3_poem: {error}") from error
+        raise ValueError(
+            f"{source} is truncated, or no configuration of sb3_poem: {error}"
+        ) from error
     found = config.get("format") if isinstance(config, dict) else None
     if found != FORMAT:
-        raise ValueError(f"{source} is not of this version of sb3_poem: its format is {found!r}, expected {FORMAT!r}")
+        raise ValueError(
+            f"{source} is not of this version of sb3_poem: its format is {found!r}, expected {FORMAT!r}"
+        )
     check_env_id(config.get("env_id"), source)
     for name in ("env_kwargs", "arguments", "card"):
         if not isinstance(config.get(name), dict):
-            raise ValueError(f"{source}: {name} must be an object, but is a {type(config.get(name)).__name__}")
+            raise ValueError(
+                f"{source}: {name} must be an object, but is a {type(config.get(name)).__name__}"
+            )
     if not isinstance(config.get("algorithm"), str):
         raise ValueError(f"{source} names no algorithm")
     return config
@@ -390,7 +455,9 @@ def from_pretrained(algorithm: type[Model], folder: str | Path, device: th.devic
     folder = find_folder(folder)
     config = read_config(folder)
     if config["algorithm"] != algorithm.__name__:
-        raise ValueError(f"{folder} holds a {config['algorithm']}; load it with {config['algorithm']}.from_pretrained")
+        raise ValueError(
+            f"{folder} holds a {config['algorithm']}; load it with {config['algorithm']}.from_pretrained"
+        )
     weights = folder / WEIGHTS
     try:
         tensors = load_tensors(weights.read_bytes())
@@ -408,11 +475,11 @@ def build_model(
 ) -> Model:
     """Make a model from what :func:`model_contents` took it apart into.
 
-    No memory is taken for networks before the configuration has been found to agree with the tensors.
+    No memory is taken for networks before the configuration has been found to agree with the
+    tensors.
 
     :param algorithm: Class of the model
     :param config: Its configuration
-    :param tensors: Its tensors
     :param source: Where they come from, for the message
     :param device: "auto", "cpu", "cuda"
     :raises ValueError: if something is missing, does not fit, or is out of all proportion
@@ -420,11 +487,15 @@ def build_model(
     try:
         _check_numbers(algorithm, config, tensors)
         make: Any = algorithm  # without an environment
-        model: Model = make("MlpPolicy", None, device=device, _init_setup_model=False, **config["arguments"])
+        model: Model = make(
+            "MlpPolicy", None, device=device, _init_setup_model=False, **config["arguments"]
+        )
         for name in SPACES:
             low, high = tensors[f"{name}.low"].numpy(), tensors[f"{name}.high"].numpy()
             setattr(model, name, spaces.Box(low, high, dtype=np.dtype(config[name]["dtype"]).type))
-        model.train_tasks = TrainTasks(**{field: tensors[name].numpy() for name, field in ARRAYS.items()})
+        model.train_tasks = TrainTasks(
+            **{field: tensors[name].numpy() for name, field in ARRAYS.items()}
+        )
         for name in ("env_id", "env_kwargs", "reward_feature_dim", "num_timesteps", "n_envs"):
             setattr(model, name, config[name])
         error = config["predicted_rewards_error"]
@@ -434,17 +505,31 @@ def build_model(
         model._n_updates = config["n_updates"]
         if model.target_entropy == "auto":  # which SAC would look up in the environment
             model.target_entropy = -float(np.prod(model.action_space.shape))
-        model.policy_kwargs |= {name: config[name] for name in ("net_arch", "layer_norm", "n_critics")}
+        model.policy_kwargs |= {
+            name: config[name] for name in ("net_arch", "layer_norm", "n_critics")
+        }
         model.policy_kwargs["activation_fn"] = _named(nn, config["activation_fn"], nn.Module)
-        model.policy_kwargs["optimizer_class"] = _named(th.optim, config["optimizer_class"], th.optim.Optimizer)
+        model.policy_kwargs["optimizer_class"] = _named(
+            th.optim, config["optimizer_class"], th.optim.Optimizer
+        )
         model.policy_kwargs["optimizer_kwargs"] = config["optimizer_kwargs"]
         _check_shapes(model, tensors)
         model._setup_model()
-        state = {name.removeprefix("policy."): value for name, value in tensors.items() if name.startswith("policy.")}
-        state |= {f"{DERIVED}{name.removeprefix('critic.')}": v for name, v in state.items() if name.startswith("critic.")}
+        state = {
+            name.removeprefix("policy."): value
+            for name, value in tensors.items()
+            if name.startswith("policy.")
+        }
+        state |= {
+            f"{DERIVED}{name.removeprefix('critic.')}": v
+            for name, v in state.items()
+            if name.startswith("critic.")
+        }
         model.policy.load_state_dict(state)
     except Exception as error:  # what foreign data may raise is no closed list
-        raise ValueError(f"{source} does not hold a complete {algorithm.__name__}: {error}") from error
+        raise ValueError(
+            f"{source} does not hold a complete {algorithm.__name__}: {error}"
+        ) from error
     return model
 
 
@@ -467,30 +552,60 @@ def _check_numbers(algorithm: type, config: dict[str, Any], tensors: dict[str, t
             raise ValueError(f"`{name}` must be finite, but is {value}")
     n_tasks = len(tensors["train_tasks"])
     if config["arguments"].get("n_train_tasks") not in (None, n_tasks):
-        raise ValueError(f"`n_train_tasks` is {config['arguments']['n_train_tasks']}, but there are {n_tasks} train_tasks")
-    for name, least in (("n_envs", 1), ("reward_feature_dim", 1), ("num_timesteps", 0), ("n_updates", 0), ("n_critics", 1)):
+        raise ValueError(
+            f"`n_train_tasks` is {config['arguments']['n_train_tasks']}, but there are {n_tasks} train_tasks"
+        )
+    for name, least in (
+        ("n_envs", 1),
+        ("reward_feature_dim", 1),
+        ("num_timesteps", 0),
+        ("n_updates", 0),
+        ("n_critics", 1),
+    ):
         check_whole(name, config[name], least, LARGEST.get(name))
     arch = config["net_arch"]
-    if not isinstance(arch, dict) or not {"pi", "qf", "encoder", "decoder", "embedding"} <= arch.keys():
-        raise ValueError(f"net_arch must have the widths of pi, qf, encoder, decoder and embedding, but is {str(arch)[:60]}")
+    if (
+        not isinstance(arch, dict)
+        or not {"pi", "qf", "encoder", "decoder", "embedding"} <= arch.keys()
+    ):
+        raise ValueError(
+            f"net_arch must have the widths of pi, qf, encoder, decoder and embedding, but is {str(arch)[:60]}"
+        )
     for width in itertools.chain(*arch.values()):
         check_whole("net_arch", width, 1)
     n_layers = sum(map(len, arch.values())) + config["n_critics"] * (len(arch["qf"]) + 1)
     if n_layers > len(tensors):
-        raise ValueError(f"net_arch and n_critics ask for {n_layers} layers, but there are {len(tensors)} tensors")
+        raise ValueError(
+            f"net_arch and n_critics ask for {n_layers} layers, but there are {len(tensors)} tensors"
+        )
 
 
 def _check_shapes(model: SavedModel, tensors: dict[str, th.Tensor]) -> None:
     """Refuse tensors of other shapes than the configured networks', of which an outline is made."""
     model._complete_policy_kwargs()
-    arguments = {**model.policy_kwargs, "optimizer_kwargs": {}}  # a fused one does not take outlines
+    arguments = {
+        **model.policy_kwargs,
+        "optimizer_kwargs": {},
+    }  # a fused one does not take outlines
     with th.device("meta"):
-        outline = model.policy_class(model.observation_space, model.action_space, lambda _: 0.0, **arguments)
+        outline = model.policy_class(
+            model.observation_space, model.action_space, lambda _: 0.0, **arguments
+        )
     latents = (len(tensors["train_tasks"]), model.latent_dim)
-    expected = {"train_tasks": (latents[0], *model.task_space.shape), "latent_means": latents, "latent_variances": latents}
+    expected = {
+        "train_tasks": (latents[0], *model.task_space.shape),
+        "latent_means": latents,
+        "latent_variances": latents,
+    }
     state = outline.state_dict().items()
-    expected |= {f"policy.{name}": tuple(value.shape) for name, value in state if not name.startswith(DERIVED)}
+    expected |= {
+        f"policy.{name}": tuple(value.shape)
+        for name, value in state
+        if not name.startswith(DERIVED)
+    }
     for name, shape in expected.items():
         found = tuple(tensors[name].shape) if name in tensors else "missing"
         if found != shape:
-            raise ValueError(f"net_arch, latent_dim and the spaces make the tensor {name} {shape}, but it is {found}")
+            raise ValueError(
+                f"net_arch, latent_dim and the spaces make the tensor {name} {shape}, but it is {found}"
+            )

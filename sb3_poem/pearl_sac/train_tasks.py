@@ -35,7 +35,9 @@ class TrainTasks:
         return cls(tasks, np.zeros(shape), np.ones(shape))
 
     @classmethod
-    def draw(cls, family: FamilyView, n: int | None, latent_dim: int, rng: np.random.Generator) -> "TrainTasks":
+    def draw(
+        cls, family: FamilyView, n: int | None, latent_dim: int, rng: np.random.Generator
+    ) -> "TrainTasks":
         """Draw tasks from a family.
 
         :param n: How many; None takes :func:`default_train_tasks`
@@ -76,7 +78,9 @@ class TrainTasks:
         means = self.latent_means
         chosen = rng.integers(len(means), size=n)
         draws = means[chosen]
-        n_neighbours = min(AGGREGATE_NEIGHBOURS, len(means) // 4)  # few tasks have nothing in between
+        n_neighbours = min(
+            AGGREGATE_NEIGHBOURS, len(means) // 4
+        )  # few tasks have nothing in between
         if n_neighbours:
             distances = ((means[:, None, :] - means[None, :, :]) ** 2).sum(axis=2)
             picks = rng.integers(1, n_neighbours + 1, size=n)

@@ -25,17 +25,25 @@ UNSUPPORTED = {
     **dict.fromkeys(("replay_buffer_class", "replay_buffer_kwargs"), _BUFFER),
     **dict.fromkeys(("features_extractor_class", "features_extractor_kwargs"), _FEATURES),
     **dict.fromkeys(("share_features_extractor", "normalize_images"), _FEATURES),
-    **dict.fromkeys(("env_wrapper", "vec_env_wrapper", "frame_stack"), f"{_WRAPPED}write it into the family"),
+    **dict.fromkeys(
+        ("env_wrapper", "vec_env_wrapper", "frame_stack"), f"{_WRAPPED}write it into the family"
+    ),
     "normalize": f"{_WRAPPED}observations and rewards are standardised by the algorithm",
     **dict.fromkeys(("log_std_init", "use_expln", "clip_mean"), _DEVIATION),
 }
 #: Arguments of the policy, which people give to the algorithm
-POLICY_ARGUMENTS = ("net_arch", "activation_fn", "layer_norm", "n_critics", "optimizer_class", "optimizer_kwargs")
+POLICY_ARGUMENTS = (
+    "net_arch",
+    "activation_fn",
+    "layer_norm",
+    "n_critics",
+    "optimizer_class",
+    "optimizer_kwargs",
+)
 
 
 def refuse_unsupported(names: Iterable[str], algorithm: str) -> None:
-    """
-    :param names: Of arguments, of the algorithm or of its policy
+    """:param names: Of arguments, of the algorithm or of its policy
     :param algorithm: Whose, for the message
     :raises TypeError: at the first that SAC takes and ours do not
     """
@@ -45,15 +53,16 @@ def refuse_unsupported(names: Iterable[str], algorithm: str) -> None:
 
 
 def refuse_unknown(names: Iterable[str], algorithm: type) -> None:
-    """
-    :param names: Of arguments that the constructor does not have
+    """:param names: Of arguments that the constructor does not have
     :param algorithm: Its class
     :raises TypeError: at the first; as :func:`refuse_unsupported`, or with a name like it
     """
     refuse_unsupported(names, algorithm.__name__)
     for name in names:
         if name in POLICY_ARGUMENTS:
-            raise TypeError(f"{algorithm.__name__} takes {name!r} in policy_kwargs: policy_kwargs=dict({name}=...)")
+            raise TypeError(
+                f"{algorithm.__name__} takes {name!r} in policy_kwargs: policy_kwargs=dict({name}=...)"
+            )
         close = difflib.get_close_matches(name, inspect.signature(algorithm).parameters, n=1)
         hint = f"; did you mean {close[0]!r}?" if close else ""
         raise TypeError(f"{algorithm.__name__} got an unexpected keyword argument {name!r}{hint}")

@@ -39,7 +39,9 @@ class EntropyCoefficient:
         return self.tensor if self.optimizer is None else self.tensor.detach().exp().squeeze()
 
     def update(self, entropy: th.Tensor) -> None:
-        """Learn from the entropy of a meta-batch: a step along the gradient of log * (entropy - target)."""
+        """Learn from the entropy of a meta-batch: a step along the gradient of log * (entropy -
+        target).
+        """
         if self.optimizer is not None:
             gradient = (entropy.detach() - self.target).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
             self.tensor.grad = gradient.view_as(self.tensor)
@@ -47,8 +49,8 @@ class EntropyCoefficient:
 
 
 class Updater:
-    """Changes the networks, one meta-batch at a time. Use it as a context, in which hidden layers compute
-    in ``dtype``.
+    """Changes the networks, one meta-batch at a time. Use it as a context, in which hidden layers
+    compute in ``dtype``.
 
     :param policy: The networks
     :param objective: What is minimised
@@ -72,12 +74,24 @@ class Updater:
         n_updates: int,
     ) -> None:
         self.policy, self.objective, self.entropy = policy, objective, entropy
-        self.tau, self.target_update_interval, self.policy_delay = tau, target_update_interval, policy_delay
+        self.tau, self.target_update_interval, self.policy_delay = (
+            tau,
+            target_update_interval,
+            policy_delay,
+        )
         self.n_updates = n_updates
         prepare_optimizers([policy.optimizer, *entropy.optimizers], policy.device)
-        learning = [policy.encoder, policy.decoder, policy.actor, policy.critic, policy.critic_target]
+        learning = [
+            policy.encoder,
+            policy.decoder,
+            policy.actor,
+            policy.critic,
+            policy.critic_target,
+        ]
         self._precision = MixedPrecision(nn.ModuleList(learning), dtype)
-        self._steps: dict[bool, Step] = {whole: partial(self._step, whole) for whole in (True, False)}
+        self._steps: dict[bool, Step] = {
+            whole: partial(self._step, whole) for whole in (True, False)
+        }
         if policy.device.type == "cuda" and target_update_interval == 1:
             self._steps = {whole: GraphedStep(step) for whole, step in self._steps.items()}
 
@@ -85,13 +99,20 @@ class Updater:
         self._precision.__enter__()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        where: TracebackType | None,
+    ) -> None:
         self._precision.__exit__(kind, error, where)
 
     def step(self, batch: MetaBatch) -> Metrics:
-        """One step on a meta-batch: of everything or, in between, of critics and encoder. Returns what to log.
+        """One step on a meta-batch: of everything or, in between, of critics and encoder. Returns
+        what to log.
 
-        :raises ValueError: on a processor, if loss or gradient is not finite; see :meth:`check_finite`
+        :raises ValueError: on a processor, if loss or gradient is not finite; see
+            :meth:`check_finite`
         """
         metrics = self._steps[self.n_updates % self.policy_delay == 0](batch)
         self.n_updates += 1
@@ -125,8 +146,7 @@ class Updater:
         return norm
 
     def check_finite(self, gradient_norms: list[th.Tensor], first: int) -> None:
-        """
-        :param gradient_norms: Of successive steps
+        """:param gradient_norms: Of successive steps
         :param first: The number of the first of them
         :raises ValueError: if one is not finite
         """

@@ -21,10 +21,17 @@ class POEMObjective(Objective):
     def embed(self, latents: th.Tensor) -> TaskEmbeddings:
         """L_policy trains f_pi and the encoder (section 5.3)."""
         policy = self.policy
-        return TaskEmbeddings(latents, policy.policy_embedding(latents), policy.reward_embedding(latents))
+        return TaskEmbeddings(
+            latents, policy.policy_embedding(latents), policy.reward_embedding(latents)
+        )
 
-    def embedding_loss(self, batch: MetaBatch, embeddings: TaskEmbeddings) -> tuple[th.Tensor, Metrics]:
+    def embedding_loss(
+        self, batch: MetaBatch, embeddings: TaskEmbeddings
+    ) -> tuple[th.Tensor, Metrics]:
         """The preference loss (eqs. 6, 7), weighted."""
         similarities = embeddings.reward @ embeddings.policy.T  # eq. 3
         loss, accuracy = preference_loss(similarities, batch.returns)
-        return self.preference_coef * loss, {"preference_loss": loss, "preference_accuracy": accuracy}
+        return self.preference_coef * loss, {
+            "preference_loss": loss,
+            "preference_accuracy": accuracy,
+        }

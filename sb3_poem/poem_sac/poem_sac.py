@@ -24,24 +24,29 @@ PREFERENCE_SOURCES = ("auto", "relabel", "rollout")
 
 
 class POEMSAC(PEARLSAC):
-    """Preference-order-preserving embedding on soft actor-critic (POEM, Xu & Zhu, ICML 2025), Algorithm 1.
+    """Preference-order-preserving embedding on soft actor-critic (POEM, Xu & Zhu, ICML 2025),
+    Algorithm 1.
 
-    On top of :class:`PEARLSAC`: a reward embedding f_r and a policy embedding f_pi of the latent, whose inner product orders
-    policies as a task's preferences do (eq. 3); the preference loss that trains them (eqs. 6, 7); contexts of the
-    current policies with their action values (eq. 8); an encoder that learns from the actor as well.
+    On top of :class:`PEARLSAC`: a reward embedding f_r and a policy embedding f_pi of the latent,
+    whose inner product orders policies as a task's preferences do (eq. 3); the preference loss that
+    trains them (eqs. 6, 7); contexts of the current policies with their action values (eq. 8); an
+    encoder that learns from the actor as well.
 
-    Differences from the paper: twin target critics and a learned entropy coefficient, as SB3's SAC has them, instead of a
-    value network; a replay buffer that outlives the epoch for the critics and the actor, while contexts and preference
-    labels are the last epoch's only; the critics' loss trains the encoder too, as in PEARL.
+    Differences from the paper: twin target critics and a learned entropy coefficient, as SB3's SAC
+    has them, instead of a value network; a replay buffer that outlives the epoch for the critics
+    and the actor, while contexts and preference labels are the last epoch's only; the critics' loss
+    trains the encoder too, as in PEARL.
 
-    All arguments of :class:`PEARLSAC` but ``context_relabel_fraction`` (contexts are of the task's own policy, eq. 8), and:
+    All arguments of :class:`PEARLSAC` but ``context_relabel_fraction`` (contexts are of the task's
+    own policy, eq. 8), and:
 
     :param preference_coef: Weight of the preference loss
-    :param similarity: "two-encoder": <f_r(z_i), f_pi(z_j)>; "inner": <z_i, z_j>, the ablation of Proposition 1
+    :param similarity: "two-encoder": <f_r(z_i), f_pi(z_j)>; "inner": <z_i, z_j>, the ablation of
+        Proposition 1
     :param context: "optimal": (s, a, s', r, Q); "pearl": (s, a, s', r), the ablation
-    :param preference_source: Where J[i, j] comes from. "relabel": task i's reward function on task j's trajectories;
-        "rollout": task j's policy is run on task i, within random groups of tasks, and the steps are counted; "auto": relabel
-        where the family shares dynamics
+    :param preference_source: Where J[i, j] comes from. "relabel": task i's reward function on task
+        j's trajectories; "rollout": task j's policy is run on task i, within random groups of
+        tasks, and the steps are counted; "auto": relabel where the family shares dynamics
     :param preference_group_size: Tasks whose policies are run on each other with "rollout"
     """
 
@@ -101,11 +106,15 @@ class POEMSAC(PEARLSAC):
             ("preference_source", preference_source, PREFERENCE_SOURCES),
         ):
             if value not in known:
-                raise ValueError(f"{name} must be one of {', '.join(map(repr, known))}, got {value!r}")
+                raise ValueError(
+                    f"{name} must be one of {', '.join(map(repr, known))}, got {value!r}"
+                )
         if not preference_coef >= 0:
             raise ValueError(f"preference_coef must be at least 0, got {preference_coef}")
         if preference_group_size < 2:
-            raise ValueError(f"preference_group_size must be at least 2, got {preference_group_size}")
+            raise ValueError(
+                f"preference_group_size must be at least 2, got {preference_group_size}"
+            )
         self.preference_coef = preference_coef
         self.similarity = similarity
         self.context = context
@@ -182,7 +191,9 @@ class POEMSAC(PEARLSAC):
     @property
     def relabels(self) -> bool:
         """Whether J[i, j] comes from relabelling, rather than from rollouts."""
-        return self.preference_source == "relabel" or (self.preference_source == "auto" and self.family.shared_dynamics)
+        return self.preference_source == "relabel" or (
+            self.preference_source == "auto" and self.family.shared_dynamics
+        )
 
     @property
     def epoch_steps(self) -> int:
@@ -197,11 +208,15 @@ class POEMSAC(PEARLSAC):
         return np.array_split(tasks, max(1, len(tasks) // self.preference_group_size))
 
     def measure_returns(self, epoch: Segment, collector: EpochCollector) -> np.ndarray | None:
-        """J[i, j] by relabelling or, within groups of tasks, by rollouts; see :meth:`PEARLSAC.measure_returns`."""
+        """J[i, j] by relabelling or, within groups of tasks, by rollouts; see
+        :meth:`PEARLSAC.measure_returns`.
+        """
         if not self.relabels:
             return self._measure_by_rollouts(epoch, collector)
         tasks = self.train_tasks.tasks
-        returns = relabelled_returns(self.family.compute_rewards, tasks, epoch.features, epoch.first_episode)
+        returns = relabelled_returns(
+            self.family.compute_rewards, tasks, epoch.features, epoch.first_episode
+        )
         return returns.reshape(len(tasks), len(tasks), -1).mean(axis=2)
 
     def _measure_by_rollouts(self, epoch: Segment, collector: EpochCollector) -> np.ndarray | None:

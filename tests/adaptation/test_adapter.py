@@ -41,7 +41,11 @@ from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.resources import pretrained_folder
 
 GOAL = np.array([2.2])
-RULES = [{"inference": "bayes"}, {"inference": "bayes", "likelihood": "similarity"}, {"inference": "paper"}]
+RULES = [
+    {"inference": "bayes"},
+    {"inference": "bayes", "likelihood": "similarity"},
+    {"inference": "paper"},
+]
 
 
 def make_env(goal=GOAL, **kwargs):
@@ -52,7 +56,9 @@ def make_env(goal=GOAL, **kwargs):
 
 def outside_oracle(left, right):
     """Knows the goal, and sees observations only."""
-    left_miss, right_miss = (np.abs(trajectory.observations[1:, 1] - GOAL).sum() for trajectory in (left, right))
+    left_miss, right_miss = (
+        np.abs(trajectory.observations[1:, 1] - GOAL).sum() for trajectory in (left, right)
+    )
     return Preference.LEFT if left_miss < right_miss else Preference.RIGHT
 
 
@@ -62,7 +68,9 @@ def point_goal():
 
 
 def adapter(env=None, seed=0, model=None, **kwargs):
-    return PreferenceAdapter(model or SpeedModel(), make_env() if env is None else env, seed=seed, **kwargs)
+    return PreferenceAdapter(
+        model or SpeedModel(), make_env() if env is None else env, seed=seed, **kwargs
+    )
 
 
 def answer(a, times, oracle=outside_oracle):
@@ -94,7 +102,9 @@ def test_the_policy_follows_sb3s_protocol():
     mean, _ = evaluate_policy(policy, DummyVecEnv([make_env] * 2), n_eval_episodes=3, warn=False)
     assert mean == pytest.approx(-200 * abs(speed - GOAL[0]), abs=1e-3)
     single, _ = policy.predict(np.zeros(2))
-    batch, state = policy.predict(np.zeros((4, 2)), state=None, episode_start=np.ones(4, bool), deterministic=True)
+    batch, state = policy.predict(
+        np.zeros((4, 2)), state=None, episode_start=np.ones(4, bool), deterministic=True
+    )
     assert single.shape == (1,)
     assert batch.shape == (4, 1)
     assert state.shape == (4, 5)
@@ -228,14 +238,21 @@ def test_another_models_file_is_refused():
 
 def test_the_same_weights_go_on_and_others_are_refused(point_goal, tmp_path):
     env = make_task_vec_env(point_goal.env_id, 1)
-    begun = PreferenceAdapter(point_goal, env, oracle=ReturnOracle(), seed=0, n_queries=2, n_candidates=20)
+    begun = PreferenceAdapter(
+        point_goal, env, oracle=ReturnOracle(), seed=0, n_queries=2, n_candidates=20
+    )
     answer(begun, 1, begun.oracle)
     text = begun.to_json()
     point_goal.save(tmp_path / "m.zip")
     point_goal.save_pretrained(tmp_path / "folder")
-    for again in (POEMSAC.load(tmp_path / "m.zip", device="cpu"), POEMSAC.from_pretrained(tmp_path / "folder", device="cpu")):
+    for again in (
+        POEMSAC.load(tmp_path / "m.zip", device="cpu"),
+        POEMSAC.from_pretrained(tmp_path / "folder", device="cpu"),
+    ):
         assert again.digest == point_goal.digest
-        np.testing.assert_array_equal(PreferenceAdapter.from_json(text, again, env).policy().latent, begun.policy().latent)
+        np.testing.assert_array_equal(
+            PreferenceAdapter.from_json(text, again, env).policy().latent, begun.policy().latent
+        )
         with torch.no_grad():
             again.policy.critic.members[0].output.bias += 1.0  # which adaptation does not use
         assert again.digest == point_goal.digest
@@ -246,7 +263,10 @@ def test_the_same_weights_go_on_and_others_are_refused(point_goal, tmp_path):
         ):
             with torch.no_grad():
                 tensor += 0.01
-            with pytest.raises(ValueError, match="saved with a model of other weights than this POEMSAC on poem/PointGoal-v0"):
+            with pytest.raises(
+                ValueError,
+                match="saved with a model of other weights than this POEMSAC on poem/PointGoal-v0",
+            ):
                 PreferenceAdapter.from_json(text, again, env)
             with torch.no_grad():
                 tensor -= 0.01
@@ -276,9 +296,13 @@ def test_a_model_that_was_not_trained(point_goal):
         lambda model: evaluate_adaptation(model, env, tasks, record_at=[0], n_episodes=1),
     )
     for call in calls:
-        with pytest.warns(UserWarning, match="POEMSAC on poem/PointGoal-v0 has not been trained") as warned:
+        with pytest.warns(
+            UserWarning, match="POEMSAC on poem/PointGoal-v0 has not been trained"
+        ) as warned:
             call(untrained)
-        assert [item.filename for item in warned if "not been trained" in str(item.message)] == [__file__]
+        assert [item.filename for item in warned if "not been trained" in str(item.message)] == [
+            __file__
+        ]
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             call(point_goal)
@@ -289,18 +313,28 @@ def test_a_model_that_was_not_trained(point_goal):
 def test_only_whole_numbers_will_do(name, value):
     calls = [
         lambda: PreferenceAdapter(SpeedModel(), make_env(), **{name: value}),
-        lambda: adapt_tasks(SpeedModel(), DummyVecEnv([SpeedEnv]), np.array([[0.4]]), ReturnOracle, **{name: value}),
+        lambda: adapt_tasks(
+            SpeedModel(), DummyVecEnv([SpeedEnv]), np.array([[0.4]]), ReturnOracle, **{name: value}
+        ),
     ]
     if name == "n_queries":
-        calls += [lambda: ANOLEOptions(value), lambda: RewardOracleOptions(value), lambda: MAMLRewardOptions(value)]
+        calls += [
+            lambda: ANOLEOptions(value),
+            lambda: RewardOracleOptions(value),
+            lambda: MAMLRewardOptions(value),
+        ]
     for call in calls:
-        with pytest.raises(ValueError, match=f"`{name}` must be (a whole number|at least [012]), but is"):
+        with pytest.raises(
+            ValueError, match=f"`{name}` must be (a whole number|at least [012]), but is"
+        ):
             call()
 
 
 def test_a_policy_knows_by_whose_answers_it_was_adapted(point_goal):
     env = make_task_vec_env(point_goal.env_id, 2)
-    one = PreferenceAdapter(point_goal, env, oracle=ReturnOracle(), seed=0, n_queries=1, n_candidates=20)
+    one = PreferenceAdapter(
+        point_goal, env, oracle=ReturnOracle(), seed=0, n_queries=1, n_candidates=20
+    )
     assert (one.policy().n_answers, one.policy().env) == (0, env)
     policy = one.adapt()
     assert policy.n_answers == 1
@@ -312,12 +346,16 @@ def test_a_policy_knows_by_whose_answers_it_was_adapted(point_goal):
 
 def test_what_a_notebook_shows(point_goal):
     env, tasks = make_task_vec_env(point_goal.env_id, 2), np.array([[0.5], [1.5]])
-    one = PreferenceAdapter(point_goal, env, oracle=ReturnOracle(), seed=0, n_queries=2, n_candidates=20)
+    one = PreferenceAdapter(
+        point_goal, env, oracle=ReturnOracle(), seed=0, n_queries=2, n_candidates=20
+    )
     query, policy = one.ask(), one.policy()
     latent = r"\[(-?\d\.\d\d, ){4}-?\d\.\d\d\]"
     trajectory = r"Trajectory\(25 steps of 2 observations and 2 actions\)"
     outcomes = evaluate_episodes(point_goal, env, np.zeros((2, 5)), tasks, 3)
-    adapted = evaluate_adaptation(point_goal, env, tasks, record_at=(0, 1), n_episodes=1, n_candidates=20)
+    adapted = evaluate_adaptation(
+        point_goal, env, tasks, record_at=(0, 1), n_episodes=1, n_candidates=20
+    )
     shown = {
         r"POEMSAC\(poem/PointGoal-v0, 105,000 steps trained\)": point_goal,
         rf"AdaptedPolicy\(POEMSAC on poem/PointGoal-v0, 0 answers, latent={latent}\)": policy,
@@ -326,7 +364,9 @@ def test_what_a_notebook_shows(point_goal):
         rf"Query\(left={trajectory}, right={trajectory}\)": query,
         r"ReturnOracle\(task=the environment's\)": ReturnOracle(),
         r"MistakeOracle\(rate=0.7, task=\[1.0\]\)": MistakeOracle(0.7, task=[1.0]),
-        r"BoltzmannOracle\(noise=BoltzmannNoise\(beta=2\), task=the environment's\)": BoltzmannOracle(2),
+        r"BoltzmannOracle\(noise=BoltzmannNoise\(beta=2\), task=the environment's\)": BoltzmannOracle(
+            2
+        ),
         r"HumanOracle\(0 asked, videos in preference_queries\)": HumanOracle(),
         r"EpisodeOutcomes\(2 times 3 episodes, mean return -\d+\.\d\)": outcomes,
         r"AdaptationEvaluation\(2 tasks, mean return -\d+\.\d, -\d+\.\d after 0, 1 answers\)": adapted,
@@ -432,9 +472,13 @@ def test_a_model_for_another_environment_is_refused():
     class Other(SpeedEnv):
         observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float64)
 
-    with pytest.raises(ValueError, match="does not belong to this environment: its observation_space"):
+    with pytest.raises(
+        ValueError, match="does not belong to this environment: its observation_space"
+    ):
         adapter(Other())
-    with pytest.raises(ValueError, match="does not belong to this environment: its observation_space"):
+    with pytest.raises(
+        ValueError, match="does not belong to this environment: its observation_space"
+    ):
         adapter("MountainCarContinuous-v0", model=POINT_GOAL)
 
 
@@ -471,7 +515,9 @@ def test_the_policy_is_for_the_task_of_the_adapters_environment():
     ],
 )
 def test_models_and_environments_by_name_and_of_every_kind(env, point_goal):
-    expected = PreferenceAdapter(point_goal, POINT, oracle=ReturnOracle(), seed=0, n_queries=2).adapt()
+    expected = PreferenceAdapter(
+        point_goal, POINT, oracle=ReturnOracle(), seed=0, n_queries=2
+    ).adapt()
     for name in (POINT_GOAL, pretrained_folder(POINT_GOAL)):
         policy = PreferenceAdapter(name, env(), oracle=ReturnOracle(), seed=0, n_queries=2).adapt()
         np.testing.assert_allclose(policy.latent, expected.latent, atol=1e-6)
@@ -496,15 +542,51 @@ def test_an_adaptation_resumes_by_names():
     [
         ({"model": SAC}, TypeError, "`model` is the class SAC, but must be a trained POEMSAC"),
         ({"model": "a SAC"}, TypeError, "`model` is of type SAC, but must be a trained POEMSAC"),
-        ({"model": POEMSAC}, TypeError, "`model` is the class POEMSAC, but must be a trained POEMSAC"),
-        ({"model": None}, TypeError, "`model` is of type NoneType.*name of a model that ships: .*PointGoal"),
-        ({"model": "PointGaol"}, FileNotFoundError, "No model 'PointGaol' is shipped; there are: .*PointGoal"),
-        ({"model": "logs/model.zip"}, FileNotFoundError, "logs/model.zip: there is no such file or folder of a model"),
-        ({"env": 3}, TypeError, "`env` must be a gymnasium.Env, an id, a Gymnasium VectorEnv or an SB3 VecEnv, but is 3"),
-        ({"env": SpeedEnv}, TypeError, "`env` must be a gymnasium.Env, .* but is <class 'worlds.SpeedEnv'>"),
-        ({"env": "poem/PointGaol-v0"}, gym.error.NameNotFound, "(?i)PointGaol.*did you mean.*PointGoal"),
-        ({"oracle": ReturnOracle}, TypeError, r"`oracle` is the class ReturnOracle, but must be an object: ReturnOracle\(\)"),
-        ({"oracle": "return"}, TypeError, r"`oracle` must be called as oracle\(left, right\).* but is 'return'"),
+        (
+            {"model": POEMSAC},
+            TypeError,
+            "`model` is the class POEMSAC, but must be a trained POEMSAC",
+        ),
+        (
+            {"model": None},
+            TypeError,
+            "`model` is of type NoneType.*name of a model that ships: .*PointGoal",
+        ),
+        (
+            {"model": "PointGaol"},
+            FileNotFoundError,
+            "No model 'PointGaol' is shipped; there are: .*PointGoal",
+        ),
+        (
+            {"model": "logs/model.zip"},
+            FileNotFoundError,
+            "logs/model.zip: there is no such file or folder of a model",
+        ),
+        (
+            {"env": 3},
+            TypeError,
+            "`env` must be a gymnasium.Env, an id, a Gymnasium VectorEnv or an SB3 VecEnv, but is 3",
+        ),
+        (
+            {"env": SpeedEnv},
+            TypeError,
+            "`env` must be a gymnasium.Env, .* but is <class 'worlds.SpeedEnv'>",
+        ),
+        (
+            {"env": "poem/PointGaol-v0"},
+            gym.error.NameNotFound,
+            "(?i)PointGaol.*did you mean.*PointGoal",
+        ),
+        (
+            {"oracle": ReturnOracle},
+            TypeError,
+            r"`oracle` is the class ReturnOracle, but must be an object: ReturnOracle\(\)",
+        ),
+        (
+            {"oracle": "return"},
+            TypeError,
+            r"`oracle` must be called as oracle\(left, right\).* but is 'return'",
+        ),
     ],
 )
 def test_arguments_of_another_kind(arguments, error, message):
@@ -524,7 +606,10 @@ def test_frames_for_ask_and_tell(tmp_path):
     assert query.to_video(tmp_path / "query.gif").stat().st_size > 1000
     resumed = PreferenceAdapter.from_json(a.to_json(), POINT_GOAL, POINT, render=True)
     np.testing.assert_array_equal(resumed.ask().right.frames, query.right.frames)
-    with pytest.raises(ValueError, match=r"the question has no frames to show: .*PreferenceAdapter\(..., render=True\)"):
+    with pytest.raises(
+        ValueError,
+        match=r"the question has no frames to show: .*PreferenceAdapter\(..., render=True\)",
+    ):
         adapter().ask().to_video(tmp_path / "query.mp4")
     with pytest.raises(ValueError, match='render_mode="rgb_array", but this one has None'):
         adapter(render=True).ask()
@@ -537,7 +622,11 @@ def test_an_id_and_a_vector_environment_will_do():
         answer(from_id, 2)
         from_id.close()
         # Other copies of a vector environment may hold other tasks: the first is watched.
-        many = adapter(DummyVecEnv([make_env, partial(make_env, np.array([0.1]))]), oracle=ReturnOracle(), n_queries=2)
+        many = adapter(
+            DummyVecEnv([make_env, partial(make_env, np.array([0.1]))]),
+            oracle=ReturnOracle(),
+            n_queries=2,
+        )
         one = adapter(make_env(), oracle=ReturnOracle(), n_queries=2)
         np.testing.assert_array_equal(many.adapt().latent, one.adapt().latent)
         first = from_id.answers[0].left.observations
@@ -548,22 +637,31 @@ def test_an_id_and_a_vector_environment_will_do():
 
 def test_the_oracles_noise_model_is_taken():
     assert adapter(oracle=MistakeOracle(0.3)).options.noise_model == MistakeNoise(0.3)
-    assert adapter(oracle=MistakeOracle(0.3), noise_model=BoltzmannNoise()).options.noise_model == BoltzmannNoise()
+    assert (
+        adapter(oracle=MistakeOracle(0.3), noise_model=BoltzmannNoise()).options.noise_model
+        == BoltzmannNoise()
+    )
     assert adapter(oracle=outside_oracle).inference.noise_model == ExactNoise()
 
 
 def test_numbers_of_numpy_can_be_saved():
-    adapter = PreferenceAdapter(SpeedModel(), make_env(), n_queries=np.int64(3), epsilon=np.float32(0.125), seed=0)
+    adapter = PreferenceAdapter(
+        SpeedModel(), make_env(), n_queries=np.int64(3), epsilon=np.float32(0.125), seed=0
+    )
     resumed = PreferenceAdapter.from_json(adapter.to_json(), SpeedModel(), make_env())
     assert (resumed.options.n_queries, resumed.options.epsilon) == (3, 0.125)
 
 
 def test_a_library_in_an_environment_that_was_not_reset(point_goal):
     model = point_goal
-    source = PreferenceAdapter(model, "poem/PointGoal-v0", oracle=ReturnOracle(), seed=0, n_queries=2)
+    source = PreferenceAdapter(
+        model, "poem/PointGoal-v0", oracle=ReturnOracle(), seed=0, n_queries=2
+    )
     source.adapt()
     library = [trajectory for item in source.answers for trajectory in (item.left, item.right)]
-    adapter = PreferenceAdapter(model, "poem/PointGoal-v0", oracle=ReturnOracle(), library=library, seed=0, n_queries=2)
+    adapter = PreferenceAdapter(
+        model, "poem/PointGoal-v0", oracle=ReturnOracle(), library=library, seed=0, n_queries=2
+    )
     adapter.adapt()
     assert adapter.done
     env = gym.make("poem/PointGoal-v0")
@@ -603,12 +701,22 @@ def test_a_library_needs_no_rollouts():
 def test_many_tasks_in_lockstep_as_each_alone(rule):
     tasks = np.array([[0.4], [1.3], [2.7]])
     model = SpeedModel()
-    together = adapt_tasks(model, DummyVecEnv([SpeedEnv] * 4), tasks, partial(MistakeOracle, 0.2), n_queries=5, seed=7, **rule)
+    together = adapt_tasks(
+        model,
+        DummyVecEnv([SpeedEnv] * 4),
+        tasks,
+        partial(MistakeOracle, 0.2),
+        n_queries=5,
+        seed=7,
+        **rule,
+    )
     assert together.latents.shape == (3, 6, 5)
     assert together.record_at == (0, 1, 2, 3, 4, 5)
     for i, task in enumerate(tasks):
         oracle = MistakeOracle(0.2, task=task, seed=7 + i)
-        alone = PreferenceAdapter(model, make_env(task), oracle=oracle, seed=7 + i, n_queries=5, **rule)
+        alone = PreferenceAdapter(
+            model, make_env(task), oracle=oracle, seed=7 + i, n_queries=5, **rule
+        )
         np.testing.assert_array_equal(together.latents[i, 0], alone.policy().latent)
         for query in range(1, 6):
             answer(alone, 1, oracle)
@@ -639,9 +747,18 @@ def test_lockstep_with_a_library():
     source = PreferenceAdapter(model, make_env(), seed=3, query_rule="random")
     answer(source, 10)
     library = [trajectory for item in source.answers for trajectory in (item.left, item.right)]
-    together = adapt_tasks(model, DummyVecEnv([SpeedEnv]), tasks, ReturnOracle, n_queries=4, library=library)
+    together = adapt_tasks(
+        model, DummyVecEnv([SpeedEnv]), tasks, ReturnOracle, n_queries=4, library=library
+    )
     for i, task in enumerate(tasks):
-        alone = PreferenceAdapter(model, make_env(task), oracle=ReturnOracle(task=task), seed=i, n_queries=4, library=library)
+        alone = PreferenceAdapter(
+            model,
+            make_env(task),
+            oracle=ReturnOracle(task=task),
+            seed=i,
+            n_queries=4,
+            library=library,
+        )
         np.testing.assert_array_equal(together.latents[i, -1], alone.adapt().latent)
 
 

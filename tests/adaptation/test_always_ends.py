@@ -9,7 +9,13 @@ from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv
 from worlds import HORIZON, SpeedEnv, SpeedModel
 
-from sb3_poem.adaptation import BoltzmannNoise, ExactNoise, MistakeNoise, Preference, PreferenceAdapter
+from sb3_poem.adaptation import (
+    BoltzmannNoise,
+    ExactNoise,
+    MistakeNoise,
+    Preference,
+    PreferenceAdapter,
+)
 from sb3_poem.adaptation.bayes import DECODER_MOVE_STEPS
 from sb3_poem.adaptation.options import AdaptationOptions
 from sb3_poem.common.trajectory import Trajectory
@@ -18,9 +24,8 @@ LEFT, RIGHT, EQUAL = Preference
 
 
 class RandomModel(SpeedModel):
-    """
-    Random networks: S is asymmetric, of any scale, and keeps no property; the decoder has nothing to do with it.
-    It counts its work.
+    """Random networks: S is asymmetric, of any scale, and keeps no property; the decoder has
+    nothing to do with it. It counts its work.
     """
 
     def __init__(self, seed: int, latent_dim: int = 5, scale: float = 3.0):
@@ -32,18 +37,28 @@ class RandomModel(SpeedModel):
 
     def similarities(self, task_latents, policy_latents):
         self.similarity_rows += len(task_latents) + len(policy_latents)
-        embeddings = [np.tanh(z @ w) for z, w in zip((task_latents, policy_latents), self.weights, strict=True)]
+        embeddings = [
+            np.tanh(z @ w)
+            for z, w in zip((task_latents, policy_latents), self.weights, strict=True)
+        ]
         return self.scale * embeddings[0] @ embeddings[1].T
 
     def predicted_returns(self, latents, trajectories, max_steps=None):
-        steps = [len(trajectory) if max_steps is None else min(len(trajectory), max_steps) for trajectory in trajectories]
+        steps = [
+            len(trajectory) if max_steps is None else min(len(trajectory), max_steps)
+            for trajectory in trajectories
+        ]
         self.decoder_steps += len(latents) * sum(steps)
-        features = np.stack([np.tanh(t.observations[:-1].sum(axis=0) + t.latent[:2]) for t in trajectories])
+        features = np.stack(
+            [np.tanh(t.observations[:-1].sum(axis=0) + t.latent[:2]) for t in trajectories]
+        )
         return 10.0 * np.tanh(latents @ self.weights[0][:, :2]) @ features.T
 
 
 def liar(left, right):
-    difference = np.abs(left.observations[1:, 1] - 2.2).sum() - np.abs(right.observations[1:, 1] - 2.2).sum()
+    difference = (
+        np.abs(left.observations[1:, 1] - 2.2).sum() - np.abs(right.observations[1:, 1] - 2.2).sum()
+    )
     return LEFT if difference > 0 else RIGHT
 
 
@@ -70,7 +85,12 @@ rules = st.sampled_from(
         {"inference": "bayes"},
         {"inference": "bayes", "likelihood": "similarity"},
         {"inference": "bayes", "candidates": "aggregate", "query_rule": "worst-case"},
-        {"inference": "bayes", "candidates": "aggregate", "likelihood": "similarity", "decision": "posterior-mean"},
+        {
+            "inference": "bayes",
+            "candidates": "aggregate",
+            "likelihood": "similarity",
+            "decision": "posterior-mean",
+        },
         {"inference": "bayes", "query_rule": "random", "decision": "most-likely"},
     ]
 )
@@ -85,7 +105,9 @@ rules = st.sampled_from(
     scale=st.sampled_from([1e-6, 3.0, 1e6]),
 )
 @settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck))
-def test_any_answers_end_in_a_finite_latent_with_bounded_work(answers, rule, noise, seed, dim, scale):
+def test_any_answers_end_in_a_finite_latent_with_bounded_work(
+    answers, rule, noise, seed, dim, scale
+):
     model = RandomModel(seed, dim, scale)
     options = AdaptationOptions(noise_model=noise, **rule)
     inference = options.make_inference(model, np.random.default_rng(seed))
@@ -104,10 +126,17 @@ def test_any_answers_end_in_a_finite_latent_with_bounded_work(answers, rule, noi
 
 
 @pytest.mark.parametrize(
-    "oracle", [liar, always(LEFT), always(EQUAL), Contradicts()], ids=["lies", "left", "equal", "contradicts"]
+    "oracle",
+    [liar, always(LEFT), always(EQUAL), Contradicts()],
+    ids=["lies", "left", "equal", "contradicts"],
 )
 @pytest.mark.parametrize(
-    "rule", [{"inference": "bayes"}, {"inference": "bayes", "likelihood": "similarity"}, {"inference": "paper"}]
+    "rule",
+    [
+        {"inference": "bayes"},
+        {"inference": "bayes", "likelihood": "similarity"},
+        {"inference": "paper"},
+    ],
 )
 def test_a_usable_policy_comes_out(oracle, rule):
     env = SpeedEnv()
@@ -127,12 +156,18 @@ def test_a_random_oracle_over_many_queries():
 
 @pytest.mark.parametrize(
     "rule",
-    [{"inference": "bayes"}, {"inference": "bayes", "likelihood": "similarity"}, {"inference": "paper", "epsilon": 0.0}],
+    [
+        {"inference": "bayes"},
+        {"inference": "bayes", "likelihood": "similarity"},
+        {"inference": "paper", "epsilon": 0.0},
+    ],
     ids=["decoder", "similarity", "paper"],
 )
 @pytest.mark.parametrize("preference", [LEFT, EQUAL])
 def test_ask_and_tell_take_less_than_50_ms(rule, preference):
-    """At N_z = 100, d = 5, k = 10, apart from rollouts; in processor time, as other programs share the machine."""
+    """At N_z = 100, d = 5, k = 10, apart from rollouts; in processor time, as other programs share
+    the machine.
+    """
     model, best = RandomModel(0), np.inf
     for seed in range(5):
         inference = AdaptationOptions(**rule).make_inference(model, np.random.default_rng(seed))
@@ -141,7 +176,10 @@ def test_ask_and_tell_take_less_than_50_ms(rule, preference):
             start = time.process_time()
             left, right = inference.ask_latents()
             asked = time.process_time()
-            shown = [Trajectory(np.ones((HORIZON + 1, 2)), np.zeros((HORIZON, 1)), z) for z in (left, right)]
+            shown = [
+                Trajectory(np.ones((HORIZON + 1, 2)), np.zeros((HORIZON, 1)), z)
+                for z in (left, right)
+            ]
             shown_at = time.process_time()
             inference.tell(preference, *shown)
             inference.estimate()

@@ -7,7 +7,13 @@ import pytest
 from scipy.special import ndtr
 from worlds import HORIZON, STEP_WEIGHT, SpeedModel
 
-from sb3_poem.adaptation.bayes import DECODED_STEPS, ERROR_CORRELATION, SIMILARITY_RESOLUTION, BayesInference, Thinning
+from sb3_poem.adaptation.bayes import (
+    DECODED_STEPS,
+    ERROR_CORRELATION,
+    SIMILARITY_RESOLUTION,
+    BayesInference,
+    Thinning,
+)
 from sb3_poem.adaptation.decisions import decide, standard_scores
 from sb3_poem.adaptation.inference import Snapshot, preference_log_likelihood
 from sb3_poem.adaptation.moves import (
@@ -47,10 +53,16 @@ ANSWERS = [(LEFT, 2.0, 1.0), (RIGHT, 2.6, 1.4), (EQUAL, 2.5, 1.3)]
     ("noise", "probability"),
     [
         (ExactNoise(), lambda d, m, e: LAPSE / 2 + (1 - LAPSE) * logistic(1.702 * d / e)),
-        (MistakeNoise(0.1), lambda d, m, e: 0.1 + 0.8 * (LAPSE / 2 + (1 - LAPSE) * logistic(1.702 * d / e))),
+        (
+            MistakeNoise(0.1),
+            lambda d, m, e: 0.1 + 0.8 * (LAPSE / 2 + (1 - LAPSE) * logistic(1.702 * d / e)),
+        ),
         (
             BoltzmannNoise(),
-            lambda d, m, e: LAPSE / 2 + (1 - LAPSE) * logistic(d / m / math.sqrt(1 + math.pi / 8 * (e / m) ** 2)),
+            lambda d, m, e: (
+                LAPSE / 2
+                + (1 - LAPSE) * logistic(d / m / math.sqrt(1 + math.pi / 8 * (e / m) ** 2))
+            ),
         ),
     ],
 )
@@ -64,9 +76,15 @@ def test_the_decoders_likelihood_is_the_direct_formula(noise, probability):
     for z, weight in zip(inference.particles, inference.log_weights, strict=True):
         goal, expected = 3 * ndtr(z[0]), 0.0
         for preference, left, right in ANSWERS:
-            r_left, r_right = (-STEP_WEIGHT * HORIZON * abs(speed - goal) for speed in (left, right))
+            r_left, r_right = (
+                -STEP_WEIGHT * HORIZON * abs(speed - goal) for speed in (left, right)
+            )
             p = probability(r_left - r_right, abs(r_left) + abs(r_right), error)
-            expected += {LEFT: math.log(p), RIGHT: math.log(1 - p), EQUAL: 0.5 * math.log(p * (1 - p))}[preference]
+            expected += {
+                LEFT: math.log(p),
+                RIGHT: math.log(1 - p),
+                EQUAL: 0.5 * math.log(p * (1 - p)),
+            }[preference]
         assert weight == pytest.approx(expected, rel=1e-6)
     assert inference.weights.sum() == pytest.approx(1.0)
 
@@ -76,11 +94,15 @@ def test_the_likelihood_from_s_is_the_direct_formula():
     inference = make(model, likelihood="similarity", n_candidates=50)
     particles = inference.particles.copy()
     s = model.similarities(particles, particles)
-    spread = math.sqrt(np.mean([(row[i] - row[j]) ** 2 for row in s for i in range(50) for j in range(50)]))
+    spread = math.sqrt(
+        np.mean([(row[i] - row[j]) ** 2 for row in s for i in range(50) for j in range(50)])
+    )
     unit = max(1.0, SIMILARITY_RESOLUTION * spread / 1.702)
     left, right = np.full(5, 0.4), np.full(5, -0.7)
     expected = np.log(
-        LAPSE / 2 + (1 - LAPSE) * logistic((model.similarities(particles, np.stack([left, right])) @ [1, -1]) / unit)
+        LAPSE / 2
+        + (1 - LAPSE)
+        * logistic((model.similarities(particles, np.stack([left, right])) @ [1, -1]) / unit)
     )
     inference._rejuvenate = lambda: None
     inference.tell(LEFT, left, right)
@@ -107,7 +129,9 @@ def test_equal_is_neither_left_nor_right():
 @pytest.mark.parametrize("likelihood", ["decoder", "similarity"])
 @pytest.mark.parametrize("candidates", ["prior", "aggregate"])
 def test_the_posterior_agrees_with_a_grid(likelihood, candidates):
-    """After several resamplings and moves the particles still follow the posterior, which a fine grid gives exactly."""
+    """After several resamplings and moves the particles still follow the posterior, which a fine
+    grid gives exactly.
+    """
     model = SpeedModel(latent_dim=1, error=0.5)
     inference = make(model, likelihood=likelihood, candidates=candidates, n_candidates=1500, seed=1)
     grid = np.linspace(-4, 4, 4001)[:, None]
@@ -130,7 +154,8 @@ def test_the_posterior_agrees_with_a_grid(likelihood, candidates):
 
 
 def test_slice_moves_leave_the_posterior_as_it_is():
-    # Prior N(0, 1), likelihood of x > 0.3 softened; start from exact draws by rejection, move often, compare quantiles.
+    # Prior N(0, 1), likelihood of x > 0.3 softened; start from exact draws by rejection, move
+    # often, compare quantiles.
     rng = np.random.default_rng(0)
 
     def log_likelihood(z):
@@ -142,24 +167,35 @@ def test_slice_moves_leave_the_posterior_as_it_is():
     mean, factor = fit_gaussian(draws, np.full(len(draws), 1 / len(draws)))
     moved, values = draws, log_likelihood(draws)
     for _ in range(8):
-        moved, values = elliptical_slice_moves(moved, values, log_likelihood, prior.log_density, mean, factor, 2, rng)
+        moved, values = elliptical_slice_moves(
+            moved, values, log_likelihood, prior.log_density, mean, factor, 2, rng
+        )
     np.testing.assert_allclose(values, log_likelihood(moved))
     assert np.mean(np.any(moved != draws, axis=1)) > 0.95
     for axis in (0, 1):
         quantiles = np.linspace(0.05, 0.95, 10)
-        np.testing.assert_allclose(np.quantile(moved[:, axis], quantiles), np.quantile(draws[:, axis], quantiles), atol=0.06)
+        np.testing.assert_allclose(
+            np.quantile(moved[:, axis], quantiles),
+            np.quantile(draws[:, axis], quantiles),
+            atol=0.06,
+        )
 
 
 def test_kernel_neighbours_keep_mean_and_covariance_and_stay_where_the_prior_is():
     rng = np.random.default_rng(0)
-    particles = rng.standard_normal((20_000, 2)) @ np.array([[1.0, 0.0], [0.8, 0.3]]).T + [2.0, -1.0]
+    particles = rng.standard_normal((20_000, 2)) @ np.array([[1.0, 0.0], [0.8, 0.3]]).T + [
+        2.0,
+        -1.0,
+    ]
     weights = np.full(len(particles), 1 / len(particles))
     mean, factor = fit_gaussian(particles, weights)
     neighbours = kernel_neighbours(particles, mean, factor, 0.3, None, rng)
     assert np.all(np.any(neighbours != particles, axis=1))
     np.testing.assert_allclose(neighbours.mean(axis=0), particles.mean(axis=0), atol=0.02)
     np.testing.assert_allclose(np.cov(neighbours.T), np.cov(particles.T), atol=0.03)
-    upper = kernel_neighbours(particles, mean, factor, 0.3, lambda z: np.where(z[:, 0] > 1, 0.0, -1e9), rng)
+    upper = kernel_neighbours(
+        particles, mean, factor, 0.3, lambda z: np.where(z[:, 0] > 1, 0.0, -1e9), rng
+    )
     inside = particles[:, 0] > 1
     assert np.all(upper[inside, 0] > 1)
 
@@ -189,7 +225,9 @@ def test_many_answers_in_many_dimensions_do_not_thin_the_particles_out(likelihoo
         assert inference.effective_size >= 50
         assert len(np.unique(inference.particles, axis=0)) >= 50
     assert model.speed(inference.estimate()) == pytest.approx(goal, abs=0.3)
-    if likelihood == "similarity":  # where all particles move, directions that no answer speaks of keep the prior's spread
+    if (
+        likelihood == "similarity"
+    ):  # where all particles move, directions that no answer speaks of keep the prior's spread
         assert 0.6 < inference.particles[:, 1:].std(axis=0).mean() < 1.4
 
 
@@ -197,7 +235,9 @@ class SignOf:
     """Forwards or backwards: the middle fits neither."""
 
     def similarities(self, tasks, policies):
-        return np.sign(tasks[:, :1]) * np.where(np.abs(policies[:, 0]) > 0.5, np.sign(policies[:, 0]), 0.0)
+        return np.sign(tasks[:, :1]) * np.where(
+            np.abs(policies[:, 0]) > 0.5, np.sign(policies[:, 0]), 0.0
+        )
 
 
 class ProductOf:
@@ -227,9 +267,16 @@ TWO_CLUSTERS = np.concatenate([np.linspace(-2.4, -1.6, 30), np.linspace(1.6, 2.4
 def test_the_decision_is_between_the_modes_only_if_that_is_fit():
     particles = np.array([[-1.0]] * 30 + [[1.0]] * 70)
     weights = np.full(100, 0.01)
-    assert decide("posterior-mean", SignOf(), particles, weights, None, TWO_CLUSTERS)[0] == pytest.approx(0.4)
-    assert decide("expected-fitness", SignOf(), particles, weights, np.array([[0.2]]), TWO_CLUSTERS)[0] == pytest.approx(1.0)
-    assert decide("most-likely", SignOf(), particles, np.arange(100) / 4950, None, TWO_CLUSTERS)[0] == 1.0
+    assert decide("posterior-mean", SignOf(), particles, weights, None, TWO_CLUSTERS)[
+        0
+    ] == pytest.approx(0.4)
+    assert decide(
+        "expected-fitness", SignOf(), particles, weights, np.array([[0.2]]), TWO_CLUSTERS
+    )[0] == pytest.approx(1.0)
+    assert (
+        decide("most-likely", SignOf(), particles, np.arange(100) / 4950, None, TWO_CLUSTERS)[0]
+        == 1.0
+    )
     with pytest.raises(ValueError, match="`decision` must be one of"):
         decide("best", SignOf(), particles, weights, None, TWO_CLUSTERS)
 
@@ -237,9 +284,13 @@ def test_the_decision_is_between_the_modes_only_if_that_is_fit():
 def test_the_decision_is_the_middle_of_what_looks_alike():
     cluster = TWO_CLUSTERS[30:]
     weights = np.full(30, 1 / 30)
-    assert decide("expected-fitness", ProductOf(), cluster, weights, None, TWO_CLUSTERS)[0] == pytest.approx(2.0)
+    assert decide("expected-fitness", ProductOf(), cluster, weights, None, TWO_CLUSTERS)[
+        0
+    ] == pytest.approx(2.0)
     lopsided = np.r_[np.full(30, 0.3 / 30), np.full(30, 0.7 / 30)]
-    assert decide("expected-fitness", ProductOf(), TWO_CLUSTERS, lopsided, None, TWO_CLUSTERS)[0] == pytest.approx(2.0)
+    assert decide("expected-fitness", ProductOf(), TWO_CLUSTERS, lopsided, None, TWO_CLUSTERS)[
+        0
+    ] == pytest.approx(2.0)
 
 
 def test_the_decision_is_not_between_policies_that_are_alike_where_the_middle_is_not():
@@ -250,7 +301,9 @@ def test_the_decision_is_not_between_policies_that_are_alike_where_the_middle_is
 
 
 def test_a_mean_in_a_hole_of_the_prior_is_not_acted_on():
-    lopsided = np.r_[np.full(30, 0.3 / 30), np.full(30, 0.7 / 30)]  # S thinks as much of their mean, 0.8, as of 2
+    lopsided = np.r_[
+        np.full(30, 0.3 / 30), np.full(30, 0.7 / 30)
+    ]  # S thinks as much of their mean, 0.8, as of 2
     args = "expected-fitness", SignOf(), TWO_CLUSTERS, lopsided, None, TWO_CLUSTERS
     assert decide(*args)[0] == pytest.approx(0.8)
     assert decide(*args, has_holes=True)[0] == pytest.approx(2.0)
@@ -261,13 +314,21 @@ def test_a_mean_in_a_hole_of_the_prior_is_not_acted_on():
 
 def test_a_training_task_that_fits_best_by_far_is_the_decision():
     particles, weights = np.linspace(0.9, 1.1, 20)[:, None], np.full(20, 0.05)
-    chosen = decide("expected-fitness", ProductOf(), particles, weights, np.array([[5.0], [-5.0]]), TWO_CLUSTERS)
+    chosen = decide(
+        "expected-fitness", ProductOf(), particles, weights, np.array([[5.0], [-5.0]]), TWO_CLUSTERS
+    )
     assert chosen[0] == 5.0
 
 
 def test_fitness_is_in_standard_scores_of_the_reference():
-    similarities, reference = np.array([[1.0, 4.0], [50.0, 20.0]]), np.array([[1.0, 2.0, 6.0], [50.0, 20.0, 20.0]])
-    expected = [[(x - np.mean(row)) / np.std(row) for x in line] for line, row in zip(similarities, reference, strict=True)]
+    similarities, reference = (
+        np.array([[1.0, 4.0], [50.0, 20.0]]),
+        np.array([[1.0, 2.0, 6.0], [50.0, 20.0, 20.0]]),
+    )
+    expected = [
+        [(x - np.mean(row)) / np.std(row) for x in line]
+        for line, row in zip(similarities, reference, strict=True)
+    ]
     np.testing.assert_allclose(standard_scores(similarities, reference), expected)
 
 
@@ -275,7 +336,12 @@ def test_the_aggregate_prior_is_the_mixture_that_it_says():
     rng = np.random.default_rng(0)
     prior = AggregatePrior(rng.normal(size=(20, 2)))
     z = rng.normal(size=(4, 2))
-    direct = [math.log(np.mean([math.exp(-0.5 * np.sum((x - c) ** 2) / prior.width**2) for c in prior.centres])) for x in z]
+    direct = [
+        math.log(
+            np.mean([math.exp(-0.5 * np.sum((x - c) ** 2) / prior.width**2) for c in prior.centres])
+        )
+        for x in z
+    ]
     np.testing.assert_allclose(prior.log_density(z), direct)
     assert prior.sample(5, rng).shape == (5, 2)
 
@@ -289,7 +355,9 @@ def test_balanced_draws_follow_the_prior_more_evenly():
     assert gaussian.balanced_sample(7, rng).shape == (7, 3)
     aggregate = AggregatePrior(100.0 * np.arange(6.0)[:, None])
     aggregate.width = 0.1
-    counts = np.bincount(np.round(aggregate.balanced_sample(15, rng)[:, 0] / 100).astype(int), minlength=6)
+    counts = np.bincount(
+        np.round(aggregate.balanced_sample(15, rng)[:, 0] / 100).astype(int), minlength=6
+    )
     assert set(counts) == {2, 3}
 
 
@@ -316,7 +384,11 @@ def test_a_library_is_asked_about_without_similarity():
     for _ in range(8):
         first, second = inference.ask_library()
         speeds = [library[i].observations[1, 1] for i in (first, second)]
-        inference.tell(LEFT if abs(speeds[0] - goal) < abs(speeds[1] - goal) else RIGHT, library[first], library[second])
+        inference.tell(
+            LEFT if abs(speeds[0] - goal) < abs(speeds[1] - goal) else RIGHT,
+            library[first],
+            library[second],
+        )
     assert model.speed(inference.estimate()) == pytest.approx(goal, abs=0.15)
 
 
@@ -325,7 +397,11 @@ def test_a_snapshot_continues_exactly():
     first, second = make(model, seed=1), make(model, seed=2)
     for _ in range(3):
         left, right = first.ask_latents()
-        first.tell(LEFT, at_speed(model, model.speed(left), left), at_speed(model, model.speed(right), right))
+        first.tell(
+            LEFT,
+            at_speed(model, model.speed(left), left),
+            at_speed(model, model.speed(right), right),
+        )
     second.restore(Snapshot.from_dict(first.snapshot().to_dict()), first.answers)
     np.testing.assert_array_equal(first.estimate(), second.estimate())
     np.testing.assert_array_equal(first.ask_latents(), second.ask_latents())
@@ -356,8 +432,16 @@ def test_the_likelihood_follows_what_the_model_has():
         (SpeedModel(), {"likelihood": "exact"}, "`likelihood` must be one of .*, but is 'exact'"),
         (SpeedModel(), {"decision": "best"}, "`decision` must be one of .*, but is 'best'"),
         (NoDecoder(), {"likelihood": "decoder"}, "needs a model with `predicted_returns`"),
-        (SpeedModel(error=float("nan")), {"likelihood": "decoder"}, "finite `predicted_rewards_error`, which is nan"),
-        (SpeedModel(), {"likelihood": "similarity", "noise_model": BoltzmannNoise(2.0)}, "fixed beta"),
+        (
+            SpeedModel(error=float("nan")),
+            {"likelihood": "decoder"},
+            "finite `predicted_rewards_error`, which is nan",
+        ),
+        (
+            SpeedModel(),
+            {"likelihood": "similarity", "noise_model": BoltzmannNoise(2.0)},
+            "fixed beta",
+        ),
         (SpeedModel(), {"library": []}, "`library` must hold at least 2"),
         (SpeedModel(), {"library": [1, 2], "query_rule": "worst-case"}, "worst-case"),
         (NoDecoder(), {"library": [1, 2]}, "`library` needs a model with a reward decoder"),
@@ -374,7 +458,9 @@ def test_the_decoder_needs_trajectories():
 
 
 class Misled(SpeedModel):
-    """From some steps alone it takes the left trajectories for better than they are, by as much for every latent."""
+    """From some steps alone it takes the left trajectories for better than they are, by as much for
+    every latent.
+    """
 
     def predicted_returns(self, latents, trajectories, max_steps=None):
         returns = super().predicted_returns(latents, trajectories)
@@ -386,7 +472,11 @@ class Misled(SpeedModel):
 def test_what_some_steps_alone_mislead_to_is_put_right():
     steps = 2 * DECODED_STEPS
     left, right = (
-        Trajectory(np.column_stack([np.zeros(steps + 1), np.full(steps + 1, v)]), np.zeros((steps, 1)), np.zeros(5))
+        Trajectory(
+            np.column_stack([np.zeros(steps + 1), np.full(steps + 1, v)]),
+            np.zeros((steps, 1)),
+            np.zeros(5),
+        )
         for v in (1.0, 1.04)
     )
     truth, misled = make(SpeedModel()), make(Misled())
@@ -400,9 +490,13 @@ def test_what_some_steps_alone_mislead_to_is_put_right():
         inference.tell(RIGHT, left, right)
         np.testing.assert_allclose(inference.particles, truth.particles)
         latents = truth.particles[:20]
-        np.testing.assert_allclose(*(each._answer_log_likelihoods(latents, each.answers) for each in (inference, truth)))
+        np.testing.assert_allclose(
+            *(each._answer_log_likelihoods(latents, each.answers) for each in (inference, truth))
+        )
     prior = make()
-    assert SpeedModel.speed(truth.estimate()) > SpeedModel.speed(prior.estimate()) + 0.2  # it says something
+    assert (
+        SpeedModel.speed(truth.estimate()) > SpeedModel.speed(prior.estimate()) + 0.2
+    )  # it says something
 
 
 def test_thinning_is_a_line_and_what_is_off_it():

@@ -1,4 +1,6 @@
-"""Evaluation against closed forms and brute force, and what ten answers reach on a family whose limit is known."""
+"""Evaluation against closed forms and brute force, and what ten answers reach on a family whose
+limit is known.
+"""
 
 import itertools
 from functools import partial
@@ -37,14 +39,32 @@ def vec_env(n=10, **kwargs):
     ("call", "message"),
     [
         (lambda: property_one(np.zeros((2, 3)), np.zeros((3, 2))), "must have the same shape"),
-        (lambda: evaluate_latents(MODEL, vec_env(1), np.zeros((2, 5)), np.zeros((3, 1))), "equally many rows"),
-        (lambda: evaluate_latents(MODEL, vec_env(1), np.zeros((2, 5)), np.ones((2, 1)), 0), "`n_episodes` must be"),
+        (
+            lambda: evaluate_latents(MODEL, vec_env(1), np.zeros((2, 5)), np.zeros((3, 1))),
+            "equally many rows",
+        ),
+        (
+            lambda: evaluate_latents(MODEL, vec_env(1), np.zeros((2, 5)), np.ones((2, 1)), 0),
+            "`n_episodes` must be",
+        ),
         (lambda: known_task_return(MODEL, vec_env(1), GOALS, 0), "`n_latents` must be at least 1"),
         (lambda: known_task_return(MODEL, vec_env(1), GOALS, source="all"), "`source` must be"),
-        (lambda: evaluate_adaptation(MODEL, vec_env(1), GOALS, record_at=()), "`record_at` must hold"),
-        (lambda: evaluate_adaptation(MODEL, vec_env(1), GOALS, record_at=(-1, 2)), "`record_at` must be at least 0"),
-        (lambda: evaluate_adaptation(MODEL, vec_env(1), GOALS, record_at=(0, 2.5)), "`record_at` must be a whole number"),
-        (lambda: evaluate_adaptation(MODEL, vec_env(1), GOALS, n_episodes=2.5), "`n_episodes` must be a whole number"),
+        (
+            lambda: evaluate_adaptation(MODEL, vec_env(1), GOALS, record_at=()),
+            "`record_at` must hold",
+        ),
+        (
+            lambda: evaluate_adaptation(MODEL, vec_env(1), GOALS, record_at=(-1, 2)),
+            "`record_at` must be at least 0",
+        ),
+        (
+            lambda: evaluate_adaptation(MODEL, vec_env(1), GOALS, record_at=(0, 2.5)),
+            "`record_at` must be a whole number",
+        ),
+        (
+            lambda: evaluate_adaptation(MODEL, vec_env(1), GOALS, n_episodes=2.5),
+            "`n_episodes` must be a whole number",
+        ),
     ],
 )
 def test_bad_arguments(call, message):
@@ -53,25 +73,44 @@ def test_bad_arguments(call, message):
 
 
 @pytest.mark.parametrize(
-    "factory", [ReturnOracle(), MistakeOracle(0.1), "return", None, lambda left, right: Preference.LEFT, lambda task: None]
+    "factory",
+    [
+        ReturnOracle(),
+        MistakeOracle(0.1),
+        "return",
+        None,
+        lambda left, right: Preference.LEFT,
+        lambda task: None,
+    ],
 )
 def test_an_oracle_in_place_of_what_makes_oracles(factory):
-    with pytest.raises(TypeError, match=r"`oracle_factory` must be called as oracle_factory\(env=.*the class ReturnOracle"):
+    with pytest.raises(
+        TypeError,
+        match=r"`oracle_factory` must be called as oracle_factory\(env=.*the class ReturnOracle",
+    ):
         evaluate_adaptation(MODEL, vec_env(1), GOALS, factory)
 
 
 def test_names_and_numbers_of_tasks_will_do():
-    """Held-out tasks, which the seed draws: those of the command line, and the same for both functions."""
-    result = evaluate_adaptation("PointGoal", "poem/PointGoal-v0", 3, record_at=(0, 2), n_episodes=1, seed=4)
+    """Held-out tasks, which the seed draws: those of the command line, and the same for both
+    functions.
+    """
+    result = evaluate_adaptation(
+        "PointGoal", "poem/PointGoal-v0", 3, record_at=(0, 2), n_episodes=1, seed=4
+    )
     env = TaskVecEnv.from_id("poem/PointGoal-v0", 4)
     np.testing.assert_array_equal(result.tasks, FamilyView(env).test_tasks(3, 4))
     model = load_model("PointGoal", "cpu")
     again = evaluate_adaptation(model, env, result.tasks, record_at=(0, 2), n_episodes=1, seed=4)
     np.testing.assert_allclose(again.returns, result.returns, atol=1e-4)
-    known = known_task_return("PointGoal", gym.make_vec("poem/PointGoal-v0", 4), n_latents=8, n_episodes=1, seed=4)
+    known = known_task_return(
+        "PointGoal", gym.make_vec("poem/PointGoal-v0", 4), n_latents=8, n_episodes=1, seed=4
+    )
     assert known.tasks.shape == (30, 1)
     np.testing.assert_array_equal(known.tasks[:3], result.tasks)
-    returns = evaluate_latents("PointGoal", gym.make("poem/PointGoal-v0"), result.latents[:, 1], result.tasks, 1, 7)
+    returns = evaluate_latents(
+        "PointGoal", gym.make("poem/PointGoal-v0"), result.latents[:, 1], result.tasks, 1, 7
+    )
     assert returns.shape == (3, 1)
 
 
@@ -86,7 +125,9 @@ def test_returns_are_the_true_ones(copies):
 
 def test_early_ends_count_up_to_the_end():
     latents = np.array([[0.0] * 5, [2.0, 0, 0, 0, 0]])
-    returns = evaluate_latents(MODEL, vec_env(3, end_at=1.5), latents, np.zeros((2, 1)), n_episodes=20)
+    returns = evaluate_latents(
+        MODEL, vec_env(3, end_at=1.5), latents, np.zeros((2, 1)), n_episodes=20
+    )
     steps = returns / (-10 * MODEL.speed(latents))[:, None]
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-4)  # whole steps
     assert steps.min() < HORIZON <= steps.max() + 1e-6
@@ -99,7 +140,9 @@ def test_the_matrix_by_relabelling_is_that_by_rolling_out():
     class OwnDynamics(SpeedEnv):
         shared_dynamics = False
 
-    rolled_out = return_matrix(MODEL, DummyVecEnv([OwnDynamics] * 5), GOALS[::10], latents, n_episodes=2)
+    rolled_out = return_matrix(
+        MODEL, DummyVecEnv([OwnDynamics] * 5), GOALS[::10], latents, n_episodes=2
+    )
     expected = -200 * np.abs(GOALS[::10] - MODEL.speed(latents)[None, :])
     np.testing.assert_allclose(relabelled, expected, rtol=1e-4)
     np.testing.assert_allclose(rolled_out, expected, rtol=1e-4)
@@ -114,7 +157,8 @@ def test_known_task_return():
     assert known.mean_return == pytest.approx(-200 * gaps.mean(), abs=1e-3)
     assert known.limit(0) < known.limit(1) < known.limit(3) <= known.limit(10) + 1e-9
     accuracy, tau = preference_order(MODEL, known)
-    # This model's S keeps the order exactly; what is missing is the gap between a task and its best candidate.
+    # This model's S keeps the order exactly; what is missing is the gap between a task and its best
+    # candidate.
     assert 0.99 < accuracy <= 1.0
     assert 0.98 < tau <= 1.0
 
@@ -125,7 +169,13 @@ def test_winners_are_measured_on_fresh_episodes():
 
         def step(self, action):
             observation, reward, terminated, truncated, _ = super().step(action)
-            return observation, reward, terminated, truncated, {"reward_features": np.array([self._luck])}
+            return (
+                observation,
+                reward,
+                terminated,
+                truncated,
+                {"reward_features": np.array([self._luck])},
+            )
 
         def reset(self, **kwargs):
             result = super().reset(**kwargs)
@@ -136,7 +186,9 @@ def test_winners_are_measured_on_fresh_episodes():
         def compute_rewards(tasks, features):
             return features[..., 0] + 0.0 * tasks[..., 0]
 
-    known = known_task_return(MODEL, DummyVecEnv([Lucky] * 10), GOALS[:3], n_latents=100, n_episodes=50)
+    known = known_task_return(
+        MODEL, DummyVecEnv([Lucky] * 10), GOALS[:3], n_latents=100, n_episodes=50
+    )
     assert known.candidate_returns.max() > 1.5 * HORIZON  # the best of a hundred draws
     assert abs(known.mean_return) < 0.5 * HORIZON
 
@@ -153,7 +205,9 @@ def test_property_one_against_scipy():
                 right += (s[a] > s[b]) == (j[a] > j[b])
     accuracy, tau = property_one(similarities, returns)
     assert accuracy == pytest.approx(right / total)
-    assert tau == pytest.approx(np.mean([kendalltau(s, j).statistic for s, j in zip(similarities, returns, strict=True)]))
+    assert tau == pytest.approx(
+        np.mean([kendalltau(s, j).statistic for s, j in zip(similarities, returns, strict=True)])
+    )
     assert property_one(np.zeros((2, 3)), returns[:2, :3])[0] == 0.5
     assert np.isnan(property_one(np.zeros((2, 3)), np.zeros((2, 3)))[0])
 
@@ -162,7 +216,14 @@ def test_property_one_against_scipy():
 def test_the_bayesian_rule_is_near_the_information_limit(likelihood):
     record_at = (0, 1, 2, 3, 5, 10)
     result = evaluate_adaptation(
-        MODEL, SpeedVecEnv(60), GOALS, ReturnOracle, record_at=record_at, n_episodes=1, seed=1, likelihood=likelihood
+        MODEL,
+        SpeedVecEnv(60),
+        GOALS,
+        ReturnOracle,
+        record_at=record_at,
+        n_episodes=1,
+        seed=1,
+        likelihood=likelihood,
     )
     assert result.returns.shape == (30, 6, 1)
     for k in record_at:
@@ -184,7 +245,9 @@ def test_random_answers_find_nothing():
         def __call__(self, left, right):
             return list(Preference)[self.rng.integers(2)]
 
-    result = evaluate_adaptation(MODEL, SpeedVecEnv(60), GOALS, Coin, record_at=(5, 10), n_episodes=1, seed=1)
+    result = evaluate_adaptation(
+        MODEL, SpeedVecEnv(60), GOALS, Coin, record_at=(5, 10), n_episodes=1, seed=1
+    )
     # Without information about the goal -150 is the best there is, by always going at 1.5.
     assert np.all(result.mean_returns < -130)
 
@@ -193,7 +256,13 @@ def test_mistakes_cost_less_under_the_bayesian_rule_than_under_the_papers():
     returns = {}
     for rule in ("bayes", "paper"):
         result = evaluate_adaptation(
-            MODEL, SpeedVecEnv(20), GOALS[::3], partial(MistakeOracle, 0.1), record_at=(10,), seed=1, inference=rule
+            MODEL,
+            SpeedVecEnv(20),
+            GOALS[::3],
+            partial(MistakeOracle, 0.1),
+            record_at=(10,),
+            seed=1,
+            inference=rule,
         )
         returns[rule] = result.after(10)
     assert returns["bayes"] > returns["paper"]
@@ -202,7 +271,10 @@ def test_mistakes_cost_less_under_the_bayesian_rule_than_under_the_papers():
 
 def test_evaluation_is_reproducible():
     runs = [
-        evaluate_adaptation(MODEL, SpeedVecEnv(n), GOALS[:3], record_at=(2,), n_episodes=2, seed=4).returns for n in (3, 3, 7)
+        evaluate_adaptation(
+            MODEL, SpeedVecEnv(n), GOALS[:3], record_at=(2,), n_episodes=2, seed=4
+        ).returns
+        for n in (3, 3, 7)
     ]
     np.testing.assert_array_equal(runs[0], runs[1])
     np.testing.assert_allclose(runs[0], runs[2], rtol=1e-6)
@@ -216,7 +288,9 @@ def test_the_prior_of_the_toy_is_uniform_in_speed():
 
 def test_each_measurement_is_told_as_it_comes_and_changes_nothing():
     tasks, told = GOALS[::12], []
-    measured = evaluate_adaptation(MODEL, vec_env(4), tasks, record_at=(0, 1, 3), n_episodes=2, on_record=told.append)
+    measured = evaluate_adaptation(
+        MODEL, vec_env(4), tasks, record_at=(0, 1, 3), n_episodes=2, on_record=told.append
+    )
     assert [one.record_at for one in told] == [(0,), (0, 1), (0, 1, 3)]
     assert [len(one.preferences[0]) for one in told] == [0, 1, 3]
     adapted = adapt_tasks(MODEL, vec_env(4), tasks, ReturnOracle, n_queries=3, record_at=(0, 1, 3))
@@ -224,5 +298,7 @@ def test_each_measurement_is_told_as_it_comes_and_changes_nothing():
     assert measured.preferences == adapted.preferences
     for n, one in enumerate(told, 1):
         np.testing.assert_array_equal(one.returns, measured.returns[:, :n])
-        alone = evaluate_latents(MODEL, vec_env(4), adapted.latents[:, n - 1], tasks, 2, evaluation_seed(0))
+        alone = evaluate_latents(
+            MODEL, vec_env(4), adapted.latents[:, n - 1], tasks, 2, evaluation_seed(0)
+        )
         np.testing.assert_array_equal(one.returns[:, -1], alone)

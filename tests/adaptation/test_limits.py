@@ -32,7 +32,8 @@ def entropy(p):
 
 @pytest.mark.parametrize("k", [0, 1, 2, 3, 5])
 def test_the_limit_on_a_line_is_150_over_2_to_the_k(k):
-    # Goals uniform on [0, 3], return -200 |v - goal|: 2^k speeds in the middles of equal parts, 0.75 / 2^k away on average.
+    # Goals uniform on [0, 3], return -200 |v - goal|: 2^k speeds in the middles of equal parts,
+    # 0.75 / 2^k away on average.
     grid = (np.arange(480) + 0.5) * 3 / 480
     returns = -200 * np.abs(grid[:, None] - grid[None, :])
     assert information_limit(returns, k) == pytest.approx(-150 / 2**k, rel=0.03)
@@ -42,11 +43,15 @@ def test_the_limit_on_a_line_is_150_over_2_to_the_k(k):
 def test_the_codebook_against_brute_force(seed, monkeypatch):
     returns = np.random.default_rng(seed).normal(size=(9, 11))
     best = {
-        size: max(returns[:, book].max(axis=1).mean() for book in itertools.combinations(range(11), size))
+        size: max(
+            returns[:, book].max(axis=1).mean() for book in itertools.combinations(range(11), size)
+        )
         for size in (1, 2, 4)
     }
     for size in (1, 2, 4):
-        assert returns[:, best_codebook(returns, size)].max(axis=1).mean() == pytest.approx(best[size])
+        assert returns[:, best_codebook(returns, size)].max(axis=1).mean() == pytest.approx(
+            best[size]
+        )
         assert information_limit(returns, int(np.log2(size))) == pytest.approx(best[size])
     # The greedy choice with swaps alone: never better than the optimum, and hardly worse.
     monkeypatch.setattr("sb3_poem.adaptation.limits.EXACT_CODEBOOKS", 0)
@@ -66,8 +71,9 @@ def test_enough_policies_or_tasks_are_trivial():
 
 @pytest.mark.parametrize("k", range(7))
 def test_on_a_line_dynamic_programming_finds_the_closed_form(k):
-    # On a grid the best speed for an interval of n goals is its median; its error is n / 4 cells, less 1 / (4 n) if n is odd.
-    # 2^k does not always divide 480; then the best cut has intervals of two lengths.
+    # On a grid the best speed for an interval of n goals is its median; its error is n / 4 cells,
+    # less 1 / (4 n) if n is odd. 2^k does not always divide 480; then the best cut has intervals of
+    # two lengths.
     short, longer = N_GOALS // 2**k, N_GOALS % 2**k
     lengths = np.full(2**k, short)
     lengths[:longer] += 1
@@ -83,8 +89,13 @@ def test_on_a_line_dynamic_programming_finds_the_closed_form(k):
 @pytest.mark.parametrize("seed", range(4))
 def test_dynamic_programming_against_brute_force_on_uneven_lines(seed):
     rng = np.random.default_rng(seed)
-    goals, speeds = np.sort(rng.uniform(0, 3, 14)), rng.uniform(0, 3, 11)  # the policies need no order
-    returns = -(np.abs(goals[:, None] - speeds[None, :]) ** rng.uniform(1.0, 2.0))  # convex: two policies cross once
+    goals, speeds = (
+        np.sort(rng.uniform(0, 3, 14)),
+        rng.uniform(0, 3, 11),
+    )  # the policies need no order
+    returns = -(
+        np.abs(goals[:, None] - speeds[None, :]) ** rng.uniform(1.0, 2.0)
+    )  # convex: two policies cross once
     for size in (1, 2, 3, 4):
         best = max(value(returns, book) for book in itertools.combinations(range(11), size))
         book = best_intervals(returns, size)
@@ -112,7 +123,9 @@ def test_rate_distortion_of_a_fair_coin(bits):
 def test_rate_distortion_of_a_fair_die(bits):
     # Hamming distortion on m equally likely letters: R(D) = log m - h(D) - D log(m - 1).
     error = brentq(lambda p: np.log2(6) - entropy(p) - p * np.log2(5) - bits, 1e-12, 5 / 6)
-    assert rate_distortion_limit(7 * np.eye(6) - 3, bits) == pytest.approx(7 * (1 - error) - 3, abs=1e-3)
+    assert rate_distortion_limit(7 * np.eye(6) - 3, bits) == pytest.approx(
+        7 * (1 - error) - 3, abs=1e-3
+    )
 
 
 def test_rate_distortion_against_another_solver():
@@ -120,7 +133,9 @@ def test_rate_distortion_against_another_solver():
 
     def information(p):
         p = p.reshape(4, 3)
-        return float((p * np.log2(np.maximum(p, 1e-300) / np.maximum(p.mean(axis=0), 1e-300))).sum() / 4)
+        return float(
+            (p * np.log2(np.maximum(p, 1e-300) / np.maximum(p.mean(axis=0), 1e-300))).sum() / 4
+        )
 
     for bits in (0.2, 0.6):
         found = minimize(
@@ -140,7 +155,8 @@ def test_rate_distortion_against_another_solver():
 
 @pytest.mark.parametrize("bits", [1, 2, 3])
 def test_rate_distortion_on_a_line_lies_between_shannon_and_the_codebook(bits):
-    # Shannon's lower bound for absolute error: h(X) - log2(2 e D) <= R; and 2^R policies are one way to use R bits.
+    # Shannon's lower bound for absolute error: h(X) - log2(2 e D) <= R; and 2^R policies are one
+    # way to use R bits.
     bound = rate_distortion_limit(SPEEDS[::4, ::4], bits)
     assert -150 / 2**bits < bound < -200 * 3 / (2 * np.e) / 2**bits + 1.0
 
@@ -151,8 +167,11 @@ def test_the_information_in_answers():
     assert answer_capacity(MistakeNoise(0.5), SPEEDS) == 0.0
     assert answer_capacity(BoltzmannNoise(), SPEEDS) == pytest.approx(1 - entropy(1 / (1 + np.e)))
     returns = np.array([[0.0, 3.0], [1.0, 0.0]])
-    assert answer_capacity(BoltzmannNoise(0.5), returns) == pytest.approx(1 - entropy(1 / (1 + np.exp(1.5))))
-    # No inputs in between carry more: the capacity of all probabilities in the range, found by brute force over two inputs.
+    assert answer_capacity(BoltzmannNoise(0.5), returns) == pytest.approx(
+        1 - entropy(1 / (1 + np.exp(1.5)))
+    )
+    # No inputs in between carry more: the capacity of all probabilities in the range, found by
+    # brute force over two inputs.
     left = np.linspace(0.2, 0.8, 31)
     mixed = [
         entropy(w * p + (1 - w) * q) - w * entropy(p) - (1 - w) * entropy(q)
@@ -190,7 +209,10 @@ class OtherNoise:
         (lambda: information_limit(np.zeros((2, 2)), -1), "`k` must not be negative"),
         (lambda: information_limit(np.zeros(3), 1), "`returns` must have shape"),
         (lambda: information_limit(np.full((2, 2), np.nan), 1), "`returns` must be finite"),
-        (lambda: information_limit(np.zeros((2, 2)), 1, noise_model=OtherNoise()), "`noise_model` must be .* OtherNoise"),
+        (
+            lambda: information_limit(np.zeros((2, 2)), 1, noise_model=OtherNoise()),
+            "`noise_model` must be .* OtherNoise",
+        ),
         (lambda: best_codebook(np.zeros((2, 2)), 0), "`size` must be at least 1"),
         (lambda: rate_distortion_limit(np.zeros((2, 2)), -0.1), "`bits` must not be negative"),
     ],

@@ -70,7 +70,10 @@ def test_mistakes_come_at_their_rate():
         MistakeOracle(1.5)
 
 
-@pytest.mark.parametrize(("beta", "expected"), [(None, 1 / (1 + np.exp(-60 / 100))), (0.02, 1 / (1 + np.exp(-0.02 * 60)))])
+@pytest.mark.parametrize(
+    ("beta", "expected"),
+    [(None, 1 / (1 + np.exp(-60 / 100))), (0.02, 1 / (1 + np.exp(-0.02 * 60)))],
+)
 def test_boltzmann_answers_come_at_their_rate(beta, expected):
     # Returns -20 and -80: C.6's beta is 1 / 100.
     oracle = BoltzmannOracle(beta, env_with_goal(2.0), seed=0)
@@ -80,7 +83,10 @@ def test_boltzmann_answers_come_at_their_rate(beta, expected):
 
 
 def test_boltzmann_with_two_returns_of_zero():
-    answers = {BoltzmannOracle(None, env_with_goal(2.0), seed=seed)(at_speed(2.0), at_speed(2.0)) for seed in range(20)}
+    answers = {
+        BoltzmannOracle(None, env_with_goal(2.0), seed=seed)(at_speed(2.0), at_speed(2.0))
+        for seed in range(20)
+    }
     assert answers == {LEFT, RIGHT}
 
 
@@ -126,7 +132,9 @@ def test_a_person_sees_both_side_by_side(tmp_path, video_format):
     import imageio.v3 as imageio
 
     terminal = Terminal("both?", "", " R ", "can't tell")
-    oracle = HumanOracle(tmp_path / "videos", video_format, read=terminal.read, write=terminal.shown.append)
+    oracle = HumanOracle(
+        tmp_path / "videos", video_format, read=terminal.read, write=terminal.shown.append
+    )
     left, right = at_speed(1.0, 4, frames(4, 30)), at_speed(2.0, 6, frames(6, 220))
     assert oracle(left, right) is RIGHT
     assert terminal.prompts == [PROMPT] * 3
@@ -136,7 +144,9 @@ def test_a_person_sees_both_side_by_side(tmp_path, video_format):
     assert files == [f"query-001.{video_format}", f"query-002.{video_format}"]
     assert str(tmp_path / "videos" / files[0]) in terminal.shown[0]
     video = imageio.imread(tmp_path / "videos" / files[0])
-    bottom = np.asarray(video[-1])[-6]  # a row well below the captions, where left is dark and right is bright
+    bottom = np.asarray(video[-1])[
+        -6
+    ]  # a row well below the captions, where left is dark and right is bright
     width = bottom.shape[0]
     assert bottom[: width // 2 - 8].mean() < 60
     assert bottom[width // 2 + 8 :].mean() > 190
@@ -145,11 +155,15 @@ def test_a_person_sees_both_side_by_side(tmp_path, video_format):
 def test_a_person_through_the_adapter(tmp_path):
     terminal = Terminal("l", "left", "1")
     oracle = HumanOracle(tmp_path, read=terminal.read, write=terminal.shown.append)
-    adapter = PreferenceAdapter(SpeedModel(), SpeedEnv(render_mode="rgb_array"), n_queries=3, oracle=oracle, seed=0)
+    adapter = PreferenceAdapter(
+        SpeedModel(), SpeedEnv(render_mode="rgb_array"), n_queries=3, oracle=oracle, seed=0
+    )
     query = adapter.ask()
     assert len(query.left.frames) == HORIZON
     # A question that comes from a file is rendered again, from its seed.
-    resumed = PreferenceAdapter.from_json(adapter.to_json(), SpeedModel(), SpeedEnv(render_mode="rgb_array"), oracle=oracle)
+    resumed = PreferenceAdapter.from_json(
+        adapter.to_json(), SpeedModel(), SpeedEnv(render_mode="rgb_array"), oracle=oracle
+    )
     assert resumed.pending.left.frames is None
     again = resumed.ask()
     np.testing.assert_array_equal(again.left.frames, query.left.frames)
@@ -173,6 +187,9 @@ def test_a_persons_terminal_and_frames_are_needed(tmp_path):
 
 def test_an_oracle_and_an_adaptation_of_one_seed_draw_from_different_streams():
     for seed in (0, 7):
-        of_oracle, of_inference = MistakeOracle(seed=seed).rng.random(4), inference_rng(seed).random(4)
+        of_oracle, of_inference = (
+            MistakeOracle(seed=seed).rng.random(4),
+            inference_rng(seed).random(4),
+        )
         assert not np.isclose(of_oracle, of_inference).any()
         assert np.array_equal(of_oracle, BoltzmannOracle(seed=seed).rng.random(4))

@@ -1,4 +1,6 @@
-"""Algorithm 2: which candidates are kept, what happens when there are none, and which one is chosen."""
+"""Algorithm 2: which candidates are kept, what happens when there are none, and which one is
+chosen.
+"""
 
 import numpy as np
 import pytest
@@ -39,10 +41,13 @@ def test_candidates_satisfy_every_answer_within_the_tolerance(epsilon):
     odds = 1.0 / (1.0 + np.exp(-differences(inference, inference.candidates)))
     assert inference.candidates.shape == (100, 5)
     assert np.all(odds >= 0.5 - epsilon - 1e-12)
-    # ... and the half-spaces are not narrower than eq. 9 says: on a grid, exactly those satisfy all.
+    # ... and the half-spaces are not narrower than eq. 9 says: on a grid, exactly those satisfy
+    # all.
     grid = np.stack([latent(x) for x in np.linspace(-3, 3, 301)])
     odds = 1.0 / (1.0 + np.exp(-differences(inference, grid)))
-    np.testing.assert_array_equal(inference.satisfied(grid) == 2, np.all(odds >= 0.5 - epsilon, axis=1))
+    np.testing.assert_array_equal(
+        inference.satisfied(grid) == 2, np.all(odds >= 0.5 - epsilon, axis=1)
+    )
 
 
 def test_equal_excludes_nobody():
@@ -65,14 +70,19 @@ def test_line_17_takes_the_candidate_of_highest_likelihood():
     inference.tell(LEFT, latent(0.5), latent(-0.5))
     inference.ask_latents()
     inference.tell(RIGHT, latent(1.5), latent(0.2))
-    # Candidates are those drawn before the last answer; the likelihood counts it (lines 3 to 17 in order).
-    likelihood = np.prod(1.0 / (1.0 + np.exp(-differences(inference, inference.candidates))), axis=1)
+    # Candidates are those drawn before the last answer; the likelihood counts it (lines 3 to 17 in
+    # order).
+    likelihood = np.prod(
+        1.0 / (1.0 + np.exp(-differences(inference, inference.candidates))), axis=1
+    )
     np.testing.assert_array_equal(inference.estimate(), inference.candidates[np.argmax(likelihood)])
 
 
 def test_contradicting_answers_fall_back_in_the_defined_order():
     inference = make(epsilon=0.0, max_draws=2000)
-    for _ in range(2):  # nobody satisfies all three; whoever satisfies two satisfies the pair of equal answers
+    for _ in range(
+        2
+    ):  # nobody satisfies all three; whoever satisfies two satisfies the pair of equal answers
         inference.tell(LEFT, latent(0.5), latent(-0.5))
     inference.tell(RIGHT, latent(0.5), latent(-0.5))
     inference.ask_latents()
@@ -104,7 +114,9 @@ def test_the_query_is_eq_10s():
     for i in range(100):
         for j in range(i + 1, 100):
             difference = model.scale * (
-                2 * model.speed(z) * (model.speed(z[i]) - model.speed(z[j])) - model.speed(z[i]) ** 2 + model.speed(z[j]) ** 2
+                2 * model.speed(z) * (model.speed(z[i]) - model.speed(z[j]))
+                - model.speed(z[i]) ** 2
+                + model.speed(z[j]) ** 2
             )
             odds = 1 / (1 + np.exp(-difference))
             best = min(best, max(np.sum(odds >= 0.4), np.sum(1 - odds >= 0.4)))
@@ -145,7 +157,10 @@ def test_every_rule_asks_about_two_policies(rule, candidates):
         ({"epsilon": -0.1}, "`epsilon` must lie in"),
         ({"epsilon": float("nan")}, "`epsilon` must lie in"),
         ({"n_candidates": 1}, "`n_candidates` must be at least 2"),
-        ({"candidates": "uniform"}, "`candidates` must be one of .*prior.*aggregate.*, but is 'uniform'"),
+        (
+            {"candidates": "uniform"},
+            "`candidates` must be one of .*prior.*aggregate.*, but is 'uniform'",
+        ),
         ({"query_rule": "best"}, "`query_rule` must be one of .*worst-case.*, but is 'best'"),
     ],
 )

@@ -10,7 +10,12 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from sb3_poem.adaptation.noise import BoltzmannNoise, ExactNoise, MistakeNoise, noise_model_from_dict
+from sb3_poem.adaptation.noise import (
+    BoltzmannNoise,
+    ExactNoise,
+    MistakeNoise,
+    noise_model_from_dict,
+)
 from sb3_poem.adaptation.queries import (
     information_gains,
     most_informative_pair,
@@ -29,13 +34,20 @@ def test_the_tolerance_widens_the_half_space():
     assert tolerance(0.0) == 0.0
 
 
-@given(seed=st.integers(0, 10_000), m=st.integers(1, 12), n=st.integers(2, 7), epsilon=st.sampled_from([0.0, 0.1, 0.4]))
+@given(
+    seed=st.integers(0, 10_000),
+    m=st.integers(1, 12),
+    n=st.integers(2, 7),
+    epsilon=st.sampled_from([0.0, 0.1, 0.4]),
+)
 @settings(max_examples=60, deadline=None)
 def test_eq_10_against_brute_force(seed, m, n, epsilon):
     similarities = np.random.default_rng(seed).normal(size=(m, n))
 
     def survives(z, better, worse):
-        odds = math.exp(similarities[z, better]) / (math.exp(similarities[z, better]) + math.exp(similarities[z, worse]))
+        odds = math.exp(similarities[z, better]) / (
+            math.exp(similarities[z, better]) + math.exp(similarities[z, worse])
+        )
         return odds >= 0.5 - epsilon
 
     sizes = [
@@ -53,15 +65,22 @@ def test_information_gain_is_the_mutual_information():
     rng = np.random.default_rng(0)
     probabilities, weights = rng.random((5, 3)), rng.dirichlet(np.ones(5))
     for question in range(3):
-        joint = np.stack([weights * probabilities[:, question], weights * (1 - probabilities[:, question])])
+        joint = np.stack(
+            [weights * probabilities[:, question], weights * (1 - probabilities[:, question])]
+        )
         independent = joint.sum(axis=1, keepdims=True) * joint.sum(axis=0, keepdims=True)
         expected = np.sum(joint * np.log(joint / independent))
-        assert math.isclose(information_gains(probabilities.T, weights)[question], expected, abs_tol=1e-12)
-    assert information_gains(np.array([[1.0, 0.0]]), np.array([0.5, 0.5]))[0] == pytest.approx(math.log(2))
+        assert math.isclose(
+            information_gains(probabilities.T, weights)[question], expected, abs_tol=1e-12
+        )
+    assert information_gains(np.array([[1.0, 0.0]]), np.array([0.5, 0.5]))[0] == pytest.approx(
+        math.log(2)
+    )
 
 
 def test_the_most_informative_pair_splits_and_can_be_told_apart():
-    # Latents on a line, fitness -|goal - speed|. Speeds 0.50 and 0.52 halve the latents too, but look the same.
+    # Latents on a line, fitness -|goal - speed|. Speeds 0.50 and 0.52 halve the latents too, but
+    # look the same.
     goals, speeds = np.linspace(0, 1, 101), np.array([0.0, 0.5, 0.52, 1.0])
     values = -np.abs(goals[:, None] - speeds[None, :])
     weights = np.full(101, 1 / 101)
@@ -80,14 +99,20 @@ def test_random_pairs_differ_and_cover():
 def test_exact_noise_averages_a_step_over_the_error(error):
     x = np.linspace(-6, 6, 25)
     probability = ExactNoise().probability_left(x, error, 1.0)
-    np.testing.assert_allclose(probability, norm.cdf(x / error), atol=0.016)  # logistic for probit, and the lapse
+    np.testing.assert_allclose(
+        probability, norm.cdf(x / error), atol=0.016
+    )  # logistic for probit, and the lapse
 
 
 @pytest.mark.parametrize(("beta", "magnitude"), [(0.7, 1.0), (None, 4.0)])
 def test_boltzmann_noise_averages_a_logistic_over_the_error(beta, magnitude):
     slope = 1 / magnitude if beta is None else beta
     for difference in (-5.0, -0.5, 0.0, 2.0):
-        expected, _ = quad(lambda d, centre=difference: norm.pdf(d, centre, 1.5) / (1 + math.exp(-slope * d)), -20, 20)
+        expected, _ = quad(
+            lambda d, centre=difference: norm.pdf(d, centre, 1.5) / (1 + math.exp(-slope * d)),
+            -20,
+            20,
+        )
         value = BoltzmannNoise(beta).probability_left(np.array(difference), 1.5, magnitude)
         assert float(value) == pytest.approx(expected, abs=0.015)
 
@@ -97,7 +122,9 @@ def test_mistakes_bound_what_an_answer_says():
     np.testing.assert_allclose(probability, [0.2, 0.5, 0.8], atol=0.01)
 
 
-@pytest.mark.parametrize("noise", [ExactNoise(), MistakeNoise(0.1), BoltzmannNoise(), BoltzmannNoise(2.0)])
+@pytest.mark.parametrize(
+    "noise", [ExactNoise(), MistakeNoise(0.1), BoltzmannNoise(), BoltzmannNoise(2.0)]
+)
 def test_noise_models_survive_json_and_never_say_never(noise):
     assert noise_model_from_dict(noise.to_dict()) == noise
     probability = noise.probability_left(np.array([-np.inf, -1e300, 0.0, 1e300, np.inf]), 0.0, 0.0)
@@ -110,7 +137,10 @@ def test_noise_models_survive_json_and_never_say_never(noise):
         (lambda: MistakeNoise(0.6), "`rate` must lie"),
         (lambda: BoltzmannNoise(0.0), "`beta` must be positive"),
         (lambda: BoltzmannNoise(float("nan")), "`beta` must be positive"),
-        (lambda: noise_model_from_dict({"kind": "gaussian"}), "unknown noise model 'gaussian'; known are"),
+        (
+            lambda: noise_model_from_dict({"kind": "gaussian"}),
+            "unknown noise model 'gaussian'; known are",
+        ),
     ],
 )
 def test_bad_noise_models(make, message):

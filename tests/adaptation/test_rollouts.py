@@ -77,7 +77,10 @@ def test_seeds_that_an_environment_was_made_with_do_not_reach_the_rollouts(kind)
     starts, tasks = [], []
     for seed in (None, None, 3, 3):  # make_vec_env seeds in any case, by chance if not told how
         env = make_vec_env("poem/PointGoal-v0", 1, vec_env_cls=kind, seed=seed)
-        starts += [rollout_latents(Still(), env, LATENTS[:1], seed=[0])[0].observations[0] for _ in range(2)]
+        starts += [
+            rollout_latents(Still(), env, LATENTS[:1], seed=[0])[0].observations[0]
+            for _ in range(2)
+        ]
         tasks.append(env.get_attr("task")[0])
     assert np.unique(starts, axis=0).shape == (1, 2)
     assert tasks[2] == tasks[3]
@@ -153,7 +156,9 @@ def test_features_as_one_array():
     fast = rollout_features(MODEL, FastFeatures(vec_env(3)), LATENTS)
     np.testing.assert_array_equal(fast, rollout_features(MODEL, vec_env(3), LATENTS))
     in_arrays = rollout_latents(MODEL, SpeedVecEnv(3), LATENTS, seed=3)
-    for trajectory, expected in zip(in_arrays, rollout_latents(MODEL, vec_env(3), LATENTS, seed=3), strict=True):
+    for trajectory, expected in zip(
+        in_arrays, rollout_latents(MODEL, vec_env(3), LATENTS, seed=3), strict=True
+    ):
         np.testing.assert_array_equal(trajectory.observations, expected.observations)
         np.testing.assert_array_equal(trajectory.reward_features, expected.reward_features)
 
@@ -174,7 +179,9 @@ def test_the_environments_own_task_stays():
     venv = DummyVecEnv([lambda: env])
     trajectories = rollout_latents(MODEL, venv, LATENTS, seed=5)
     np.testing.assert_array_equal(env.task, task)
-    for expected, trajectory in zip(rollout_latents(MODEL, vec_env(7), LATENTS, seed=5), trajectories, strict=True):
+    for expected, trajectory in zip(
+        rollout_latents(MODEL, vec_env(7), LATENTS, seed=5), trajectories, strict=True
+    ):
         np.testing.assert_array_equal(trajectory.observations, expected.observations)
 
 
@@ -203,10 +210,16 @@ def test_the_task_of_a_vectorised_family_stays():
 
 
 def test_frames():
-    frames = rollout_latents(MODEL, vec_env(1, render_mode="rgb_array"), LATENTS[:2], frames=True)[1].frames
-    assert len(frames) == HORIZON  # the reset and every step but the last, after which the next episode has begun
+    frames = rollout_latents(MODEL, vec_env(1, render_mode="rgb_array"), LATENTS[:2], frames=True)[
+        1
+    ].frames
+    assert (
+        len(frames) == HORIZON
+    )  # the reset and every step but the last, after which the next episode has begun
     assert frames[0].shape == (16, 16, 3)
-    third = rollout_latents(MODEL, vec_env(1, render_mode="rgb_array"), LATENTS[:2], frames=3)[1].frames
+    third = rollout_latents(MODEL, vec_env(1, render_mode="rgb_array"), LATENTS[:2], frames=3)[
+        1
+    ].frames
     np.testing.assert_array_equal(third, frames[::3])
     with pytest.raises(ValueError, match="render_mode"):
         rollout_latents(MODEL, vec_env(1), LATENTS[:1], frames=True)
@@ -224,10 +237,14 @@ def test_stochastic_actions_are_reproducible_and_leave_torch_alone():
             return np.clip(actions + noise, -1, 1), state
 
     state = torch.get_rng_state()
-    first, second = (rollout_latents(Noisy(), vec_env(3), LATENTS, seed=2, deterministic=False) for _ in range(2))
+    first, second = (
+        rollout_latents(Noisy(), vec_env(3), LATENTS, seed=2, deterministic=False) for _ in range(2)
+    )
     assert torch.equal(torch.get_rng_state(), state)
     np.testing.assert_array_equal(first[4].actions, second[4].actions)
-    assert not np.array_equal(first[0].actions, rollout_latents(Noisy(), vec_env(3), LATENTS, seed=2)[0].actions)
+    assert not np.array_equal(
+        first[0].actions, rollout_latents(Noisy(), vec_env(3), LATENTS, seed=2)[0].actions
+    )
 
 
 @pytest.mark.parametrize("culprit", ["observation", "action"])
@@ -235,7 +252,9 @@ def test_an_episode_that_is_not_finite_is_named(culprit):
     class BrokenEnv(SpeedEnv):
         def step(self, action):
             observation, *rest = super().step(action)
-            return (observation * np.nan if self._time == 4 and observation[1] > 1.5 else observation), *rest
+            return (
+                observation * np.nan if self._time == 4 and observation[1] > 1.5 else observation
+            ), *rest
 
     class BrokenModel(SpeedModel):
         def predict(self, observation, state=None, episode_start=None, deterministic=True):
@@ -244,7 +263,11 @@ def test_an_episode_that_is_not_finite_is_named(culprit):
 
     latents = np.zeros((5, 5))
     latents[:, 0] = [-1.0, -1.0, -1.0, 1.0, -1.0]
-    env, model = (DummyVecEnv([BrokenEnv] * 2), MODEL) if culprit == "observation" else (vec_env(2), BrokenModel())
+    env, model = (
+        (DummyVecEnv([BrokenEnv] * 2), MODEL)
+        if culprit == "observation"
+        else (vec_env(2), BrokenModel())
+    )
     with pytest.raises(ValueError, match=f"an {culprit} of episode 3 at step"):
         rollout_latents(model, env, latents)
 

@@ -1,4 +1,6 @@
-"""Success rates beside returns: in evaluation, the callback's log, the command line and the benchmark's table."""
+"""Success rates beside returns: in evaluation, the callback's log, the command line and the
+benchmark's table.
+"""
 
 import functools
 import json
@@ -43,7 +45,11 @@ class Walk(TaskFamily):
 @pytest.fixture(scope="module")
 def env_id():
     for name, vectorised in (("test/WalkToSuccess-v0", True), ("test/WalkOneByOne-v0", False)):
-        vector = {"vector_entry_point": functools.partial(ProcessFamilyVector, Walk, nthread=1)} if vectorised else {}
+        vector = (
+            {"vector_entry_point": functools.partial(ProcessFamilyVector, Walk, nthread=1)}
+            if vectorised
+            else {}
+        )
         gym.register(name, entry_point=Walk, max_episode_steps=10, **vector)
     yield "test/WalkToSuccess-v0"
     for name in ("test/WalkToSuccess-v0", "test/WalkOneByOne-v0"):
@@ -51,8 +57,16 @@ def env_id():
 
 
 def make_model(env_id, env=None):
-    options = {"batch_size": 8, "context_size": 8, "meta_batch_size": 4, "gradient_steps": 2, "policy_kwargs": SMALL}
-    return POEMSAC("MlpPolicy", env or TaskVecEnv.from_id(env_id, 4), n_train_tasks=4, seed=0, **options)
+    options = {
+        "batch_size": 8,
+        "context_size": 8,
+        "meta_batch_size": 4,
+        "gradient_steps": 2,
+        "policy_kwargs": SMALL,
+    }
+    return POEMSAC(
+        "MlpPolicy", env or TaskVecEnv.from_id(env_id, 4), n_train_tasks=4, seed=0, **options
+    )
 
 
 def by_hand(model, latent, task, seed):
@@ -76,7 +90,10 @@ def test_successes_are_those_of_the_evaluated_episodes(env_id):
     expected = np.array(
         [
             [
-                [by_hand(model, result.latents[i, k], task, evaluation_seed(1) + 6 * episode + i) for episode in range(2)]
+                [
+                    by_hand(model, result.latents[i, k], task, evaluation_seed(1) + 6 * episode + i)
+                    for episode in range(2)
+                ]
                 for k in range(2)
             ]
             for i, task in enumerate(tasks)
@@ -94,7 +111,13 @@ def test_successes_are_those_of_the_evaluated_episodes(env_id):
 
 
 def test_a_family_without_successes_has_no_rates():
-    model = POEMSAC("MlpPolicy", TaskVecEnv.from_id("poem/PointGoal-v0", 4), n_train_tasks=4, seed=0, policy_kwargs=SMALL)
+    model = POEMSAC(
+        "MlpPolicy",
+        TaskVecEnv.from_id("poem/PointGoal-v0", 4),
+        n_train_tasks=4,
+        seed=0,
+        policy_kwargs=SMALL,
+    )
     tasks = np.array([[0.5], [1.0]])
     result = evaluate_adaptation(model, model.env, tasks, record_at=(0,), n_episodes=1)
     assert result.successes is None
@@ -109,7 +132,11 @@ def test_the_callback_logs_them(env_id, name, tmp_path):
     env = None if name == env_id else gym.make(name)
     model = make_model(env_id, env).learn(80, callback=callback)
     metrics = callback.last_evaluation
-    for key in ("success_rate_after_0_queries", "success_rate_after_1_queries", "known_task_success_rate"):
+    for key in (
+        "success_rate_after_0_queries",
+        "success_rate_after_1_queries",
+        "known_task_success_rate",
+    ):
         assert 0.0 <= metrics[key] <= 1.0
         assert metrics[key] * 6 == pytest.approx(round(metrics[key] * 6))  # of 3 tasks x 2 episodes
     assert model.ep_success_buffer  # SB3's own rollout/success_rate
@@ -120,7 +147,17 @@ def test_the_command_line_reports_them(env_id, tmp_path, capsys):
     model = make_model(env_id)
     model.save(tmp_path / "model.zip")
     out = tmp_path / "adapt.json"
-    command = ["adapt", "--model", str(tmp_path / "model.zip"), "--env", env_id, "--tasks", "3", "--queries", "2"]
+    command = [
+        "adapt",
+        "--model",
+        str(tmp_path / "model.zip"),
+        "--env",
+        env_id,
+        "--tasks",
+        "3",
+        "--queries",
+        "2",
+    ]
     assert main([*command, "--episodes", "2", "--json", str(out)]) in (None, 0)
     data = json.loads(out.read_text())
     assert len(data["success_rate"]) == 3
@@ -133,8 +170,15 @@ def test_the_command_line_reports_them(env_id, tmp_path, capsys):
 def test_the_benchmarks_table_has_them():
     import adaptation
 
-    result = {"inference": "bayes", "candidates": "prior", "success_rate": [0.0, 0.25, 1.0], "known_task_success_rate": 0.5}
+    result = {
+        "inference": "bayes",
+        "candidates": "prior",
+        "success_rate": [0.0, 0.25, 1.0],
+        "known_task_success_rate": 0.5,
+    }
     run = {"training": {"seed": 0}, "adaptations": [result]}
-    assert adaptation.success_table([run])[-1] == "| 0 | bayes | prior | 0.00 | 0.25 | 1.00 | 0.50 |"
+    assert (
+        adaptation.success_table([run])[-1] == "| 0 | bayes | prior | 0.00 | 0.25 | 1.00 | 0.50 |"
+    )
     del result["success_rate"]
     assert adaptation.success_table([run]) == []

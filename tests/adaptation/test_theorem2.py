@@ -1,17 +1,19 @@
-"""
-Theorem 2 of Xu & Zhu (2025), in the full form of its Theorem 3, on a family that satisfies the assumptions.
+"""Theorem 2 of Xu & Zhu (2025), in the full form of its Theorem 3, on a family that satisfies the
+assumptions.
 
-The density of the candidates at the true latent is p(z*) / P_k as long as z* satisfies all answers, where P_k is the prior's
-mass of the latents that do; and 0 otherwise. The theorem says P_k <= (1 - c) / 2^k + c with
-c = sqrt(2 / pi) L_r log((1 + 2 epsilon) / (1 - 2 epsilon)).
+The density of the candidates at the true latent is p(z*) / P_k as long as z* satisfies all answers,
+where P_k is the prior's mass of the latents that do; and 0 otherwise. The theorem says P_k <= (1 -
+c) / 2^k + c with c = sqrt(2 / pi) L_r log((1 + 2 epsilon) / (1 - 2 epsilon)).
 
-The family: latents are N(0, I) in R^3; a policy is a point of the sphere of radius R (its features); task z earns the
-inner product of a point with A z. So the best policy of task z is R A z / |A z|, which makes S(z, z') = <A z, R A z' / |A
-z'|> the return of that policy itself: Property 1 holds exactly, f_r is linear and bijective, and L_r = 1 / sigma_min(A).
-The proof's mild condition is |f_pi(z') - f_pi(z'')| >= 1 for the pair asked; with R = 4 eq. 10's pairs have it.
+The family: latents are N(0, I) in R^3; a policy is a point of the sphere of radius R (its
+features); task z earns the inner product of a point with A z. So the best policy of task z is R A z
+/ |A z|, which makes S(z, z') = <A z, R A z' / |A z'|> the return of that policy itself: Property 1
+holds exactly, f_r is linear and bijective, and L_r = 1 / sigma_min(A). The proof's mild condition
+is |f_pi(z') - f_pi(z'')| >= 1 for the pair asked; with R = 4 eq. 10's pairs have it.
 
-The proof takes eq. 10's counts over N_z candidates for probabilities. They are estimates: the better half by count holds up to
-about 1/2 + 1/sqrt(N_z) by mass (two standard deviations). The bound is tested with that in place of 1/2.
+The proof takes eq. 10's counts over N_z candidates for probabilities. They are estimates: the
+better half by count holds up to about 1/2 + 1/sqrt(N_z) by mass (two standard deviations). The
+bound is tested with that in place of 1/2.
 """
 
 import numpy as np
@@ -54,14 +56,18 @@ def surviving_mass(model, inference, epsilon, draws):
     alive = np.ones(len(draws), dtype=bool)
     for answer in inference.answers:
         s = model.similarities(draws, np.stack([answer.left, answer.right]))
-        better, worse = (s[:, 0], s[:, 1]) if answer.preference is Preference.LEFT else (s[:, 1], s[:, 0])
+        better, worse = (
+            (s[:, 0], s[:, 1]) if answer.preference is Preference.LEFT else (s[:, 1], s[:, 0])
+        )
         with np.errstate(over="ignore"):
             alive &= 1.0 / (1.0 + np.exp(worse - better)) >= 0.5 - epsilon
     return alive.mean()
 
 
 def run(epsilon, seed):
-    """Masses P_0 ... P_K, and whether the truth satisfied all answers, under the worst oracle within the tolerance."""
+    """Masses P_0 ... P_K, and whether the truth satisfied all answers, under the worst oracle
+    within the tolerance.
+    """
     model = SphereModel()
     rng = np.random.default_rng([seed, 1])
     truth, draws = rng.standard_normal((1, 3)), rng.standard_normal((30_000, 3))
@@ -72,11 +78,17 @@ def run(epsilon, seed):
         difference = np.subtract(*model.similarities(truth, np.stack([left, right]))[0])
         # Assumption 2: it errs only where eq. 9 still holds for the truth. There it always errs.
         errs = abs(difference) <= slack(epsilon) * (1 - 1e-9)
-        inference.tell(Preference.LEFT if (difference > 0) != errs else Preference.RIGHT, left, right)
-        distances.append(np.linalg.norm(np.subtract(*model.policy_embedding(np.stack([left, right])))))
+        inference.tell(
+            Preference.LEFT if (difference > 0) != errs else Preference.RIGHT, left, right
+        )
+        distances.append(
+            np.linalg.norm(np.subtract(*model.policy_embedding(np.stack([left, right]))))
+        )
         masses.append(surviving_mass(model, inference, epsilon, draws))
         alive &= inference.satisfied(truth)[0] == len(inference.answers)
-    assert epsilon == 0.0 or min(distances) >= 1.0  # the proof's mild condition, on the width of the strip of tolerance
+    assert (
+        epsilon == 0.0 or min(distances) >= 1.0
+    )  # the proof's mild condition, on the width of the strip of tolerance
     return np.array(masses), alive
 
 
@@ -111,7 +123,9 @@ def test_the_density_at_the_truth_grows_as_the_bound_says(epsilon):
 
 
 def test_it_can_fail_with_the_sign_of_the_papers_proof(monkeypatch):
-    """The appendix's inequality shrinks the half-spaces. Then the truth is thrown out, and its density is 0."""
+    """The appendix's inequality shrinks the half-spaces. Then the truth is thrown out, and its
+    density is 0.
+    """
     widening = inference_module.tolerance
     monkeypatch.setattr(inference_module, "tolerance", lambda epsilon: -widening(epsilon))
     assert not all(run(0.2, seed)[1] for seed in range(3))
@@ -140,7 +154,9 @@ def test_it_can_fail_with_random_questions():
 
 
 def test_candidates_converge_to_the_truth():
-    """Part (b), epsilon = 0: the directions of A z, which are all that answers can tell, close in on the truth's."""
+    """Part (b), epsilon = 0: the directions of A z, which are all that answers can tell, close in
+    on the truth's.
+    """
     model = SphereModel()
     for seed in range(3):
         rng = np.random.default_rng(seed)
@@ -149,7 +165,11 @@ def test_candidates_converge_to_the_truth():
         angles = []
         for _ in range(11):
             left, right = inference.ask_latents()
-            cosine = model.policy_embedding(inference.candidates) @ model.policy_embedding(truth)[0] / RADIUS**2
+            cosine = (
+                model.policy_embedding(inference.candidates)
+                @ model.policy_embedding(truth)[0]
+                / RADIUS**2
+            )
             angles.append(np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean())
             s = model.similarities(truth, np.stack([left, right]))[0]
             inference.tell(Preference.LEFT if s[0] > s[1] else Preference.RIGHT, left, right)

@@ -31,7 +31,9 @@ def test_json_keeps_every_bit_but_the_frames(features):
     assert len(copy) == 3
 
 
-@pytest.mark.parametrize("array", [np.array(np.nan), np.zeros((0, 3)), np.arange(6, dtype=np.int8).reshape(2, 3)[:, ::2]])
+@pytest.mark.parametrize(
+    "array", [np.array(np.nan), np.zeros((0, 3)), np.arange(6, dtype=np.int8).reshape(2, 3)[:, ::2]]
+)
 def test_arrays_survive(array):
     copy = decode_array(json.loads(json.dumps(encode_array(array))))
     np.testing.assert_array_equal(copy, array)
@@ -54,7 +56,12 @@ def test_broken_arrays_are_refused(data):
     ],
 )
 def test_shapes_are_checked(changes, message):
-    arguments = {"observations": np.zeros((4, 2)), "actions": np.zeros((3, 1)), "latent": np.zeros(4), **changes}
+    arguments = {
+        "observations": np.zeros((4, 2)),
+        "actions": np.zeros((3, 1)),
+        "latent": np.zeros(4),
+        **changes,
+    }
     with pytest.raises(ValueError, match=message):
         Trajectory(**arguments)
 

@@ -10,7 +10,13 @@ from worlds import SpeedEnv, SpeedModel, SpeedVecEnv
 
 import sb3_poem
 from sb3_poem import PEARLSAC, ANOLEAdapter
-from sb3_poem.adaptation import MistakeOracle, Preference, ReturnOracle, adapt_tasks, evaluate_adaptation
+from sb3_poem.adaptation import (
+    MistakeOracle,
+    Preference,
+    ReturnOracle,
+    adapt_tasks,
+    evaluate_adaptation,
+)
 from sb3_poem.adaptation.options import inference_rng
 from sb3_poem.baselines import replay_fragments, rollout_fragments, training_rollouts
 from sb3_poem.baselines.anole import ANOLEOptions
@@ -35,15 +41,23 @@ def test_volumes_by_counting_all_answer_strings(n_queries, budget):
     # A candidate's true answers are all 0: a string's ones are the lies.
     for asked in range(n_queries + 1):
         for told in itertools.product((0, 1), repeat=asked):
-            strings = [rest for rest in itertools.product((0, 1), repeat=n_queries - asked) if sum(told) + sum(rest) <= budget]
-            assert berlekamp_volumes(np.array([sum(told)]), n_queries - asked, budget)[0] == len(strings)
+            strings = [
+                rest
+                for rest in itertools.product((0, 1), repeat=n_queries - asked)
+                if sum(told) + sum(rest) <= budget
+            ]
+            assert berlekamp_volumes(np.array([sum(told)]), n_queries - asked, budget)[0] == len(
+                strings
+            )
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_worst_case_volumes_by_counting(seed):
     rng = np.random.default_rng(seed)
     n_queries, budget, asked = 6, 2, 2
-    differences = rng.integers(-1, 2, size=(7, 9)).astype(float)  # with ties, which contradict nothing
+    differences = rng.integers(-1, 2, size=(7, 9)).astype(
+        float
+    )  # with ties, which contradict nothing
     contradictions = rng.integers(0, 3, size=7)
     expected = []
     for pair in range(9):
@@ -56,7 +70,9 @@ def test_worst_case_volumes_by_counting(seed):
                 total += sum(1 for string in rest if lies + sum(string) <= budget)
             after.append(total)
         expected.append(max(after))
-    np.testing.assert_array_equal(worst_case_volumes(differences, contradictions, n_queries - asked - 1, budget), expected)
+    np.testing.assert_array_equal(
+        worst_case_volumes(differences, contradictions, n_queries - asked - 1, budget), expected
+    )
 
 
 def test_numbers_of_candidates():
@@ -78,7 +94,9 @@ def test_greedy_takes_the_pair_of_an_exhaustive_search(seed):
     for answer in (LEFT, RIGHT, LEFT):
         returns = MODEL.predicted_returns(inference.candidates[inference.alive], LIBRARY[:8])
         survivors = {
-            (i, j): max((returns[:, i] >= returns[:, j]).sum(), (returns[:, i] <= returns[:, j]).sum())
+            (i, j): max(
+                (returns[:, i] >= returns[:, j]).sum(), (returns[:, i] <= returns[:, j]).sum()
+            )
             for i, j in itertools.permutations(range(8), 2)
         }
         i, j = inference.ask_library()
@@ -89,7 +107,9 @@ def test_greedy_takes_the_pair_of_an_exhaustive_search(seed):
 
 
 def test_contradictions_are_counted_and_the_budget_grows():
-    inference = ANOLEOptions(n_queries=5, n_candidates=30).make_inference(MODEL, np.random.default_rng(0), LIBRARY)
+    inference = ANOLEOptions(n_queries=5, n_candidates=30).make_inference(
+        MODEL, np.random.default_rng(0), LIBRARY
+    )
     assert inference.budget == 1
     i, j = inference.ask_library()
     for answer in (LEFT, RIGHT, LEFT, RIGHT, EQUAL):
@@ -102,7 +122,9 @@ def test_contradictions_are_counted_and_the_budget_grows():
 
 
 def test_greedy_keeps_candidates_when_none_agrees():
-    inference = ANOLEOptions(n_queries=3, strategy="greedy").make_inference(MODEL, np.random.default_rng(0), LIBRARY)
+    inference = ANOLEOptions(n_queries=3, strategy="greedy").make_inference(
+        MODEL, np.random.default_rng(0), LIBRARY
+    )
     order = np.argsort([t.observations[1, 1] for t in LIBRARY])
     slow, fast = LIBRARY[order[0]], LIBRARY[order[-1]]
     inference.tell(LEFT, slow, fast)
@@ -150,17 +172,28 @@ def test_two_lies_in_ten_answers_are_borne():
 
 def test_one_task_and_many_tasks_agree_and_the_state_resumes():
     many = adapt_tasks(
-        MODEL, SpeedVecEnv(2), GOALS[[3, 20]], ReturnOracle, n_queries=4, seed=7, adapter=ANOLEAdapter, library=LIBRARY
+        MODEL,
+        SpeedVecEnv(2),
+        GOALS[[3, 20]],
+        ReturnOracle,
+        n_queries=4,
+        seed=7,
+        adapter=ANOLEAdapter,
+        library=LIBRARY,
     )
     env = DummyVecEnv([SpeedEnv])
     env.env_method("set_task", GOALS[20])
-    adapter = ANOLEAdapter(MODEL, env, n_queries=4, seed=8, library=LIBRARY, oracle=ReturnOracle(task=GOALS[20]))
+    adapter = ANOLEAdapter(
+        MODEL, env, n_queries=4, seed=8, library=LIBRARY, oracle=ReturnOracle(task=GOALS[20])
+    )
     for _ in range(2):
         query = adapter.ask()
         adapter.tell(adapter.oracle(query.left, query.right))
         adapter.policy()
     adapter.ask()
-    resumed = ANOLEAdapter.from_json(adapter.to_json(), MODEL, env, library=LIBRARY, oracle=ReturnOracle(env, GOALS[20]))
+    resumed = ANOLEAdapter.from_json(
+        adapter.to_json(), MODEL, env, library=LIBRARY, oracle=ReturnOracle(env, GOALS[20])
+    )
     for one in (adapter, resumed):
         np.testing.assert_array_equal(one.adapt().latent, many.latents[1, -1])
     assert resumed.n_answers == 4
@@ -179,7 +212,9 @@ def test_undo():
 
 @pytest.fixture(scope="module")
 def trained():
-    return small(PEARLSAC, walks(5, edge=0.6), horizon=10, n_train_tasks=5, buffer_size=45).learn(4 * 50)
+    return small(PEARLSAC, walks(5, edge=0.6), horizon=10, n_train_tasks=5, buffer_size=45).learn(
+        4 * 50
+    )
 
 
 def test_fragments_are_pieces_of_episodes(trained):
@@ -188,34 +223,50 @@ def test_fragments_are_pieces_of_episodes(trained):
     for fragment in fragments:
         assert fragment.observations.shape == (5, 2)
         # Walk's own dynamics: 0.1 of the action a step, and a clock that goes up by 0.1.
-        np.testing.assert_allclose(np.diff(fragment.observations[:, 0]), 0.1 * fragment.actions[:, 0], atol=1e-3)
+        np.testing.assert_allclose(
+            np.diff(fragment.observations[:, 0]), 0.1 * fragment.actions[:, 0], atol=1e-3
+        )
         np.testing.assert_allclose(np.diff(fragment.observations[:, 1]), 0.1, atol=1e-6)
-        np.testing.assert_allclose(fragment.reward_features[:, 0], fragment.observations[1:, 0], atol=1e-6)
+        np.testing.assert_allclose(
+            fragment.reward_features[:, 0], fragment.observations[1:, 0], atol=1e-6
+        )
     tasks = {tuple(fragment.latent) for fragment in fragments}
     assert len(tasks) == 5
-    with pytest.raises(ValueError, match="`fragment_length` is 11, but the replay buffer holds too few"):
+    with pytest.raises(
+        ValueError, match="`fragment_length` is 11, but the replay buffer holds too few"
+    ):
         replay_fragments(trained, 5, 11, np.random.default_rng(0))
 
 
 def test_it_runs_on_a_trained_model_from_its_replay_buffer(trained):
     env = walks(1)
-    adapter = ANOLEAdapter(trained, env, n_queries=3, n_pairs=20, fragment_length=4, seed=0, oracle=ReturnOracle())
+    adapter = ANOLEAdapter(
+        trained, env, n_queries=3, n_pairs=20, fragment_length=4, seed=0, oracle=ReturnOracle()
+    )
     env.env_method("set_task", np.array([0.5]))
     env.reset()
     policy = adapter.adapt()
     assert policy.latent.shape == (5,)
-    again = ANOLEOptions(n_queries=3, n_pairs=20, fragment_length=4).make_inference(trained, inference_rng(0))
+    again = ANOLEOptions(n_queries=3, n_pairs=20, fragment_length=4).make_inference(
+        trained, inference_rng(0)
+    )
     np.testing.assert_array_equal(again.candidates, adapter.inference.candidates)
     assert len(training_rollouts(trained, walks(4), 6)) == 6
 
 
 def test_it_takes_ids_and_names():
     trained = small(PEARLSAC).learn(EPOCH)
-    policy = ANOLEAdapter(trained, POINT_GOAL, n_queries=2, n_pairs=5, seed=0, oracle=ReturnOracle()).adapt()
+    policy = ANOLEAdapter(
+        trained, POINT_GOAL, n_queries=2, n_pairs=5, seed=0, oracle=ReturnOracle()
+    ).adapt()
     assert policy.latent.shape == (5,)
     fragments = training_rollouts("PointGoal", POINT_GOAL, 4)
-    ANOLEAdapter("PointGoal", POINT_GOAL, n_queries=2, seed=0, library=fragments, oracle=ReturnOracle()).adapt()
-    with pytest.raises(ValueError, match=r"pass library=sb3_poem.baselines.training_rollouts\(model, env, 200\)"):
+    ANOLEAdapter(
+        "PointGoal", POINT_GOAL, n_queries=2, seed=0, library=fragments, oracle=ReturnOracle()
+    ).adapt()
+    with pytest.raises(
+        ValueError, match=r"pass library=sb3_poem.baselines.training_rollouts\(model, env, 200\)"
+    ):
         ANOLEAdapter("PointGoal", POINT_GOAL)
 
 
@@ -242,7 +293,9 @@ def test_bad_arguments(arguments, message):
 
 
 def test_models_and_families_that_will_not_do(trained):
-    with pytest.raises(ValueError, match="`model` needs a trained reward decoder, which this Blind"):
+    with pytest.raises(
+        ValueError, match="`model` needs a trained reward decoder, which this Blind"
+    ):
         ANOLEAdapter(Blind(), SpeedEnv(), library=LIBRARY)
     untrained = small(PEARLSAC, walks(2), horizon=10, n_train_tasks=2, reward_coef=0.0)
     with pytest.raises(ValueError, match="`model` needs a trained reward decoder"):
@@ -261,9 +314,15 @@ def test_fragments_of_rollouts_are_pieces_of_the_training_tasks_episodes():
     starts = set()
     for fragment, episode in zip(fragments, episodes, strict=True):
         assert len(fragment) == 6
-        [start] = [t for t in range(5) if np.array_equal(episode.observations[t : t + 7], fragment.observations)]
+        [start] = [
+            t
+            for t in range(5)
+            if np.array_equal(episode.observations[t : t + 7], fragment.observations)
+        ]
         np.testing.assert_array_equal(episode.actions[start : start + 6], fragment.actions)
-        np.testing.assert_array_equal(episode.reward_features[start : start + 6], fragment.reward_features)
+        np.testing.assert_array_equal(
+            episode.reward_features[start : start + 6], fragment.reward_features
+        )
         np.testing.assert_array_equal(episode.latent, fragment.latent)
         starts.add(start)
     assert len(starts) > 2

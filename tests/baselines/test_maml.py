@@ -9,7 +9,13 @@ from torch.func import grad
 from sb3_poem import PEARLSAC
 from sb3_poem.adaptation import Preference
 from sb3_poem.baselines import replay_fragments
-from sb3_poem.baselines.maml import PreferencePairs, RewardNetwork, adapt_parameters, maml_loss, preference_loss
+from sb3_poem.baselines.maml import (
+    PreferencePairs,
+    RewardNetwork,
+    adapt_parameters,
+    maml_loss,
+    preference_loss,
+)
 from sb3_poem.baselines.maml_reward import JudgedPair, MetaReward, meta_train_reward
 
 
@@ -52,22 +58,32 @@ def test_the_outer_gradient_against_finite_differences(steps):
                 moved = {key: part.clone() for key, part in parameters.items()}
                 moved[name][index] += sign * width
                 ends.append(float(maml_loss(network, moved, support, query, rate, steps)))
-            assert float(slope[name][index]) == pytest.approx((ends[0] - ends[1]) / (2 * width), abs=1e-8)
+            assert float(slope[name][index]) == pytest.approx(
+                (ends[0] - ends[1]) / (2 * width), abs=1e-8
+            )
         adapted = [
-            adapt_parameters(network, parameters, PreferencePairs(*(part[i] for part in support)), rate, steps)
+            adapt_parameters(
+                network, parameters, PreferencePairs(*(part[i] for part in support)), rate, steps
+            )
             for i in range(3)
         ]
         plain = sum(
-            grad(preference_loss, argnums=1)(network, adapted[i], PreferencePairs(*(part[i] for part in query)))[name]
+            grad(preference_loss, argnums=1)(
+                network, adapted[i], PreferencePairs(*(part[i] for part in query))
+            )[name]
             for i in range(3)
         )
         first_order = max(first_order, float((plain / 3 - slope[name]).abs().max()))
-    assert first_order > 1e-3  # the second derivatives matter here, so a first-order gradient would have failed
+    assert (
+        first_order > 1e-3
+    )  # the second derivatives matter here, so a first-order gradient would have failed
 
 
 @pytest.fixture(scope="module")
 def trained():
-    return small(PEARLSAC, walks(10), horizon=10, n_train_tasks=10, learning_starts=10**6).learn(3 * 100)
+    return small(PEARLSAC, walks(10), horizon=10, n_train_tasks=10, learning_starts=10**6).learn(
+        3 * 100
+    )
 
 
 def judged(fragments, goal, n, seed):
@@ -75,7 +91,10 @@ def judged(fragments, goal, n, seed):
     answers = []
     for _ in range(n):
         left, right = (fragments[i] for i in rng.choice(len(fragments), size=2, replace=False))
-        better = sum((-np.abs(t.reward_features[:, 0] - goal)).sum() * sign for t, sign in ((left, 1), (right, -1)))
+        better = sum(
+            (-np.abs(t.reward_features[:, 0] - goal)).sum() * sign
+            for t, sign in ((left, 1), (right, -1))
+        )
         answers.append(JudgedPair(Preference.LEFT if better > 0 else Preference.RIGHT, left, right))
     return answers
 
@@ -83,13 +102,18 @@ def judged(fragments, goal, n, seed):
 def accuracy(meta, parameters, answers):
     right = 0
     for answer in answers:
-        difference = meta.rewards(parameters, answer.left).sum() - meta.rewards(parameters, answer.right).sum()
+        difference = (
+            meta.rewards(parameters, answer.left).sum()
+            - meta.rewards(parameters, answer.right).sum()
+        )
         right += (difference > 0) == (answer.preference == Preference.LEFT)
     return right / len(answers)
 
 
 def test_ten_answers_tell_the_meta_trained_reward_its_task(trained):
-    meta = meta_train_reward(trained, n_iterations=100, fragment_length=10, n_fragments=100, learning_rate=3e-3)
+    meta = meta_train_reward(
+        trained, n_iterations=100, fragment_length=10, n_fragments=100, learning_rate=3e-3
+    )
     fragments = replay_fragments(trained, 100, 10, np.random.default_rng(1))
     before, after = [], []
     for goal in (-0.8, 0.8):
@@ -150,11 +174,16 @@ def test_a_meta_reward_is_saved_and_read(tmp_path):
     left, right = replay_fragments(model, 2, 10, np.random.default_rng(0))
     answers = [JudgedPair(Preference.LEFT, left, right)]
     for judged in ([], answers):
-        np.testing.assert_array_equal(loaded.rewards(loaded.adapted(judged), right), meta.rewards(meta.adapted(judged), right))
+        np.testing.assert_array_equal(
+            loaded.rewards(loaded.adapted(judged), right), meta.rewards(meta.adapted(judged), right)
+        )
     assert {file.suffix for file in (tmp_path / "reward").iterdir()} == {".safetensors", ".json"}
 
     other = small(PEARLSAC, seed=5).learn(300)
-    with pytest.raises(ValueError, match=r"is not the one with which the reward in .* was meta-trained: its obs_mean differs"):
+    with pytest.raises(
+        ValueError,
+        match=r"is not the one with which the reward in .* was meta-trained: its obs_mean differs",
+    ):
         MetaReward.load(tmp_path / "reward", other.policy)
     with pytest.raises(FileNotFoundError, match="holds no meta-trained reward"):
         MetaReward.load(tmp_path, model.policy)

@@ -18,7 +18,9 @@ FAST = {"gradient_steps": 5, "batch_size": 16}
 
 @pytest.fixture(scope="module")
 def trained():
-    return small(PEARLSAC, walks(5), horizon=10, n_train_tasks=5, learning_starts=10**6).learn(2 * 50)
+    return small(PEARLSAC, walks(5), horizon=10, n_train_tasks=5, learning_starts=10**6).learn(
+        2 * 50
+    )
 
 
 @pytest.fixture
@@ -27,19 +29,33 @@ def model(trained):
 
 
 def test_it_learns_a_reward_that_it_is_told(trained, model, monkeypatch):
-    # The adapted reward is replaced by the true one, "as far to the right as can be"; what is left is SAC.
-    monkeypatch.setattr(MetaReward, "rewards", lambda self, parameters, trajectory: trajectory.observations[1:, 0])
+    # The adapted reward is replaced by the true one, "as far to the right as can be"; what is left
+    # is SAC.
+    monkeypatch.setattr(
+        MetaReward, "rewards", lambda self, parameters, trajectory: trajectory.observations[1:, 0]
+    )
     learning = {"gradient_steps": 80, "batch_size": 64, "learning_rate": 3e-3, "gamma": 0.9}
     adapted = adapt_tasks(
-        model, walks(2), np.ones((1, 1)), ReturnOracle, n_queries=4, record_at=(0, 4), adapter=MAMLRewardAdapter, **learning
+        model,
+        walks(2),
+        np.ones((1, 1)),
+        ReturnOracle,
+        n_queries=4,
+        record_at=(0, 4),
+        adapter=MAMLRewardAdapter,
+        **learning,
     )
-    before, after = (t.observations[-1, 0] for t in rollout_latents(model, walks(2), adapted.latents[0]))
+    before, after = (
+        t.observations[-1, 0] for t in rollout_latents(model, walks(2), adapted.latents[0])
+    )
     # The furthest that ten steps can go is 4, from a start near 0.
     assert after > 3.0 > before
 
 
 def test_pairs_differ_and_the_budget_is_kept(model):
-    adapter = MAMLRewardAdapter(model, walks(1), n_queries=2, seed=0, oracle=lambda left, right: "left", **FAST)
+    adapter = MAMLRewardAdapter(
+        model, walks(1), n_queries=2, seed=0, oracle=lambda left, right: "left", **FAST
+    )
     query = adapter.ask()
     assert np.abs(query.left.actions - query.right.actions).max() > 0.01
     adapter.adapt()
@@ -49,13 +65,17 @@ def test_pairs_differ_and_the_budget_is_kept(model):
 
 def test_the_state_resumes_and_the_generators_stay(model):
     env = walks(1)
-    adapter = MAMLRewardAdapter(model, env, n_queries=3, seed=0, oracle=lambda left, right: "left", **FAST)
+    adapter = MAMLRewardAdapter(
+        model, env, n_queries=3, seed=0, oracle=lambda left, right: "left", **FAST
+    )
     adapter.ask()
     states = np.random.get_state()[1].copy(), th.random.get_rng_state()  # noqa: NPY002
     adapter.tell("left")
     np.testing.assert_array_equal(np.random.get_state()[1], states[0])  # noqa: NPY002
     assert th.equal(th.random.get_rng_state(), states[1])
-    resumed = MAMLRewardAdapter.from_json(adapter.to_json(), model, env, oracle=lambda left, right: "left")
+    resumed = MAMLRewardAdapter.from_json(
+        adapter.to_json(), model, env, oracle=lambda left, right: "left"
+    )
     obs = np.random.default_rng(0).normal(size=(6, 2))
     first, second = (one.adapt().predict(obs)[0] for one in (adapter, resumed))
     np.testing.assert_allclose(first, second, atol=1e-5)
@@ -68,9 +88,16 @@ def test_a_pending_question_is_shown_again_by_a_model_that_was_made_anew(model, 
     shown.ask()
     shown.tell("left")
     query = shown.ask()
-    monkeypatch.setattr("sb3_poem.adaptation.adapter.PreferenceAdapter._needs_frames", property(lambda self: True))
-    monkeypatch.setattr("sb3_poem.adaptation.adapter.rollout_latents", lambda *a, frames, **k: rollout_latents(*a, **k))
-    resumed = MAMLRewardAdapter.from_json(shown.to_json(), MAMLRewardModel(model.reward, model), walks(1))
+    monkeypatch.setattr(
+        "sb3_poem.adaptation.adapter.PreferenceAdapter._needs_frames", property(lambda self: True)
+    )
+    monkeypatch.setattr(
+        "sb3_poem.adaptation.adapter.rollout_latents",
+        lambda *a, frames, **k: rollout_latents(*a, **k),
+    )
+    resumed = MAMLRewardAdapter.from_json(
+        shown.to_json(), MAMLRewardModel(model.reward, model), walks(1)
+    )
     again = resumed.ask()
     np.testing.assert_array_equal(again.left.actions, query.left.actions)
     np.testing.assert_array_equal(again.right.actions, query.right.actions)
@@ -83,12 +110,16 @@ def test_another_reward_does_not_go_on_where_this_one_stood(model):
     other = MAMLRewardModel(reward, model)
     assert other.digest == model.digest
     reward.parameters = {name: value + 0.1 for name, value in reward.parameters.items()}
-    with pytest.raises(ValueError, match="saved with a model of other weights than this MAMLRewardModel"):
+    with pytest.raises(
+        ValueError, match="saved with a model of other weights than this MAMLRewardModel"
+    ):
         MAMLRewardAdapter.from_json(begun.to_json(), other, walks(1))
 
 
 def test_what_will_not_do(trained, model):
-    with pytest.raises(ValueError, match="`model` must be a MAMLRewardModel, but is of type SpeedModel"):
+    with pytest.raises(
+        ValueError, match="`model` must be a MAMLRewardModel, but is of type SpeedModel"
+    ):
         MAMLRewardAdapter(SpeedModel(), SpeedEnv())
     with pytest.raises(ValueError, match="a family whose tasks share their dynamics"):
         MAMLRewardAdapter(model, walks(1, WindyWalk))
@@ -99,4 +130,6 @@ def test_what_will_not_do(trained, model):
     with pytest.raises(ValueError, match="`learning_rate` must be positive"):
         MAMLRewardAdapter(model, walks(1), learning_rate=0.0)
     with pytest.raises(ValueError, match="`library` must be None"):
-        adapt_tasks(model, walks(1), np.zeros((1, 1)), ReturnOracle, adapter=MAMLRewardAdapter, library=[])
+        adapt_tasks(
+            model, walks(1), np.zeros((1, 1)), ReturnOracle, adapter=MAMLRewardAdapter, library=[]
+        )

@@ -28,13 +28,21 @@ def test_contexts_are_those_of_training(trained):
     centre, deviation = trained.context_reward_statistics
     rewards = trained.epoch_context.rewards.numpy()
     assert (centre, deviation) == pytest.approx((rewards.mean(), rewards.std(ddof=1)), rel=1e-5)
-    np.testing.assert_allclose(trained.epoch_context.transitions[..., -1].numpy(), (rewards - centre) / deviation, atol=1e-5)
+    np.testing.assert_allclose(
+        trained.epoch_context.transitions[..., -1].numpy(),
+        (rewards - centre) / deviation,
+        atol=1e-5,
+    )
     features = query.left.reward_features
     true_rewards = -np.abs(features[:, 0] - 0.3) - 0.01 * features[:, 1] ** 2
     np.testing.assert_allclose(rows[:10, -1], (true_rewards - centre) / deviation, atol=1e-5)
     mean, std = trained.policy.obs_norm.mean.numpy(), trained.policy.obs_norm.std.numpy()
-    np.testing.assert_allclose(rows[:10, :2], (query.left.observations[:-1] - mean) / std, atol=1e-4)
-    np.testing.assert_allclose(rows[:10, 2], (query.left.actions[:, 0] - 1.0) / 3.0, atol=1e-5)  # from [-2, 4] to [-1, 1]
+    np.testing.assert_allclose(
+        rows[:10, :2], (query.left.observations[:-1] - mean) / std, atol=1e-4
+    )
+    np.testing.assert_allclose(
+        rows[:10, 2], (query.left.actions[:, 0] - 1.0) / 3.0, atol=1e-5
+    )  # from [-2, 4] to [-1, 1]
     with th.no_grad():
         expected, _ = trained.policy.encoder(th.as_tensor(rows)[None])
     np.testing.assert_allclose(adapter.policy().latent, expected[0].numpy(), atol=1e-5)
@@ -61,7 +69,13 @@ def test_answers_do_not_matter_and_many_tasks_are_as_one(trained):
         latents.append(adapter.policy().latent)
     np.testing.assert_array_equal(*latents)
     many = adapt_tasks(
-        trained, walks(4), np.array([[-0.5], [0.5]]), ReturnOracle, n_queries=3, seed=3, adapter=RewardOracleAdapter
+        trained,
+        walks(4),
+        np.array([[-0.5], [0.5]]),
+        ReturnOracle,
+        n_queries=3,
+        seed=3,
+        adapter=RewardOracleAdapter,
     )
     np.testing.assert_allclose(many.latents[1, -1], latents[0], atol=1e-4)
 
@@ -79,7 +93,9 @@ def test_the_state_resumes_after_saving_the_model(trained, tmp_path):
 
 
 class RewardEncoder(th.nn.Module):
-    """The Gaussian whose mean is the mean standardised reward of the context, and whose variance falls as 1 / n."""
+    """The Gaussian whose mean is the mean standardised reward of the context, and whose variance
+    falls as 1 / n.
+    """
 
     def forward(self, context):
         mean = context[..., -1].mean(dim=1, keepdim=True).expand(-1, 5)
@@ -97,7 +113,9 @@ def test_the_posterior_is_that_of_all_rewarded_trajectories(trained, monkeypatch
         query = adapter.ask()
         for shown in (query.left, query.right):
             features = shown.reward_features
-            rewards.append((-np.abs(features[:, 0] + 0.5) - 0.01 * features[:, 1] ** 2 - centre) / deviation)
+            rewards.append(
+                (-np.abs(features[:, 0] + 0.5) - 0.01 * features[:, 1] ** 2 - centre) / deviation
+            )
         adapter.tell("equal")
         # As in training no more than context_size transitions, of all that there are.
         n = min(20 * k, trained.context_size)
@@ -120,7 +138,14 @@ def test_what_will_not_do(trained):
     with pytest.raises(ValueError, match="`n_queries` must be at least 1"):
         RewardOracleAdapter(trained, walks(1), n_queries=0)
     with pytest.raises(ValueError, match="`library` must be None"):
-        adapt_tasks(trained, walks(1), np.zeros((1, 1)), ReturnOracle, adapter=RewardOracleAdapter, library=[])
+        adapt_tasks(
+            trained,
+            walks(1),
+            np.zeros((1, 1)),
+            ReturnOracle,
+            adapter=RewardOracleAdapter,
+            library=[],
+        )
 
     class NoFamily(SpeedEnv):
         observation_space = trained.observation_space

@@ -30,10 +30,22 @@ def finished(cell: Cell, returns: Returns, samples: int = 1000, **result: Any) -
         content["queries"] = list(queries)
         content["task_returns"] = np.stack([returns(cell, k) for k in queries], axis=1).tolist()
     content |= result
-    provenance = {"machine": "a test", "commit": "abc", "model": {"source": "trained", "commit": "abc"}}
-    return Record(cell.key, cell.family, cell.method, cell.seed, cell.identity(), content, provenance)
+    provenance = {
+        "machine": "a test",
+        "commit": "abc",
+        "model": {"source": "trained", "commit": "abc"},
+    }
+    return Record(
+        cell.key, cell.family, cell.method, cell.seed, cell.identity(), content, provenance
+    )
 
 
 def cells_of(suite: Suite, **arguments: Any) -> list[Cell]:
     """A suite's cells on its own families, with three seeds."""
-    return suite.cells(**{"env_ids": [f"poem/{name}-v0" for name in suite.families], "seeds": range(3), **arguments})
+    return suite.cells(
+        **{
+            "env_ids": [f"poem/{name}-v0" for name in suite.families],
+            "seeds": range(3),
+            **arguments,
+        }
+    )

@@ -18,7 +18,9 @@ RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
 
 
 def pace_of(records: list[Record]) -> Pace:
-    """How fast the machine was that wrote the records: of random questions, which are evaluation alone, and of PEARL."""
+    """How fast the machine was that wrote the records: of random questions, which are evaluation
+    alone, and of PEARL.
+    """
     random = [r for r in records if r.method == "anole-random" and r.identity["snapshot"] is None]
     budget = random[0].identity
     steps = budget["tasks"] * budget["episodes"] * len(budget["record_at"]) * 25
@@ -53,12 +55,19 @@ def test_the_estimate_grows_with_what_is_asked_for() -> None:
     pace = Pace(1e-4, 1e-2)
 
     def seconds(**budget: int) -> float:
-        cells = SUITES["table3"].cells(["poem/AntVel-v0"], [0], budget=Budget(**budget), snapshots=1)
+        cells = SUITES["table3"].cells(
+            ["poem/AntVel-v0"], [0], budget=Budget(**budget), snapshots=1
+        )
         return sum(cell_seconds(cell, pace) for cell in cells)
 
-    assert seconds(tasks=60, episodes=10) == pytest.approx(2 * seconds(tasks=30, episodes=10), rel=0.1)
+    assert seconds(tasks=60, episodes=10) == pytest.approx(
+        2 * seconds(tasks=30, episodes=10), rel=0.1
+    )
     assert seconds(tasks=30, episodes=20) > seconds(tasks=30, episodes=10)
-    alone, both = (training_seconds(ModelKey("poem/AntVel-v0", name, 0), pace) for name in ("pearl", "maml-reward"))
+    alone, both = (
+        training_seconds(ModelKey("poem/AntVel-v0", name, 0), pace)
+        for name in ("pearl", "maml-reward")
+    )
     assert both < alone
 
 
@@ -68,11 +77,24 @@ def test_the_list_estimates_each_training_and_the_whole(
     monkeypatch.chdir(tmp_path)
 
     def minutes(*flags: str) -> float:
-        assert cli.main(["benchmark", "run", "--suite", "smoke", "--seeds", "1", "--list", *flags]) == 0
+        assert (
+            cli.main(["benchmark", "run", "--suite", "smoke", "--seeds", "1", "--list", *flags])
+            == 0
+        )
         shown = capsys.readouterr().out
-        assert len(re.findall(r"PointGoal (?:poem|pearl|maml-reward) seed 0: missing, .*, about \d+ min", shown)) == 3
+        assert (
+            len(
+                re.findall(
+                    r"PointGoal (?:poem|pearl|maml-reward) seed 0: missing, .*, about \d+ min",
+                    shown,
+                )
+            )
+            == 3
+        )
         number, unit = re.findall(r"\nabout ([\d.]+) (min|h) in one process", shown)[0]
         return float(number) * (60 if unit == "h" else 1)
 
-    assert minutes("--snapshots", "1", "--timesteps", "3000") < minutes("--episodes", "500", "--tasks", "50")
+    assert minutes("--snapshots", "1", "--timesteps", "3000") < minutes(
+        "--episodes", "500", "--tasks", "50"
+    )
     assert not list(tmp_path.iterdir())

@@ -21,8 +21,16 @@ from sb3_poem.resources import shipped_folder
 POINT = "poem/PointGoal-v0"
 
 
-def plan_for(library: ModelLibrary, suite: str, families: list[str], methods: list[str] | None = None, seeds: int = 1):
-    return make_plan(SUITES[suite], library, None, families, methods, range(seeds), Budget(), Training())
+def plan_for(
+    library: ModelLibrary,
+    suite: str,
+    families: list[str],
+    methods: list[str] | None = None,
+    seeds: int = 1,
+):
+    return make_plan(
+        SUITES[suite], library, None, families, methods, range(seeds), Budget(), Training()
+    )
 
 
 def test_the_training_plan_follows_the_hyperparameter_file(tmp_path: Path) -> None:
@@ -44,8 +52,17 @@ def test_shipped_models_are_taken_for_their_own_seed_alone() -> None:
     for family in ("PointGoal", "HalfCheetahVel", "HalfCheetahFwdBack"):
         own = json.loads((folder / family / "config.json").read_text())["arguments"]["seed"]
         keys = [ModelKey(f"poem/{family}-v0", "poem", seed) for seed in range(3)]
-        assert [library.given(key) is not None for key in keys] == [seed == own for seed in range(3)]
-        for variant in ("poem-inner", "poem-pearl-context", "poem-d2", "poem-d10", "pearl", "maml-reward"):
+        assert [library.given(key) is not None for key in keys] == [
+            seed == own for seed in range(3)
+        ]
+        for variant in (
+            "poem-inner",
+            "poem-pearl-context",
+            "poem-d2",
+            "poem-d10",
+            "pearl",
+            "maml-reward",
+        ):
             assert library.given(ModelKey(f"poem/{family}-v0", variant, own)) is None
     altered = ModelKey("poem/HalfCheetahVel-v0", "poem", 0, Training(timesteps=1000))
     assert library.given(altered) is None
@@ -54,8 +71,15 @@ def test_shipped_models_are_taken_for_their_own_seed_alone() -> None:
 def test_families_of_one_name_have_folders_of_their_own(tmp_path: Path) -> None:
     library = ModelLibrary(Workplace(str(tmp_path)))
     ids = ("poem/PointGoal-v0", "mine/PointGoal-v0", "poem/PointGoal-v1")
-    folders = [library.folder(ModelKey(env_id, "poem", 0)).relative_to(tmp_path).as_posix() for env_id in ids]
-    assert folders == ["PointGoal/poem/seed0", "mine-PointGoal-v0/poem/seed0", "poem-PointGoal-v1/poem/seed0"]
+    folders = [
+        library.folder(ModelKey(env_id, "poem", 0)).relative_to(tmp_path).as_posix()
+        for env_id in ids
+    ]
+    assert folders == [
+        "PointGoal/poem/seed0",
+        "mine-PointGoal-v0/poem/seed0",
+        "poem-PointGoal-v1/poem/seed0",
+    ]
 
 
 def test_models_are_found_in_a_folder_or_by_name_and_checked(tmp_path: Path) -> None:
@@ -66,7 +90,9 @@ def test_models_are_found_in_a_folder_or_by_name_and_checked(tmp_path: Path) -> 
     pearl.save_checkpoint(tmp_path / "models/PointGoal/pearl/seed0/checkpoint.zip")
     poem.save_pretrained(tmp_path / "elsewhere")
     named = (("PointGoal", "poem-inner", 0, str(tmp_path / "elsewhere")),)
-    library = ModelLibrary(Workplace(str(tmp_path / "runs"), models=(str(tmp_path / "models"),), named=named))
+    library = ModelLibrary(
+        Workplace(str(tmp_path / "runs"), models=(str(tmp_path / "models"),), named=named)
+    )
     env = make_task_vec_env(POINT, 4)
     loaded = library.load(ModelKey(POINT, "poem-d2", 0), env)
     assert loaded.num_timesteps == poem.num_timesteps
@@ -76,35 +102,60 @@ def test_models_are_found_in_a_folder_or_by_name_and_checked(tmp_path: Path) -> 
     assert info["source"] == "handed over"
     assert len(info["sha256"]) == 64
     assert str(tmp_path) not in json.dumps(info)
-    with pytest.raises(ValueError, match=r"handed over as PointGoal poem-inner seed 0, but has \(similarity, context, latent"):
+    with pytest.raises(
+        ValueError,
+        match=r"handed over as PointGoal poem-inner seed 0, but has \(similarity, context, latent",
+    ):
         library.load(ModelKey(POINT, "poem-inner", 0), env)
-    with pytest.raises(ValueError, match="was handed over, and so has no models along its training"):
+    with pytest.raises(
+        ValueError, match="was handed over, and so has no models along its training"
+    ):
         library.load(ModelKey(POINT, "poem-d2", 0), env, snapshot=0.5)
-    gone = ModelLibrary(Workplace(str(tmp_path), named=(("PointGoal", "poem", 0, str(tmp_path / "gone")),)))
-    with pytest.raises(ValueError, match=r"--model PointGoal:poem:0=.*gone: there is no such file or folder"):
+    gone = ModelLibrary(
+        Workplace(str(tmp_path), named=(("PointGoal", "poem", 0, str(tmp_path / "gone")),))
+    )
+    with pytest.raises(
+        ValueError, match=r"--model PointGoal:poem:0=.*gone: there is no such file or folder"
+    ):
         gone.given(ModelKey(POINT, "poem", 0))
     env.close()
 
 
-def test_a_method_that_cannot_run_on_a_family_says_so_before_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_method_that_cannot_run_on_a_family_says_so_before_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     known = family_facts("PointGoal")
-    ml10 = FamilyFacts("poem/MetaWorldML10-v0", 200, None, False)  # Meta-World takes seconds to make it
+    ml10 = FamilyFacts(
+        "poem/MetaWorldML10-v0", 200, None, False
+    )  # Meta-World takes seconds to make it
     for module in ("plan", "hyperparameters"):
         monkeypatch.setattr(
-            f"sb3_poem.benchmark.{module}.family_facts", lambda name: ml10 if "ML10" in name else family_facts(name)
+            f"sb3_poem.benchmark.{module}.family_facts",
+            lambda name: ml10 if "ML10" in name else family_facts(name),
         )
     assert known.shared_dynamics
     library = ModelLibrary(Workplace(str(tmp_path)))
-    with pytest.raises(ValueError, match="--methods anole cannot run on MetaWorldML10: its tasks do not share their dynamics"):
+    with pytest.raises(
+        ValueError,
+        match="--methods anole cannot run on MetaWorldML10: its tasks do not share their dynamics",
+    ):
         plan_for(library, "table3", ["MetaWorldML10"], ["anole"])
     plan = plan_for(library, "table3", ["MetaWorldML10"])
-    assert {cell.method for cell, _ in plan.skipped} == {"anole", "anole-greedy", "anole-random", "maml-reward"}
+    assert {cell.method for cell, _ in plan.skipped} == {
+        "anole",
+        "anole-greedy",
+        "anole-random",
+        "maml-reward",
+    }
     assert {cell.method for cell in plan.todo} >= {"poem-bayes", "poem-paper", "reward-oracle"}
     lines = "\n".join(describe(plan, library))
     assert "anole cannot run on MetaWorldML10" in lines
     assert re.search(r"MetaWorldML10 poem seed 0: missing, [\d,]+ steps", lines)
     for families, message in (
-        (["HalfCheetahFly"], "--families HalfCheetahFly: .* The package's own families are: AntDir2D"),
+        (
+            ["HalfCheetahFly"],
+            "--families HalfCheetahFly: .* The package's own families are: AntDir2D",
+        ),
         (["CartPole-v1"], "--families CartPole-v1: .* is no task family"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -116,7 +167,9 @@ def test_the_plan_names_each_model_once_and_a_base_first(tmp_path: Path) -> None
     plan = plan_for(ModelLibrary(Workplace(str(tmp_path))), "table3", ["PointGoal"], seeds=2)
     names = [(key.variant, key.seed) for key in plan.models]
     assert names == [(v, s) for s in range(2) for v in ("poem", "pearl", "maml-reward")]
-    only = plan_for(ModelLibrary(Workplace(str(tmp_path))), "table3", ["PointGoal"], ["maml-reward"])
+    only = plan_for(
+        ModelLibrary(Workplace(str(tmp_path))), "table3", ["PointGoal"], ["maml-reward"]
+    )
     assert [key.variant for key in only.models] == ["pearl", "maml-reward"]
 
 
@@ -124,7 +177,8 @@ def test_named_models_of_two_families_of_one_name(tmp_path: Path) -> None:
     for name in ("mine", "theirs"):
         (tmp_path / name).write_bytes(b"")
     named = tuple(
-        (f"{name}/PointGoal-v0", "poem", 0, str(tmp_path / file)) for name, file in (("my", "mine"), ("poem", "theirs"))
+        (f"{name}/PointGoal-v0", "poem", 0, str(tmp_path / file))
+        for name, file in (("my", "mine"), ("poem", "theirs"))
     )
     library = ModelLibrary(Workplace(str(tmp_path), named=named))
     assert library.given(ModelKey("my/PointGoal-v0", "poem", 0)) == tmp_path / "mine"
@@ -144,7 +198,9 @@ def test_a_model_of_ones_own_family_needs_no_entry(tmp_path: Path) -> None:
 
 
 def test_a_named_folder_without_a_model(tmp_path: Path) -> None:
-    library = ModelLibrary(Workplace(str(tmp_path), named=(("PointGoal", "poem", 0, str(tmp_path)),)))
+    library = ModelLibrary(
+        Workplace(str(tmp_path), named=(("PointGoal", "poem", 0, str(tmp_path)),))
+    )
     with pytest.raises(ValueError, match=r"holds no model: neither checkpoint\.zip"):
         library.given(ModelKey(POINT, "poem", 0))
 
@@ -153,9 +209,15 @@ def test_a_named_folder_without_a_model(tmp_path: Path) -> None:
     ("words", "message"),
     [
         (["--models", "no_such_folder"], "--models no_such_folder: there is no such folder"),
-        (["--model", "PointGaol:poem:0=."], "PointGaol is none of the families of this run: PointGoal"),
+        (
+            ["--model", "PointGaol:poem:0=."],
+            "PointGaol is none of the families of this run: PointGoal",
+        ),
         (["--model", "PointGoal:poem:5=."], "5 is none of the seeds of this run: 0, 1, 2"),
-        (["--params", "net_arch:{'pi': [64]}"], "--params net_arch: .* is a dictionary; write it as text"),
+        (
+            ["--params", "net_arch:{'pi': [64]}"],
+            "--params net_arch: .* is a dictionary; write it as text",
+        ),
     ],
 )
 def test_what_would_quietly_train_something_else_is_refused(
@@ -165,7 +227,23 @@ def test_what_would_quietly_train_something_else_is_refused(
     assert re.search(message, capsys.readouterr().err)
 
 
-def test_lists_are_taken_as_hyperparameters(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_lists_are_taken_as_hyperparameters(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     runs = ["--runs", str(tmp_path), "--store", str(tmp_path / "s.sqlite")]
-    assert main(["benchmark", "run", "--suite", "smoke", "--list", "--params", "train_freq:[1, 'step']", *runs]) == 0
+    assert (
+        main(
+            [
+                "benchmark",
+                "run",
+                "--suite",
+                "smoke",
+                "--list",
+                "--params",
+                "train_freq:[1, 'step']",
+                *runs,
+            ]
+        )
+        == 0
+    )
     assert "PointGoal poem seed 0: missing" in capsys.readouterr().out

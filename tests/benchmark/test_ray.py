@@ -17,9 +17,19 @@ from sb3_poem.benchmark.suites import SUITES, Budget, Entry, Suite, Training
 
 POEMS = ("poem-bayes", "poem-paper")
 TINY = Suite(
-    "tiny", "Two questions", ("PointGoal",), (Entry("methods", "Methods", POEMS, record_at=(0, 1, 2)),), ("known-task",)
+    "tiny",
+    "Two questions",
+    ("PointGoal",),
+    (Entry("methods", "Methods", POEMS, record_at=(0, 1, 2)),),
+    ("known-task",),
 )
-MODEL = {"n_train_tasks": 12, "n_envs": 12, "gradient_steps": 40, "batch_size": 8, "meta_batch_size": 6}
+MODEL = {
+    "n_train_tasks": 12,
+    "n_envs": 12,
+    "gradient_steps": 40,
+    "batch_size": 8,
+    "meta_batch_size": 6,
+}
 TRAINING = Training(9000, tuple(sorted(MODEL.items())))
 
 
@@ -34,12 +44,19 @@ def test_a_lost_worker_costs_no_cell_and_counts_none_twice(tmp_path: Path) -> No
     ray = pytest.importorskip("ray")
     from ray.cluster_utils import Cluster
 
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+    cluster = Cluster(
+        initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False}
+    )
     workers = [cluster.add_node(num_cpus=1) for _ in range(2)]
     ray.init(address=cluster.address, log_to_driver=False, include_dashboard=False)
     cluster.wait_for_nodes()
-    library, store = ModelLibrary(Workplace(str(tmp_path / "runs"))), Store(tmp_path / "store.sqlite")
-    plan = make_plan(TINY, library, store, None, None, range(2), Budget(tasks=2, episodes=1), TRAINING, 1)
+    library, store = (
+        ModelLibrary(Workplace(str(tmp_path / "runs"))),
+        Store(tmp_path / "store.sqlite"),
+    )
+    plan = make_plan(
+        TINY, library, store, None, None, range(2), Budget(tasks=2, episodes=1), TRAINING, 1
+    )
     lost, over = threading.Event(), threading.Event()
 
     def lose_a_worker() -> None:
@@ -47,7 +64,11 @@ def test_a_lost_worker_costs_no_cell_and_counts_none_twice(tmp_path: Path) -> No
         while not (lost.is_set() or over.is_set()):
             for checkpoint in (tmp_path / "runs").rglob("checkpoint.zip"):
                 raylet = parent(parent(training_process(checkpoint.parents[2])))
-                node = next(node for node in workers if node.all_processes["raylet"][0].process.pid == raylet)
+                node = next(
+                    node
+                    for node in workers
+                    if node.all_processes["raylet"][0].process.pid == raylet
+                )
                 cluster.remove_node(node, allow_graceful=False)
                 lost.set()
                 return
@@ -72,13 +93,19 @@ def test_a_lost_worker_costs_no_cell_and_counts_none_twice(tmp_path: Path) -> No
     # A trial that is tried again may be told of twice; in the store each cell stands once.
     assert len(set(lines)) == 2 + len(records)
     # The one that was lost went on from its checkpoint.
-    counts = [record.provenance["model"]["sessions"] for record in records if record.method == "known-task"]
+    counts = [
+        record.provenance["model"]["sessions"]
+        for record in records
+        if record.method == "known-task"
+    ]
     assert sorted(counts) == [1, 2]
     assert sum("Resuming" in log.read_text() for log in (tmp_path / "runs").rglob("train.log")) == 1
     assert all(record.provenance["model"]["env_steps"] == 9000 for record in records)
 
     # The same command finds nothing to do.
-    again = make_plan(TINY, library, store, None, None, range(2), Budget(tasks=2, episodes=1), TRAINING, 1)
+    again = make_plan(
+        TINY, library, store, None, None, range(2), Budget(tasks=2, episodes=1), TRAINING, 1
+    )
     assert again.todo == []
 
 

@@ -32,9 +32,13 @@ def ladder(cell: Cell, k: int) -> np.ndarray:
 
 
 def matrix(cell: Cell) -> dict:
-    """Four tasks and four policies, each the best of one: 0 on the diagonal, -1 beside it, and so on."""
+    """Four tasks and four policies, each the best of one: 0 on the diagonal, -1 beside it, and so
+    on.
+    """
     places = np.arange(4)
-    return {"candidate_returns": (-np.abs(places[:, None] - places[None, :]).astype(float)).tolist()}
+    return {
+        "candidate_returns": (-np.abs(places[:, None] - places[None, :]).astype(float)).tolist()
+    }
 
 
 def fill(path: Path, suite: str = "table3", seeds: int = 3, **arguments: object) -> Store:
@@ -51,10 +55,13 @@ def test_means_deviations_and_interquartile_means() -> None:
     assert (one.n_seeds, one.mean) == (2, 17.0)
     assert one.deviation == pytest.approx(np.sqrt(8.0))  # seeds 15 and 19
     assert one.iqm == 17.0  # of 0 4 10 14 20 24 30 34 the middle four
-    # Of a seed drawn for each task anew the sorted eight values lie between all of seed 0 and all of seed 1.
+    # Of a seed drawn for each task anew the sorted eight values lie between all of seed 0 and all
+    # of seed 1.
     assert 15.0 <= one.low < one.iqm < one.high <= 19.0
     assert shifted.mean == one.mean + 100.0
-    assert summarise(returns[:, :, None]) == summarise(returns[:, :, None])  # a report is the same twice
+    assert summarise(returns[:, :, None]) == summarise(
+        returns[:, :, None]
+    )  # a report is the same twice
     [single] = summarise(returns[:1, :, None])
     assert (single.deviation, single.low, single.high) == (None, None, None)
     for bad in (returns, np.full((2, 2, 1), np.nan), np.empty((0, 3, 1))):
@@ -83,22 +90,32 @@ def test_rows_of_table_3(tmp_path: Path) -> None:
 def test_an_unfinished_method_shows_the_seeds_that_there_are(tmp_path: Path) -> None:
     with fill(tmp_path / "store.sqlite", seeds=1) as store:
         selection = Selection(SUITES["table3"], store.records())
-    [row] = [r for r in suite_rows(selection) if (r.method, r.queries, r.snapshot) == ("anole", 10, None)]
+    [row] = [
+        r for r in suite_rows(selection) if (r.method, r.queries, r.snapshot) == ("anole", 10, None)
+    ]
     assert (row.n_seeds, row.mean, row.deviation, row.iqm_low) == (1, -15.0, None, None)
 
 
 def test_noisy_answers_have_a_lower_limit(tmp_path: Path) -> None:
     store = fill(tmp_path / "store.sqlite", "noise", seeds=1)
-    rows = [r for r in suite_rows(Selection(SUITES["noise"], store.records())) if r.kind == "limit" and r.queries == 10]
+    rows = [
+        r
+        for r in suite_rows(Selection(SUITES["noise"], store.records()))
+        if r.kind == "limit" and r.queries == 10
+    ]
     by_oracle = {r.oracle: r.mean for r in rows if r.method == "known-task"}
-    assert set(by_oracle) == {o.label for o in (BOLTZMANN, OracleSpec("mistake", 0.1), OracleSpec("mistake", 0.2))}
+    assert set(by_oracle) == {
+        o.label for o in (BOLTZMANN, OracleSpec("mistake", 0.1), OracleSpec("mistake", 0.2))
+    }
     assert all(-1.0 <= value <= 0.0 for value in by_oracle.values())
     assert by_oracle[BOLTZMANN.label] < by_oracle["10 % of the answers flipped"]
 
 
 def test_other_budgets_stand_in_other_tables(tmp_path: Path) -> None:
     with fill(tmp_path / "store.sqlite", seeds=1, snapshots=1) as store:
-        for cell in SUITES["table3"].cells([VEL], [0], ["anole"], replace(FOUR, episodes=3), snapshots=1):
+        for cell in SUITES["table3"].cells(
+            [VEL], [0], ["anole"], replace(FOUR, episodes=3), snapshots=1
+        ):
             store.add(finished(cell, ladder))
         tables = suite_tables(Selection(SUITES["table3"], store.records()))
     assert [table.title for table in tables] == [
@@ -112,13 +129,23 @@ def test_families_of_one_name_and_curves_of_different_parts_stay_apart(tmp_path:
     with Store(tmp_path / "store.sqlite") as store:
         for env_id, parts in ((VEL, 5), ("mine/HalfCheetahVel-v0", 2)):
             for cell in SUITES["table3"].cells([env_id], [0], ["anole"], FOUR, snapshots=parts):
-                store.add(finished(cell, lambda cell, k: ladder(cell, k) - 100.0 * cell.env_id.startswith("mine")))
+                store.add(
+                    finished(
+                        cell,
+                        lambda cell, k: ladder(cell, k) - 100.0 * cell.env_id.startswith("mine"),
+                    )
+                )
         selection = Selection(SUITES["table3"], store.records())
     measured: dict[str, set[float | None]] = {}
     for row in suite_rows(selection):
         measured.setdefault(row.condition.split(":")[0], set()).add(row.snapshot)
-    assert measured == {"HalfCheetahVel": {None, 0.2, 0.4, 0.6, 0.8}, "mine/HalfCheetahVel-v0": {None, 0.5}}
-    tables = [table for table in suite_tables(selection) if table.title.endswith("methods, exact answers")]
+    assert measured == {
+        "HalfCheetahVel": {None, 0.2, 0.4, 0.6, 0.8},
+        "mine/HalfCheetahVel-v0": {None, 0.5},
+    }
+    tables = [
+        table for table in suite_tables(selection) if table.title.endswith("methods, exact answers")
+    ]
     assert sorted((table.title.split(":")[0], table.rows[0][2]) for table in tables) == [
         ("HalfCheetahVel", "-24.0"),
         ("mine/HalfCheetahVel-v0", "-124.0"),
@@ -153,17 +180,22 @@ def test_every_format(tmp_path: Path) -> None:
     assert [float(row["mean"]) for row in table] == [row["mean"] for row in data]
 
 
-@pytest.mark.parametrize("suite", ["table3", pytest.param("noise", marks=pytest.mark.slow), "ablation", "epsilon"])
+@pytest.mark.parametrize(
+    "suite", ["table3", pytest.param("noise", marks=pytest.mark.slow), "ablation", "epsilon"]
+)
 def test_figures(suite: str, tmp_path: Path) -> None:
     store = fill(tmp_path / "store.sqlite", suite, seeds=1)
     _, files = make_report(store, [suite], out=tmp_path)
     expected = {
         "table3": {"methods-queries", "methods-samples"},
-        "noise": {f"methods-{o}-queries" for o in ("boltzmann", "mistake-0.1", "mistake-0.2")} | {"methods-boltzmann-samples"},
+        "noise": {f"methods-{o}-queries" for o in ("boltzmann", "mistake-0.1", "mistake-0.2")}
+        | {"methods-boltzmann-samples"},
         "ablation": {"design-queries", "design-samples", "rules-queries", "queries-queries"},
         "epsilon": {"tolerance"},
     }[suite]
-    names = {f"{suite}-{name}{suffix}" for name in expected for suffix in (".png", ".pdf")} | {f"{suite}.md"}
+    names = {f"{suite}-{name}{suffix}" for name in expected for suffix in (".png", ".pdf")} | {
+        f"{suite}.md"
+    }
     assert {file.name for file in files} == names
     assert all(file.stat().st_size > 500 for file in files)
     assert all(file.read_bytes()[:4] == b"\x89PNG" for file in files if file.suffix == ".png")

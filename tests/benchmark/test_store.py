@@ -17,7 +17,15 @@ from sb3_poem.benchmark.suites import SUITES
 
 
 def some_record(number: int, value: float = 0.0) -> Record:
-    return Record(f"key{number}", "PointGoal", "anole", number, {"n": number}, {"value": value}, {"commit": "abc"})
+    return Record(
+        f"key{number}",
+        "PointGoal",
+        "anole",
+        number,
+        {"n": number},
+        {"value": value},
+        {"commit": "abc"},
+    )
 
 
 def test_a_record_comes_back_as_it_was(tmp_path: Path) -> None:
@@ -57,7 +65,9 @@ def test_what_is_there_stays(tmp_path: Path) -> None:
 def test_a_store_whose_creation_was_interrupted_is_completed(tmp_path: Path) -> None:
     path = tmp_path / "store.sqlite"
     Store(path).close()
-    with sqlite3.connect(path) as connection:  # as after a kill between the first table and its rows
+    with sqlite3.connect(
+        path
+    ) as connection:  # as after a kill between the first table and its rows
         connection.execute("delete from about")
         connection.execute("drop table cells")
     with Store(path) as store:
@@ -72,7 +82,10 @@ def test_another_version_is_refused_by_name(tmp_path: Path) -> None:
     with sqlite3.connect(path) as connection:
         connection.execute("update about set value = '7' where name = 'schema'")
         connection.execute("update about set value = '9.9' where name = 'version'")
-    with pytest.raises(ValueError, match=r"written in schema '7' by sb3_poem '9.9', but this is .* which reads schema '2'"):
+    with pytest.raises(
+        ValueError,
+        match=r"written in schema '7' by sb3_poem '9.9', but this is .* which reads schema '2'",
+    ):
         Store(path)
 
 
@@ -81,7 +94,10 @@ def test_other_files_are_refused_and_stay_as_they_are(tmp_path: Path) -> None:
     text.write_text("not a database, but long enough to look at " * 10)
     with sqlite3.connect(foreign) as connection:
         connection.execute("create table t (x)")
-    for path, message in ((text, "file is not a database"), (foreign, "a database of another program")):
+    for path, message in (
+        (text, "file is not a database"),
+        (foreign, "a database of another program"),
+    ):
         before = path.read_bytes()
         with pytest.raises(ValueError, match=message):
             Store(path)
@@ -104,8 +120,15 @@ print(sum(store.add(some_record(number, float(sys.argv[2]))) for number in range
 def test_two_processes_do_not_harm_one_store(tmp_path: Path) -> None:
     """Both make it, and write the same cells at the same time: each is kept once, whole."""
     path = tmp_path / "store.sqlite"
-    command = [sys.executable, "-c", WRITER.format(path=[str(Path(__file__).parent), *sys.path]), str(path)]
-    writers = [subprocess.Popen([*command, str(n)], stdout=subprocess.PIPE, text=True) for n in (1, 2)]
+    command = [
+        sys.executable,
+        "-c",
+        WRITER.format(path=[str(Path(__file__).parent), *sys.path]),
+        str(path),
+    ]
+    writers = [
+        subprocess.Popen([*command, str(n)], stdout=subprocess.PIPE, text=True) for n in (1, 2)
+    ]
     added = [int(writer.communicate()[0]) for writer in writers]
     assert [writer.returncode for writer in writers] == [0, 0]
     assert sum(added) == 60

@@ -30,35 +30,83 @@ def test_suites_hold_what_the_issue_asks_for() -> None:
     table = SUITES["table3"].cells(["poem/AntVel-v0"], [0])
     final = {cell.method for cell in table if cell.snapshot is None}
     assert final == {*SUITES["table3"].methods}
-    assert {"anole", "anole-greedy", "anole-random", "maml-reward", "reward-oracle", "poem-paper", "poem-bayes"} < final
-    assert all(cell.oracle == EXACT and cell.budget.tasks == 30 and cell.budget.episodes == 10 for cell in table)
-    assert sorted({cell.snapshot for cell in table if cell.method == "anole"} - {None}) == [0.2, 0.4, 0.6, 0.8]
-    assert {cell.snapshot for cell in table if cell.method in ("maml-reward", "anole-greedy")} == {None}
+    assert {
+        "anole",
+        "anole-greedy",
+        "anole-random",
+        "maml-reward",
+        "reward-oracle",
+        "poem-paper",
+        "poem-bayes",
+    } < final
+    assert all(
+        cell.oracle == EXACT and cell.budget.tasks == 30 and cell.budget.episodes == 10
+        for cell in table
+    )
+    assert sorted({cell.snapshot for cell in table if cell.method == "anole"} - {None}) == [
+        0.2,
+        0.4,
+        0.6,
+        0.8,
+    ]
+    assert {cell.snapshot for cell in table if cell.method in ("maml-reward", "anole-greedy")} == {
+        None
+    }
 
     ablation = SUITES["ablation"].cells(["poem/HalfCheetahVel-v0"], [0])
-    hyperparameters = {json.dumps(dict(VARIANTS[cell.definition.variant].hyperparameters)) for cell in ablation}
+    hyperparameters = {
+        json.dumps(dict(VARIANTS[cell.definition.variant].hyperparameters)) for cell in ablation
+    }
     assert hyperparameters == {
         json.dumps(dict(changes))
-        for changes in ({}, {"similarity": "inner"}, {"context": "pearl"}, {"latent_dim": 2}, {"latent_dim": 10})
+        for changes in (
+            {},
+            {"similarity": "inner"},
+            {"context": "pearl"},
+            {"latent_dim": 2},
+            {"latent_dim": 10},
+        )
     }
-    assert {cell.options["inference"] for cell in ablation if cell.definition.kind == "preference"} == {"paper", "bayes"}
-    assert {cell.options.get("query_rule") for cell in ablation} == {None, "worst-case", "information-gain", "random"}
+    assert {
+        cell.options["inference"] for cell in ablation if cell.definition.kind == "preference"
+    } == {"paper", "bayes"}
+    assert {cell.options.get("query_rule") for cell in ablation} == {
+        None,
+        "worst-case",
+        "information-gain",
+        "random",
+    }
     assert tuple(range(21)) in {cell.budget.record_at for cell in ablation}
 
-    epsilon = SUITES["epsilon"].cells(["poem/HalfCheetahVel-v0"], [0], ["poem-paper-epsilon-0", "poem-paper-epsilon-0.4"])
+    epsilon = SUITES["epsilon"].cells(
+        ["poem/HalfCheetahVel-v0"], [0], ["poem-paper-epsilon-0", "poem-paper-epsilon-0.4"]
+    )
     assert {(cell.options["epsilon"], cell.oracle) for cell in epsilon} == {
         (value, oracle) for value in (0.0, 0.4) for oracle in (EXACT, BOLTZMANN)
     }
     assert len([name for name in SUITES["epsilon"].methods if "epsilon" in name]) == 6
     noise = {cell.oracle for cell in cells_of(SUITES["noise"]) if cell.definition.kind != "known"}
-    assert {(oracle.kind, oracle.value) for oracle in noise} == {("boltzmann", None), ("mistake", 0.1), ("mistake", 0.2)}
+    assert {(oracle.kind, oracle.value) for oracle in noise} == {
+        ("boltzmann", None),
+        ("mistake", 0.1),
+        ("mistake", 0.2),
+    }
 
 
 def test_a_cell_is_the_same_in_every_suite() -> None:
-    keys = {name: {cell.key for cell in cells_of(suite, env_ids=["poem/AntVel-v0"])} for name, suite in SUITES.items()}
-    one = {cell.method: cell for cell in SUITES["table3"].cells(["poem/AntVel-v0"], [0]) if cell.snapshot is None}
+    keys = {
+        name: {cell.key for cell in cells_of(suite, env_ids=["poem/AntVel-v0"])}
+        for name, suite in SUITES.items()
+    }
+    one = {
+        cell.method: cell
+        for cell in SUITES["table3"].cells(["poem/AntVel-v0"], [0])
+        if cell.snapshot is None
+    }
     assert one["poem-paper"].key in keys["table3"] & keys["ablation"] & keys["epsilon"]
-    assert one["known-task"].key in keys["table3"] & keys["noise"] & keys["ablation"] & keys["epsilon"]
+    assert (
+        one["known-task"].key in keys["table3"] & keys["noise"] & keys["ablation"] & keys["epsilon"]
+    )
     for name, suite in SUITES.items():
         cells = cells_of(suite, env_ids=["poem/AntVel-v0"])
         assert len(keys[name]) == len(cells)
@@ -66,7 +114,11 @@ def test_a_cell_is_the_same_in_every_suite() -> None:
 
 def test_whatever_changes_a_result_changes_the_key() -> None:
     suite = SUITES["smoke"]
-    [cell] = [c for c in suite.cells(["poem/PointGoal-v0"], [0], ["anole"], snapshots=1) if c.oracle == EXACT]
+    [cell] = [
+        c
+        for c in suite.cells(["poem/PointGoal-v0"], [0], ["anole"], snapshots=1)
+        if c.oracle == EXACT
+    ]
     others = [
         suite.cells(["poem/PointGoal-v0"], [0], ["anole"], budget, training, 1)
         for budget, training in (
@@ -77,8 +129,16 @@ def test_whatever_changes_a_result_changes_the_key() -> None:
         )
     ]
     keys = [cell.key, *(c.key for cells in others for c in cells if c.oracle == EXACT)]
-    keys += [c.key for c in suite.cells(["poem/PointGoal-v0"], [1], ["anole"], snapshots=1) if c.oracle == EXACT]
-    keys += [c.key for c in suite.cells(["poem/AntVel-v0"], [0], ["anole"], snapshots=1) if c.oracle == EXACT]
+    keys += [
+        c.key
+        for c in suite.cells(["poem/PointGoal-v0"], [1], ["anole"], snapshots=1)
+        if c.oracle == EXACT
+    ]
+    keys += [
+        c.key
+        for c in suite.cells(["poem/AntVel-v0"], [0], ["anole"], snapshots=1)
+        if c.oracle == EXACT
+    ]
     assert len(set(keys)) == 7
 
 
@@ -93,7 +153,9 @@ def test_methods_that_need_shared_dynamics_say_why() -> None:
     assert METHODS["poem-bayes"].objection(shared_dynamics=False) is None
     assert METHODS["anole"].objection(shared_dynamics=True) is None
     for name in ("anole", "anole-greedy", "anole-random", "maml-reward"):
-        assert "do not share their dynamics" in (METHODS[name].objection(shared_dynamics=False) or "")
+        assert "do not share their dynamics" in (
+            METHODS[name].objection(shared_dynamics=False) or ""
+        )
 
 
 def test_family_names() -> None:
@@ -104,14 +166,20 @@ def test_family_names() -> None:
 
 def test_baselines_are_trained_on_as_many_samples() -> None:
     """PointGoal's PEARL takes fewer: its file says so."""
-    poem, pearl = (yaml.safe_load(config_file(name).read_text()) for name in ("poem_sac", "pearl_sac"))
+    poem, pearl = (
+        yaml.safe_load(config_file(name).read_text()) for name in ("poem_sac", "pearl_sac")
+    )
     assert poem.keys() == pearl.keys()
-    assert [env_id for env_id in poem if poem[env_id]["n_timesteps"] != pearl[env_id]["n_timesteps"]] == ["poem/PointGoal-v0"]
+    assert [
+        env_id for env_id in poem if poem[env_id]["n_timesteps"] != pearl[env_id]["n_timesteps"]
+    ] == ["poem/PointGoal-v0"]
 
 
 def test_the_papers_table() -> None:
     assert set(TABLE_3) == set(PAPER_FAMILIES)
-    assert all(len(rows) == 5 and all(len(row) == 3 for row in rows.values()) for rows in TABLE_3.values())
+    assert all(
+        len(rows) == 5 and all(len(row) == 3 for row in rows.values()) for rows in TABLE_3.values()
+    )
     assert paper_figure("HalfCheetahVel", "POEM", 10) == (-46.0, 6.0)
     assert paper_figure("MetaWorldML1", "ANOLE-greedy", 1) == (1091.0, 47.0)
     assert paper_figure("HumanoidDir2D", "MAML-reward", 5) == (529.0, 56.0)
@@ -123,12 +191,19 @@ def test_the_papers_table() -> None:
 def test_the_declarations_are_light() -> None:
     """The command line reads them for its help."""
     code = "import sys, sb3_poem.benchmark.suites; print({'torch', 'mujoco', 'sqlalchemy'} & set(sys.modules))"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "set()"
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout.strip()
+        == "set()"
+    )
 
 
 def test_seeds_share_no_episodes_or_answers() -> None:
     cells = SUITES["noise"].cells(["poem/PointGoal-v0"], range(3), ["anole"], snapshots=1)
-    seeds = {cell.seed: {_episode_seed(cell) + i for i in range(cell.budget.tasks)} for cell in cells}
+    seeds = {
+        cell.seed: {_episode_seed(cell) + i for i in range(cell.budget.tasks)} for cell in cells
+    }
     assert len(set.union(*seeds.values())) == 3 * 30
 
 

@@ -13,7 +13,14 @@ from sb3_poem.common.buffers import INITIAL_ROWS_PER_TASK, Segment, TaskBatch, T
 
 OBS = spaces.Box(-np.inf, np.inf, (2,), np.float64)
 ACTION = spaces.Box(-1.0, 1.0, (3,), np.float32)
-WIDTHS = {"observations": 2, "actions": 3, "next_observations": 2, "rewards": 0, "terminated": 0, "features": 4}
+WIDTHS = {
+    "observations": 2,
+    "actions": 3,
+    "next_observations": 2,
+    "rewards": 0,
+    "terminated": 0,
+    "features": 4,
+}
 
 
 def make_buffer(size: int, n_tasks: int) -> TaskReplayBuffer:
@@ -23,15 +30,16 @@ def make_buffer(size: int, n_tasks: int) -> TaskReplayBuffer:
 def fields_of(numbers: np.ndarray) -> dict[str, np.ndarray]:
     """Every entry of a transition follows from its number and its column, so that a mix-up shows.
 
-    The observation after transition n is that of n + 1, unless n ends an episode: every seventh does, and every fourteenth
-    of all terminates.
+    The observation after transition n is that of n + 1, unless n ends an episode: every seventh
+    does, and every fourteenth of all terminates.
     """
     numbers = np.asarray(numbers)
     is_end = numbers % 7 == 3
     return {
         "observations": numbers[..., None] + np.arange(2) / 16.0,
         "actions": (numbers[..., None] * 7 + np.arange(3)) % 32767 / 32767.0,
-        "next_observations": np.where(is_end, -numbers, numbers + 1)[..., None] + np.arange(2) / 16.0,
+        "next_observations": np.where(is_end, -numbers, numbers + 1)[..., None]
+        + np.arange(2) / 16.0,
         "rewards": numbers + 0.5,
         "terminated": (numbers % 14 == 3).astype(np.float64),
         "features": numbers[..., None] + np.arange(4) / 8.0,
@@ -80,7 +88,10 @@ class ListBuffer:
 @given(
     size=st.integers(1, 20),
     n_tasks=st.integers(1, 4),
-    segments=st.lists(st.tuples(st.lists(st.integers(0, 3), min_size=1, max_size=6), st.integers(1, 30)), max_size=8),
+    segments=st.lists(
+        st.tuples(st.lists(st.integers(0, 3), min_size=1, max_size=6), st.integers(1, 30)),
+        max_size=8,
+    ),
     restore_at=st.integers(0, 8),
 )
 def test_is_a_ring_of_the_latest_transitions_of_each_task(
@@ -92,7 +103,9 @@ def test_is_a_ring_of_the_latest_transitions_of_each_task(
             state, buffer = buffer.state(), make_buffer(size, n_tasks)
             buffer.load_state(state)
         task_ids = [task % n_tasks for task in tasks]
-        numbers = counter + np.arange(len(task_ids) * steps, dtype=np.float64).reshape(len(task_ids), steps)
+        numbers = counter + np.arange(len(task_ids) * steps, dtype=np.float64).reshape(
+            len(task_ids), steps
+        )
         counter += numbers.size
         buffer.extend(segment_of(task_ids, numbers))
         truth.extend(task_ids, numbers)
@@ -102,7 +115,9 @@ def test_is_a_ring_of_the_latest_transitions_of_each_task(
     for task, kept in enumerate(truth.kept):
         assert stored_numbers(buffer, task) == sorted(kept)
         if kept:
-            drawn = numbers_in(buffer.sample_rows(th.full((1, 40), task), th.Generator().manual_seed(counter)))
+            drawn = numbers_in(
+                buffer.sample_rows(th.full((1, 40), task), th.Generator().manual_seed(counter))
+            )
             assert set(drawn.ravel()) <= set(kept)
 
 
@@ -164,7 +179,9 @@ def test_state_leaves_unused_room_out_and_continues_alike() -> None:
     for one in (buffer, restored):
         one.extend(segment_of([1, 0], numbers[:, :900]))  # wraps
     sources = th.randint(2, (2, 64), generator=th.Generator().manual_seed(0))
-    first, second = (one.sample_rows(sources, th.Generator().manual_seed(1)) for one in (buffer, restored))
+    first, second = (
+        one.sample_rows(sources, th.Generator().manual_seed(1)) for one in (buffer, restored)
+    )
     assert np.array_equal(numbers_in(first), numbers_in(second))
     assert restored.size() == buffer.size()
     assert restored.full

@@ -1,4 +1,6 @@
-"""Collection against a plain loop over single environments, and relabelling against environments of the other tasks."""
+"""Collection against a plain loop over single environments, and relabelling against environments of
+the other tasks.
+"""
 
 from __future__ import annotations
 
@@ -25,11 +27,19 @@ def random_policy(env: VecEnv, seed: int = 0):  # type: ignore[no-untyped-def]
     return act
 
 
-def collect(env: VecEnv, tasks: np.ndarray, horizon: int | None = None, seed: int = 3, on_step=lambda _: True):  # type: ignore[no-untyped-def]
+def collect(
+    env: VecEnv,
+    tasks: np.ndarray,
+    horizon: int | None = None,
+    seed: int = 3,
+    on_step=lambda _: True,
+):  # type: ignore[no-untyped-def]
     family, n = FamilyView.for_training(env, horizon), env.num_envs
     counts = np.zeros(n, dtype=int)
     latents = np.arange(2.0 * n).reshape(n, 2)
-    return collect_segment(family, random_policy(env), np.arange(n), tasks, latents, seed, counts, on_step), counts
+    return collect_segment(
+        family, random_policy(env), np.arange(n), tasks, latents, seed, counts, on_step
+    ), counts
 
 
 def unscaled(segment: Segment, env: VecEnv) -> np.ndarray:
@@ -55,7 +65,9 @@ def test_a_segment_is_what_single_environments_give(edge: float) -> None:
             assert segment.rewards[copy, step] == pytest.approx(reward, abs=1e-6)
             assert segment.terminated[copy, step] == terminated
             assert segment.first_episode[copy, step] == first
-            np.testing.assert_allclose(segment.features[copy, step], info["reward_features"], atol=1e-12)
+            np.testing.assert_allclose(
+                segment.features[copy, step], info["reward_features"], atol=1e-12
+            )
             ended_early += terminated
             if terminated or truncated:
                 first = False
@@ -111,9 +123,19 @@ def test_actions_that_are_not_finite_do_not_reach_the_environment() -> None:
         bad = np.array([[0.0], [np.nan]], dtype=np.float32)
         return bad, bad
 
-    with pytest.raises(ValueError, match=r"actions \(of the policy\) that are NaN or infinite: copy 1, training task 7"):
+    with pytest.raises(
+        ValueError,
+        match=r"actions \(of the policy\) that are NaN or infinite: copy 1, training task 7",
+    ):
         collect_segment(
-            family, act, np.array([5, 7]), np.zeros((2, 1)), np.zeros((2, 1)), 0, np.zeros(2, dtype=int), lambda _: True
+            family,
+            act,
+            np.array([5, 7]),
+            np.zeros((2, 1)),
+            np.zeros((2, 1)),
+            0,
+            np.zeros(2, dtype=int),
+            lambda _: True,
         )
 
 
@@ -121,7 +143,9 @@ def test_actions_that_are_not_finite_do_not_reach_the_environment() -> None:
 
 
 def true_returns(make_env, tasks: np.ndarray, actions: np.ndarray, seeds: list[int]) -> np.ndarray:  # type: ignore[no-untyped-def]
-    """(tasks, trajectories): what the first episode earns when an environment of each task is stepped."""
+    """(tasks, trajectories): what the first episode earns when an environment of each task is
+    stepped.
+    """
     returns = np.zeros((len(tasks), len(actions)))
     for i, task in enumerate(tasks):
         for j, trajectory in enumerate(actions):
@@ -136,14 +160,22 @@ def true_returns(make_env, tasks: np.ndarray, actions: np.ndarray, seeds: list[i
     return returns
 
 
-@pytest.mark.parametrize(("env_id", "steps"), [(POINT_GOAL, 25), ("poem/AntVel-v0", 60), ("poem/HumanoidDir2D-v0", 60)])
-def test_relabelled_returns_are_what_the_other_tasks_environments_return(env_id: str, steps: int) -> None:
+@pytest.mark.parametrize(
+    ("env_id", "steps"), [(POINT_GOAL, 25), ("poem/AntVel-v0", 60), ("poem/HumanoidDir2D-v0", 60)]
+)
+def test_relabelled_returns_are_what_the_other_tasks_environments_return(
+    env_id: str, steps: int
+) -> None:
     kwargs = {"max_episode_steps": steps}
     env = TaskVecEnv.from_id(env_id, 3, **kwargs)
     tasks = FamilyView(env).sample_tasks(3, np.random.default_rng(0))
     segment, _ = collect(env, tasks, seed=11)
-    relabelled = relabelled_returns(FamilyView(env).compute_rewards, tasks, segment.features, segment.first_episode)
-    truth = true_returns(lambda: gym.make(env_id, **kwargs), tasks, unscaled(segment, env), [11, 12, 13])
+    relabelled = relabelled_returns(
+        FamilyView(env).compute_rewards, tasks, segment.features, segment.first_episode
+    )
+    truth = true_returns(
+        lambda: gym.make(env_id, **kwargs), tasks, unscaled(segment, env), [11, 12, 13]
+    )
     assert segment.first_episode.all() == (env_id == POINT_GOAL)  # the others fall
     assert np.ptp(truth, axis=0).min() > 1e-3  # the tasks do differ
     np.testing.assert_allclose(relabelled, truth, rtol=1e-6, atol=1e-6)
@@ -157,5 +189,7 @@ def test_relabelling_counts_the_marked_steps_only() -> None:
     assert (~segment.first_episode).any()
     rewards_of = FamilyView(env).compute_rewards
     relabelled = relabelled_returns(rewards_of, tasks, segment.features, segment.first_episode)
-    truth = true_returns(lambda: gym.wrappers.TimeLimit(Walk(edge=0.35), 8), tasks, unscaled(segment, env), [3, 4, 5])
+    truth = true_returns(
+        lambda: gym.wrappers.TimeLimit(Walk(edge=0.35), 8), tasks, unscaled(segment, env), [3, 4, 5]
+    )
     np.testing.assert_allclose(relabelled, truth, rtol=1e-6)

@@ -26,8 +26,12 @@ def test_reads_a_family() -> None:
     assert not FamilyView.for_training(walks(1, WindyWalk), 10).shared_dynamics
 
 
-@pytest.mark.parametrize("wrap", [lambda env: env, VecMonitor, lambda env: VecMonitor(VecMonitor(env))])
-@pytest.mark.parametrize("make", [lambda: make_vec_env(POINT_GOAL, 3), lambda: TaskVecEnv.from_id(POINT_GOAL, 3)])
+@pytest.mark.parametrize(
+    "wrap", [lambda env: env, VecMonitor, lambda env: VecMonitor(VecMonitor(env))]
+)
+@pytest.mark.parametrize(
+    "make", [lambda: make_vec_env(POINT_GOAL, 3), lambda: TaskVecEnv.from_id(POINT_GOAL, 3)]
+)
 def test_tasks_reach_the_copies_and_features_come_back(make, wrap) -> None:  # type: ignore[no-untyped-def]
     env = wrap(make())
     family, tasks = FamilyView.for_training(env), np.array([[0.5], [1.0], [3.0]])
@@ -44,32 +48,48 @@ def test_tasks_reach_the_copies_and_features_come_back(make, wrap) -> None:  # t
 
 def test_sampling_leaves_the_environments_generator_alone() -> None:
     family = FamilyView.for_training(make_vec_env(POINT_GOAL, 1))
-    assert np.array_equal(family.sample_tasks(4, np.random.default_rng(0)), family.sample_tasks(4, np.random.default_rng(0)))
+    assert np.array_equal(
+        family.sample_tasks(4, np.random.default_rng(0)),
+        family.sample_tasks(4, np.random.default_rng(0)),
+    )
 
 
 # ---------------------------------------------------------------- refusals
 
 
-@pytest.mark.parametrize("vec_env_class", [DummyVecEnv, functools.partial(SubprocVecEnv, start_method="fork")])
+@pytest.mark.parametrize(
+    "vec_env_class", [DummyVecEnv, functools.partial(SubprocVecEnv, start_method="fork")]
+)
 def test_an_environment_that_is_no_family(vec_env_class) -> None:  # type: ignore[no-untyped-def]
     env = vec_env_class([functools.partial(gym.make, "Pendulum-v1")])
     try:
-        with pytest.raises(ValueError, match=r"env <.*<Pendulum-v1>.*> is no task family.*TaskFamily.*GoalFamily"):
+        with pytest.raises(
+            ValueError, match=r"env <.*<Pendulum-v1>.*> is no task family.*TaskFamily.*GoalFamily"
+        ):
             FamilyView.for_training(env)
     finally:
         env.close()
 
 
-@pytest.mark.parametrize("space", [spaces.Box(0, 1, (2, 2)), spaces.Discrete(3), spaces.Dict(a=spaces.Box(0, 1, (1,)))])
+@pytest.mark.parametrize(
+    "space", [spaces.Box(0, 1, (2, 2)), spaces.Discrete(3), spaces.Dict(a=spaces.Box(0, 1, (1,)))]
+)
 def test_observations_must_be_flat(space: spaces.Space) -> None:
-    with pytest.raises(ValueError, match=r"observation_space must be a flat gymnasium\.spaces\.Box, but is "):
-        FamilyView.for_training(walks(1, type("Changed", (Walk,), {"observation_space": space})), 10)
+    with pytest.raises(
+        ValueError, match=r"observation_space must be a flat gymnasium\.spaces\.Box, but is "
+    ):
+        FamilyView.for_training(
+            walks(1, type("Changed", (Walk,), {"observation_space": space})), 10
+        )
 
 
 @pytest.mark.parametrize(
     ("space", "message"),
     [
-        (spaces.Discrete(3), r"must be a flat gymnasium\.spaces\.Box, bounded .*, but is Discrete\(3\)"),
+        (
+            spaces.Discrete(3),
+            r"must be a flat gymnasium\.spaces\.Box, bounded .*, but is Discrete\(3\)",
+        ),
         (spaces.Box(-np.inf, np.inf, (1,)), "must be a flat .*, bounded below and above, but is"),
         (spaces.Box(0.0, np.inf, (1,)), "must be a flat .*, bounded below and above, but is"),
         (spaces.Box(-np.inf, 0.0, (1,)), "must be a flat .*, bounded below and above, but is"),
@@ -81,10 +101,15 @@ def test_actions_must_be_bounded(space: spaces.Space, message: str) -> None:
 
 
 def test_the_horizon_must_be_known_and_agree() -> None:
-    with pytest.raises(ValueError, match=r"horizon is unknown: .*max_episode_steps, or pass horizon"):
+    with pytest.raises(
+        ValueError, match=r"horizon is unknown: .*max_episode_steps, or pass horizon"
+    ):
         FamilyView.for_training(walks(1))
     assert FamilyView.for_training(walks(1), 10).horizon == 10
-    with pytest.raises(ValueError, match="horizon is 30, but the environment ends episodes after 25 steps; they must agree"):
+    with pytest.raises(
+        ValueError,
+        match="horizon is 30, but the environment ends episodes after 25 steps; they must agree",
+    ):
         FamilyView.for_training(make_vec_env(POINT_GOAL, 1), 30)
     assert FamilyView.for_training(make_vec_env(POINT_GOAL, 1), 25).horizon == 25
 
@@ -103,7 +128,9 @@ def test_the_horizon_must_be_positive(horizon: int) -> None:
 def test_another_family_is_told_apart() -> None:
     family = FamilyView.for_training(walks(1), 10)
     family.check_same_family(Walk.task_space, 2)
-    with pytest.raises(ValueError, match=r"trained for tasks in .*Pass an environment of the model's own family"):
+    with pytest.raises(
+        ValueError, match=r"trained for tasks in .*Pass an environment of the model's own family"
+    ):
         family.check_same_family(OtherWalk.task_space, 2)
     with pytest.raises(ValueError, match="own family"):
         family.check_same_family(Walk.task_space, 3)

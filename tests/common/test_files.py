@@ -26,7 +26,9 @@ def assert_untouched(path: Path) -> None:
     assert os.listdir(path.parent) == [path.name]
 
 
-@pytest.mark.parametrize("content", [b"after", memoryview(b"after"), b"", bytes(range(256)) * 10_000])
+@pytest.mark.parametrize(
+    "content", [b"after", memoryview(b"after"), b"", bytes(range(256)) * 10_000]
+)
 def test_replaces_the_file(path: Path, content: bytes | memoryview) -> None:
     write_atomically(path, content)
     assert path.read_bytes() == bytes(content)
@@ -64,7 +66,9 @@ def test_permissions_are_those_of_any_new_file(path: Path, umask: int, mode: int
 
 @pytest.mark.parametrize("call", ["fsync", "replace"])
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO, errno.EROFS])
-def test_a_failure_leaves_the_previous_file_whole(path: Path, call: str, code: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failure_leaves_the_previous_file_whole(
+    path: Path, call: str, code: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fail(*args: object) -> None:
         raise OSError(code, os.strerror(code))
 
@@ -76,7 +80,9 @@ def test_a_failure_leaves_the_previous_file_whole(path: Path, call: str, code: i
     assert_untouched(path)
 
 
-def test_an_interrupt_leaves_the_previous_file_whole(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupt_leaves_the_previous_file_whole(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def interrupt(*args: object) -> None:
         raise KeyboardInterrupt
 
@@ -98,7 +104,9 @@ try:
 except OSError as error:
     print(error.errno, error)
 """
-    result = subprocess.run([sys.executable, "-c", program, str(path)], capture_output=True, text=True, check=True)
+    result = subprocess.run(
+        [sys.executable, "-c", program, str(path)], capture_output=True, text=True, check=True
+    )
     assert result.stdout.startswith(f"{errno.EFBIG} "), result
     assert str(path) in result.stdout
     assert_untouched(path)

@@ -1,4 +1,6 @@
-"""Models' files from somebody who means harm: each is refused with a message, soon, and nothing of theirs is run."""
+"""Models' files from somebody who means harm: each is refused with a message, soon, and nothing of
+theirs is run.
+"""
 
 from __future__ import annotations
 
@@ -50,8 +52,12 @@ def folder(sound: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def trap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A module ``trap`` in the working folder, and the file that it would write if it were imported."""
-    (tmp_path / "trap.py").write_text("from pathlib import Path\nPath(__file__).with_name('sprung').touch()\n")
+    """A module ``trap`` in the working folder, and the file that it would write if it were
+    imported.
+    """
+    (tmp_path / "trap.py").write_text(
+        "from pathlib import Path\nPath(__file__).with_name('sprung').touch()\n"
+    )
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     return tmp_path / "sprung"
@@ -96,9 +102,20 @@ def test_a_sound_file_is_read(folder: Path, read: Callable[[Path], Any]) -> None
 
 @reader
 @pytest.mark.parametrize(
-    "env_id", ["trap:Foo-v0", "trap:poem/PointGoal-v0", "../trap", ["trap"], 3, "poem/PointGoal-v0\n", "x" * 1000]
+    "env_id",
+    [
+        "trap:Foo-v0",
+        "trap:poem/PointGoal-v0",
+        "../trap",
+        ["trap"],
+        3,
+        "poem/PointGoal-v0\n",
+        "x" * 1000,
+    ],
 )
-def test_an_id_imports_nothing(folder: Path, trap: Path, read: Callable[[Path], Any], env_id: Any) -> None:
+def test_an_id_imports_nothing(
+    folder: Path, trap: Path, read: Callable[[Path], Any], env_id: Any
+) -> None:
     spoil(folder, {"env_id": env_id})
     with refused("env_id is .* must be a plain one"):
         read(folder)
@@ -107,19 +124,37 @@ def test_an_id_imports_nothing(folder: Path, trap: Path, read: Callable[[Path], 
     assert not trap.exists()
 
 
-def test_the_command_line_imports_nothing(folder: Path, trap: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_line_imports_nothing(
+    folder: Path, trap: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     spoil(folder, {"env_id": "trap:Foo-v0"})
     model = POEMSAC.load(small_zip(folder, env_id="trap:Foo-v0"))
-    assert model.env_id == "trap:Foo-v0"  # it may still be used on an environment that the user names
+    assert (
+        model.env_id == "trap:Foo-v0"
+    )  # it may still be used on an environment that the user names
     model.save_checkpoint(folder / "checkpoint.zip")
     for name in ("model", "model.zip", "checkpoint.zip"):
         assert cli.main(["adapt", "--model", str(folder / name), *ADAPT]) == 1
         assert "env_id is 'trap:Foo-v0'" in capsys.readouterr().err
-    assert cli.main(["label", "--model", str(folder / "model"), "--store", str(folder / "store")]) == 1
+    assert (
+        cli.main(["label", "--model", str(folder / "model"), "--store", str(folder / "store")]) == 1
+    )
     assert "env_id is 'trap:Foo-v0'" in capsys.readouterr().err
     assert not trap.exists()
     # the user's own word is another matter
-    assert cli.main(["adapt", "--model", str(folder / "model.zip"), *ADAPT, "--env", "trap:poem/PointGoal-v0"]) == 0
+    assert (
+        cli.main(
+            [
+                "adapt",
+                "--model",
+                str(folder / "model.zip"),
+                *ADAPT,
+                "--env",
+                "trap:poem/PointGoal-v0",
+            ]
+        )
+        == 0
+    )
     assert trap.exists()
 
 
@@ -148,7 +183,11 @@ REFUSED_ARGUMENTS = [
     (CHEETAH, {"xml_file": "humanoid.xml"}, "names another file"),
     (CHEETAH, {"width": 100_000}, "does not say how it is drawn"),
     (CHEETAH, {"camera_name": "track"}, "does not say how it is drawn"),
-    (CHEETAH, {"max_episode_steps": 1e9}, "no such argument, it has ctrl_cost_weight, .*frame_skip, .*split"),
+    (
+        CHEETAH,
+        {"max_episode_steps": 1e9},
+        "no such argument, it has ctrl_cost_weight, .*frame_skip, .*split",
+    ),
     (CHEETAH, {"nthread": 10_000}, "no such argument"),
     (CHEETAH, {"observation_space": 3}, "no such argument"),
     (CHEETAH, {"self": 3}, "no such argument"),
@@ -178,13 +217,19 @@ def test_arguments_that_a_file_may_not_give(
     folder: Path, trap: Path, env_id: str, env_kwargs: dict[str, Any], message: str
 ) -> None:
     spoil(folder, {"env_id": env_id, "env_kwargs": env_kwargs})
-    with refused(f"model asks for {env_id} with {next(iter(env_kwargs))}=.*{message}.*say so yourself: --env-kwargs"):
+    with refused(
+        f"model asks for {env_id} with {next(iter(env_kwargs))}=.*{message}.*say so yourself: --env-kwargs"
+    ):
         read_catalogue(str(folder))
     assert not trap.exists()
 
 
-@pytest.mark.parametrize("env_kwargs", [{"width": 10**5}, {"max_episode_steps": 1e9}, {"step_length": [[1]]}, [1], 3])
-def test_the_command_line_makes_no_such_environment(folder: Path, env_kwargs: Any, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    "env_kwargs", [{"width": 10**5}, {"max_episode_steps": 1e9}, {"step_length": [[1]]}, [1], 3]
+)
+def test_the_command_line_makes_no_such_environment(
+    folder: Path, env_kwargs: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
     spoil(folder, {"env_kwargs": env_kwargs})
     assert cli.main(["adapt", "--model", str(folder / "model"), *ADAPT]) == 1
     said = capsys.readouterr().err
@@ -194,33 +239,51 @@ def test_the_command_line_makes_no_such_environment(folder: Path, env_kwargs: An
 @pytest.mark.parametrize(
     ("env_id", "env_kwargs"),
     [
-        (CHEETAH, {"ctrl_cost_weight": 0.2, "frame_skip": 4, "split": "train", "reset_noise_scale": 0}),
+        (
+            CHEETAH,
+            {"ctrl_cost_weight": 0.2, "frame_skip": 4, "split": "train", "reset_noise_scale": 0},
+        ),
         (ANT, {"healthy_z_range": [0.3, 1.2], "terminate_when_unhealthy": False}),
         ("poem/MetaWorldML1-v0", {"env_name": "door-open", "split": "test"}),
-        ("poem/FetchReach-v0", {"reward_type": "sparse", "goal_low": [1.0, 0.5, 0.4], "observe_achieved_goal": True}),
+        (
+            "poem/FetchReach-v0",
+            {"reward_type": "sparse", "goal_low": [1.0, 0.5, 0.4], "observe_achieved_goal": True},
+        ),
     ],
 )
 def test_a_familys_own_arguments(env_id: str, env_kwargs: dict[str, Any]) -> None:
     chosen, arguments = environment_of("a model", env_id, env_kwargs)
     assert chosen == env_id
-    assert {name: list(value) if isinstance(value, tuple) else value for name, value in arguments.items()} == env_kwargs
+    assert {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in arguments.items()
+    } == env_kwargs
 
 
 def test_what_the_user_says_is_taken() -> None:
     theirs = {"xml_file": "/etc/passwd", "width": 10**5, "frame_skip": 4}
     given = {"xml_file": "mine.xml", "width": 64}
-    assert environment_of("a model", CHEETAH, theirs, None, given) == (CHEETAH, {**given, "frame_skip": 4})
+    assert environment_of("a model", CHEETAH, theirs, None, given) == (
+        CHEETAH,
+        {**given, "frame_skip": 4},
+    )
     assert environment_of("a model", "trap:Foo-v0", theirs, ANT, given) == (ANT, given)
     with pytest.raises(ValueError, match="--env is needed: a model does not say"):
         environment_of("a model", None, {})
 
 
-def test_a_model_keeps_what_its_environment_was_made_with_beyond_its_registration(tmp_path: Path) -> None:
+def test_a_model_keeps_what_its_environment_was_made_with_beyond_its_registration(
+    tmp_path: Path,
+) -> None:
     def register(**kwargs: Any) -> None:
         gym.register("test/Edge-v0", Walk, max_episode_steps=5, kwargs=kwargs)
 
     try:
-        for registered, given in (({"edge": 3.0}, {}), ({}, {"edge": 3.0}), ({"edge": 2.0}, {"edge": 3.0})):
+        for registered, given in (
+            ({"edge": 3.0}, {}),
+            ({}, {"edge": 3.0}),
+            ({"edge": 2.0}, {"edge": 3.0}),
+        ):
             register(**registered)
             small(POEMSAC, make_task_vec_env("test/Edge-v0", 1, **given)).save_pretrained(tmp_path)
             assert dict(read_catalogue(str(tmp_path))[0].env_kwargs) == given
@@ -255,7 +318,11 @@ REFUSED_NUMBERS: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     ({}, {"horizon": 1e12}, "`horizon` must be a whole number"),
     ({}, {"kl_coef": NAN}, "`kl_coef` must be finite, but is nan"),
     ({}, {"seed": -1}, "does not hold a complete POEMSAC"),
-    ({}, {"tensorboard_log": "logs"}, "`tensorboard_log` is no argument that a model is saved with"),
+    (
+        {},
+        {"tensorboard_log": "logs"},
+        "`tensorboard_log` is no argument that a model is saved with",
+    ),
     ({}, {"policy_kwargs": {"net_arch": [HUGE]}}, "`policy_kwargs` is no argument"),
     ({"n_envs": 10**9}, {}, "`n_envs` must be at most 10000"),
     ({"n_envs": 1e9}, {}, "`n_envs` must be a whole number"),
@@ -269,40 +336,64 @@ REFUSED_NUMBERS: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     ({"algorithm": ["POEMSAC"]}, {}, "names no algorithm"),
     ({"algorithm": "SAC"}, {}, "holds a SAC"),
     ({"arguments": {}, "card": [1]}, {}, "card must be an object"),
-    ({"format": "sb3_poem pretrained 1"}, {}, f"its format is 'sb3_poem pretrained 1', expected '{FORMAT}'"),
+    (
+        {"format": "sb3_poem pretrained 1"},
+        {},
+        f"its format is 'sb3_poem pretrained 1', expected '{FORMAT}'",
+    ),
 ]
 
 
 @reader
 @pytest.mark.parametrize(("changes", "arguments", "message"), REFUSED_NUMBERS)
 def test_numbers_that_do_not_fit(
-    folder: Path, read: Callable[[Path], Any], changes: dict[str, Any], arguments: dict[str, Any], message: str
+    folder: Path,
+    read: Callable[[Path], Any],
+    changes: dict[str, Any],
+    arguments: dict[str, Any],
+    message: str,
 ) -> None:
     spoil(folder, changes, arguments)
     with refused(message):
         read(folder)
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, '{"format": ' + "[" * 100_000, '{"a": ' + "9" * 10_000 + "}", "null", ""])
+@pytest.mark.parametrize(
+    "text",
+    ["[" * 100_000, '{"format": ' + "[" * 100_000, '{"a": ' + "9" * 10_000 + "}", "null", ""],
+)
 def test_json_that_only_looks_small(folder: Path, text: str) -> None:
     (folder / "model" / "config.json").write_text(text)
-    for read in (READERS["from_pretrained"], READERS["load_model"], lambda folder: read_catalogue(str(folder))):
+    for read in (
+        READERS["from_pretrained"],
+        READERS["load_model"],
+        lambda folder: read_catalogue(str(folder)),
+    ):
         with refused("config.json is (truncated, or no configuration|not of this version)"):
             read(folder)
     policy = folder / "policy.safetensors"
-    save_file(load_file(policy), policy, {"format": "sb3_poem adapted policy 2", "config": text, "n_answers": "1"})
+    save_file(
+        load_file(policy),
+        policy,
+        {"format": "sb3_poem adapted policy 2", "config": text, "n_answers": "1"},
+    )
     with refused("policy.safetensors is (truncated, or no configuration|not of this version)"):
         AdaptedPolicy.load(policy)
 
 
 @pytest.mark.parametrize(
-    ("latent", "n_answers"), [(np.zeros(4), "3"), (np.full(5, np.nan), "3"), (np.zeros(5), "9" * 5000), (np.zeros(5), "-1")]
+    ("latent", "n_answers"),
+    [(np.zeros(4), "3"), (np.full(5, np.nan), "3"), (np.zeros(5), "9" * 5000), (np.zeros(5), "-1")],
 )
 def test_a_broken_adapted_policy(folder: Path, latent: np.ndarray, n_answers: str) -> None:
     policy = folder / "policy.safetensors"
     with safe_open(policy, "pt") as file:
         facts = file.metadata()
-    save_file({**load_file(policy), "latent": th.as_tensor(latent)}, policy, {**facts, "n_answers": n_answers})
+    save_file(
+        {**load_file(policy), "latent": th.as_tensor(latent)},
+        policy,
+        {**facts, "n_answers": n_answers},
+    )
     with refused(
         "policy.safetensors is broken: (`latent` has shape|`latent` must be finite|n_answers must be a whole number)"
     ):
@@ -324,7 +415,9 @@ def test_files_of_the_wrong_kind(folder: Path, monkeypatch: pytest.MonkeyPatch) 
             read("empty")
     with refused("use POEMSAC.from_pretrained\\('model'\\)"):
         POEMSAC.load("model")
-    with refused("HalfCheetahVel is the name of a model that ships: use PEARLSAC.from_pretrained\\('HalfCheetahVel'\\)"):
+    with refused(
+        "HalfCheetahVel is the name of a model that ships: use PEARLSAC.from_pretrained\\('HalfCheetahVel'\\)"
+    ):
         PEARLSAC.load("HalfCheetahVel")
     with refused("model.zip: there is no such file or folder", FileNotFoundError):
         POEMSAC.from_pretrained("model.zip")

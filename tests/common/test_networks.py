@@ -125,7 +125,10 @@ def test_posterior_is_the_normalised_product_of_the_factors() -> None:
     with th.no_grad():
         mean, variance = encoder(context)
         assert mean.shape == variance.shape == (4, 3)
-        posterior, terms = Normal(mean.double(), variance.double().sqrt()), factors(encoder, context)
+        posterior, terms = (
+            Normal(mean.double(), variance.double().sqrt()),
+            factors(encoder, context),
+        )
         points = th.linspace(-2.0, 2.0, 9, dtype=th.float64)[:, None, None]  # (points, 1, 1)
         product = terms.log_prob(points[..., None]).sum(dim=2)  # (points, tasks, d), not normalised
         constant = product - posterior.log_prob(points)
@@ -180,7 +183,9 @@ def test_log_probability_does_not_saturate() -> None:
     set_output(actor.mlp, [mean, log_std])
     actions, log_prob = actor(th.zeros(1, 1), th.zeros(1, 1), th.zeros(1, 1))
     # log N(0; 0, 1) - log(1 - tanh(x)^2), where 1 - tanh(x)^2 = 4 exp(-2 x) for large x
-    assert log_prob.item() == pytest.approx(-0.5 * np.log(2 * np.pi) - np.log(4.0) + 2.0 * mean, rel=1e-6)
+    assert log_prob.item() == pytest.approx(
+        -0.5 * np.log(2 * np.pi) - np.log(4.0) + 2.0 * mean, rel=1e-6
+    )
     assert actions.item() == 1.0
     log_prob.sum().backward()
     assert all(parameter.grad.isfinite().all() for parameter in actor.parameters())
@@ -224,12 +229,16 @@ def test_decoder_broadcasts_over_leading_dimensions() -> None:
     th.testing.assert_close(rewards[2, 3], one)
 
 
-# ---------------------------------------------------------------- gradients worked out by hand, against finite differences
+# ---------------------------------------------------------------- gradients worked out by hand,
+# against finite differences
 
 
 def test_gradient_of_actions_and_their_log_probability() -> None:
     raw = th.randn(3, 4, 6, dtype=th.float64)
-    raw[0, 0, 3], raw[0, 1, 4] = LOG_STD_MAX + 1.0, LOG_STD_MIN - 1.0  # beyond the bounds nothing changes
+    raw[0, 0, 3], raw[0, 1, 4] = (
+        LOG_STD_MAX + 1.0,
+        LOG_STD_MIN - 1.0,
+    )  # beyond the bounds nothing changes
     raw.requires_grad_()
     noise = th.randn(3, 4, 3, dtype=th.float64)
     assert th.autograd.gradcheck(lambda x: _SquashedGaussian.apply(x, noise), (raw,))

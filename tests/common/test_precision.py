@@ -1,4 +1,6 @@
-"""The hidden layers' arithmetic: its choice, and mixed precision against float32 and against autocast."""
+"""The hidden layers' arithmetic: its choice, and mixed precision against float32 and against
+autocast.
+"""
 
 import pytest
 import torch as th
@@ -16,7 +18,9 @@ def test_named_precisions(device: str) -> None:
 
 
 @pytest.mark.parametrize(("supported", "expected"), [(True, th.bfloat16), (False, th.float32)])
-def test_auto_asks_the_processor(supported: bool, expected: th.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_auto_asks_the_processor(
+    supported: bool, expected: th.dtype, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(precision, "cpu_has_bfloat16", lambda: supported)
     monkeypatch.setattr(th.cuda, "is_bf16_supported", lambda: not supported)
     assert hidden_dtype("auto", "cpu") is expected
@@ -67,7 +71,10 @@ def test_bfloat16_is_close_to_float32_and_is_not_it(mlp: MLP) -> None:
 def test_hidden_layers_are_those_of_autocast(mlp: MLP) -> None:
     x = th.randn(100, mlp.hidden[0].in_features)
     norms = [
-        nn.LayerNorm(layer.out_features) if isinstance(mlp.activation, Normalised) else nn.Identity() for layer in mlp.hidden
+        nn.LayerNorm(layer.out_features)
+        if isinstance(mlp.activation, Normalised)
+        else nn.Identity()
+        for layer in mlp.hidden
     ]
     hidden = nn.Sequential(mlp.hidden[0], norms[0], nn.ReLU(), mlp.hidden[1], norms[1], nn.ReLU())
     with th.autocast("cpu", dtype=th.bfloat16):
@@ -117,7 +124,9 @@ def test_float32_changes_nothing(mlp: MLP) -> None:
 
 @pytest.mark.parametrize("layer_norm", [False, True])
 def test_frozen_and_unused_networks_get_no_gradient(layer_norm: bool) -> None:
-    networks = nn.ModuleList([MLP(6, 3, [8], layer_norm=layer_norm), LatentCritic(2, 2, 2, [8], layer_norm=layer_norm)])
+    networks = nn.ModuleList(
+        [MLP(6, 3, [8], layer_norm=layer_norm), LatentCritic(2, 2, 2, [8], layer_norm=layer_norm)]
+    )
     obs = th.randn(4, 2, requires_grad=True)
     for _ in range(2):
         with MixedPrecision(networks, th.bfloat16) as precision:

@@ -44,7 +44,9 @@ def test_children_are_independent_and_reproducible() -> None:
     values = [child.random(4).tolist() for child in children]
     assert len({tuple(row) for row in values}) == 3
     assert [same.child().random(4).tolist() for _ in range(3)] == values
-    assert generators.integer_seed() == same.integer_seed()  # a child's own draws do not advance its parent
+    assert (
+        generators.integer_seed() == same.integer_seed()
+    )  # a child's own draws do not advance its parent
     assert 0 <= generators.integer_seed() < 2**31
 
 

@@ -22,13 +22,20 @@ from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.vec_env import TaskVecEnv, as_task_vec_env, make_task_vec_env
 
 SMALL = {"buffer_size": 500, "batch_size": 16, "policy_kwargs": {"net_arch": [8]}, "device": "cpu"}
-FAMILIES = ["poem/PointGoal-v0", "poem/HalfCheetahVel-v0", "poem/AntFwdBack-v0", "poem/HumanoidDir2D-v0"]
+FAMILIES = [
+    "poem/PointGoal-v0",
+    "poem/HalfCheetahVel-v0",
+    "poem/AntFwdBack-v0",
+    "poem/HumanoidDir2D-v0",
+]
 
 
 def random_actions(env, steps, seed=0):
     rng = np.random.default_rng(seed)
     space = env.action_space
-    return rng.uniform(space.low, space.high, size=(steps, env.num_envs, *space.shape)).astype(np.float32)
+    return rng.uniform(space.low, space.high, size=(steps, env.num_envs, *space.shape)).astype(
+        np.float32
+    )
 
 
 @pytest.mark.parametrize("env_id", FAMILIES)
@@ -46,7 +53,11 @@ def test_gives_what_dummy_vec_env_gives(env_id):
     ended = 0
     for step, actions in enumerate(random_actions(ours, steps)):
         if step == 30:
-            tasks = np.repeat(theirs.env_method("sample_tasks", 2, np.random.default_rng(1), indices=[0])[0], 2, axis=0)
+            tasks = np.repeat(
+                theirs.env_method("sample_tasks", 2, np.random.default_rng(1), indices=[0])[0],
+                2,
+                axis=0,
+            )
             ours.set_tasks(tasks)
             for index, task in enumerate(tasks):
                 theirs.env_method("set_task", task, indices=[index])
@@ -62,9 +73,14 @@ def test_gives_what_dummy_vec_env_gives(env_id):
                 ended += 1
                 assert np.array_equal(info["terminal_observation"], other["terminal_observation"])
                 assert info["episode"].keys() == other["episode"].keys()
-                assert (info["episode"]["r"], info["episode"]["l"]) == (other["episode"]["r"], other["episode"]["l"])
+                assert (info["episode"]["r"], info["episode"]["l"]) == (
+                    other["episode"]["r"],
+                    other["episode"]["l"],
+                )
                 assert 0 <= info["episode"]["t"] < 60
-        assert np.array_equal(ours.last_reward_features, [info["reward_features"] for info in infos])
+        assert np.array_equal(
+            ours.last_reward_features, [info["reward_features"] for info in infos]
+        )
     assert ended >= 3 * n_envs
 
 
@@ -75,11 +91,16 @@ def test_a_copy_looks_like_a_single_environment(env_id):
         for one, two in zip(ours.get_attr(name), theirs.get_attr(name), strict=True):
             assert np.array_equal(one, two)
     assert ours.get_attr("spec", indices=[1])[0].id == env_id
-    assert ours.get_attr("spec")[0].max_episode_steps == theirs.get_attr("spec")[0].max_episode_steps
+    assert (
+        ours.get_attr("spec")[0].max_episode_steps == theirs.get_attr("spec")[0].max_episode_steps
+    )
     assert ours.get_attr("observation_space") == theirs.get_attr("observation_space")
     assert ours.get_attr("action_space") == theirs.get_attr("action_space")
     task, other = ours.env_method("sample_tasks", 2, np.random.default_rng(0), indices=[0])[0]
-    assert np.array_equal([task, other], theirs.env_method("sample_tasks", 2, np.random.default_rng(0), indices=[0])[0])
+    assert np.array_equal(
+        [task, other],
+        theirs.env_method("sample_tasks", 2, np.random.default_rng(0), indices=[0])[0],
+    )
     for env in (ours, theirs):
         env.seed(5)
         env.env_method("set_task", task, indices=[1])
@@ -92,9 +113,12 @@ def test_a_copy_looks_like_a_single_environment(env_id):
     features = np.random.default_rng(0).normal(size=(4, ours.get_attr("reward_feature_dim")[0]))
     relabel = functools.partial(TaskVecEnv.env_method, method_name="compute_rewards", indices=[0])
     assert np.array_equal(
-        relabel(ours, tasks=task, features=features)[0], theirs.env_method("compute_rewards", task, features, indices=[0])[0]
+        relabel(ours, tasks=task, features=features)[0],
+        theirs.env_method("compute_rewards", task, features, indices=[0])[0],
     )
-    ours.env_method("set_physics_state", ours.env_method("get_physics_state", indices=[0])[0], indices=[2])
+    ours.env_method(
+        "set_physics_state", ours.env_method("get_physics_state", indices=[0])[0], indices=[2]
+    )
     states = ours.env_method("get_physics_state")
     assert np.array_equal(states[0], states[2])
     assert ours.has_attr("task")
@@ -137,7 +161,11 @@ def test_only_the_first_function_is_called():
 
 def test_ids_that_name_their_module():
     assert isinstance(make_task_vec_env("poem_envs:poem/PointGoal-v0", 2), TaskVecEnv)
-    assert plain_id("poem_envs:poem/PointGoal-v0") == plain_id("poem/PointGoal-v0") == "poem/PointGoal-v0"
+    assert (
+        plain_id("poem_envs:poem/PointGoal-v0")
+        == plain_id("poem/PointGoal-v0")
+        == "poem/PointGoal-v0"
+    )
     with pytest.raises(ModuleNotFoundError, match="no_such_module"):
         make_task_vec_env("no_such_module:poem/PointGoal-v0", 2)
 
@@ -231,7 +259,9 @@ def test_images():
 
 def test_sb3_algorithms_and_wrappers_take_it():
     env = TaskVecEnv.from_id("poem/PointGoal-v0", 4)
-    model = SAC("MlpPolicy", VecNormalize(VecFrameStack(env, 2)), learning_starts=100, seed=0, **SMALL)
+    model = SAC(
+        "MlpPolicy", VecNormalize(VecFrameStack(env, 2)), learning_starts=100, seed=0, **SMALL
+    )
     model.learn(120)
     assert len(model.ep_info_buffer) == 4
     with warnings.catch_warnings():
@@ -246,7 +276,9 @@ def test_learning_is_the_same_as_with_dummy_vec_env():
         env = make_vec_env("poem/PointGoal-v0", 2, seed=1, vec_env_cls=kind)
         model = SAC("MlpPolicy", env, learning_starts=60, seed=1, **SMALL).learn(70)
         weights.append(model.policy.state_dict())
-    assert all(np.array_equal(weights[0][key].numpy(), weights[1][key].numpy()) for key in weights[0])
+    assert all(
+        np.array_equal(weights[0][key].numpy(), weights[1][key].numpy()) for key in weights[0]
+    )
 
 
 def test_takes_environments_that_were_made_after_an_import_of_rl_zoo3():
@@ -283,7 +315,11 @@ def test_a_task_is_chosen_through_whatever_is_around_the_family(make, num_envs):
             return env.get_wrapper_attr("task")
         if isinstance(env, gym.vector.SyncVectorEnv):
             return np.stack(env.call("task"))
-        return env.unwrapped.tasks if isinstance(env, gym.vector.VectorEnv) else np.stack(env.get_attr("task"))
+        return (
+            env.unwrapped.tasks
+            if isinstance(env, gym.vector.VectorEnv)
+            else np.stack(env.get_attr("task"))
+        )
 
     env = make()
     set_task(env, [2.5])
@@ -298,12 +334,19 @@ def test_a_task_is_chosen_through_whatever_is_around_the_family(make, num_envs):
     env.reset()
     assert np.array_equal(tasks(), of_each)
     for wrong in (2.5, [[1.0]] * (num_envs + 1)):
-        with pytest.raises(ValueError, match=rf"expected \(task_dim,\) or \(num_envs, task_dim\) with num_envs={num_envs}"):
+        with pytest.raises(
+            ValueError,
+            match=rf"expected \(task_dim,\) or \(num_envs, task_dim\) with num_envs={num_envs}",
+        ):
             set_task(env, wrong)
 
 
 def test_a_task_of_what_is_no_family():
-    cart_poles = (gym.make("CartPole-v1"), gym.make_vec("CartPole-v1", 2), make_vec_env("CartPole-v1", 2))
+    cart_poles = (
+        gym.make("CartPole-v1"),
+        gym.make_vec("CartPole-v1", 2),
+        make_vec_env("CartPole-v1", 2),
+    )
     for env in (POINT, None, *cart_poles):
         with pytest.raises(TypeError, match=r"must be a task family \(poem_envs.TaskFamily\)"):
             set_task(env, [1.0])
@@ -314,10 +357,17 @@ def test_gymnasiums_vector_environments_are_taken_as_they_are(mode):
     vector_env = gym.make_vec(POINT, 2, vectorization_mode=mode, step_length=0.1)
     env = as_task_vec_env(vector_env)
     family = FamilyView.for_training(env)
-    assert (family.num_envs, family.horizon, family.env_id, family.env_kwargs) == (2, 25, POINT, {"step_length": 0.1})
+    assert (family.num_envs, family.horizon, family.env_id, family.env_kwargs) == (
+        2,
+        25,
+        POINT,
+        {"step_length": 0.1},
+    )
     family.reset(np.array([[0.5], [2.0]]), seed=0)
     set_task(vector_env, [1.0])  # the same copies
     vector_env.reset()
     assert np.array_equal(np.stack(env.get_attr("task")), [[1.0], [1.0]])
-    with pytest.raises(ValueError, match=r"env is a RecordEpisodeStatistics, but must be gym.make_vec\(id, n\)"):
+    with pytest.raises(
+        ValueError, match=r"env is a RecordEpisodeStatistics, but must be gym.make_vec\(id, n\)"
+    ):
         as_task_vec_env(gym.wrappers.vector.RecordEpisodeStatistics(vector_env))

@@ -31,7 +31,9 @@ def store(tmp_path: Path):
 
 @pytest.fixture
 def with_conversations(store: Store, point_goal: Choice) -> Callable[..., Any]:
-    """Runs ``talk(conversations)`` as one life of a server; what the store holds stays for the next."""
+    """Runs ``talk(conversations)`` as one life of a server; what the store holds stays for the
+    next.
+    """
 
     def run(talk: Callable[[Conversations], Coroutine[Any, Any, T]], **options: Any) -> T:
         async def life() -> T:

@@ -13,15 +13,23 @@ from sb3_poem.label.store import Session, Store
 from sb3_poem.label.workshop import Workshop
 
 
-def make_conversations(store: Store, choice: Choice, ahead: bool = False, **options: Any) -> Conversations:
-    """A server's conversations; rendering ahead, which triples the work, is for the tests that ask for it."""
-    conversations = Conversations(store, Workshop(1, lambda: ThreadPoolExecutor(1)), [choice], seed=5, **options)
+def make_conversations(
+    store: Store, choice: Choice, ahead: bool = False, **options: Any
+) -> Conversations:
+    """A server's conversations; rendering ahead, which triples the work, is for the tests that ask
+    for it.
+    """
+    conversations = Conversations(
+        store, Workshop(1, lambda: ThreadPoolExecutor(1)), [choice], seed=5, **options
+    )
     if not ahead:
         conversations._render_ahead = lambda *_: None  # type: ignore[method-assign]
     return conversations
 
 
-async def settled(conversations: Conversations, session: Session, seconds: float = 60.0) -> dict[str, Any]:
+async def settled(
+    conversations: Conversations, session: Session, seconds: float = 60.0
+) -> dict[str, Any]:
     """The session's view once nothing is being prepared."""
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:

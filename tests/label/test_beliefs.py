@@ -17,13 +17,16 @@ from sb3_poem.pearl_sac.train_tasks import TrainTasks
 
 
 def adapter(latents: np.ndarray, weights: np.ndarray, tasks: np.ndarray, means: np.ndarray) -> Any:
-    """As much of one as a belief is drawn from: a task's number is the first coordinate of its latent."""
-    inference = SimpleNamespace(particles=latents, weights=weights, estimate=lambda: weights @ latents)
+    """As much of one as a belief is drawn from: a task's number is the first coordinate of its
+    latent.
+    """
+    inference = SimpleNamespace(
+        particles=latents, weights=weights, estimate=lambda: weights @ latents
+    )
     variances = np.full(means.shape, 0.01)
     variances[:, 1:] = 1.0  # what training has left unused keeps the prior's variance
     return SimpleNamespace(
-        inference=inference,
-        model=SimpleNamespace(train_tasks=TrainTasks(tasks, means, variances)),
+        inference=inference, model=SimpleNamespace(train_tasks=TrainTasks(tasks, means, variances))
     )
 
 
@@ -48,9 +51,13 @@ def test_directions_are_averaged_around_the_circle() -> None:
 
 
 def test_tasks_as_points() -> None:
-    np.testing.assert_allclose(as_points("poem/PointGoal-v0", np.array([[np.pi / 2]])), [[0.0, 1.0]], atol=1e-12)
+    np.testing.assert_allclose(
+        as_points("poem/PointGoal-v0", np.array([[np.pi / 2]])), [[0.0, 1.0]], atol=1e-12
+    )
     np.testing.assert_allclose(as_points("poem/AntGoal-v0", np.array([[1.0, -2.0]])), [[1.0, -2.0]])
-    np.testing.assert_allclose(as_points("poem/HalfCheetahFwdBack-v0", np.array([[-1.0]])), [[-1.0, 0.0]])
+    np.testing.assert_allclose(
+        as_points("poem/HalfCheetahFwdBack-v0", np.array([[-1.0]])), [[-1.0, 0.0]]
+    )
     assert describe("Walk1D-v0").picture == "projection"
     assert describe("Walk1D-v0").title == "Walk1D"
 
@@ -60,10 +67,16 @@ def test_places_in_space_are_drawn_as_the_camera_sees_them() -> None:
     fetch.reset(seed=0)
     robot = fetch.unwrapped.env.unwrapped
     config, camera = robot.mujoco_renderer.default_cam_config, mujoco.MjvCamera()
-    camera.distance, camera.azimuth, camera.elevation = config["distance"], config["azimuth"], config["elevation"]
+    camera.distance, camera.azimuth, camera.elevation = (
+        config["distance"],
+        config["azimuth"],
+        config["elevation"],
+    )
     camera.lookat[:] = config["lookat"]
     scene = mujoco.MjvScene(robot.model, 1000)
-    mujoco.mjv_updateScene(robot.model, robot.data, mujoco.MjvOption(), None, camera, mujoco.mjtCatBit.mjCAT_ALL, scene)
+    mujoco.mjv_updateScene(
+        robot.model, robot.data, mujoco.MjvOption(), None, camera, mujoco.mjtCatBit.mjCAT_ALL, scene
+    )
     forward, up = scene.camera[0].forward, scene.camera[0].up
     hand = robot.initial_gripper_xpos
     places = hand + np.random.default_rng(0).uniform(-0.15, 0.15, size=(20, 3))
@@ -75,7 +88,9 @@ def test_places_in_space_are_drawn_as_the_camera_sees_them() -> None:
     arm = sawyer.unwrapped._sawyer.env
     axes = arm.model.cam("corner2").mat0.reshape(3, 3)
     places = arm.hand_init_pos + np.random.default_rng(1).uniform(-0.3, 0.3, size=(20, 3))
-    expected = -(places - arm.hand_init_pos) @ axes[:, :2]  # videos show this camera's image turned by half a turn
+    expected = (
+        -(places - arm.hand_init_pos) @ axes[:, :2]
+    )  # videos show this camera's image turned by half a turn
     np.testing.assert_allclose(as_points("poem/MetaWorldML1-v0", places), expected, atol=2e-3)
     # Placements of an object and a goal are more than a place.
     assert describe("poem/MetaWorldML1-v0", 6).picture == "projection"
@@ -87,7 +102,9 @@ def test_weighted_quantiles_are_those_of_the_repeated_sample() -> None:
     repeated = np.sort(np.repeat(values, counts))
     for share in (0.1, 0.5, 0.9):
         expected = repeated[int(np.ceil(share * len(repeated))) - 1]
-        assert weighted_quantiles(values, counts / counts.sum(), (share,)) == [pytest.approx(expected)]
+        assert weighted_quantiles(values, counts / counts.sum(), (share,)) == [
+            pytest.approx(expected)
+        ]
 
 
 def test_sentences() -> None:
@@ -96,7 +113,9 @@ def test_sentences() -> None:
     assert "between 1.1 and 1.9 m/s" in sentence("speed", speeds, even, speeds.mean(axis=0), "m/s")
     ways = np.array([[1.0, 0.0], [-1.0, 0.0]])
     assert "25 % sure" not in sentence("direction", ways, np.array([0.25, 0.75]), ways[1], "")
-    assert "75 % sure that you want it to run to the left" in sentence("direction", ways, np.array([0.25, 0.75]), ways[1], "")
+    assert "75 % sure that you want it to run to the left" in sentence(
+        "direction", ways, np.array([0.25, 0.75]), ways[1], ""
+    )
     up = np.array([[0.0, 1.0], [0.1, 0.99]])
     assert "away from you" in sentence("direction", up, np.full(2, 0.5), up[0], "")
 

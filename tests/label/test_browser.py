@@ -25,7 +25,9 @@ from sb3_poem.label.catalogue import Choice, read_catalogue
 from sb3_poem.label.store import Store
 from sb3_poem.label.turns import load_choice
 
-playwright_api = pytest.importorskip("playwright.sync_api", reason="the Python package playwright is not installed")
+playwright_api = pytest.importorskip(
+    "playwright.sync_api", reason="the Python package playwright is not installed"
+)
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="no chromium: apt-get install chromium"),
@@ -44,9 +46,20 @@ class Server:
         self.start()
 
     def start(self) -> None:
-        command = [sys.executable, "-m", "sb3_poem.cli", "label", "--model", self.model, "--port", str(self.port)]
+        command = [
+            sys.executable,
+            "-m",
+            "sb3_poem.cli",
+            "label",
+            "--model",
+            self.model,
+            "--port",
+            str(self.port),
+        ]
         command += ["--store", str(self.store), "--seed", str(SEED), "--workers", "1"]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        self.process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        )
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
         match = re.search(r"http://127\.0\.0\.1:(\d+)", line)
@@ -83,7 +96,9 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 @pytest.fixture
 def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
-    """A page of its own, which fails the test if a script of it failed or it asked another host for anything."""
+    """A page of its own, which fails the test if a script of it failed or it asked another host for
+    anything.
+    """
     contexts, problems = [], []
 
     def opened(url: str, viewport: dict[str, int] = DESKTOP, **options: Any) -> Any:
@@ -127,7 +142,10 @@ class Person:
         row = store.whole_turn(turn["id"])
         store.close()
         assert row is not None
-        sides = [Trajectory.from_dict(json.loads(row[f"{side}_trajectory"])) for side in ("left", "right")]
+        sides = [
+            Trajectory.from_dict(json.loads(row[f"{side}_trajectory"]))
+            for side in ("left", "right")
+        ]
         return self.oracle(*sides).value
 
     def answer(self, times: int = 1, keyboard: bool = False) -> None:
@@ -140,7 +158,9 @@ class Person:
                 self.page.keyboard.press(keys[preference])
             else:
                 self.page.click(f"[data-preference={preference}]")
-            self.page.wait_for_function(f"() => view.answered === {answered + 1} && view.phase !== 'preparing' && !busy")
+            self.page.wait_for_function(
+                f"() => view.answered === {answered + 1} && view.phase !== 'preparing' && !busy"
+            )
 
     def answered(self) -> int:
         return int(self.page.evaluate("() => view.answered"))
@@ -163,7 +183,9 @@ class Person:
         return np.array(json.loads(turn["latent"]))
 
 
-def begin(open_page: Callable[..., Any], server: Server, choice: Choice, task: float, **options: Any) -> Person:
+def begin(
+    open_page: Callable[..., Any], server: Server, choice: Choice, task: float, **options: Any
+) -> Person:
     page = open_page(server.url, **options)
     page.click(f"button[value={choice.name}]")
     page.wait_for_function(SHOWN)
@@ -173,7 +195,10 @@ def begin(open_page: Callable[..., Any], server: Server, choice: Choice, task: f
 def returns(choice: Choice, latents: np.ndarray, task: float) -> np.ndarray:
     """True returns of latents, the mean of the same ten episodes each."""
     env, model = TaskVecEnv.from_id(choice.env_id, 10), load_choice(choice)
-    values = [evaluate_latents(model, env, latent[None, :], np.array([[task]]), 10, seed=77).mean() for latent in latents]
+    values = [
+        evaluate_latents(model, env, latent[None, :], np.array([[task]]), 10, seed=77).mean()
+        for latent in latents
+    ]
     env.close()
     return np.array(values)
 
@@ -181,13 +206,17 @@ def returns(choice: Choice, latents: np.ndarray, task: float) -> np.ndarray:
 def oracles_latents(choice: Choice, task: float) -> np.ndarray:
     """Before any answer, and after ten by ``ReturnOracle``."""
     oracle = ReturnOracle(gym.make(choice.env_id), np.array([task]))
-    adapter = PreferenceAdapter(load_choice(choice), choice.env_id, oracle=oracle, seed=SEED, noise_model=MistakeNoise(0.05))
+    adapter = PreferenceAdapter(
+        load_choice(choice), choice.env_id, oracle=oracle, seed=SEED, noise_model=MistakeNoise(0.05)
+    )
     before = adapter.policy().latent
     return np.stack([before, adapter.adapt().latent])
 
 
 def assert_learned(choice: Choice, person: Person, task: float) -> None:
-    before, by_oracle, by_person = returns(choice, np.vstack([oracles_latents(choice, task), person.learned()]), task)
+    before, by_oracle, by_person = returns(
+        choice, np.vstack([oracles_latents(choice, task), person.learned()]), task
+    )
     # What ReturnOracle's ten answers gained, a person on the page must gain, but for a hundredth.
     assert by_oracle > before
     assert by_person >= by_oracle - 0.01 * (by_oracle - before), (before, by_oracle, by_person)
@@ -207,7 +236,11 @@ def test_ten_clicks_teach_what_the_oracle_teaches(
     assert_learned(point_goal, person, 2.2)
     page.click('[data-verdict="yes"]')
     page.wait_for_selector("#thanks:visible")
-    for link, suffix in (("#get-video", ".mp4"), ("#get-answers", ".json"), ("#get-policy", ".safetensors")):
+    for link, suffix in (
+        ("#get-video", ".mp4"),
+        ("#get-answers", ".json"),
+        ("#get-policy", ".safetensors"),
+    ):
         with page.expect_download() as download:
             page.click(link)
         path = tmp_path / download.value.suggested_filename
@@ -217,7 +250,9 @@ def test_ten_clicks_teach_what_the_oracle_teaches(
     assert json.loads((tmp_path / "answers.json").read_text())["wish"] == "up and to the left"
 
 
-def test_undo_and_reload_in_the_middle(open_page: Callable[..., Any], server: Server, point_goal: Choice) -> None:
+def test_undo_and_reload_in_the_middle(
+    open_page: Callable[..., Any], server: Server, point_goal: Choice
+) -> None:
     person = begin(open_page, server, point_goal, 0.4)
     page = person.page
     person.answer(3)
@@ -241,7 +276,9 @@ def test_undo_and_reload_in_the_middle(open_page: Callable[..., Any], server: Se
     assert person.answered() == 3
 
 
-def test_two_people_and_a_second_tab(open_page: Callable[..., Any], server: Server, point_goal: Choice) -> None:
+def test_two_people_and_a_second_tab(
+    open_page: Callable[..., Any], server: Server, point_goal: Choice
+) -> None:
     ann, ben = begin(open_page, server, point_goal, 0.3), begin(open_page, server, point_goal, 2.8)
     assert ann.token != ben.token
     tab = open_page(ann.page.url)
@@ -249,14 +286,17 @@ def test_two_people_and_a_second_tab(open_page: Callable[..., Any], server: Serv
     for _ in range(2):
         ann.answer()
         ben.answer()
-    # The second tab of the same session still shows the first question: its answer is refused, and it catches up.
+    # The second tab of the same session still shows the first question: its answer is refused, and
+    # it catches up.
     tab.keyboard.press("ArrowDown")
     tab.wait_for_function("() => view.answered === 2 && view.phase === 'question' && !busy")
     assert ann.stored() != ben.stored()
     assert len(ann.stored()) == len(ben.stored()) == 2
 
 
-def test_the_keyboard_alone(open_page: Callable[..., Any], server: Server, point_goal: Choice) -> None:
+def test_the_keyboard_alone(
+    open_page: Callable[..., Any], server: Server, point_goal: Choice
+) -> None:
     page = open_page(server.url)
     page.keyboard.press("Tab")
     page.keyboard.press("Enter")
@@ -271,7 +311,9 @@ def test_the_keyboard_alone(open_page: Callable[..., Any], server: Server, point
     assert page.get_attribute("#play", "aria-label") == "Play"
     moment = page.input_value("#frame")
     page.keyboard.press(".")
-    page.wait_for_function("before => document.querySelector('#frame').value !== before", arg=moment)
+    page.wait_for_function(
+        "before => document.querySelector('#frame').value !== before", arg=moment
+    )
     page.focus("#frame")
     page.keyboard.press("ArrowRight")  # moves the film, and answers nothing
     page.focus("#wish")
@@ -281,19 +323,27 @@ def test_the_keyboard_alone(open_page: Callable[..., Any], server: Server, point
     page.evaluate("() => document.activeElement.blur()")
     page.keyboard.press("u")
     page.wait_for_function("() => view.answered === 1 && !busy")
-    for element in page.query_selector_all("button:visible, a:visible, input:visible, select:visible, textarea:visible"):
+    for element in page.query_selector_all(
+        "button:visible, a:visible, input:visible, select:visible, textarea:visible"
+    ):
         element.focus()
         assert element.evaluate("element => element === document.activeElement")
 
 
-def test_both_halves_of_the_film_are_in_step(open_page: Callable[..., Any], server: Server, point_goal: Choice) -> None:
+def test_both_halves_of_the_film_are_in_step(
+    open_page: Callable[..., Any], server: Server, point_goal: Choice
+) -> None:
     person = begin(open_page, server, point_goal, 1.0)
     page = person.page
     for frame in (0, 7, 24, 3):
         page.evaluate("frame => player.seek(frame)", frame)
-        page.wait_for_function("frame => !player.video.seeking && player.frame === frame", arg=frame)
+        page.wait_for_function(
+            "frame => !player.video.seeking && player.frame === frame", arg=frame
+        )
     page.evaluate("() => player.seek(24)")
-    page.wait_for_function("() => !player.video.seeking && document.querySelector('#frame').value === '24'")
+    page.wait_for_function(
+        "() => !player.video.seeking && document.querySelector('#frame').value === '24'"
+    )
     spread = page.evaluate(
         """() => ['left', 'right'].map(side => {
             const canvas = document.getElementById(side + '-screen');
@@ -307,24 +357,35 @@ def test_both_halves_of_the_film_are_in_step(open_page: Callable[..., Any], serv
 
 
 def test_a_phone(open_page: Callable[..., Any], server: Server, point_goal: Choice) -> None:
-    person = begin(open_page, server, point_goal, 2.0, viewport=PHONE, has_touch=True, is_mobile=True)
+    person = begin(
+        open_page, server, point_goal, 2.0, viewport=PHONE, has_touch=True, is_mobile=True
+    )
     page = person.page
     person.answer(1)
     assert page.evaluate("() => document.documentElement.scrollWidth") <= PHONE["width"]
-    for selector in ("[data-preference=left]", "[data-preference=right]", "[data-preference=equal]", "#play"):
+    for selector in (
+        "[data-preference=left]",
+        "[data-preference=right]",
+        "[data-preference=equal]",
+        "#play",
+    ):
         box = page.locator(selector).bounding_box()
         assert box["height"] >= 44
         assert box["y"] + box["height"] <= PHONE["height"]  # all that is needed is in sight
 
 
-def test_the_server_is_killed_in_the_middle(open_page: Callable[..., Any], point_goal: Choice, tmp_path: Path) -> None:
+def test_the_server_is_killed_in_the_middle(
+    open_page: Callable[..., Any], point_goal: Choice, tmp_path: Path
+) -> None:
     server = Server(tmp_path, "PointGoal")
     try:
         person = begin(open_page, server, point_goal, 2.5)
         page = person.page
         person.answer(2)
         page.keyboard.press("ArrowLeft")
-        page.wait_for_function("() => view.answered === 3")  # kept, and what follows perhaps not yet made
+        page.wait_for_function(
+            "() => view.answered === 3"
+        )  # kept, and what follows perhaps not yet made
         server.kill()
         assert len(person.stored()) == 3
         server.start()

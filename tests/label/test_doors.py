@@ -1,4 +1,6 @@
-"""The page's doors: who holds connections, a full disk, and what else a hostile client tries over a real socket."""
+"""The page's doors: who holds connections, a full disk, and what else a hostile client tries over a
+real socket.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,9 @@ def serve(store: Store, point_goal: Choice) -> Iterator[Serve]:
     """Starts the page, or another application, on loopback; gives the port."""
     servers = []
 
-    def start(app: Starlette | None = None, deadline: float = 10.0, access: Access | None = None) -> int:
+    def start(
+        app: Starlette | None = None, deadline: float = 10.0, access: Access | None = None
+    ) -> int:
         page = app or make_app(make_conversations(store, point_goal), access)
         servers.append(BackgroundServer(page, deadline=deadline))
         return servers[-1].port
@@ -58,7 +62,9 @@ def serve(store: Store, point_goal: Choice) -> Iterator[Serve]:
 
 
 @pytest.fixture
-def no_traceback(capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture) -> Iterator[None]:
+def no_traceback(
+    capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> Iterator[None]:
     """Fails the test if the server logs one."""
     yield
     assert "Traceback" not in capsys.readouterr().err
@@ -66,7 +72,9 @@ def no_traceback(capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFi
 
 
 def connect(port: int, sent: bytes = b"", source: str = "127.0.0.1") -> socket.socket:
-    connection = socket.create_connection(("127.0.0.1", port), timeout=5.0, source_address=(source, 0))
+    connection = socket.create_connection(
+        ("127.0.0.1", port), timeout=5.0, source_address=(source, 0)
+    )
     connection.sendall(sent)
     return connection
 
@@ -100,8 +108,12 @@ def status(port: int, path: str = "/", source: str = "127.0.0.1") -> int:
         client.close()
 
 
-@pytest.mark.parametrize(("deadline", "seconds"), [(0.5, 1.5), pytest.param(10.0, 30.0, marks=pytest.mark.slow)])
-def test_300_half_open_connections_shut_nobody_out(serve: Serve, deadline: float, seconds: float) -> None:
+@pytest.mark.parametrize(
+    ("deadline", "seconds"), [(0.5, 1.5), pytest.param(10.0, 30.0, marks=pytest.mark.slow)]
+)
+def test_300_half_open_connections_shut_nobody_out(
+    serve: Serve, deadline: float, seconds: float
+) -> None:
     """They come from the address of those who are served, and each that is closed comes again."""
     port = serve(deadline=deadline)
     begun = time.monotonic()
@@ -136,7 +148,10 @@ def test_a_slow_body_ends_at_the_deadline_while_others_are_served(serve: Serve) 
 
 
 def test_a_request_that_takes_too_long_is_told_so(serve: Serve) -> None:
-    slow = connect(serve(deadline=0.2), b"POST /start HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\nmodel=")
+    slow = connect(
+        serve(deadline=0.2),
+        b"POST /start HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\nmodel=",
+    )
     answer = read_all(slow)
     assert answer.startswith(b"HTTP/1.1 408 ")
     assert b"took too long" in answer
@@ -155,12 +170,16 @@ def test_a_request_that_takes_too_long_is_told_so(serve: Serve) -> None:
     ],
 )
 def test_no_connection_is_held_for_ever(serve: Serve, sent: bytes) -> None:
-    read_all(connect(serve(deadline=0.2), sent), seconds=3.0)  # raises TimeoutError if the server does not close it
+    read_all(
+        connect(serve(deadline=0.2), sent), seconds=3.0
+    )  # raises TimeoutError if the server does not close it
 
 
 def test_who_does_not_take_an_answer_is_left(serve: Serve) -> None:
     whole = 30_000_000
-    port = serve(Starlette(routes=[Route("/", lambda _: PlainTextResponse(b"x" * whole))]), deadline=0.2)
+    port = serve(
+        Starlette(routes=[Route("/", lambda _: PlainTextResponse(b"x" * whole))]), deadline=0.2
+    )
     reader = socket.socket()
     reader.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     reader.connect(("127.0.0.1", port))
@@ -183,7 +202,9 @@ def test_one_addresss_connections_do_not_end_anothers(serve: Serve) -> None:
     deadline = time.monotonic() + 3.0
     while sum(map(is_open, crowd)) > MAX_OF_ADDRESS and time.monotonic() < deadline:
         time.sleep(0.02)
-    assert [is_open(connection) for connection in crowd] == [False] * (200 - MAX_OF_ADDRESS) + [True] * MAX_OF_ADDRESS
+    assert [is_open(connection) for connection in crowd] == [False] * (200 - MAX_OF_ADDRESS) + [
+        True
+    ] * MAX_OF_ADDRESS
     assert is_open(other)
     for connection in (other, *crowd):
         connection.close()
@@ -225,14 +246,30 @@ def test_an_address_is_what_one_household_has(host: str, network: str) -> None:
         (b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * 5000, b"400"),
         (b"GET http://evil.example/ HTTP/1.1\r\nHost: localhost\r\n\r\n", b"404"),
         (b"CONNECT evil.example:443 HTTP/1.1\r\nHost: localhost\r\n\r\n", b"404"),
-        (b"POST /start HTTP/1.1\r\nHost: localhost\r\nOrigin: http://[\r\nContent-Length: 0\r\n\r\n", b"403"),
-        (b"POST /start HTTP/1.1\r\nHost: localhost\r\nContent-Length: " + b"9" * 5000 + b"\r\n\r\n", b"400"),
-        (b"POST /start HTTP/1.1\r\nHost: localhost\r\nContent-Length: 3\r\nContent-Length: 4\r\n\r\nabc", b"400"),
-        (b"POST /start HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n-1\r\n", b"400"),
+        (
+            b"POST /start HTTP/1.1\r\nHost: localhost\r\nOrigin: http://[\r\nContent-Length: 0\r\n\r\n",
+            b"403",
+        ),
+        (
+            b"POST /start HTTP/1.1\r\nHost: localhost\r\nContent-Length: "
+            + b"9" * 5000
+            + b"\r\n\r\n",
+            b"400",
+        ),
+        (
+            b"POST /start HTTP/1.1\r\nHost: localhost\r\nContent-Length: 3\r\nContent-Length: 4\r\n\r\nabc",
+            b"400",
+        ),
+        (
+            b"POST /start HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n-1\r\n",
+            b"400",
+        ),
         (b"POST /start HTTP/1.1\r\nHost: evil\r\nTransfer-Encoding: chunked\r\n\r\n-1\r\n", b"400"),
     ],
 )
-def test_what_is_no_request_is_refused_without_an_error(serve: Serve, sent: bytes, answer: bytes) -> None:
+def test_what_is_no_request_is_refused_without_an_error(
+    serve: Serve, sent: bytes, answer: bytes
+) -> None:
     port = serve(deadline=0.3)
     assert read_all(connect(port, sent)).startswith(b"HTTP/1.1 " + answer)
     assert status(port) == 200
@@ -242,7 +279,10 @@ def test_what_is_no_request_is_refused_without_an_error(serve: Serve, sent: byte
 def test_a_body_that_goes_wrong_after_the_answer_ends_the_connection(serve: Serve) -> None:
     port = serve()
     large = b"%x\r\n" % (2 * MAX_BODY) + b"x" * (2 * MAX_BODY)
-    connection = connect(port, b"POST /start HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n" + large)
+    connection = connect(
+        port,
+        b"POST /start HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n" + large,
+    )
     assert connection.recv(65536).startswith(b"HTTP/1.1 413 ")
     connection.sendall(b"\r\n-1\r\n")
     read_all(connection, seconds=3.0)
@@ -251,7 +291,10 @@ def test_a_body_that_goes_wrong_after_the_answer_ends_the_connection(serve: Serv
 
 def test_a_body_that_breaks_off_is_no_request(serve: Serve, store: Store) -> None:
     port = serve()
-    cut = connect(port, b"POST /start HTTP/1.1\r\nHost: localhost\r\nContent-Length: 99\r\n\r\nmodel=PointGoal")
+    cut = connect(
+        port,
+        b"POST /start HTTP/1.1\r\nHost: localhost\r\nContent-Length: 99\r\n\r\nmodel=PointGoal",
+    )
     assert status(port) == 200
     cut.close()
     time.sleep(0.1)
@@ -271,7 +314,10 @@ def full_disk(room: int = 0) -> Iterator[None]:
 
 
 def test_a_full_disk_is_a_sentence_and_what_was_answered_stays(
-    store: Store, point_goal: Choice, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    store: Store,
+    point_goal: Choice,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.setattr(sessions, "RETRY_SECONDS", 0.0)
     app = make_app(make_conversations(store, point_goal))
@@ -288,14 +334,20 @@ def test_a_full_disk_is_a_sentence_and_what_was_answered_stays(
         with full_disk():
             refused = client.post("/start", data={"model": "PointGoal"})
             assert (refused.status_code, refused.json()) == (507, {"error": DISK_FULL})
-            refused = client.post("/start", data={"model": "PointGoal"}, headers={"Accept": "text/html,*/*"})
+            refused = client.post(
+                "/start", data={"model": "PointGoal"}, headers={"Accept": "text/html,*/*"}
+            )
             assert (refused.status_code, refused.text) == (507, DISK_FULL + "\n")
         session = client.post("/start", data={"model": "PointGoal"}).headers["location"]
         with full_disk():
             assert state(507) == {"error": DISK_FULL}  # the film cannot be written
             assert client.get(session).status_code == 200
         view = state(200)
-        posts = {"answer": {"question": view["turn"]["id"], "preference": "left"}, "wish": {"wish": "left"}, "stop": {}}
+        posts = {
+            "answer": {"question": view["turn"]["id"], "preference": "left"},
+            "wish": {"wish": "left"},
+            "stop": {},
+        }
         with full_disk():
             for name, body in posts.items():
                 refused = client.post(f"{session}/{name}", json=body)
@@ -313,14 +365,22 @@ def test_a_film_that_does_not_fit_on_the_disk_is_no_film(tmp_path: Path) -> None
     write_clip(frames, tmp_path / "whole.mp4", 20.0)
     size = (tmp_path / "whole.mp4").stat().st_size
     for room in (0, 4096, size // 2, size - 1):
-        with full_disk(room), pytest.raises(StorageError, match=r"cut.mp4 cannot be written: ffmpeg ended"):
+        with (
+            full_disk(room),
+            pytest.raises(StorageError, match=r"cut.mp4 cannot be written: ffmpeg ended"),
+        ):
             write_clip(frames, tmp_path / "cut.mp4", 20.0)
         assert [file.name for file in tmp_path.iterdir()] == ["whole.mp4"]
 
 
-@pytest.mark.parametrize("command", [["--model", "PointGoal", "--port", "0"], ["export", "--out", "a.jsonl"], ["replay"]])
+@pytest.mark.parametrize(
+    "command", [["--model", "PointGoal", "--port", "0"], ["export", "--out", "a.jsonl"], ["replay"]]
+)
 def test_commands_say_that_the_disk_is_full_or_the_store_broken(
-    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    command: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("SB3_POEM_TRACEBACK", raising=False)
@@ -328,10 +388,16 @@ def test_commands_say_that_the_disk_is_full_or_the_store_broken(
     Store(path.parent).close()
     with full_disk():
         assert cli.main(["label", *command]) == 1
-    assert f"error: {path} cannot be read or written: disk I/O error (is the disk full?)" in capsys.readouterr().err
+    assert (
+        f"error: {path} cannot be read or written: disk I/O error (is the disk full?)"
+        in capsys.readouterr().err
+    )
     path.write_bytes(b"no data base" * 1000)
     assert cli.main(["label", *command]) == 1
-    assert f"error: {path} cannot be read or written: file is not a database" in capsys.readouterr().err
+    assert (
+        f"error: {path} cannot be read or written: file is not a database"
+        in capsys.readouterr().err
+    )
 
 
 def test_the_stores_folders_are_its_owners(tmp_path: Path) -> None:
@@ -341,7 +407,10 @@ def test_the_stores_folders_are_its_owners(tmp_path: Path) -> None:
     finally:
         os.umask(mask)
     store.create_session("M", "poem/PointGoal-v0", 1, {})
-    assert [folder.stat().st_mode & 0o777 for folder in (store.folder, store.videos)] == [0o700, 0o700]
+    assert [folder.stat().st_mode & 0o777 for folder in (store.folder, store.videos)] == [
+        0o700,
+        0o700,
+    ]
     assert {file.stat().st_mode & 0o077 for file in store.folder.glob("answers.sqlite*")} == {0}
     store.close()
 
@@ -352,7 +421,12 @@ def test_the_printed_links_host_can_be_reached(host: str) -> None:
         listener = bind(host, 0)
     except OSError as error:
         pytest.skip(f"this machine has no such address: {error}")
-    with listener, socket.create_connection((link_host(listener, host), listener.getsockname()[1]), timeout=5.0):
+    with (
+        listener,
+        socket.create_connection(
+            (link_host(listener, host), listener.getsockname()[1]), timeout=5.0
+        ),
+    ):
         assert link_host(listener, host) not in ("0.0.0.0", "", "::", "[::1]")
 
 
@@ -361,8 +435,16 @@ def test_the_printed_links_host_can_be_reached(host: str) -> None:
     [
         (["--port", "99999999"], None, "--port 99999999: must be between 0 and 65535"),
         (["--auth-file", "missing"], None, "No such file or directory: 'missing'"),
-        (["--auth-file", "short"], None, "--auth-file short: the password must have at least 12 characters, but has 5"),
-        ([], "ann:short", "SB3_POEM_AUTH: the password must have at least 12 characters, but has 5"),
+        (
+            ["--auth-file", "short"],
+            None,
+            "--auth-file short: the password must have at least 12 characters, but has 5",
+        ),
+        (
+            [],
+            "ann:short",
+            "SB3_POEM_AUTH: the password must have at least 12 characters, but has 5",
+        ),
         ([], "", "SB3_POEM_AUTH must have the form USER:PASSWORD"),
         (["--auth", "nobody"], f"ann:{PASSWORD}", "--auth must have the form USER:PASSWORD"),
     ],
@@ -383,7 +465,9 @@ def test_wrong_doors_are_named(
     assert words in capsys.readouterr().err
 
 
-def test_the_password_comes_from_a_file_or_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_password_comes_from_a_file_or_the_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "password").write_text(f"ann:{PASSWORD}\n")
     assert read_password(None, None) == (None, None)
     assert read_password(None, tmp_path / "password") == ("ann", PASSWORD)
@@ -396,9 +480,29 @@ def test_the_password_comes_from_a_file_or_the_environment(tmp_path: Path, monke
 @pytest.mark.slow
 def test_the_list_of_processes_does_not_show_the_password(tmp_path: Path) -> None:
     (tmp_path / "password").write_text(f"ann:{PASSWORD}\n")
-    command = [sys.executable, "-m", "sb3_poem.cli", "label", "--model", "PointGoal", "--port", "0", "--workers", "1"]
-    command += ["--host", "0.0.0.0", "--store", str(tmp_path / "store"), "--auth-file", str(tmp_path / "password")]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    command = [
+        sys.executable,
+        "-m",
+        "sb3_poem.cli",
+        "label",
+        "--model",
+        "PointGoal",
+        "--port",
+        "0",
+        "--workers",
+        "1",
+    ]
+    command += [
+        "--host",
+        "0.0.0.0",
+        "--store",
+        str(tmp_path / "store"),
+        "--auth-file",
+        str(tmp_path / "password"),
+    ]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
     try:
         assert process.stdout is not None
         link = re.search(r"http://(\S+):(\d+)", process.stdout.readline())
@@ -406,7 +510,9 @@ def test_the_list_of_processes_does_not_show_the_password(tmp_path: Path) -> Non
         codes = []
         for given in ("ann:wrong", f"ann:{PASSWORD}"):
             client = http.client.HTTPConnection(link[1], int(link[2]), timeout=10.0)
-            client.request("GET", "/", headers={"Authorization": "Basic " + b64encode(given.encode()).decode()})
+            client.request(
+                "GET", "/", headers={"Authorization": "Basic " + b64encode(given.encode()).decode()}
+            )
             codes.append(client.getresponse().status)
             client.close()
         assert codes == [401, 200]

@@ -35,7 +35,9 @@ TASK = np.array([0.7])
 
 @pytest.fixture
 def answered(with_conversations: Callable[..., Any], store: Store, point_goal: Choice) -> Session:
-    """A session whose four answers are by true return; the first was given the wrong way, and taken back."""
+    """A session whose four answers are by true return; the first was given the wrong way, and taken
+    back.
+    """
     oracle = ReturnOracle(gym.make(point_goal.env_id), TASK)
 
     async def talk(conversations: Conversations) -> Session:
@@ -46,7 +48,10 @@ def answered(with_conversations: Callable[..., Any], store: Store, point_goal: C
             view = await settled(conversations, session)
             row = store.whole_turn(view["turn"]["id"])
             assert row is not None
-            sides = [Trajectory.from_dict(json.loads(row[f"{side}_trajectory"])) for side in ("left", "right")]
+            sides = [
+                Trajectory.from_dict(json.loads(row[f"{side}_trajectory"]))
+                for side in ("left", "right")
+            ]
             right = oracle(*sides).value
             wrong = {"left": "right", "right": "left", "equal": "left"}[right]
             await conversations.answer(session, view["turn"]["id"], wrong if wrong_first else right)
@@ -60,7 +65,9 @@ def answered(with_conversations: Callable[..., Any], store: Store, point_goal: C
     return session
 
 
-def test_both_formats_hold_the_same_answers(answered: Session, store: Store, tmp_path: Path) -> None:
+def test_both_formats_hold_the_same_answers(
+    answered: Session, store: Store, tmp_path: Path
+) -> None:
     from pyarrow import parquet
 
     assert export(store, tmp_path / "a.jsonl", trajectories=True) == 4
@@ -82,7 +89,9 @@ def test_both_formats_hold_the_same_answers(answered: Session, store: Store, tmp
     assert set(with_undone[0]) == set(FIELDS)
 
 
-def test_replay_to_the_same_rule_ends_where_the_session_ended(answered: Session, store: Store, point_goal: Choice) -> None:
+def test_replay_to_the_same_rule_ends_where_the_session_ended(
+    answered: Session, store: Store, point_goal: Choice
+) -> None:
     model = load_choice(point_goal)
     result = replay(store, answered, model, {"mistake_rate": 0.05}, seed=answered.seed)
     assert len(result["latents"]) == 5
@@ -90,10 +99,14 @@ def test_replay_to_the_same_rule_ends_where_the_session_ended(answered: Session,
     assert result["decided"] <= 4
     # Each rule and seed must come to latents that do what was asked for, better than the first.
     other = replay(store, answered, model, {"inference": "paper"}, seed=1, is_own=False)
-    assert 0.0 <= other["action_error"] < 0.2  # the very latents are not among the candidates, like ones are
+    assert (
+        0.0 <= other["action_error"] < 0.2
+    )  # the very latents are not among the candidates, like ones are
     env = gym.make(point_goal.env_id)
     for outcome in (result, other):
-        first, last = (_return(model, env, np.array(outcome["latents"][index])) for index in (0, -1))
+        first, last = (
+            _return(model, env, np.array(outcome["latents"][index])) for index in (0, -1)
+        )
         assert last > first
 
 
@@ -107,12 +120,19 @@ def _return(model: Any, env: gym.Env, latent: np.ndarray) -> float:
     return total
 
 
-def test_the_commands(answered: Session, store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_commands(
+    answered: Session, store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out, folder = tmp_path / "out.jsonl", str(store.folder)
     assert cli.main(["label", "export", "--store", folder, "--out", str(out), "--undone"]) == 0
     assert len(out.read_text().splitlines()) == 5
     result = tmp_path / "replay.json"
-    assert cli.main(["label", "replay", "--store", folder, "--inference", "paper", "--json", str(result)]) == 0
+    assert (
+        cli.main(
+            ["label", "replay", "--store", folder, "--inference", "paper", "--json", str(result)]
+        )
+        == 0
+    )
     assert "foretold" in capsys.readouterr().out
     assert len(json.loads(result.read_text())["sessions"]) == 1
     assert cli.main(["label", "replay", "--store", folder, "--model", "HalfCheetahVel"]) == 1
@@ -130,9 +150,17 @@ def test_replay_knows_a_model_by_its_folder_and_says_which_it_lacks(
 ) -> None:
     shutil.copytree(pretrained_folder("PointGoal"), tmp_path / "models" / "PointGoal")
     result, own = tmp_path / "replay.json", str(tmp_path / "models" / "PointGoal")
-    assert cli.main(["label", "replay", "--store", str(store.folder), "--model", own, "--json", str(result)]) == 0
+    assert (
+        cli.main(
+            ["label", "replay", "--store", str(store.folder), "--model", own, "--json", str(result)]
+        )
+        == 0
+    )
     assert json.loads(result.read_text())["sessions"][0]["action_error"] is None
-    for gone in ("gone", str(tmp_path / "models" / "PointGoal")):  # a store that comes from elsewhere opens no other file
+    for gone in (
+        "gone",
+        str(tmp_path / "models" / "PointGoal"),
+    ):  # a store that comes from elsewhere opens no other file
         with sqlite3.connect(store.folder / "answers.sqlite") as connection:
             connection.execute("update sessions set model = ?", (gone,))
         capsys.readouterr()
@@ -155,18 +183,28 @@ def test_replay_knows_a_model_by_its_folder_and_says_which_it_lacks(
     ],
 )
 def test_wrong_commands_say_what_is_wrong(
-    arguments: list[str], words: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    arguments: list[str],
+    words: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert cli.main(["label", *arguments]) == 1
     assert words in capsys.readouterr().err
 
 
-def test_the_terminals_answers_are_in_the_same_store(store: Store, point_goal: Choice, tmp_path: Path) -> None:
+def test_the_terminals_answers_are_in_the_same_store(
+    store: Store, point_goal: Choice, tmp_path: Path
+) -> None:
     replies = iter(["l", "nonsense", "e"])
     recorder = StoreRecorder(store, "PointGoal", point_goal.env_id, seed=3, wish="left")
-    oracle = HumanOracle(tmp_path / "gifs", read=lambda _: next(replies), write=lambda _: None, record=recorder)
-    adapter = PreferenceAdapter(load_choice(point_goal), point_goal.env_id, oracle=oracle, seed=3, n_queries=2)
+    oracle = HumanOracle(
+        tmp_path / "gifs", read=lambda _: next(replies), write=lambda _: None, record=recorder
+    )
+    adapter = PreferenceAdapter(
+        load_choice(point_goal), point_goal.env_id, oracle=oracle, seed=3, n_queries=2
+    )
     adapter.adapt()
     kept = list(records(store))
     assert [(record["source"], record["preference"], record["wish"]) for record in kept] == [
@@ -187,15 +225,22 @@ def test_the_widget_moves_the_adapter(point_goal: Choice, tmp_path: Path) -> Non
         assert f'src="{widget.url}"' in widget._repr_html_()
         for preference in ("right", "left", "left"):
             question = _wait(widget.url, "question")
-            _post(f"{widget.url}/answer", {"question": question["turn"]["id"], "preference": preference})
+            _post(
+                f"{widget.url}/answer",
+                {"question": question["turn"]["id"], "preference": preference},
+            )
             alone.ask()
             alone.tell(preference)
         _wait(widget.url, "result")
         np.testing.assert_array_equal(widget.policy().latent, alone.policy().latent)
         assert adapter.done
-        assert [answer.preference for answer in adapter.answers] == [answer.preference for answer in alone.answers]
+        assert [answer.preference for answer in adapter.answers] == [
+            answer.preference for answer in alone.answers
+        ]
         with urllib.request.urlopen(f"{widget.url}/policy.safetensors") as response:
-            np.testing.assert_array_equal(AdaptedPolicy.from_bytes(response.read()).latent, alone.policy().latent)
+            np.testing.assert_array_equal(
+                AdaptedPolicy.from_bytes(response.read()).latent, alone.policy().latent
+            )
     finally:
         widget.close()
     with pytest.raises(ValueError, match="fresh one"):
@@ -215,7 +260,9 @@ def _wait(url: str, phase: str) -> dict[str, Any]:
 
 
 def _post(url: str, body: dict[str, Any]) -> None:
-    request = urllib.request.Request(url, json.dumps(body).encode(), {"Content-Type": "application/json"})
+    request = urllib.request.Request(
+        url, json.dumps(body).encode(), {"Content-Type": "application/json"}
+    )
     urllib.request.urlopen(request).close()
 
 
@@ -240,7 +287,13 @@ def test_an_adapted_policy_is_one_file(point_goal: Choice, tmp_path: Path) -> No
 
 @pytest.mark.parametrize("quality", ["full", "fast"])
 def test_the_widget_takes_an_environment_that_was_rendered_and_gives_it_back(quality: str) -> None:
-    env = gym.make("poem/HalfCheetahVel-v0", render_mode="rgb_array", render_quality=quality, width=64, height=64)
+    env = gym.make(
+        "poem/HalfCheetahVel-v0",
+        render_mode="rgb_array",
+        render_quality=quality,
+        width=64,
+        height=64,
+    )
     try:
         env.reset(seed=0)
         before = env.render()

@@ -169,7 +169,9 @@ for n in range(10**6):
 
 def test_a_kill_loses_no_answer(tmp_path: Path) -> None:
     code = WRITER.format(tests=str(Path(__file__).parent))
-    process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True
+    )
     assert process.stdout is not None
     said = [process.stdout.readline().strip() for _ in range(40)]
     os.kill(process.pid, signal.SIGKILL)

@@ -24,7 +24,9 @@ HOST = "http://localhost"
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory, point_goal: Choice) -> Iterator[tuple[TestClient, Store]]:
+def served(
+    tmp_path_factory: pytest.TempPathFactory, point_goal: Choice
+) -> Iterator[tuple[TestClient, Store]]:
     store = Store(tmp_path_factory.mktemp("served"))
     app = make_app(make_conversations(store, point_goal, n_queries=3, max_sessions=30))
     with TestClient(app, base_url=HOST, follow_redirects=False) as client:
@@ -60,11 +62,20 @@ def test_a_whole_conversation(served: tuple[TestClient, Store], tmp_path: Path) 
         video = client.get(f"{session}/video/{view['turn']['id']}")
         assert video.headers["content-type"] == "video/mp4"
         assert video.content[4:8] == b"ftyp"
-        assert client.get(f"{session}/video/{view['turn']['id']}", headers={"Range": "bytes=0-9"}).status_code == 206
-        client.post(f"{session}/answer", json={"question": view["turn"]["id"], "preference": preference})
+        assert (
+            client.get(
+                f"{session}/video/{view['turn']['id']}", headers={"Range": "bytes=0-9"}
+            ).status_code
+            == 206
+        )
+        client.post(
+            f"{session}/answer", json={"question": view["turn"]["id"], "preference": preference}
+        )
     view = settled(client, session)
     assert view["phase"] == "result"
-    response = client.post(f"{session}/verdict", json={"result": view["turn"]["id"], "verdict": "yes"})
+    response = client.post(
+        f"{session}/verdict", json={"result": view["turn"]["id"], "verdict": "yes"}
+    )
     assert response.json()["turn"]["verdict"] == "yes"
     assert "&lt;b&gt;right" in client.get(session).text
 
@@ -85,7 +96,16 @@ def test_wrong_tokens_find_nothing(served: tuple[TestClient, Store]) -> None:
     client, _ = served
     session = begin(client)
     token = session.removeprefix("/s/")
-    for wrong in (token[:-1], token + "x", token[::-1], "x", "a" * 5000, "%00", "..%2f" + token, "*"):
+    for wrong in (
+        token[:-1],
+        token + "x",
+        token[::-1],
+        "x",
+        "a" * 5000,
+        "%00",
+        "..%2f" + token,
+        "*",
+    ):
         for rest in ("", "/state", "/answers.json", "/policy.safetensors", "/video/1"):
             assert client.get(f"/s/{wrong}{rest}").status_code == 404, wrong
         assert client.post(f"/s/{wrong}/stop", json={}).status_code == 404
@@ -97,13 +117,21 @@ def test_one_session_does_not_see_anothers_video(served: tuple[TestClient, Store
     turn = settled(client, other)["turn"]["id"]
     assert client.get(f"{other}/video/{turn}").status_code == 200
     assert client.get(f"{mine}/video/{turn}").status_code == 404
-    assert client.post(f"{mine}/answer", json={"question": turn, "preference": "left"}).status_code == 409
+    assert (
+        client.post(f"{mine}/answer", json={"question": turn, "preference": "left"}).status_code
+        == 409
+    )
 
 
 @pytest.mark.parametrize(
     "path",
     [
-        *("/static/../start.html", "/static/%2e%2e/start.html", "/static/..%2f..%2fstore.py", "/static/%2fetc/passwd"),
+        *(
+            "/static/../start.html",
+            "/static/%2e%2e/start.html",
+            "/static/..%2f..%2fstore.py",
+            "/static/%2fetc/passwd",
+        ),
         *("/static/....//....//etc/passwd", "//etc/passwd", "/static/", "/answers.sqlite", "/.env"),
     ],
 )
@@ -138,11 +166,17 @@ def test_repeated_late_and_contradicting_posts(served: tuple[TestClient, Store])
         assert client.post(f"{session}/answer", json=body).status_code == 200
     assert settled(client, session)["answered"] == 1
     assert client.post(f"{session}/answer", json={**body, "preference": "right"}).status_code == 409
-    assert client.post(f"{session}/answer", json={**body, "question": question + 1000}).status_code == 409
+    assert (
+        client.post(f"{session}/answer", json={**body, "question": question + 1000}).status_code
+        == 409
+    )
     assert client.post(f"{session}/undo", json={"answered": 2}).status_code == 409
     assert client.post(f"{session}/undo", json={"answered": 1}).status_code == 200
     assert client.post(f"{session}/undo", json={"answered": 1}).status_code == 409
-    assert client.post(f"{session}/verdict", json={"result": question, "verdict": "yes"}).status_code == 409
+    assert (
+        client.post(f"{session}/verdict", json={"result": question, "verdict": "yes"}).status_code
+        == 409
+    )
     found = store.find(session.removeprefix("/s/"))
     assert found is not None
     assert store.answers(found.id) == []
@@ -172,7 +206,9 @@ def test_repeated_late_and_contradicting_posts(served: tuple[TestClient, Store])
         (b"question=1&preference=left", "application/x-www-form-urlencoded", 415),
     ],
 )
-def test_bodies_that_are_no_answer(served: tuple[TestClient, Store], content: bytes, kind: str, status: int) -> None:
+def test_bodies_that_are_no_answer(
+    served: tuple[TestClient, Store], content: bytes, kind: str, status: int
+) -> None:
     client, store = served
     session = _shared(client)
     response = client.post(f"{session}/answer", content=content, headers={"Content-Type": kind})
@@ -201,11 +237,18 @@ def test_huge_bodies_are_refused_declared_or_not(served: tuple[TestClient, Store
     assert client.post(f"{session}/wish", json={"wish": "\U0001f600"}).status_code == 200
     for half in (b"\\ud800", b"\\udfff", b"\xed\xa0\x80"):
         content = b'{"wish": "' + half + b'"}'
-        response = client.post(f"{session}/wish", content=content, headers={"Content-Type": "application/json"})
+        response = client.post(
+            f"{session}/wish", content=content, headers={"Content-Type": "application/json"}
+        )
         assert (response.status_code, "half a character" in response.text) == (400, True)
-    assert client.post(f"{session}/wish", content=b"{}", headers={"Content-Length": "-5"}).status_code == 413
+    assert (
+        client.post(f"{session}/wish", content=b"{}", headers={"Content-Length": "-5"}).status_code
+        == 413
+    )
     for length in (b"9" * 5000, b"\xb2", b"+1", b"0x1"):
-        response = client.post(f"{session}/wish", content=b"{}", headers={b"Content-Length": length})
+        response = client.post(
+            f"{session}/wish", content=b"{}", headers={b"Content-Length": length}
+        )
         assert response.status_code == 413
     read = 0
 
@@ -218,7 +261,9 @@ def test_huge_bodies_are_refused_declared_or_not(served: tuple[TestClient, Store
     assert client.post(f"{session}/wish", content=endless()).status_code == 413
 
 
-def test_other_sites_cannot_post_and_other_names_are_not_answered(served: tuple[TestClient, Store]) -> None:
+def test_other_sites_cannot_post_and_other_names_are_not_answered(
+    served: tuple[TestClient, Store],
+) -> None:
     client, _ = served
     session = _shared(client)
     for headers in (
@@ -227,16 +272,28 @@ def test_other_sites_cannot_post_and_other_names_are_not_answered(served: tuple[
         {"Origin": "null"},
         {"Origin": "http://["},
     ):
-        assert client.post("/start", data={"model": "PointGoal"}, headers=headers).status_code == 403
+        assert (
+            client.post("/start", data={"model": "PointGoal"}, headers=headers).status_code == 403
+        )
         assert client.post(f"{session}/stop", json={}, headers=headers).status_code == 403
     assert client.get("/", headers={"Host": "evil.example"}).status_code == 421
     assert client.get("/", headers={"Host": "127.0.0.1:7860"}).status_code == 200
-    assert client.post("/start", data={"model": "PointGoal"}, headers={"Origin": HOST}).status_code == 303
+    assert (
+        client.post("/start", data={"model": "PointGoal"}, headers={"Origin": HOST}).status_code
+        == 303
+    )
 
 
 def test_unknown_models_are_refused_and_no_path_is_one(served: tuple[TestClient, Store]) -> None:
     client, _ = served
-    for name in ("", "Nobody", "../PointGoal", "/etc/passwd", "pretrained/PointGoal", "PointGoal\x00"):
+    for name in (
+        "",
+        "Nobody",
+        "../PointGoal",
+        "/etc/passwd",
+        "pretrained/PointGoal",
+        "PointGoal\x00",
+    ):
         assert client.post("/start", data={"model": name}).status_code == 409
 
 
@@ -259,7 +316,11 @@ def test_pages_load_nothing_from_elsewhere(served: tuple[TestClient, Store]) -> 
 @pytest.fixture
 def guarded(store: Store, point_goal: Choice) -> Iterator[TestClient]:
     access = Access(user="ann", password="a long password", token="t" * 32)
-    with TestClient(make_app(make_conversations(store, point_goal), access), base_url=HOST, follow_redirects=False) as client:
+    with TestClient(
+        make_app(make_conversations(store, point_goal), access),
+        base_url=HOST,
+        follow_redirects=False,
+    ) as client:
         yield client
 
 
@@ -276,7 +337,9 @@ def test_a_password_or_a_token_is_asked_for(guarded: TestClient) -> None:
     assert entry.status_code == 303
     assert entry.headers["location"] == "/"
     assert "httponly" in entry.headers["set-cookie"].lower()
-    assert "samesite=lax" in entry.headers["set-cookie"].lower()  # a browser keeps a strict one back after a click elsewhere
+    assert (
+        "samesite=lax" in entry.headers["set-cookie"].lower()
+    )  # a browser keeps a strict one back after a click elsewhere
     assert guarded.get("/").status_code == 200  # the client keeps the cookie
 
 
@@ -291,14 +354,23 @@ def test_a_password_or_a_token_is_asked_for(guarded: TestClient) -> None:
         ("/", [(b"cookie", b"sb3_poem_access_80=wrong")]),
     ],
 )
-def test_who_guesses_waits(guarded: TestClient, path: str, headers: list[tuple[bytes, bytes]]) -> None:
+def test_who_guesses_waits(
+    guarded: TestClient, path: str, headers: list[tuple[bytes, bytes]]
+) -> None:
     begun = time.monotonic()
     assert guarded.get(path, headers=headers).status_code == 401
     assert time.monotonic() - begun >= PAUSE_AFTER_WRONG_PASSWORD
 
 
 @pytest.mark.parametrize(
-    "path", ["//evil.example/", "///evil.example/", "/%2Fevil.example/", "/%5Cevil.example/", "/%09/evil.example"]
+    "path",
+    [
+        "//evil.example/",
+        "///evil.example/",
+        "/%2Fevil.example/",
+        "/%5Cevil.example/",
+        "/%09/evil.example",
+    ],
 )
 def test_a_token_leads_to_no_other_site(guarded: TestClient, path: str) -> None:
     entry = guarded.get(f"{HOST}{path}?token=" + "t" * 32)
@@ -315,7 +387,10 @@ def test_two_servers_of_one_host_keep_their_cookies(store: Store, point_goal: Ch
         jar += clients[-1].get(f"/?token={token}").headers["set-cookie"].partition(";")[0] + "; "
         clients[-1].cookies.clear()
     assert [client.get("/").status_code for client in clients] == [401, 401]
-    assert [client.get("/", headers={"Cookie": jar}).status_code for client in clients] == [200, 200]
+    assert [client.get("/", headers={"Cookie": jar}).status_code for client in clients] == [
+        200,
+        200,
+    ]
 
 
 def test_no_redirect_names_a_scheme(served: tuple[TestClient, Store]) -> None:
@@ -326,7 +401,14 @@ def test_no_redirect_names_a_scheme(served: tuple[TestClient, Store]) -> None:
 
 @pytest.mark.parametrize(
     ("host", "expected"),
-    [("127.0.0.1", True), ("127.8.9.1", True), ("localhost", True), ("::1", True), ("0.0.0.0", False), ("192.168.1.4", False)],
+    [
+        ("127.0.0.1", True),
+        ("127.8.9.1", True),
+        ("localhost", True),
+        ("::1", True),
+        ("0.0.0.0", False),
+        ("192.168.1.4", False),
+    ],
 )
 def test_loopback(host: str, expected: bool) -> None:
     assert is_loopback(host) is expected

@@ -1,4 +1,6 @@
-"""Conversations: the same questions and the same posterior, whether rendered ahead, resumed, undone or computed anew."""
+"""Conversations: the same questions and the same posterior, whether rendered ahead, resumed, undone
+or computed anew.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ async def begin(conversations: Conversations) -> tuple[Session, str]:
     return session, token
 
 
-async def talk_through(conversations: Conversations, session: Session, answers: tuple[str, ...]) -> dict[str, Any]:
+async def talk_through(
+    conversations: Conversations, session: Session, answers: tuple[str, ...]
+) -> dict[str, Any]:
     view = await settled(conversations, session)
     for preference in answers:
         await conversations.answer(session, view["turn"]["id"], preference)
@@ -38,7 +42,9 @@ async def talk_through(conversations: Conversations, session: Session, answers: 
     return view
 
 
-def contents(store: Store, session: Session, number: int, kind: str = "question") -> tuple[Any, ...]:
+def contents(
+    store: Store, session: Session, number: int, kind: str = "question"
+) -> tuple[Any, ...]:
     """Everything that a turn is, apart from when it was made and how its files are called."""
     turn = store.turn(session.id, kind, number)
     assert turn is not None
@@ -48,7 +54,9 @@ def contents(store: Store, session: Session, number: int, kind: str = "question"
     return (*(row[name] for name in columns), (store.videos / row["video"]).read_bytes())
 
 
-def test_the_page_asks_what_an_adapter_asks(with_conversations: Callable[..., Any], store: Store, point_goal: Choice) -> None:
+def test_the_page_asks_what_an_adapter_asks(
+    with_conversations: Callable[..., Any], store: Store, point_goal: Choice
+) -> None:
     async def talk(conversations: Conversations) -> Session:
         session, _ = await begin(conversations)
         await talk_through(conversations, session, ANSWERS)
@@ -113,7 +121,9 @@ def test_a_session_does_not_go_on_with_a_model_of_other_weights(
     model.save_pretrained(tmp_path / "PointGoal")
 
     async def second_half() -> str:
-        conversations = make_conversations(store, replace(point_goal, folder=tmp_path / "PointGoal"))
+        conversations = make_conversations(
+            store, replace(point_goal, folder=tmp_path / "PointGoal")
+        )
         session = await conversations.find(token)
         assert session is not None
         view = await conversations.view(session)
@@ -128,7 +138,9 @@ def test_a_session_does_not_go_on_with_a_model_of_other_weights(
     assert "with a model of other weights" in asyncio.run(second_half())
 
 
-def test_undo_and_the_same_answer_lead_to_the_same_question(with_conversations: Callable[..., Any], store: Store) -> None:
+def test_undo_and_the_same_answer_lead_to_the_same_question(
+    with_conversations: Callable[..., Any], store: Store
+) -> None:
     async def talk(conversations: Conversations) -> None:
         session, _ = await begin(conversations)
         await talk_through(conversations, session, ANSWERS)
@@ -147,7 +159,9 @@ def test_undo_and_the_same_answer_lead_to_the_same_question(with_conversations: 
     with_conversations(talk)
 
 
-def test_the_likely_next_pairs_are_rendered_ahead(with_conversations: Callable[..., Any], store: Store) -> None:
+def test_the_likely_next_pairs_are_rendered_ahead(
+    with_conversations: Callable[..., Any], store: Store
+) -> None:
     async def talk(conversations: Conversations) -> None:
         session, _ = await begin(conversations)
         view = await settled(conversations, session)
@@ -159,7 +173,9 @@ def test_the_likely_next_pairs_are_rendered_ahead(with_conversations: Callable[.
         await settled(conversations, session)
         turn = store.turn(session.id, "question", 1)
         assert turn is not None
-        assert turn["video"] == ahead["right"].request.video.name  # what was rendered ahead, not another
+        assert (
+            turn["video"] == ahead["right"].request.video.name
+        )  # what was rendered ahead, not another
         assert not ahead["left"].request.video.exists()
 
     with_conversations(talk, ahead=True)
@@ -183,7 +199,9 @@ def test_after_the_last_answer_comes_the_result_and_not_quite_asks_more(
     with_conversations(talk, n_queries=2)
 
 
-def test_a_video_that_was_deleted_is_filmed_again(with_conversations: Callable[..., Any], store: Store) -> None:
+def test_a_video_that_was_deleted_is_filmed_again(
+    with_conversations: Callable[..., Any], store: Store
+) -> None:
     async def talk(conversations: Conversations) -> None:
         session, _ = await begin(conversations)
         view = await talk_through(conversations, session, ("left",))
@@ -239,4 +257,8 @@ def test_a_film_made_again_while_crowded_is_described_as_it_is(
         return before, (await settled(conversations, first))["turn"]
 
     before, after = with_conversations(talk)
-    assert (after["id"], after["fps"], after["frames"]) == (before["id"], before["fps"] / 2, -(-before["frames"] // 2))
+    assert (after["id"], after["fps"], after["frames"]) == (
+        before["id"],
+        before["fps"] / 2,
+        -(-before["frames"] // 2),
+    )

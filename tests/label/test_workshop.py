@@ -14,7 +14,15 @@ import gymnasium
 import pytest
 
 from sb3_poem.label.catalogue import Choice
-from sb3_poem.label.turns import Bench, NotWantedError, Request, Turn, _RendersWhileWanted, make_env, make_turn
+from sb3_poem.label.turns import (
+    Bench,
+    NotWantedError,
+    Request,
+    Turn,
+    _RendersWhileWanted,
+    make_env,
+    make_turn,
+)
 from sb3_poem.label.workshop import LIKELY, WAITED_FOR, Workshop, process_pool
 
 TURN = Turn(None, None, None, None, None, 20.0, 1)
@@ -24,7 +32,9 @@ def request(choice: Choice, folder: Path, name: str) -> Request:
     return Request(choice, 5, {}, "question", folder / f"{name}.mp4")
 
 
-def test_a_turn_that_nobody_wants_any_more_is_stopped_for_the_next(point_goal: Choice, tmp_path: Path) -> None:
+def test_a_turn_that_nobody_wants_any_more_is_stopped_for_the_next(
+    point_goal: Choice, tmp_path: Path
+) -> None:
     started = threading.Event()
 
     def make(wanted: Request) -> Turn:
@@ -66,7 +76,9 @@ def test_rendering_ends_when_the_marker_is_taken_away(point_goal: Choice, tmp_pa
     assert env.render().ndim == 3
 
 
-def test_a_worker_leaves_a_turn_whose_marker_goes(point_goal: Choice, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_leaves_a_turn_whose_marker_goes(
+    point_goal: Choice, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     wanted = request(point_goal, tmp_path, "turn")
     images = 0
     render = _RendersWhileWanted.render
@@ -89,18 +101,27 @@ def test_a_worker_leaves_a_turn_whose_marker_goes(point_goal: Choice, tmp_path: 
     assert wanted.video.is_file()
 
 
-@pytest.mark.parametrize(("fps", "alone", "crowded"), [(10, 1, 1), (20, 1, 2), (25, 1, 2), (80, 4, 8)])
+@pytest.mark.parametrize(
+    ("fps", "alone", "crowded"), [(10, 1, 1), (20, 1, 2), (25, 1, 2), (80, 4, 8)]
+)
 def test_films_show_about_twenty_frames_a_second(
     point_goal: Choice, tmp_path: Path, fps: int, alone: int, crowded: int
 ) -> None:
     bench = object.__new__(Bench)
     bench.fps = float(fps)
     wanted = request(point_goal, tmp_path, "turn")
-    assert [bench._film_every(replace(wanted, film_every=every)) for every in (1, 2)] == [alone, crowded]
+    assert [bench._film_every(replace(wanted, film_every=every)) for every in (1, 2)] == [
+        alone,
+        crowded,
+    ]
 
 
-def test_workers_know_the_packages_that_register_environments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "walk_package.py").write_text("import gymnasium\ngymnasium.register('Strolling-v0', entry_point=dict)\n")
+def test_workers_know_the_packages_that_register_environments(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "walk_package.py").write_text(
+        "import gymnasium\ngymnasium.register('Strolling-v0', entry_point=dict)\n"
+    )
     monkeypatch.syspath_prepend(tmp_path)
     with process_pool(1, packages=["walk_package"]) as pool:
         assert pool.submit(gymnasium.spec, "Strolling-v0").result(60).id == "Strolling-v0"

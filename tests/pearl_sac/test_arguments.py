@@ -7,10 +7,18 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
-from meta_toys import ARCH, EPOCH, N_TASKS, POINT_GOAL, assert_same_model, differing, parameters, small, walks
-from stable_baselines3.common.callbacks import (
-    BaseCallback,
+from meta_toys import (
+    ARCH,
+    EPOCH,
+    N_TASKS,
+    POINT_GOAL,
+    assert_same_model,
+    differing,
+    parameters,
+    small,
+    walks,
 )
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.sac.policies import SACPolicy
 
@@ -58,7 +66,10 @@ def test_tasks_come_from_the_family_and_the_seed(algorithm: type[PEARLSAC]) -> N
     # uniform on [0, pi]: Kolmogorov-Smirnov at 1 %
     deviation = np.abs(np.sort(tasks[:, 0]) / np.pi - (np.arange(200) + 0.5) / 200).max()
     assert deviation < 1.63 / np.sqrt(200)
-    assert small(algorithm, walks(1), horizon=10, n_train_tasks=None).train_tasks.tasks.shape == (120, 1)
+    assert small(algorithm, walks(1), horizon=10, n_train_tasks=None).train_tasks.tasks.shape == (
+        120,
+        1,
+    )
 
 
 def test_the_callers_policy_kwargs_stay_as_they_are(algorithm: type[PEARLSAC]) -> None:
@@ -70,12 +81,16 @@ def test_the_callers_policy_kwargs_stay_as_they_are(algorithm: type[PEARLSAC]) -
 
 
 def test_net_arch_as_a_list_is_for_actor_and_critics(algorithm: type[PEARLSAC]) -> None:
-    policy = small(algorithm, policy_kwargs={"net_arch": [24, 12], "activation_fn": th.nn.Tanh}).policy
+    policy = small(
+        algorithm, policy_kwargs={"net_arch": [24, 12], "activation_fn": th.nn.Tanh}
+    ).policy
     assert policy.net_arch["pi"] == policy.net_arch["qf"] == [24, 12]
     assert policy.actor.mlp.output.in_features == 12
     assert policy.encoder.mlp.output.in_features == 200
     assert isinstance(policy.actor.mlp.activation, th.nn.Tanh)
-    with pytest.raises(ValueError, match=r"net_arch has unknown keys \['vf'\]; known are .*'decoder'.*"):
+    with pytest.raises(
+        ValueError, match=r"net_arch has unknown keys \['vf'\]; known are .*'decoder'.*"
+    ):
         small(algorithm, policy_kwargs={"net_arch": {"vf": [1]}})
 
 
@@ -91,7 +106,11 @@ def test_the_policy_can_be_a_class(algorithm: type[PEARLSAC]) -> None:
 
 @one_is_enough
 def test_another_optimizer(algorithm: type[PEARLSAC]) -> None:
-    kwargs = {"net_arch": ARCH, "optimizer_class": th.optim.SGD, "optimizer_kwargs": {"momentum": 0.9}}
+    kwargs = {
+        "net_arch": ARCH,
+        "optimizer_class": th.optim.SGD,
+        "optimizer_kwargs": {"momentum": 0.9},
+    }
     model = small(algorithm, policy_kwargs=kwargs).learn(EPOCH)
     assert isinstance(model.policy.optimizer, th.optim.SGD)
     assert model.policy.optimizer.param_groups[0]["momentum"] == 0.9
@@ -125,7 +144,9 @@ def test_learning_rate_schedules_reach_the_optimisers(algorithm: type[PEARLSAC])
     small(algorithm, learning_rate=lambda remaining: 1e-3 * remaining).learn(4 * EPOCH, record)
     # epochs train after their collection: with 3/4, 2/4, 1/4 and 0 of the run remaining
     expected = [1e-3, 0.75e-3, 0.5e-3, 0.25e-3, 0.0]
-    np.testing.assert_allclose(record.values, np.repeat(np.array(expected)[:, None], 2, axis=1), atol=1e-12)
+    np.testing.assert_allclose(
+        record.values, np.repeat(np.array(expected)[:, None], 2, axis=1), atol=1e-12
+    )
 
 
 @one_is_enough
@@ -181,7 +202,10 @@ def test_target_critics_follow_slowly(algorithm: type[PEARLSAC]) -> None:
 @one_is_enough
 def test_target_update_interval(algorithm: type[PEARLSAC]) -> None:
     """Updates at gradient steps 0, 3, 6, ... with tau = 1 copy the critics."""
-    model, copied = small(algorithm, gradient_steps=0, target_update_interval=3, tau=1.0).learn(1), []
+    model, copied = (
+        small(algorithm, gradient_steps=0, target_update_interval=3, tau=1.0).learn(1),
+        [],
+    )
     with model.make_updater() as updater:
         for batch in model.make_sampler().sample(7, 16):
             updater.step(batch)
@@ -193,9 +217,13 @@ def test_target_update_interval(algorithm: type[PEARLSAC]) -> None:
 def test_gradient_steps_and_learning_starts(algorithm: type[PEARLSAC]) -> None:
     assert small(algorithm, gradient_steps=0).learn(EPOCH)._n_updates == 0
     assert small(algorithm, gradient_steps=-1, n_train_tasks=2).learn(1)._n_updates == 50
-    model = small(algorithm, learning_starts=EPOCH).learn(2 * EPOCH)  # the first epoch acts at random and learns nothing
+    model = small(algorithm, learning_starts=EPOCH).learn(
+        2 * EPOCH
+    )  # the first epoch acts at random and learns nothing
     assert model._n_updates == 5
-    first_actions = th.cat([model.replay_buffer.transitions(task).actions[:, :25] for task in range(N_TASKS)])
+    first_actions = th.cat(
+        [model.replay_buffer.transitions(task).actions[:, :25] for task in range(N_TASKS)]
+    )
     assert first_actions.abs().max() < 1.0
     assert abs(first_actions.mean().item()) < 0.1
     assert first_actions.std().item() == pytest.approx(1 / np.sqrt(3), rel=0.1)
@@ -209,7 +237,9 @@ def test_horizons_per_task_and_epoch(algorithm: type[PEARLSAC]) -> None:
     assert (model.replay_buffer.counts == 75).all()
     # contexts are the tasks' own
     raw = model.replay_buffer.transitions(4).rewards[0]
-    assert sorted(model.epoch_context.rewards[4].tolist()) == pytest.approx(sorted(raw.tolist()), abs=1e-5)
+    assert sorted(model.epoch_context.rewards[4].tolist()) == pytest.approx(
+        sorted(raw.tolist()), abs=1e-5
+    )
 
 
 @one_is_enough

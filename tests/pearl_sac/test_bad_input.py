@@ -12,7 +12,18 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from meta_toys import ARCH, POINT_GOAL, Poisoned, TwoWalks, Walk, WindyWalk, differing, parameters, small, walks
+from meta_toys import (
+    ARCH,
+    POINT_GOAL,
+    Poisoned,
+    TwoWalks,
+    Walk,
+    WindyWalk,
+    differing,
+    parameters,
+    small,
+    walks,
+)
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
@@ -52,21 +63,33 @@ FRACTIONS = ("gamma", "tau", "relabel_fraction", "shaping_coef", "mirror_fractio
         ("gradient_steps", -2, "`gradient_steps` must be at least -1, but is -2"),
         ("learning_starts", -1, "`learning_starts` must be at least 0, but is -1"),
         ("target_update_interval", 0, "`target_update_interval` must be at least 1, but is 0"),
-        *[("batch_size", value, f"`batch_size` must be a whole number, but is {value}") for value in (1.5, NAN, True)],
         *[
-            (name, value, f"`{name}` must be {'at least 0' if value == -0.5 else 'a finite number'}, but is {value}")
+            ("batch_size", value, f"`batch_size` must be a whole number, but is {value}")
+            for value in (1.5, NAN, True)
+        ],
+        *[
+            (
+                name,
+                value,
+                f"`{name}` must be {'at least 0' if value == -0.5 else 'a finite number'}, but is {value}",
+            )
             for name in ("kl_coef", "reward_coef", "policy_coef", "noise_color", *FRACTIONS)
             for value in (-0.5, NAN)
         ],
         *[(name, 1.01, f"`{name}` must be at most 1, but is 1.01") for name in FRACTIONS],
-        *[("reward_scale", value, "reward_scale must be a positive number or") for value in (0, -1.0, NAN, "big", None)],
+        *[
+            ("reward_scale", value, "reward_scale must be a positive number or")
+            for value in (0, -1.0, NAN, "big", None)
+        ],
         ("precision", "fp16", "precision must be one of 'auto', 'bf16', 'fp32', got 'fp16'"),
         ("horizon", 30, "horizon is 30, but the environment ends episodes after 25 steps"),
         ("policy_kwargs", {"net_arch": {"critic": [3]}}, "net_arch has unknown keys"),
         ("device", "tpu7", "[Dd]evice|tpu"),
     ],
 )
-def test_arguments_of_both(algorithm: type[PEARLSAC], argument: str, value: Any, message: str) -> None:
+def test_arguments_of_both(
+    algorithm: type[PEARLSAC], argument: str, value: Any, message: str
+) -> None:
     with pytest.raises((ValueError, RuntimeError), match=message):
         small(algorithm, **{argument: value})
 
@@ -76,7 +99,11 @@ def test_arguments_of_both(algorithm: type[PEARLSAC], argument: str, value: Any,
     [
         ("similarity", "cosine", "similarity must be one of 'two-encoder', 'inner', got 'cosine'"),
         ("context", "rewards", "context must be one of 'optimal', 'pearl', got 'rewards'"),
-        ("preference_source", "human", "preference_source must be one of 'auto', 'relabel', 'rollout', got 'human'"),
+        (
+            "preference_source",
+            "human",
+            "preference_source must be one of 'auto', 'relabel', 'rollout', got 'human'",
+        ),
         ("preference_coef", -1.0, r"preference_coef must be at least 0, got -1\.0"),
         ("preference_coef", NAN, "preference_coef must be at least 0, got nan"),
         ("preference_group_size", 1, "preference_group_size must be at least 2, got 1"),
@@ -96,7 +123,10 @@ def test_arguments_of_poem(argument: str, value: Any, message: str) -> None:
         ({"sde_sample_freq": 4}, "noise_color=1"),
         ({"use_sde_at_warmup": True}, "noise_color=1"),
         ({"train_freq": 1}, "trajectories_per_task and gradient_steps"),
-        ({"replay_buffer_class": HerReplayBuffer}, "as HER does for goals; see buffer_size, relabel_fraction"),
+        (
+            {"replay_buffer_class": HerReplayBuffer},
+            "as HER does for goals; see buffer_size, relabel_fraction",
+        ),
         ({"replay_buffer_kwargs": {"n_sampled_goal": 4}}, "GoalFamily"),
         ({"policy_kwargs": {"features_extractor_class": FlattenExtractor}}, "net_arch"),
         ({"policy_kwargs": {"share_features_extractor": True}}, "net_arch"),
@@ -104,15 +134,21 @@ def test_arguments_of_poem(argument: str, value: Any, message: str) -> None:
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
-def test_what_only_sac_takes(algorithm: type[PEARLSAC], arguments: dict[str, Any], instead: str) -> None:
+def test_what_only_sac_takes(
+    algorithm: type[PEARLSAC], arguments: dict[str, Any], instead: str
+) -> None:
     name = next(iter(arguments.get("policy_kwargs", arguments)))
     of_policy = "'s policy" if "policy_kwargs" in arguments else ""
-    with pytest.raises(TypeError, match=f"{algorithm.__name__}{of_policy} takes no '{name}': .*{instead}"):
+    with pytest.raises(
+        TypeError, match=f"{algorithm.__name__}{of_policy} takes no '{name}': .*{instead}"
+    ):
         small(algorithm, **arguments)
 
 
 def test_every_argument_of_sac_is_taken_or_refused_with_a_reason(algorithm: type[PEARLSAC]) -> None:
-    of_sac, of_its_policy, ours = (set(inspect.signature(kind).parameters) for kind in (SAC, SACPolicy, algorithm))
+    of_sac, of_its_policy, ours = (
+        set(inspect.signature(kind).parameters) for kind in (SAC, SACPolicy, algorithm)
+    )
     of_our_policy = set(inspect.signature(LatentPolicy).parameters)
     assert of_sac - ours <= UNSUPPORTED.keys()
     assert of_its_policy - of_our_policy <= UNSUPPORTED.keys()
@@ -125,7 +161,9 @@ def test_an_unknown_argument(algorithm: type[PEARLSAC]) -> None:
         small(algorithm, learning_rat=1)
     with pytest.raises(TypeError, match="keyword argument 'xyz'"):
         small(algorithm, xyz=1)
-    with pytest.raises(TypeError, match="POEMSAC got an unexpected keyword argument 'context_relabel_fraction'"):
+    with pytest.raises(
+        TypeError, match="POEMSAC got an unexpected keyword argument 'context_relabel_fraction'"
+    ):
         small(POEMSAC, context_relabel_fraction=0.5)
 
 
@@ -143,7 +181,9 @@ class DictObservations(gym.Env):
     action_space = Walk.action_space
 
 
-NO_FAMILY = r"env <.*> is no task family.*poem_envs\.TaskFamily.*poem_envs\.GoalFamily.*docs/families\.md"
+NO_FAMILY = (
+    r"env <.*> is no task family.*poem_envs\.TaskFamily.*poem_envs\.GoalFamily.*docs/families\.md"
+)
 
 
 @pytest.mark.parametrize(
@@ -160,7 +200,9 @@ def test_no_task_family(algorithm: type[PEARLSAC], env: Any) -> None:
 
 
 def test_no_environment_at_all(algorithm: type[PEARLSAC]) -> None:
-    with pytest.raises(gym.error.NameNotFound, match=r"No environment 'xyzzy' is registered .* nor any like it"):
+    with pytest.raises(
+        gym.error.NameNotFound, match=r"No environment 'xyzzy' is registered .* nor any like it"
+    ):
         small(algorithm, "xyzzy")
     for name in ("poem/HalfCheetahVel", "HalfCheetahVel-v0", "poem/HalfCheetaVel-v0"):
         with pytest.raises(gym.error.NameNotFound, match="did you mean 'poem/HalfCheetahVel-v0'"):
@@ -169,7 +211,8 @@ def test_no_environment_at_all(algorithm: type[PEARLSAC]) -> None:
         small(algorithm, None)
     for env in (3, Walk):
         with pytest.raises(
-            TypeError, match=r"env is .*, but must be an environment.*, a vectorised one.*, or a registered id"
+            TypeError,
+            match=r"env is .*, but must be an environment.*, a vectorised one.*, or a registered id",
         ):
             small(algorithm, env)
 
@@ -185,7 +228,10 @@ class FlatAllTasks(Walk):
 @pytest.mark.parametrize(
     ("family", "message"),
     [
-        (Discrete, r"env .*Discrete.*: action_space must be a flat gymnasium.spaces.Box, .*but is Discrete\(3\)"),
+        (
+            Discrete,
+            r"env .*Discrete.*: action_space must be a flat gymnasium.spaces.Box, .*but is Discrete\(3\)",
+        ),
         (FlatAllTasks, r"env .*FlatAllTasks.*: all_tasks must have shape \(n, 1\)"),
     ],
 )
@@ -206,9 +252,7 @@ def test_a_family_without_a_method_cannot_be_made(method: str) -> None:
 
 
 def test_more_tasks_than_a_finite_family_has(algorithm: type[PEARLSAC]) -> None:
-    message = (
-        r"n_train_tasks is 3, but poem/HalfCheetahFwdBack-v0 is a finite family of 2 tasks; use at most 2, or None for all"
-    )
+    message = r"n_train_tasks is 3, but poem/HalfCheetahFwdBack-v0 is a finite family of 2 tasks; use at most 2, or None for all"
     with pytest.raises(ValueError, match=message):
         small(algorithm, "poem/HalfCheetahFwdBack-v0", n_train_tasks=3)
     model = small(algorithm, walks(2, TwoWalks), horizon=10, n_train_tasks=None)
@@ -221,13 +265,22 @@ def test_vec_normalize(algorithm: type[PEARLSAC]) -> None:
 
 
 def test_relabelling_needs_shared_dynamics(algorithm: type[PEARLSAC]) -> None:
-    with pytest.raises(ValueError, match=r"relabel_fraction must be 0: the tasks of .* do not share dynamics"):
+    with pytest.raises(
+        ValueError, match=r"relabel_fraction must be 0: the tasks of .* do not share dynamics"
+    ):
         small(algorithm, walks(2, WindyWalk), horizon=10, relabel_fraction=0.5)
-    with pytest.raises(ValueError, match=r"context_relabel_fraction must be 0: the tasks of .* do not share dynamics"):
+    with pytest.raises(
+        ValueError,
+        match=r"context_relabel_fraction must be 0: the tasks of .* do not share dynamics",
+    ):
         small(PEARLSAC, walks(2, WindyWalk), horizon=10, context_relabel_fraction=0.5)
-    with pytest.raises(ValueError, match=r"`context_relabel_fraction` must be at most 1, but is 1\.5"):
+    with pytest.raises(
+        ValueError, match=r"`context_relabel_fraction` must be at most 1, but is 1\.5"
+    ):
         small(PEARLSAC, walks(2), horizon=10, context_relabel_fraction=1.5)
-    with pytest.raises(ValueError, match=r'preference_source must be "rollout" or "auto": .* do not share dynamics'):
+    with pytest.raises(
+        ValueError, match=r'preference_source must be "rollout" or "auto": .* do not share dynamics'
+    ):
         small(POEMSAC, walks(2, WindyWalk), horizon=10, preference_source="relabel")
 
 
@@ -254,7 +307,9 @@ def poisoned(what: str, episode: int, step: int) -> DummyVecEnv:
 
 @pytest.mark.parametrize("what", ["observations", "rewards", "reward features"])
 def test_poison_stops_training_before_the_weights(algorithm: type[PEARLSAC], what: str) -> None:
-    """In the second wave (tasks 4 to 7) of the third epoch; every wave resets twice, as SB3's DummyVecEnv does at an end."""
+    """In the second wave (tasks 4 to 7) of the third epoch; every wave resets twice, as SB3's
+    DummyVecEnv does at an end.
+    """
     seen: list[dict[str, th.Tensor]] = []
 
     def callback(local_variables: dict[str, Any], _: dict[str, Any]) -> bool:
@@ -264,7 +319,8 @@ def test_poison_stops_training_before_the_weights(algorithm: type[PEARLSAC], wha
     waves_before = 2 * 3 + 1
     model = small(algorithm, poisoned(what, episode=1 + 2 * waves_before, step=6), horizon=10)
     with pytest.raises(
-        ValueError, match=rf"returned {what} that are NaN or infinite: copy 2, training task 6, episode \d+, step 6: .*nan|inf"
+        ValueError,
+        match=rf"returned {what} that are NaN or infinite: copy 2, training task 6, episode \d+, step 6: .*nan|inf",
     ):
         model.learn(1000, callback)
     assert model.epoch == 2
@@ -282,7 +338,10 @@ def test_a_loss_that_is_not_finite_changes_no_weight(algorithm: type[PEARLSAC]) 
     model = small(algorithm).learn(300)
     before = parameters(model)
     model.epoch_context.transitions[:] = float("nan")  # latents, and with them all losses
-    with pytest.raises(ValueError, match=r"loss or its gradient is not finite at update 5; no network was changed by it"):
+    with pytest.raises(
+        ValueError,
+        match=r"loss or its gradient is not finite at update 5; no network was changed by it",
+    ):
         model.train(3, 16)
     assert not differing(before, parameters(model))
 
@@ -296,7 +355,10 @@ def test_a_reward_that_overflows_changes_no_weight(algorithm: type[PEARLSAC]) ->
     before = parameters(model)
     at = model.replay_buffer.at
     model.replay_buffer.at = lambda *args: overflowing(at(*args))
-    with pytest.raises(ValueError, match=r"loss or its gradient is not finite at update 5; no network was changed by it"):
+    with pytest.raises(
+        ValueError,
+        match=r"loss or its gradient is not finite at update 5; no network was changed by it",
+    ):
         model.train(3, 16)
     assert not differing(before, parameters(model))
 
@@ -306,7 +368,9 @@ def test_a_reward_that_overflows_changes_no_weight(algorithm: type[PEARLSAC]) ->
 
 def test_sample_latents_and_sources(algorithm: type[PEARLSAC]) -> None:
     model = small(algorithm)
-    with pytest.raises(ValueError, match='source must be "prior" or "aggregate", got \'posterior\''):
+    with pytest.raises(
+        ValueError, match='source must be "prior" or "aggregate", got \'posterior\''
+    ):
         model.sample_latents(3, np.random.default_rng(0), "posterior")
 
 
@@ -314,7 +378,11 @@ def test_no_task_family_after_all(algorithm: type[PEARLSAC]) -> None:
     """It has some of what a family has."""
 
     class Half(gym.Env):
-        observation_space, action_space, task_space = Walk.observation_space, Walk.action_space, Walk.task_space
+        observation_space, action_space, task_space = (
+            Walk.observation_space,
+            Walk.action_space,
+            Walk.task_space,
+        )
         all_tasks = None
 
         def reset(self, **_: Any) -> tuple[np.ndarray, dict]:
@@ -326,7 +394,9 @@ def test_no_task_family_after_all(algorithm: type[PEARLSAC]) -> None:
 
 @pytest.mark.skipif(th.cuda.is_available(), reason="shows what happens without the device")
 def test_a_missing_gpu_is_told() -> None:
-    with pytest.warns(UserWarning, match="device is 'cuda', but torch sees no CUDA device: the CPU is used"):
+    with pytest.warns(
+        UserWarning, match="device is 'cuda', but torch sees no CUDA device: the CPU is used"
+    ):
         model = small(POEMSAC, device="cuda")
     assert model.device.type == "cpu"
 

@@ -59,7 +59,11 @@ def test_sb3s_callbacks(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
             return True
 
     evaluation = EvalCallback(
-        make_vec_env(POINT_GOAL, 1), n_eval_episodes=2, eval_freq=20, best_model_save_path=str(tmp_path), verbose=0
+        make_vec_env(POINT_GOAL, 1),
+        n_eval_episodes=2,
+        eval_freq=20,
+        best_model_save_path=str(tmp_path),
+        verbose=0,
     )
     callbacks = CallbackList(
         [
@@ -129,7 +133,11 @@ def test_csv_and_json_logs(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
     lines = [json.loads(line) for line in (tmp_path / "progress.json").read_text().splitlines()]
     promised = LOGGED | (LOGGED_BY_POEM if algorithm is POEMSAC else set())
     for entries in (rows, lines):
-        assert [int(float(entry["time/total_timesteps"])) for entry in entries] == [EPOCH, 2 * EPOCH, 3 * EPOCH]
+        assert [int(float(entry["time/total_timesteps"])) for entry in entries] == [
+            EPOCH,
+            2 * EPOCH,
+            3 * EPOCH,
+        ]
         for entry in entries:
             assert promised <= set(entry)
             assert np.isfinite([float(entry[name]) for name in promised]).all()
@@ -137,20 +145,28 @@ def test_csv_and_json_logs(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
     assert float(rows[0]["rollout/ep_len_mean"]) == 25
     assert [int(row["train/n_updates"]) for row in rows] == [5, 10, 15]
     # the first row is of the first epoch alone: twelve episodes, whose returns Monitor saw too
-    assert float(rows[0]["rollout/train_task_return"]) == pytest.approx(float(rows[0]["rollout/ep_rew_mean"]), rel=1e-5)
+    assert float(rows[0]["rollout/train_task_return"]) == pytest.approx(
+        float(rows[0]["rollout/ep_rew_mean"]), rel=1e-5
+    )
 
 
 @one_is_enough
-def test_observations_beyond_the_bound_are_counted(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
+def test_observations_beyond_the_bound_are_counted(
+    algorithm: type[PEARLSAC], tmp_path: Path
+) -> None:
     model = small(algorithm)
     model.policy.obs_norm.std[:] = 0.02
     model.policy.obs_norm.update = lambda rows: None
     model.set_logger(configure(str(tmp_path), ["json"]))
     model.learn(EPOCH)
-    seen = np.concatenate([model.replay_buffer.transitions(task).observations for task in range(N_TASKS)]).reshape(-1, 2)
+    seen = np.concatenate(
+        [model.replay_buffer.transitions(task).observations for task in range(N_TASKS)]
+    ).reshape(-1, 2)
     share = (np.abs(seen) / 0.02 >= 10).any(axis=1).mean()
     assert 0.05 < share < 0.95
-    assert json.loads((tmp_path / "progress.json").read_text())["train/clipped_observations"] == pytest.approx(share)
+    assert json.loads((tmp_path / "progress.json").read_text())[
+        "train/clipped_observations"
+    ] == pytest.approx(share)
 
 
 @one_is_enough
@@ -173,7 +189,10 @@ def test_tensorboard(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
     model.learn(2 * EPOCH)
     model.learn(EPOCH, reset_num_timesteps=False)
     model.learn(EPOCH, tb_log_name="named")
-    assert sorted(path.name for path in tmp_path.iterdir()) == [f"{algorithm.__name__}_1", "named_1"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        f"{algorithm.__name__}_1",
+        "named_1",
+    ]
     events = EventAccumulator(str(tmp_path / f"{algorithm.__name__}_1"))
     events.Reload()
     promised = LOGGED | (LOGGED_BY_POEM if algorithm is POEMSAC else set())
@@ -182,7 +201,9 @@ def test_tensorboard(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
 
 
 @one_is_enough
-def test_verbose_prints_a_table(algorithm: type[PEARLSAC], capsys: pytest.CaptureFixture[str]) -> None:
+def test_verbose_prints_a_table(
+    algorithm: type[PEARLSAC], capsys: pytest.CaptureFixture[str]
+) -> None:
     model = small(algorithm, verbose=1)
     assert "Using cpu device" in capsys.readouterr().out
 
@@ -201,10 +222,16 @@ def test_verbose_prints_a_table(algorithm: type[PEARLSAC], capsys: pytest.Captur
 
     model.learn(2 * EPOCH + 1, Printed())
     printed = Printed.printed + capsys.readouterr().out
-    sentence = "Training for 601 steps in 3 epochs: each has 300 environment steps, then 5 gradient steps"
+    sentence = (
+        "Training for 601 steps in 3 epochs: each has 300 environment steps, then 5 gradient steps"
+    )
     assert printed.index(sentence) < printed.index("decoder_error")
     assert printed.count("decoder_error") == 3
-    assert Printed.tables == [0, 0, 1]  # that of an epoch is printed when the next begins, right after this
+    assert Printed.tables == [
+        0,
+        0,
+        1,
+    ]  # that of an epoch is printed when the next begins, right after this
     small(algorithm, verbose=0).learn(EPOCH)
     assert capsys.readouterr().out == ""
 
@@ -222,7 +249,9 @@ def test_monitors_episode_info(algorithm: type[PEARLSAC], tmp_path: Path) -> Non
     assert len(list((tmp_path / "monitor").glob("*.monitor.csv"))) == 3
 
 
-def test_a_model_from_a_gpu_goes_on_training_here(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
+def test_a_model_from_a_gpu_goes_on_training_here(
+    algorithm: type[PEARLSAC], tmp_path: Path
+) -> None:
     """There optimisers are captured in a graph, which Adam refuses on a processor."""
     model = small(algorithm).learn(EPOCH)
     for optimizer in (model.policy.optimizer, model.ent_coef_optimizer):

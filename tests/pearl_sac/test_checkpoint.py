@@ -1,4 +1,6 @@
-"""Runs that were interrupted, killed with SIGKILL too, end with the same bits as runs that were not."""
+"""Runs that were interrupted, killed with SIGKILL too, end with the same bits as runs that were
+not.
+"""
 
 from __future__ import annotations
 
@@ -37,9 +39,14 @@ def assert_same_run(one: PEARLSAC, two: PEARLSAC) -> None:
     first, second = one.replay_buffer.state(), two.replay_buffer.state()
     assert first.keys() == second.keys()
     assert all(np.array_equal(first[name], second[name]) for name in first)
-    first, second = ({k: v for k, v in vars(model.epoch_context).items() if v is not None} for model in (one, two))
+    first, second = (
+        {k: v for k, v in vars(model.epoch_context).items() if v is not None}
+        for model in (one, two)
+    )
     assert not differing(first, second)
-    assert [episode["r"] for episode in one.ep_info_buffer] == [episode["r"] for episode in two.ep_info_buffer]
+    assert [episode["r"] for episode in one.ep_info_buffer] == [
+        episode["r"] for episode in two.ep_info_buffer
+    ]
 
 
 class StopAt(BaseCallback):
@@ -62,10 +69,26 @@ def schedule(remaining: float) -> float:
 VARIANTS: dict[str, tuple[type[PEARLSAC], Any, dict[str, Any]]] = {
     "pearl": (PEARLSAC, lambda: POINT_GOAL, {}),
     "poem": (POEMSAC, lambda: POINT_GOAL, {"learning_rate": schedule}),
-    "relabelled-contexts": (PEARLSAC, lambda: make_vec_env(POINT_GOAL, 5), {"context_relabel_fraction": 0.5}),
-    "relabelled-batches": (POEMSAC, lambda: make_vec_env(POINT_GOAL, 5), {"relabel_fraction": 0.5, "ent_coef": 0.1}),
-    "measured-preferences": (POEMSAC, lambda: walks(4, WindyWalk), {"horizon": 10, "trajectories_per_task": 2}),
-    "full-buffers": (PEARLSAC, lambda: walks(4, edge=0.4), {"horizon": 10, "buffer_size": 25, "learning_starts": 120}),
+    "relabelled-contexts": (
+        PEARLSAC,
+        lambda: make_vec_env(POINT_GOAL, 5),
+        {"context_relabel_fraction": 0.5},
+    ),
+    "relabelled-batches": (
+        POEMSAC,
+        lambda: make_vec_env(POINT_GOAL, 5),
+        {"relabel_fraction": 0.5, "ent_coef": 0.1},
+    ),
+    "measured-preferences": (
+        POEMSAC,
+        lambda: walks(4, WindyWalk),
+        {"horizon": 10, "trajectories_per_task": 2},
+    ),
+    "full-buffers": (
+        PEARLSAC,
+        lambda: walks(4, edge=0.4),
+        {"horizon": 10, "buffer_size": 25, "learning_starts": 120},
+    ),
 }
 
 
@@ -77,7 +100,9 @@ def test_a_resumed_run_ends_as_the_uninterrupted_one(variant: str, tmp_path: Pat
     interrupted = small(algorithm, make_env(), **arguments)
     steps_a_call = interrupted.env.num_envs
     with pytest.raises(KeyboardInterrupt):
-        interrupted.learn(total, [TrainingCheckpointCallback(path), StopAt(int(0.7 * total / steps_a_call))])
+        interrupted.learn(
+            total, [TrainingCheckpointCallback(path), StopAt(int(0.7 * total / steps_a_call))]
+        )
     del interrupted
     resumed = algorithm.load_checkpoint(path, make_env())
     assert 0 < resumed.num_timesteps < 0.7 * total
@@ -163,11 +188,23 @@ for moment in moments:  # forked: the imports take longer than the runs
 """
 
 # fsync is called for the file and for its folder
-MOMENTS = ("collecting-30", "collecting-75", "learning-13", "writing-5", "replacing-3", "outside-3", "outside-137")
+MOMENTS = (
+    "collecting-30",
+    "collecting-75",
+    "learning-13",
+    "writing-5",
+    "replacing-3",
+    "outside-3",
+    "outside-137",
+)
 
 
 def test_a_run_killed_at_any_moment_continues_as_if_nothing_had_happened(tmp_path: Path) -> None:
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*sys.path, str(TESTS)]), "OMP_NUM_THREADS": "1"}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([*sys.path, str(TESTS)]),
+        "OMP_NUM_THREADS": "1",
+    }
     command = [sys.executable, "-c", CHILDREN, str(tmp_path), *MOMENTS]
     result = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
@@ -179,7 +216,13 @@ def test_a_run_killed_at_any_moment_continues_as_if_nothing_had_happened(tmp_pat
         assert_same_run(whole, resumed.resume())
     # where the moment is known, the checkpoint is the last one before it
     known = {moment: epoch for moment, epoch in epochs.items() if not moment.startswith("outside")}
-    assert known == {"collecting-30": 1, "collecting-75": 2, "learning-13": 2, "writing-5": 2, "replacing-3": 2}
+    assert known == {
+        "collecting-30": 1,
+        "collecting-75": 2,
+        "learning-13": 2,
+        "writing-5": 2,
+        "replacing-3": 2,
+    }
 
 
 # ---------------------------------------------------------------- what a checkpoint holds
@@ -204,7 +247,9 @@ def test_a_checkpoint_before_training(tmp_path: Path) -> None:
 
 
 def test_saving_a_checkpoint_changes_nothing(tmp_path: Path) -> None:
-    with_checkpoints = small(POEMSAC).learn(3 * EPOCH, TrainingCheckpointCallback(tmp_path / "c.pt"))
+    with_checkpoints = small(POEMSAC).learn(
+        3 * EPOCH, TrainingCheckpointCallback(tmp_path / "c.pt")
+    )
     assert_same_run(with_checkpoints, small(POEMSAC).learn(3 * EPOCH))
 
 
@@ -223,7 +268,9 @@ def test_a_disk_that_is_full_half_way_is_named(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_full_disk_leaves_the_previous_checkpoint_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_leaves_the_previous_checkpoint_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path, model = tmp_path / "checkpoint.pt", small(POEMSAC)
     model.learn(EPOCH, TrainingCheckpointCallback(path))
     before = path.read_bytes()
@@ -233,7 +280,9 @@ def test_a_full_disk_leaves_the_previous_checkpoint_whole(tmp_path: Path, monkey
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
-        with pytest.raises(OSError, match=r"could not write .*checkpoint\.pt \(No space left on device\)"):
+        with pytest.raises(
+            OSError, match=r"could not write .*checkpoint\.pt \(No space left on device\)"
+        ):
             model.learn(EPOCH, TrainingCheckpointCallback(path), reset_num_timesteps=False)
         with pytest.raises(OSError, match=r"could not write .*model\.zip"):
             model.save(tmp_path / "model")
@@ -255,14 +304,19 @@ def foreign_files(folder: Path) -> dict[str, Path]:
         "start.pt": content[:3],
         "empty.pt": b"",
         "text.pt": b"learning_rate: 3e-4\n",
-        **{f"noise{i}.pt": bytes([first]) + rng.bytes(300) for i, first in enumerate(b"\x80(]}cRqKNI\x00PX.")},
+        **{
+            f"noise{i}.pt": bytes([first]) + rng.bytes(300)
+            for i, first in enumerate(b"\x80(]}cRqKNI\x00PX.")
+        },
     }
     for name, data in files.items():
         (folder / name).write_bytes(data)
     model.save(folder / "model.zip")
     th.save({"weights": th.zeros(3)}, folder / "other.pt")
     th.save([1, 2], folder / "list.pt")
-    SAC("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [4]}, buffer_size=10).save(folder / "sac.zip")
+    SAC("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [4]}, buffer_size=10).save(
+        folder / "sac.zip"
+    )
     np.savez(folder / "arrays.npz", a=np.zeros(3))
     return {path.name: path for path in folder.iterdir() if path.name != "whole.pt"}
 
@@ -271,7 +325,9 @@ def test_files_that_are_no_checkpoints(tmp_path: Path) -> None:
     files = foreign_files(tmp_path)
     assert len(files) > 15
     for name, path in files.items():
-        with pytest.raises(ValueError, match=r"truncated, or no checkpoint of|no checkpoint of this version") as caught:
+        with pytest.raises(
+            ValueError, match=r"truncated, or no checkpoint of|no checkpoint of this version"
+        ) as caught:
             POEMSAC.load_checkpoint(path)
         assert name in str(caught.value)
     with pytest.raises(FileNotFoundError):
@@ -293,7 +349,9 @@ def test_a_pickle_in_place_of_a_checkpoint_does_not_run(tmp_path: Path) -> None:
 
 def test_another_algorithm_or_family(tmp_path: Path) -> None:
     small(POEMSAC).save_checkpoint(tmp_path / "c.pt")
-    with pytest.raises(ValueError, match=r"c\.pt holds a POEMSAC; load it with POEMSAC\.load_checkpoint"):
+    with pytest.raises(
+        ValueError, match=r"c\.pt holds a POEMSAC; load it with POEMSAC\.load_checkpoint"
+    ):
         PEARLSAC.load_checkpoint(tmp_path / "c.pt")
     with pytest.raises(ValueError, match=r"own family|[Oo]bservation spaces do not match"):
         POEMSAC.load_checkpoint(tmp_path / "c.pt", "poem/HalfCheetahVel-v0")

@@ -10,7 +10,9 @@ from sb3_poem.pearl_sac.saving import read_config
 
 
 def trained(fraction: float) -> PEARLSAC:
-    return small(PEARLSAC, walks(6), horizon=10, n_train_tasks=6, context_relabel_fraction=fraction).learn(2 * 60)
+    return small(
+        PEARLSAC, walks(6), horizon=10, n_train_tasks=6, context_relabel_fraction=fraction
+    ).learn(2 * 60)
 
 
 def sampled(model: PEARLSAC, n: int = 600) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -24,7 +26,10 @@ def own_transitions(model: PEARLSAC, tasks: np.ndarray, context: np.ndarray) -> 
     """(n, size), whether a transition, its reward aside, was collected by the task itself."""
     stored = model.epoch_context.transitions.numpy()[..., :-1]
     return np.array(
-        [[(stored[i] == row[:-1]).all(axis=1).any() for row in rows] for i, rows in zip(tasks, context, strict=True)]
+        [
+            [(stored[i] == row[:-1]).all(axis=1).any() for row in rows]
+            for i, rows in zip(tasks, context, strict=True)
+        ]
     )
 
 
@@ -33,10 +38,15 @@ def test_rewards_are_the_tasks_own_whoever_acted(fraction: float) -> None:
     model = trained(fraction)
     tasks, context, rewards = sampled(model)
     policy = model.policy
-    obs, next_obs = (context[..., i : i + 2] * policy.obs_norm.std.numpy() + policy.obs_norm.mean.numpy() for i in (0, 3))
+    obs, next_obs = (
+        context[..., i : i + 2] * policy.obs_norm.std.numpy() + policy.obs_norm.mean.numpy()
+        for i in (0, 3)
+    )
     actions = 3.0 * context[..., 2] + 1.0  # from [-1, 1] to [-2, 4]
     goals = model.train_tasks.tasks[tasks]
-    np.testing.assert_allclose(rewards, -np.abs(next_obs[..., 0] - goals) - 0.01 * actions**2, atol=1e-4)
+    np.testing.assert_allclose(
+        rewards, -np.abs(next_obs[..., 0] - goals) - 0.01 * actions**2, atol=1e-4
+    )
     centre, deviation = model.context_reward_statistics
     np.testing.assert_allclose(context[..., -1], (rewards - centre) / deviation, atol=1e-4)
     # It is one step of the walk: the place moves by a tenth of the action.

@@ -9,7 +9,18 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from meta_toys import EPOCH, N_TASKS, POINT_GOAL, Walk, WindyWalk, assert_same_model, differing, parameters, small, walks
+from meta_toys import (
+    EPOCH,
+    N_TASKS,
+    POINT_GOAL,
+    Walk,
+    WindyWalk,
+    assert_same_model,
+    differing,
+    parameters,
+    small,
+    walks,
+)
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
@@ -32,8 +43,13 @@ OBS = np.random.default_rng(0).normal(size=(6, 2))
         pytest.param(lambda: gym.make(POINT_GOAL), id="single"),
         pytest.param(lambda: Monitor(gym.make(POINT_GOAL)), id="monitor"),
         pytest.param(lambda: make_vec_env(POINT_GOAL, 5), id="dummy"),
-        pytest.param(lambda: VecMonitor(DummyVecEnv([functools.partial(gym.make, POINT_GOAL)] * 5)), id="vec-monitor"),
-        pytest.param(lambda: make_vec_env(POINT_GOAL, 5, vec_env_cls=TaskVecEnv), id="task-vec-env"),
+        pytest.param(
+            lambda: VecMonitor(DummyVecEnv([functools.partial(gym.make, POINT_GOAL)] * 5)),
+            id="vec-monitor",
+        ),
+        pytest.param(
+            lambda: make_vec_env(POINT_GOAL, 5, vec_env_cls=TaskVecEnv), id="task-vec-env"
+        ),
         pytest.param(lambda: TaskVecEnv.from_id(POINT_GOAL, 30), id="more-copies-than-tasks"),
     ],
 )
@@ -52,7 +68,9 @@ def test_any_number_of_environments(algorithm: type[PEARLSAC], make_env: Any) ->
     # the stored transitions are the tasks' own
     for task in range(N_TASKS):
         stored = model.replay_buffer.transitions(task)
-        expected = model.family.compute_rewards(model.train_tasks.tasks[task], stored.features.numpy())
+        expected = model.family.compute_rewards(
+            model.train_tasks.tasks[task], stored.features.numpy()
+        )
         np.testing.assert_allclose(stored.rewards.numpy(), expected, atol=1e-5)
 
 
@@ -72,7 +90,10 @@ def test_gymnasiums_vectorised_environment(algorithm: type[PEARLSAC], mode: str)
     """A family's own, and copies that are stepped one after another."""
     arguments = {"vectorization_mode": mode, "max_episode_steps": 12}
     model = small(algorithm, make_vec(3, step_length=0.2, **arguments)).learn(N_TASKS * 12)
-    same = small(algorithm, make_vec_env(POINT_GOAL, 3, env_kwargs={"step_length": 0.2, "max_episode_steps": 12}))
+    same = small(
+        algorithm,
+        make_vec_env(POINT_GOAL, 3, env_kwargs={"step_length": 0.2, "max_episode_steps": 12}),
+    )
     assert_same_model(model, same.learn(N_TASKS * 12))
     assert isinstance(model.env, TaskVecEnv if mode == "vector_entry_point" else DummyVecEnv)
     assert model.horizon == 12
@@ -100,14 +121,17 @@ def test_a_vectorised_environment_that_is_not_registered() -> None:
 def test_other_vectorised_environments(make: Any, request: pytest.FixtureRequest) -> None:
     env = make()
     with pytest.raises(
-        ValueError, match=rf"env is a {type(env).__name__}, but must be gym.make_vec\(id, n\) of a task family"
+        ValueError,
+        match=rf"env is a {type(env).__name__}, but must be gym.make_vec\(id, n\) of a task family",
     ):
         small(POEMSAC, env)
     env.close()
 
 
 @pytest.mark.parametrize(("family", "n_envs"), [(Walk, 5), (WindyWalk, 2), (WindyWalk, 5)])
-def test_an_epoch_has_as_many_steps_as_it_says(algorithm: type[PEARLSAC], family: type[Walk], n_envs: int) -> None:
+def test_an_epoch_has_as_many_steps_as_it_says(
+    algorithm: type[PEARLSAC], family: type[Walk], n_envs: int
+) -> None:
     model = small(algorithm, walks(n_envs, family), horizon=10, n_train_tasks=7)
     assert model.learn(1).num_timesteps == model.epoch_steps
 
@@ -122,10 +146,14 @@ def test_set_env_takes_an_id(algorithm: type[PEARLSAC]) -> None:
 
 @one_is_enough
 def test_subprocesses(algorithm: type[PEARLSAC]) -> None:
-    env = SubprocVecEnv([functools.partial(gym.make, f"poem_envs:{POINT_GOAL}")] * 2, start_method="forkserver")
+    env = SubprocVecEnv(
+        [functools.partial(gym.make, f"poem_envs:{POINT_GOAL}")] * 2, start_method="forkserver"
+    )
     try:
         model = small(algorithm, env).learn(EPOCH)
-        same = small(algorithm, DummyVecEnv([functools.partial(gym.make, POINT_GOAL)] * 2)).learn(EPOCH)
+        same = small(algorithm, DummyVecEnv([functools.partial(gym.make, POINT_GOAL)] * 2)).learn(
+            EPOCH
+        )
         assert not differing(parameters(model), parameters(same))
     finally:
         env.close()
@@ -134,7 +162,9 @@ def test_subprocesses(algorithm: type[PEARLSAC]) -> None:
 def test_early_ends_and_unsymmetric_actions(algorithm: type[PEARLSAC]) -> None:
     model = small(algorithm, walks(4, edge=0.4), horizon=10).learn(240)
     assert model.num_timesteps == 240
-    terminated = th.cat([model.replay_buffer.transitions(task).terminated for task in range(N_TASKS)], dim=1)
+    terminated = th.cat(
+        [model.replay_buffer.transitions(task).terminated for task in range(N_TASKS)], dim=1
+    )
     assert 0 < terminated.sum() < terminated.numel()
     assert model._episode_num > 24
     actions, _ = model.predict(OBS, deterministic=False)

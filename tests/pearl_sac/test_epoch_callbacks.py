@@ -40,7 +40,9 @@ def after(epoch: int) -> tuple[int, int, int]:
     return epoch, 5 * epoch, EPOCH * epoch
 
 
-@pytest.mark.parametrize(("every", "expected"), [(1, [1, 2, 3, 4, 5]), (2, [2, 4, 5]), (5, [5]), (9, [5])])
+@pytest.mark.parametrize(
+    ("every", "expected"), [(1, [1, 2, 3, 4, 5]), (2, [2, 4, 5]), (5, [5]), (9, [5])]
+)
 def test_is_called_between_epochs_and_at_the_end(every: int, expected: list[int]) -> None:
     note = Note(every)
     model = small(PEARLSAC).learn(5 * EPOCH, note)
@@ -68,7 +70,9 @@ def test_checkpoints_replace_each_other(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 def test_a_stop_within_an_epoch_writes_no_checkpoint_of_half_an_epoch(tmp_path: Path) -> None:
-    """What was collected since the last whole epoch was not learned from, and could not be continued bit for bit."""
+    """What was collected since the last whole epoch was not learned from, and could not be
+    continued bit for bit.
+    """
 
     class Stop(BaseCallback):
         def _on_step(self) -> bool:
@@ -88,7 +92,9 @@ def test_a_training_that_is_told_to_stop_goes_on_bit_for_bit(tmp_path: Path) -> 
         small(PEARLSAC).learn(5 * EPOCH, [StopAt(EPOCH + N_TASKS, checkpoint), checkpoint])
     loaded = PEARLSAC.load_checkpoint(path, POINT_GOAL)
     assert loaded.num_timesteps == checkpoint.saved_steps == 2 * EPOCH
-    assert not differing(parameters(loaded.resume(checkpoint)), parameters(small(PEARLSAC).learn(5 * EPOCH)))
+    assert not differing(
+        parameters(loaded.resume(checkpoint)), parameters(small(PEARLSAC).learn(5 * EPOCH))
+    )
 
 
 class StopAt(BaseCallback):
@@ -102,7 +108,9 @@ class StopAt(BaseCallback):
         return True
 
 
-def test_checkpoints_that_take_long_are_rare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_checkpoints_that_take_long_are_rare(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     saved = []
 
     def save(model: PEARLSAC, path: Path) -> None:
@@ -124,7 +132,9 @@ def test_a_full_disk_ends_training_only_where_checkpoints_were_asked_for(
     with pytest.raises(OSError, match=r"could not write .*c\.pt \(No space left on device\)"):
         small(PEARLSAC).learn(2 * EPOCH, TrainingCheckpointCallback(tmp_path / "c.pt"))
     model = small(PEARLSAC)
-    with pytest.warns(UserWarning, match=r"no checkpoint of 300 steps: .* could not write .*c\.pt \(No space"):
+    with pytest.warns(
+        UserWarning, match=r"no checkpoint of 300 steps: .* could not write .*c\.pt \(No space"
+    ):
         model.learn(2 * EPOCH, TrainingCheckpointCallback(tmp_path / "c.pt", every=None))
     assert model.num_timesteps == 2 * EPOCH
 
@@ -137,7 +147,9 @@ POEM_METRICS = {"preference_accuracy", "kendall_tau"}
 
 
 @pytest.mark.parametrize("algorithm", [PEARLSAC, POEMSAC])
-def test_evaluation_is_logged_and_changes_nothing(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
+def test_evaluation_is_logged_and_changes_nothing(
+    algorithm: type[PEARLSAC], tmp_path: Path
+) -> None:
     callback = AdaptationEvalCallback(every=2, best_model_save_path=tmp_path / "best", **QUICK)
     model = small(algorithm)
     model.set_logger(configure(str(tmp_path), ["json"]))
@@ -146,7 +158,9 @@ def test_evaluation_is_logged_and_changes_nothing(algorithm: type[PEARLSAC], tmp
     plain = small(algorithm).learn(3 * EPOCH)
     assert not differing(parameters(model), parameters(plain))
     assert model.num_timesteps == plain.num_timesteps
-    assert [episode["r"] for episode in model.ep_info_buffer] == [episode["r"] for episode in plain.ep_info_buffer]
+    assert [episode["r"] for episode in model.ep_info_buffer] == [
+        episode["r"] for episode in plain.ep_info_buffer
+    ]
 
     lines = [json.loads(line) for line in (tmp_path / "progress.json").read_text().splitlines()]
     metrics = METRICS | (POEM_METRICS if algorithm is POEMSAC else set())
@@ -172,10 +186,18 @@ def test_a_resumed_run_goes_on_comparing_with_its_best_model(tmp_path: Path) -> 
     model.save_checkpoint(tmp_path / "checkpoint.zip")
     best = (tmp_path / "best" / "best_model.zip").read_bytes()
     resumed = POEMSAC.load_checkpoint(tmp_path / "checkpoint.zip", POINT_GOAL)
-    resumed.learn(EPOCH, AdaptationEvalCallback(best_model_save_path=tmp_path / "best", **QUICK), reset_num_timesteps=False)
+    resumed.learn(
+        EPOCH,
+        AdaptationEvalCallback(best_model_save_path=tmp_path / "best", **QUICK),
+        reset_num_timesteps=False,
+    )
     assert (tmp_path / "best" / "best_model.zip").read_bytes() == best
     # another folder holds no model that it could be compared with
-    resumed.learn(EPOCH, AdaptationEvalCallback(best_model_save_path=tmp_path / "other", **QUICK), reset_num_timesteps=False)
+    resumed.learn(
+        EPOCH,
+        AdaptationEvalCallback(best_model_save_path=tmp_path / "other", **QUICK),
+        reset_num_timesteps=False,
+    )
     assert (tmp_path / "other" / "best_model.zip").exists()
 
 
@@ -192,7 +214,9 @@ def test_evaluation_takes_the_training_environments_arguments() -> None:
     from sb3_poem.common.vec_env import TaskVecEnv
 
     callback = AdaptationEvalCallback(**QUICK)
-    callback.init_callback(small(POEMSAC, TaskVecEnv.from_id(POINT_GOAL, 3, step_length=0.2, max_episode_steps=7)))
+    callback.init_callback(
+        small(POEMSAC, TaskVecEnv.from_id(POINT_GOAL, 3, step_length=0.2, max_episode_steps=7))
+    )
     env, tasks = callback._make_env()
     assert env.num_envs == 20
     assert tasks.shape == (10, 1)
@@ -231,7 +255,12 @@ def test_evaluation_prints_when_asked(capsys: pytest.CaptureFixture[str]) -> Non
 
 
 def test_a_baseline_evaluates_a_model_without_a_similarity() -> None:
-    evaluation = {"n_tasks": 2, "n_episodes": 1, "record_at": (0, 1), "adaptation_kwargs": {"adapter": RewardOracleAdapter}}
+    evaluation = {
+        "n_tasks": 2,
+        "n_episodes": 1,
+        "record_at": (0, 1),
+        "adaptation_kwargs": {"adapter": RewardOracleAdapter},
+    }
     callback = AdaptationEvalCallback(every=1, **evaluation)
     small(PEARLSAC).learn(EPOCH, callback)
     assert np.isfinite(callback.last_evaluation["return_after_1_queries"])

@@ -34,8 +34,12 @@ def test_schedules_and_python_are_read_as_rl_zoo3_reads_them(algorithm: type[PEA
 
     env_id = "poem/HalfCheetahFwdBack-v0"
     entry = yaml.safe_load(config_file(algorithm.zoo_name).read_text())[env_id]
-    expected: Any = ExperimentManager._preprocess_schedules({"learning_rate": entry["learning_rate"]})["learning_rate"]
-    model = algorithm.from_zoo(f"poem_envs:{env_id}", n_envs=2, device="cpu", _init_setup_model=False)
+    expected: Any = ExperimentManager._preprocess_schedules(
+        {"learning_rate": entry["learning_rate"]}
+    )["learning_rate"]
+    model = algorithm.from_zoo(
+        f"poem_envs:{env_id}", n_envs=2, device="cpu", _init_setup_model=False
+    )
     model._setup_lr_schedule()
     for remaining in (1.0, 0.37, 0.0):
         assert model.lr_schedule(remaining) == pytest.approx(expected(remaining), rel=1e-12)
@@ -49,10 +53,17 @@ def test_every_entry_makes_a_model(algorithm: type[PEARLSAC]) -> None:
 
 
 def test_learn_takes_the_entrys_steps(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
-    model = algorithm.from_zoo(POINT_GOAL, seed=0, n_timesteps=3000, gradient_steps=1, device="cpu").learn()
+    model = algorithm.from_zoo(
+        POINT_GOAL, seed=0, n_timesteps=3000, gradient_steps=1, device="cpu"
+    ).learn()
     assert model.num_timesteps == 3000  # two epochs of 60 tasks and 25 steps
     model.save(tmp_path / "model")
-    assert algorithm.load(tmp_path / "model", POINT_GOAL).learn(reset_num_timesteps=False).num_timesteps == 6000
+    assert (
+        algorithm.load(tmp_path / "model", POINT_GOAL)
+        .learn(reset_num_timesteps=False)
+        .num_timesteps
+        == 6000
+    )
     assert model.learn(1500).num_timesteps == 1500
 
 
@@ -75,10 +86,19 @@ def test_another_family_by_an_entry() -> None:
 
 def test_it_is_what_the_constructor_makes() -> None:
     """With the same arguments, the same model."""
-    of_zoo = POEMSAC.from_zoo(POINT_GOAL, seed=0, n_timesteps=1500, gradient_steps=2, learning_rate=5e-3).learn()
+    of_zoo = POEMSAC.from_zoo(
+        POINT_GOAL, seed=0, n_timesteps=1500, gradient_steps=2, learning_rate=5e-3
+    ).learn()
     entry = yaml.safe_load(config_file("poem_sac").read_text())[POINT_GOAL]
-    arguments = {name: entry[name] for name in entry.keys() & inspect.signature(POEMSAC).parameters.keys()}
-    changed = {"seed": 0, "gradient_steps": 2, "learning_rate": 5e-3, "env": TaskVecEnv.from_id(POINT_GOAL, 60)}
+    arguments = {
+        name: entry[name] for name in entry.keys() & inspect.signature(POEMSAC).parameters.keys()
+    }
+    changed = {
+        "seed": 0,
+        "gradient_steps": 2,
+        "learning_rate": 5e-3,
+        "env": TaskVecEnv.from_id(POINT_GOAL, 60),
+    }
     policy_kwargs = eval(entry["policy_kwargs"])
     by_hand = POEMSAC(**{**arguments, **changed, "policy_kwargs": policy_kwargs}).learn(1500)
     assert not differing(parameters(of_zoo), parameters(by_hand))
@@ -86,7 +106,8 @@ def test_it_is_what_the_constructor_makes() -> None:
 
 def test_no_entry(algorithm: type[PEARLSAC]) -> None:
     with pytest.raises(
-        ValueError, match=rf"{algorithm.zoo_name}.yml has no entry 'Pendulum-v1'; there are: poem/PointGoal-v0, "
+        ValueError,
+        match=rf"{algorithm.zoo_name}.yml has no entry 'Pendulum-v1'; there are: poem/PointGoal-v0, ",
     ):
         algorithm.from_zoo("Pendulum-v1")
     with pytest.raises(gym.error.NameNotFound, match="did you mean 'poem/PointGoal-v0'"):
@@ -94,4 +115,6 @@ def test_no_entry(algorithm: type[PEARLSAC]) -> None:
 
 
 def test_the_names_are_those_of_the_command_line() -> None:
-    assert {name: kind.zoo_name for name, kind in ALGORITHMS.items()} == {name: name for name in ALGORITHMS}
+    assert {name: kind.zoo_name for name, kind in ALGORITHMS.items()} == {
+        name: name for name in ALGORITHMS
+    }

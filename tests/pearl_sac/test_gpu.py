@@ -49,7 +49,9 @@ def test_everything_is_trained(algorithm: type[PEARLSAC], precision: str) -> Non
     assert all(value.isfinite().all() for value in weights(model).values())
 
 
-def test_a_step_waits_for_nothing(algorithm: type[PEARLSAC], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_waits_for_nothing(
+    algorithm: type[PEARLSAC], monkeypatch: pytest.MonkeyPatch
+) -> None:
     step = updater.Updater.step
 
     def watched(self: updater.Updater, batch: MetaBatch) -> dict[str, th.Tensor]:
@@ -99,7 +101,9 @@ def test_adaptation_is_that_of_a_processor(algorithm: type[PEARLSAC], inference:
     latents = []
     for device in ("cuda", "cpu"):
         copy = algorithm.load(saved(model), device=device)
-        adapter = PreferenceAdapter(copy, POINT_GOAL, oracle=ReturnOracle(), n_queries=3, inference=inference, seed=0)
+        adapter = PreferenceAdapter(
+            copy, POINT_GOAL, oracle=ReturnOracle(), n_queries=3, inference=inference, seed=0
+        )
         latents.append(adapter.adapt().latent)
     np.testing.assert_allclose(*latents, atol=0.05)
 

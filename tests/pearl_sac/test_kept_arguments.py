@@ -14,7 +14,13 @@ ANT_GOAL = "poem/AntGoal-v0"  # has all that the arguments need
 
 @pytest.mark.parametrize("algorithm", [PEARLSAC, POEMSAC])
 def test_arguments_come_back(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
-    arguments = {"n_steps": 2, "noise_color": 1.0, "policy_delay": 2, "shaping_coef": 0.5, "mirror_fraction": 0.25}
+    arguments = {
+        "n_steps": 2,
+        "noise_color": 1.0,
+        "policy_delay": 2,
+        "shaping_coef": 0.5,
+        "mirror_fraction": 0.25,
+    }
     model = small(algorithm, ANT_GOAL, n_train_tasks=4, meta_batch_size=4, **arguments).learn(800)
     model.save_pretrained(tmp_path)
     model.save(tmp_path / "model.zip")

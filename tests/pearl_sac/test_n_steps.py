@@ -1,4 +1,6 @@
-"""Targets some steps ahead, as they were and in a symmetry, against sums over the recorded episodes."""
+"""Targets some steps ahead, as they were and in a symmetry, against sums over the recorded
+episodes.
+"""
 
 import numpy as np
 import pytest
@@ -14,7 +16,9 @@ GAMMA = 0.9
 def collected(
     monkeypatch: pytest.MonkeyPatch, family: type[Walk] = Walk, **arguments: float
 ) -> tuple[PEARLSAC, list[Segment]]:
-    """A model whose episodes end early, are cut off, and have partly been overwritten; and all that it has seen."""
+    """A model whose episodes end early, are cut off, and have partly been overwritten; and all that
+    it has seen.
+    """
     model = small(
         PEARLSAC,
         walks(6, family, edge=0.6),
@@ -26,31 +30,45 @@ def collected(
     )
     segments: list[Segment] = []
     extend = model.replay_buffer.extend
-    monkeypatch.setattr(model.replay_buffer, "extend", lambda segment: (segments.append(segment), extend(segment)))
+    monkeypatch.setattr(
+        model.replay_buffer, "extend", lambda segment: (segments.append(segment), extend(segment))
+    )
     return model.learn(5 * 60), segments
 
 
 def places(segments: list[Segment], obs: np.ndarray) -> list[tuple[Segment, int, int]]:
     """Where an observation was recorded: segment, copy and step."""
     return [
-        (segment, copy, step) for segment in segments for copy, step in np.argwhere((segment.observations == obs).all(axis=-1))
+        (segment, copy, step)
+        for segment in segments
+        for copy, step in np.argwhere((segment.observations == obs).all(axis=-1))
     ]
 
 
 def ahead(
-    model: PEARLSAC, segments: list[Segment], task: int, obs: np.ndarray, n_steps: int, symmetry: Symmetry | None = None
+    model: PEARLSAC,
+    segments: list[Segment],
+    task: int,
+    obs: np.ndarray,
+    n_steps: int,
+    symmetry: Symmetry | None = None,
 ) -> tuple[float, np.ndarray, float]:
-    """Step by step: the discounted rewards of ``task``, the observation after them, and the discount of its value.
+    """Step by step: the discounted rewards of ``task``, the observation after them, and the
+    discount of its value.
 
     :param symmetry: of which the observation, and all that follows, is a mirror image
     """
-    [(segment, copy, step)] = places(segments, obs if symmetry is None else symmetry.observations(obs))
+    [(segment, copy, step)] = places(
+        segments, obs if symmetry is None else symmetry.observations(obs)
+    )
     total, horizon = 0.0, segment.observations.shape[1]
     for k in range(n_steps):
         features = segment.features[copy, step].astype(np.float64)
         if symmetry is not None:
             features = symmetry.features(features)
-        total += GAMMA**k * float(model.family.compute_rewards(model.train_tasks.tasks[task], features))
+        total += GAMMA**k * float(
+            model.family.compute_rewards(model.train_tasks.tasks[task], features)
+        )
         over, after = segment.terminated[copy, step] > 0, segment.next_observations[copy, step]
         cut = step + 1 == horizon or not (segment.observations[copy, step + 1] == after).all()
         if over or cut or k + 1 == n_steps:
@@ -62,7 +80,9 @@ def ahead(
 
 @pytest.mark.parametrize("relabel_fraction", [0.0, 0.5])
 @pytest.mark.parametrize("n_steps", [2, 4])
-def test_rewards_values_and_discounts(monkeypatch: pytest.MonkeyPatch, n_steps: int, relabel_fraction: float) -> None:
+def test_rewards_values_and_discounts(
+    monkeypatch: pytest.MonkeyPatch, n_steps: int, relabel_fraction: float
+) -> None:
     model, segments = collected(monkeypatch, n_steps=n_steps, relabel_fraction=relabel_fraction)
     assert model.replay_buffer.full
     [batch] = model.make_sampler().sample(1, 60)
@@ -77,7 +97,11 @@ def test_rewards_values_and_discounts(monkeypatch: pytest.MonkeyPatch, n_steps: 
             np.testing.assert_array_equal(observations[row, column], after)
             assert discounts[row, column] == pytest.approx(discount, abs=1e-6)
             lengths.add(round(discount, 6))
-    assert {0.0, round(GAMMA, 6), round(GAMMA**n_steps, 6)} <= lengths  # all kinds of ends were seen
+    assert {
+        0.0,
+        round(GAMMA, 6),
+        round(GAMMA**n_steps, 6),
+    } <= lengths  # all kinds of ends were seen
 
 
 @pytest.mark.parametrize("relabel_fraction", [0.0, 0.5])
@@ -85,7 +109,13 @@ def test_rewards_values_and_discounts(monkeypatch: pytest.MonkeyPatch, n_steps: 
 def test_mirror_images_have_the_rewards_of_what_is_seen(
     monkeypatch: pytest.MonkeyPatch, n_steps: int, relabel_fraction: float
 ) -> None:
-    model, segments = collected(monkeypatch, EvenWalk, n_steps=n_steps, relabel_fraction=relabel_fraction, mirror_fraction=0.3)
+    model, segments = collected(
+        monkeypatch,
+        EvenWalk,
+        n_steps=n_steps,
+        relabel_fraction=relabel_fraction,
+        mirror_fraction=0.3,
+    )
     [batch] = model.make_sampler().sample(1, 60)
     transitions, n_mirrored = batch.transitions, 0
     rewards, observations, discounts = batch.bootstraps or (
@@ -103,14 +133,19 @@ def test_mirror_images_have_the_rewards_of_what_is_seen(
             np.testing.assert_array_equal(observations[row, column], after)
             assert discounts[row, column].item() == pytest.approx(discount, abs=1e-6)
             moved = transitions.next_observations[row, column, 0].item() - obs[0]
-            assert 0.1 * 3.0 * transitions.actions[row, column, 0].item() == pytest.approx(moved, abs=1e-4)
+            assert 0.1 * 3.0 * transitions.actions[row, column, 0].item() == pytest.approx(
+                moved, abs=1e-4
+            )
     assert 0.2 < n_mirrored / (60 * len(batch.task_ids)) < 0.4
 
 
 @pytest.mark.parametrize(
     ("family", "message"),
     [
-        (Walk, r"mirror_fraction must be 0: .* names no symmetries; a family of them sets `symmetries`"),
+        (
+            Walk,
+            r"mirror_fraction must be 0: .* names no symmetries; a family of them sets `symmetries`",
+        ),
         (WindyWalk, r"mirror_fraction must be 0: .* do not share dynamics"),
     ],
 )
@@ -130,7 +165,9 @@ def test_the_critics_learn_from_what_lies_ahead() -> None:
     [batch] = model.make_sampler().sample(1, 16)
     assert batch.bootstraps is not None
     _, metrics = model.make_objective().loss(batch, model.entropy_coefficient.value)
-    richer = batch._replace(bootstraps=batch.bootstraps._replace(rewards=batch.bootstraps.rewards + 100.0))
+    richer = batch._replace(
+        bootstraps=batch.bootstraps._replace(rewards=batch.bootstraps.rewards + 100.0)
+    )
     _, other = model.make_objective().loss(richer, model.entropy_coefficient.value)
     scale = 1.0 / model.policy.reward_norm.std.item()
     # Half the squared error of two critics: raising targets by c adds about c^2 once c is large.

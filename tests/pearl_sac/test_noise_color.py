@@ -22,7 +22,9 @@ def noises(color: float, steps: int = 400) -> np.ndarray:
 def test_the_power_falls_with_frequency_as_asked(color: float) -> None:
     sequences = noises(color)
     assert sequences.mean() == pytest.approx(0.0, abs=0.1)
-    assert sequences.std() == pytest.approx(1.0, abs=0.2)  # red noise varies more: its mean does, too
+    assert sequences.std() == pytest.approx(
+        1.0, abs=0.2
+    )  # red noise varies more: its mean does, too
     power = np.square(np.abs(np.fft.rfft(sequences, axis=0))).mean(axis=(1, 2))[1:]
     slope = np.polyfit(np.log(np.arange(1, len(power) + 1)), np.log(power), 1)[0]
     assert slope == pytest.approx(-color, abs=0.1)

@@ -10,9 +10,9 @@ from sb3_poem.common.vec_env import TaskVecEnv
 
 
 def test_pearl_learns_point_goal() -> None:
-    """
-    A fifth of the way from the best that a policy can do blindly to the best that there is. Measured: 70 %, but how soon the
-    latents begin to tell depends on the seed; another had come 12 % of the way by then.
+    """A fifth of the way from the best that a policy can do blindly to the best that there is.
+    Measured: 70 %, but how soon the latents begin to tell depends on the seed; another had come 12
+    % of the way by then.
     """
     model = PEARLSAC("MlpPolicy", POINT_GOAL, **LEARN).learn(2 * LEARN_STEPS)
     tasks, latents = model.train_tasks.tasks, model.task_latents
@@ -21,9 +21,13 @@ def test_pearl_learns_point_goal() -> None:
     blind, known = point_goal_bounds(tasks)
     assert own > blind + 0.2 * (known - blind)
     # and it is the latent that tells: with those of other tasks the policies go elsewhere
-    foreign = evaluate_latents(model, env, np.roll(latents, 7, axis=0), tasks, n_episodes=2, seed=5).mean()
+    foreign = evaluate_latents(
+        model, env, np.roll(latents, 7, axis=0), tasks, n_episodes=2, seed=5
+    ).mean()
     assert foreign < blind
     # the decoder knows a reward to a tenth: rewards deviate by about 0.35, distances are about 1
     assert model.predicted_rewards_error < 0.2
-    rewards = th.cat([model.replay_buffer.transitions(task).rewards for task in range(len(tasks))], dim=1)
+    rewards = th.cat(
+        [model.replay_buffer.transitions(task).rewards for task in range(len(tasks))], dim=1
+    )
     assert model.predicted_rewards_error < 0.5 * rewards.std().item()

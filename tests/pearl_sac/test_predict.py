@@ -29,7 +29,9 @@ def test_predict_takes_latents_as_state(trained: PEARLSAC) -> None:
         assert action.shape == (2,)
         np.testing.assert_allclose(action, actions[index], atol=1e-6)
         assert np.array_equal(state, latents[index : index + 1])
-        again, _ = trained.predict(OBS[index], state=state, deterministic=True)  # the state that came back
+        again, _ = trained.predict(
+            OBS[index], state=state, deterministic=True
+        )  # the state that came back
         assert np.array_equal(again, action)
     assert np.ptp(actions, axis=0).min() > 1e-4
 
@@ -48,7 +50,10 @@ def test_predict_with_one_latent_for_all_and_with_none(trained: PEARLSAC) -> Non
 
 def test_a_latent_that_is_missing_is_told_once(tmp_path: Path) -> None:
     model = small(POEMSAC).learn(EPOCH)
-    env, told = make_vec_env(POINT_GOAL, 1), "without a latent.*PreferenceAdapter.*AdaptationEvalCallback"
+    env, told = (
+        make_vec_env(POINT_GOAL, 1),
+        "without a latent.*PreferenceAdapter.*AdaptationEvalCallback",
+    )
     with pytest.warns(UserWarning, match=told) as warned:
         evaluate_policy(model, env, n_eval_episodes=2)
     assert len(warned) == 1
@@ -56,7 +61,10 @@ def test_a_latent_that_is_missing_is_told_once(tmp_path: Path) -> None:
         warnings.simplefilter("error")
         model.predict(OBS)
     with pytest.warns(UserWarning, match=told):
-        small(POEMSAC).learn(EPOCH, EvalCallback(env, eval_freq=20, n_eval_episodes=1, best_model_save_path=str(tmp_path)))
+        small(POEMSAC).learn(
+            EPOCH,
+            EvalCallback(env, eval_freq=20, n_eval_episodes=1, best_model_save_path=str(tmp_path)),
+        )
 
 
 def test_what_tells_the_task_is_not_warned_of() -> None:
@@ -119,14 +127,18 @@ def test_predict_without_determinism_explores(trained: PEARLSAC) -> None:
         (OBS, np.where(np.eye(6, 5, -2), np.nan, 0.0), "state .*NaN"),
     ],
 )
-def test_predict_refuses(trained: PEARLSAC, obs: np.ndarray, state: np.ndarray | None, message: str) -> None:
+def test_predict_refuses(
+    trained: PEARLSAC, obs: np.ndarray, state: np.ndarray | None, message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         trained.predict(obs, state=state)
 
 
 def test_policy_forward_is_predict_at_the_priors_mean(trained: PEARLSAC) -> None:
     scaled = trained.policy._predict(th.as_tensor(OBS), deterministic=True)
-    np.testing.assert_allclose(scaled.numpy(), trained.predict(OBS, deterministic=True)[0], atol=1e-6)
+    np.testing.assert_allclose(
+        scaled.numpy(), trained.predict(OBS, deterministic=True)[0], atol=1e-6
+    )
 
 
 def test_evaluate_policy(trained: PEARLSAC) -> None:

@@ -44,17 +44,31 @@ def folder(trained: PEARLSAC, tmp_path: Path) -> Path:
 
 def trajectories() -> list[Trajectory]:
     rng = np.random.default_rng(0)
-    return [Trajectory(rng.normal(size=(6, 2)), rng.uniform(-1, 1, size=(5, 2)), np.zeros(5)) for _ in range(4)]
+    return [
+        Trajectory(rng.normal(size=(6, 2)), rng.uniform(-1, 1, size=(5, 2)), np.zeros(5))
+        for _ in range(4)
+    ]
 
 
 def assert_same_predictions(one: PEARLSAC, two: PEARLSAC) -> None:
     rng = np.random.default_rng(1)
-    obs, latents = rng.normal(size=(7, one.observation_space.shape[0])), rng.normal(size=(7, one.latent_dim))
-    assert np.array_equal(one.predict(obs, latents, deterministic=True)[0], two.predict(obs, latents, deterministic=True)[0])
+    obs, latents = (
+        rng.normal(size=(7, one.observation_space.shape[0])),
+        rng.normal(size=(7, one.latent_dim)),
+    )
+    assert np.array_equal(
+        one.predict(obs, latents, deterministic=True)[0],
+        two.predict(obs, latents, deterministic=True)[0],
+    )
     if one.observation_space.shape == (2,) and one.action_space.shape == (2,):
-        assert np.array_equal(one.predicted_returns(latents, trajectories()), two.predicted_returns(latents, trajectories()))
+        assert np.array_equal(
+            one.predicted_returns(latents, trajectories()),
+            two.predicted_returns(latents, trajectories()),
+        )
     if isinstance(one, POEMSAC):
-        assert np.array_equal(one.similarities(latents, latents[:3]), two.similarities(latents, latents[:3]))
+        assert np.array_equal(
+            one.similarities(latents, latents[:3]), two.similarities(latents, latents[:3])
+        )
     for source in ("prior", "aggregate"):
         draws = [model.sample_latents(9, np.random.default_rng(4), source) for model in (one, two)]
         assert np.array_equal(*draws)
@@ -62,7 +76,9 @@ def assert_same_predictions(one: PEARLSAC, two: PEARLSAC) -> None:
     assert np.array_equal(one.train_tasks.tasks, two.train_tasks.tasks)
     for name in ("observation_space", "action_space", "task_space", "env_id", "horizon"):
         assert getattr(one, name) == getattr(two, name), name
-    assert one.predicted_rewards_error == pytest.approx(two.predicted_rewards_error, rel=0, abs=0, nan_ok=True)
+    assert one.predicted_rewards_error == pytest.approx(
+        two.predicted_rewards_error, rel=0, abs=0, nan_ok=True
+    )
     for name in ("num_timesteps", "_n_updates", "latent_dim", "seed", "reward_feature_dim"):
         assert getattr(one, name) == getattr(two, name), name
 
@@ -72,7 +88,11 @@ def test_a_round_trip_keeps_all_predictions(trained: PEARLSAC, folder: Path) -> 
     assert_same_predictions(trained, loaded)
     state, other = trained.policy.state_dict(), loaded.policy.state_dict()
     assert state.keys() == other.keys()
-    assert all(th.equal(state[name], other[name]) for name in state if not name.startswith("critic_target."))
+    assert all(
+        th.equal(state[name], other[name])
+        for name in state
+        if not name.startswith("critic_target.")
+    )
     for name, value in loaded.policy.critic.state_dict().items():  # these are rebuilt
         assert th.equal(loaded.policy.critic_target.state_dict()[name], value)
     loaded.save_pretrained(folder.parent / "again", CARD)
@@ -89,7 +109,11 @@ def test_the_folder_holds_nothing_that_can_run(trained: PEARLSAC, folder: Path) 
         assert not content.startswith(mark)
     # the tensors fill the file, so that nothing else is inside
     header = int.from_bytes(content[:8], "little")
-    sizes = [entry["data_offsets"] for name, entry in json.loads(content[8 : 8 + header]).items() if name != "__metadata__"]
+    sizes = [
+        entry["data_offsets"]
+        for name, entry in json.loads(content[8 : 8 + header]).items()
+        if name != "__metadata__"
+    ]
     assert sum(end - start for start, end in sizes) == len(content) - 8 - header
 
 
@@ -131,15 +155,24 @@ def test_continues_training(trained: PEARLSAC, folder: Path) -> None:
         assert_same_predictions(trained, loaded)
         # it goes on at the rate and the entropy at which it stopped
         assert loaded.lr_schedule(1.0) == 2e-3
-        assert loaded.entropy_coefficient.value.item() == pytest.approx(trained.entropy_coefficient.value.item(), rel=1e-4)
+        assert loaded.entropy_coefficient.value.item() == pytest.approx(
+            trained.entropy_coefficient.value.item(), rel=1e-4
+        )
         assert loaded.target_entropy == trained.target_entropy
         before = parameters(loaded)
         loaded.learn(EPOCH, reset_num_timesteps=False)
         assert loaded.num_timesteps >= 3 * EPOCH
         changed = differing(before, parameters(loaded))
-        assert {"policy.actor.mlp.output.weight", "policy.decoder.mlp.output.weight", "log_ent_coef"} <= set(changed)
+        assert {
+            "policy.actor.mlp.output.weight",
+            "policy.decoder.mlp.output.weight",
+            "log_ent_coef",
+        } <= set(changed)
         assert "policy.obs_norm.mean" in changed
-        assert loaded.policy.obs_norm.count == trained.policy.obs_norm.count + loaded.num_timesteps - trained.num_timesteps
+        assert (
+            loaded.policy.obs_norm.count
+            == trained.policy.obs_norm.count + loaded.num_timesteps - trained.num_timesteps
+        )
 
 
 VARIANTS = {
@@ -158,10 +191,19 @@ def test_every_kind_of_model(variant: str, tmp_path: Path) -> None:
     arguments, env = VARIANTS[variant]
     model = small(POEMSAC, env() if callable(env) else env, **arguments)
     model.save_pretrained(tmp_path / "m")
-    json.loads((tmp_path / "m" / "config.json").read_text(), parse_constant=pytest.fail)  # NaN, which only Python reads
+    json.loads(
+        (tmp_path / "m" / "config.json").read_text(), parse_constant=pytest.fail
+    )  # NaN, which only Python reads
     loaded = POEMSAC.from_pretrained(tmp_path / "m", env=env() if callable(env) else env)
     assert_same_predictions(model, loaded)
-    for name in ("similarity", "context", "preference_group_size", "target_update_interval", "gamma", "tau"):
+    for name in (
+        "similarity",
+        "context",
+        "preference_group_size",
+        "target_update_interval",
+        "gamma",
+        "tau",
+    ):
         assert getattr(loaded, name) == getattr(model, name)
     assert loaded.policy.layer_norm == model.policy.layer_norm == (variant == "layer-norm")
     assert len(loaded.policy.critic.members) == len(model.policy.critic.members)
@@ -183,7 +225,11 @@ def test_an_activation_that_cannot_be_named_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_optimiser_is_kept(tmp_path: Path) -> None:
-    policy_kwargs = {"net_arch": ARCH, "optimizer_class": th.optim.AdamW, "optimizer_kwargs": {"weight_decay": 0.3}}
+    policy_kwargs = {
+        "net_arch": ARCH,
+        "optimizer_class": th.optim.AdamW,
+        "optimizer_kwargs": {"weight_decay": 0.3},
+    }
     small(POEMSAC, policy_kwargs=policy_kwargs).save_pretrained(tmp_path / "m")
     optimizer = POEMSAC.from_pretrained(tmp_path / "m").policy.optimizer
     assert type(optimizer) is th.optim.AdamW
@@ -204,7 +250,9 @@ def test_an_optimiser_that_cannot_be_named_is_refused(tmp_path: Path) -> None:
 
 def test_missing_files(trained: PEARLSAC, folder: Path) -> None:
     cls = type(trained)
-    with pytest.raises(FileNotFoundError, match="nowhere: there is no such file or folder of a model"):
+    with pytest.raises(
+        FileNotFoundError, match="nowhere: there is no such file or folder of a model"
+    ):
         cls.from_pretrained(folder.parent / "nowhere")
     (folder / "model.safetensors").rename(folder / "elsewhere")
     with pytest.raises(FileNotFoundError, match=r"model\.safetensors"):
@@ -232,7 +280,9 @@ def test_foreign_configurations(trained: PEARLSAC, folder: Path, text: str) -> N
         type(trained).from_pretrained(folder)
 
 
-@pytest.mark.parametrize("key", ["arguments", "net_arch", "observation_space", "task_space", "env_id", "num_timesteps"])
+@pytest.mark.parametrize(
+    "key", ["arguments", "net_arch", "observation_space", "task_space", "env_id", "num_timesteps"]
+)
 def test_incomplete_configurations(trained: PEARLSAC, folder: Path, key: str) -> None:
     config = json.loads((folder / "config.json").read_text())
     del config[key]
@@ -247,10 +297,13 @@ def test_foreign_weights(trained: PEARLSAC, folder: Path) -> None:
     save_file({"weights": th.zeros(3)}, path)
     with pytest.raises(ValueError, match="folder does not hold a complete"):
         cls.from_pretrained(folder)
-    one_missing = {name: value for name, value in tensors.items() if name != "policy.actor.mlp.output.bias"}
+    one_missing = {
+        name: value for name, value in tensors.items() if name != "policy.actor.mlp.output.bias"
+    }
     save_file(one_missing, path)
     with pytest.raises(
-        ValueError, match=r"folder does not hold a complete .*policy\.actor\.mlp\.output\.bias .*but it is missing"
+        ValueError,
+        match=r"folder does not hold a complete .*policy\.actor\.mlp\.output\.bias .*but it is missing",
     ):
         cls.from_pretrained(folder)
     save_file({**tensors, "policy.actor.mlp.output.bias": th.zeros(7)}, path)
@@ -264,7 +317,10 @@ def test_foreign_weights(trained: PEARLSAC, folder: Path) -> None:
 def test_another_algorithm_or_family(trained: PEARLSAC, folder: Path) -> None:
     cls = type(trained)
     other = POEMSAC if cls is PEARLSAC else PEARLSAC
-    with pytest.raises(ValueError, match=rf"folder holds a {cls.__name__}; load it with {cls.__name__}\.from_pretrained"):
+    with pytest.raises(
+        ValueError,
+        match=rf"folder holds a {cls.__name__}; load it with {cls.__name__}\.from_pretrained",
+    ):
         other.from_pretrained(folder)
     for env in ("poem/HalfCheetahVel-v0", make_vec_env("poem/HalfCheetahVel-v0", 1)):
         with pytest.raises(ValueError, match=r"own family|[Oo]bservation spaces do not match"):
@@ -282,7 +338,9 @@ def test_a_full_disk_or_a_bad_card_leaves_the_previous_model_whole(
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
-        with pytest.raises(OSError, match=r"could not write .*model\.safetensors \(No space left on device\)"):
+        with pytest.raises(
+            OSError, match=r"could not write .*model\.safetensors \(No space left on device\)"
+        ):
             other.save_pretrained(folder)
     assert {file: (folder / file).read_bytes() for file in os.listdir(folder)} == before
     with pytest.raises(TypeError, match="cannot be written as JSON"):

@@ -56,8 +56,13 @@ def test_save_to_a_buffer(trained: PEARLSAC) -> None:
     assert_same_model(trained, type(trained).load(buffer))
 
 
-@pytest.mark.parametrize("make_env", [lambda: make_vec_env(POINT_GOAL, 3), lambda: gym.make(POINT_GOAL), lambda: POINT_GOAL])
-def test_loaded_models_continue_with_any_number_of_copies(trained: PEARLSAC, tmp_path: Path, make_env: Any) -> None:
+@pytest.mark.parametrize(
+    "make_env",
+    [lambda: make_vec_env(POINT_GOAL, 3), lambda: gym.make(POINT_GOAL), lambda: POINT_GOAL],
+)
+def test_loaded_models_continue_with_any_number_of_copies(
+    trained: PEARLSAC, tmp_path: Path, make_env: Any
+) -> None:
     trained.save(tmp_path / "model")
     loaded = type(trained).load(tmp_path / "model", env=make_env())
     assert_same_model(trained, loaded)
@@ -66,26 +71,41 @@ def test_loaded_models_continue_with_any_number_of_copies(trained: PEARLSAC, tmp
     assert loaded.num_timesteps == 2 * EPOCH + EPOCH
     assert (loaded.epoch, loaded._n_updates) == (3, 15)
     changed = differing(before, parameters(loaded))
-    assert {"policy.actor.mlp.output.weight", "policy.encoder.mlp.output.weight", "log_ent_coef"} <= set(changed)
+    assert {
+        "policy.actor.mlp.output.weight",
+        "policy.encoder.mlp.output.weight",
+        "log_ent_coef",
+    } <= set(changed)
     assert "policy.reward_norm.std" not in changed  # rewards keep the first epoch's
     assert (trained.policy.obs_norm.count, loaded.policy.obs_norm.count) == (2 * EPOCH, 3 * EPOCH)
     third = th.cat([loaded.replay_buffer.transitions(task).observations for task in range(N_TASKS)])
     mean = third.reshape(-1, 2).mean(dim=0)  # what the buffer, which is new, holds
-    th.testing.assert_close(loaded.policy.obs_norm.mean, (2 * trained.policy.obs_norm.mean + mean) / 3, atol=1e-5, rtol=0)
+    th.testing.assert_close(
+        loaded.policy.obs_norm.mean,
+        (2 * trained.policy.obs_norm.mean + mean) / 3,
+        atol=1e-5,
+        rtol=0,
+    )
     assert np.array_equal(loaded.train_tasks.tasks, trained.train_tasks.tasks)
 
 
 @one_is_enough
 def test_set_env_takes_another_number_of_copies(algorithm: type[PEARLSAC]) -> None:
     model = small(algorithm).learn(EPOCH)
-    for env in (make_vec_env(POINT_GOAL, 2), TaskVecEnv.from_id(POINT_GOAL, 30), gym.make(POINT_GOAL)):
+    for env in (
+        make_vec_env(POINT_GOAL, 2),
+        TaskVecEnv.from_id(POINT_GOAL, 30),
+        gym.make(POINT_GOAL),
+    ):
         model.set_env(env)
         model.learn(1, reset_num_timesteps=False)
     assert model.num_timesteps == EPOCH + 300 + 750 + 300
 
 
 @one_is_enough
-def test_set_env_of_a_family_that_is_not_registered(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
+def test_set_env_of_a_family_that_is_not_registered(
+    algorithm: type[PEARLSAC], tmp_path: Path
+) -> None:
     """Its episodes' length is the model's to know."""
     model = small(algorithm, walks(2), horizon=10).learn(1)
     model.set_env(walks(3))
@@ -113,8 +133,12 @@ def test_set_env_of_another_family(algorithm: type[PEARLSAC]) -> None:
         assert model.env is env  # a refused environment leaves the model as it was
         assert model.family is family
         assert model.n_envs == 2
-    with pytest.raises(ValueError, match="horizon is 200, but the environment ends episodes after 50 steps"):
-        model.set_env(make_vec_env("poem/HalfCheetahVel-v0", 1, env_kwargs={"max_episode_steps": 50}))
+    with pytest.raises(
+        ValueError, match="horizon is 200, but the environment ends episodes after 50 steps"
+    ):
+        model.set_env(
+            make_vec_env("poem/HalfCheetahVel-v0", 1, env_kwargs={"max_episode_steps": 50})
+        )
 
 
 def test_load_with_another_family(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
@@ -131,7 +155,13 @@ def test_broken_and_foreign_files(trained: PEARLSAC, tmp_path: Path) -> None:
     trained.save(tmp_path / "model.zip")
     content = (tmp_path / "model.zip").read_bytes()
     broken = tmp_path / "broken.zip"
-    for bad in (content[: len(content) // 2], content[:-30], b"", b"hello", np.random.default_rng(0).bytes(5000)):
+    for bad in (
+        content[: len(content) // 2],
+        content[:-30],
+        b"",
+        b"hello",
+        np.random.default_rng(0).bytes(5000),
+    ):
         broken.write_bytes(bad)
         with pytest.raises(ValueError, match=r"broken\.zip is truncated, or no model saved by"):
             cls.load(broken)
@@ -142,7 +172,9 @@ def test_broken_and_foreign_files(trained: PEARLSAC, tmp_path: Path) -> None:
         cls.load(broken)
     with pytest.raises(FileNotFoundError):
         cls.load(tmp_path / "nothing.zip")
-    SAC("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [4]}, buffer_size=10).save(tmp_path / "sac.zip")
+    SAC("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [4]}, buffer_size=10).save(
+        tmp_path / "sac.zip"
+    )
     with pytest.raises(ValueError, match=r"sac\.zip holds a model of another algorithm"):
         cls.load(tmp_path / "sac.zip")
     with pytest.raises(ValueError, match=r"model\.zip holds a model of another algorithm"):
@@ -154,7 +186,9 @@ def test_get_and_set_parameters(trained: PEARLSAC, tmp_path: Path) -> None:
     assert differing(parameters(other), parameters(trained))
     other.set_parameters(trained.get_parameters())
     mine, theirs = parameters(other), parameters(trained)
-    assert not [name for name in differing(mine, theirs) if name != "log_ent_coef"]  # SB3 keeps it beside the parameters
+    assert not [
+        name for name in differing(mine, theirs) if name != "log_ent_coef"
+    ]  # SB3 keeps it beside the parameters
     latents = np.random.default_rng(1).normal(size=(6, 5))
     actions = [model.predict(OBS, latents, deterministic=True)[0] for model in (other, trained)]
     assert np.array_equal(*actions)
@@ -183,7 +217,11 @@ def test_replay_buffer_saves_alone(algorithm: type[PEARLSAC], tmp_path: Path) ->
     other = small(algorithm)
     other.load_replay_buffer(tmp_path / "buffer")
     for task in range(N_TASKS):
-        stored = zip(other.replay_buffer.transitions(task), model.replay_buffer.transitions(task), strict=True)
+        stored = zip(
+            other.replay_buffer.transitions(task),
+            model.replay_buffer.transitions(task),
+            strict=True,
+        )
         assert all(th.equal(one, two) for one, two in stored)
     other.learn(EPOCH)
     assert other.replay_buffer.size() == 2 * EPOCH
@@ -192,7 +230,9 @@ def test_replay_buffer_saves_alone(algorithm: type[PEARLSAC], tmp_path: Path) ->
 def test_parameters_come_with_their_standardisation(trained: PEARLSAC) -> None:
     copy = small(type(trained), gradient_steps=0)
     copy.set_parameters(trained.get_parameters())
-    assert np.array_equal(copy.predict(OBS, deterministic=True)[0], trained.predict(OBS, deterministic=True)[0])
+    assert np.array_equal(
+        copy.predict(OBS, deterministic=True)[0], trained.predict(OBS, deterministic=True)[0]
+    )
     copy.learn(EPOCH)  # which collects, and goes on where the other stopped
     assert copy.policy.obs_norm.count == 3 * EPOCH
     assert th.equal(copy.policy.reward_norm.mean, trained.policy.reward_norm.mean)
@@ -204,7 +244,9 @@ def test_parameters_come_with_their_standardisation(trained: PEARLSAC) -> None:
 
 
 @one_is_enough
-def test_arguments_of_a_model_that_is_loaded(algorithm: type[POEMSAC], trained: PEARLSAC, tmp_path: Path) -> None:
+def test_arguments_of_a_model_that_is_loaded(
+    algorithm: type[POEMSAC], trained: PEARLSAC, tmp_path: Path
+) -> None:
     model = small(algorithm, similarity="inner", context="pearl", latent_dim=3)
     model.save(tmp_path / "m.zip")
     same = {"similarity": "inner", "context": "pearl", "latent_dim": 3}
@@ -212,7 +254,9 @@ def test_arguments_of_a_model_that_is_loaded(algorithm: type[POEMSAC], trained: 
     assert (loaded.n_steps, loaded.kl_coef) == (5, 0.7)
     assert loaded.similarities(np.zeros((2, 3)), np.zeros((1, 3))).shape == (2, 1)
     for name, value in {"similarity": "two", "context": "poem", "latent_dim": 5}.items():
-        with pytest.raises(ValueError, match=f"{name} is .* in .*m.zip, and cannot become {value!r}"):
+        with pytest.raises(
+            ValueError, match=f"{name} is .* in .*m.zip, and cannot become {value!r}"
+        ):
             algorithm.load(tmp_path / "m.zip", **{name: value})
 
 
@@ -235,7 +279,9 @@ def test_a_seed_changes_what_follows(algorithm: type[PEARLSAC], tmp_path: Path) 
 
 
 @one_is_enough
-def test_an_id_becomes_as_many_copies_as_in_training(algorithm: type[POEMSAC], tmp_path: Path) -> None:
+def test_an_id_becomes_as_many_copies_as_in_training(
+    algorithm: type[POEMSAC], tmp_path: Path
+) -> None:
     arguments = {"n_train_tasks": 4, "trajectories_per_task": 3, "meta_batch_size": 4}
     whole = small(algorithm, **arguments).learn(3 * 12 * 25)
     half = small(algorithm, **arguments).learn(12 * 25)
@@ -282,11 +328,15 @@ def test_arguments_that_the_family_cannot_have(algorithm: type[PEARLSAC], tmp_pa
     small(algorithm, walks(3, WindyWalk), horizon=10, n_train_tasks=4).save(tmp_path / "windy.zip")
     calm = small(algorithm, walks(3), horizon=10, n_train_tasks=4, relabel_fraction=0.5)
     calm.save(tmp_path / "calm.zip")
-    with pytest.raises(ValueError, match=r"relabel_fraction must be 0: the tasks of .* do not share dynamics"):
+    with pytest.raises(
+        ValueError, match=r"relabel_fraction must be 0: the tasks of .* do not share dynamics"
+    ):
         algorithm.load(tmp_path / "windy.zip", walks(3, WindyWalk), relabel_fraction=0.5)
     with pytest.raises(ValueError, match="relabel_fraction must be 0"):
         calm.set_env(walks(3, WindyWalk))
     with pytest.raises(ValueError, match=r"n_train_tasks is 4 in .*calm\.zip, and cannot become 2"):
         algorithm.load(tmp_path / "calm.zip", n_train_tasks=2)
-    with pytest.raises(ValueError, match=r"ent_coef is 'auto' in .*calm\.zip, and cannot become 0\.1"):
+    with pytest.raises(
+        ValueError, match=r"ent_coef is 'auto' in .*calm\.zip, and cannot become 0\.1"
+    ):
         algorithm.load(tmp_path / "calm.zip", ent_coef=0.1)

@@ -46,7 +46,9 @@ def test_targets_are_the_plain_ones_and_the_difference_of_potentials(n_steps: in
     plain_model, plain = targets(0.0, n_steps)
     np.testing.assert_array_equal(model.train_tasks.tasks, plain_model.train_tasks.tasks)
     for name in ("observations", "actions", "rewards"):  # the decoder learns rewards as they are
-        th.testing.assert_close(getattr(batch.transitions, name), getattr(plain.transitions, name), rtol=0, atol=0)
+        th.testing.assert_close(
+            getattr(batch.transitions, name), getattr(plain.transitions, name), rtol=0, atol=0
+        )
     if n_steps == 1:
         rewards, after = plain.transitions.rewards, plain.transitions.next_observations
         discounts = GAMMA * (1.0 - plain.transitions.terminated)
@@ -58,7 +60,9 @@ def test_targets_are_the_plain_ones_and_the_difference_of_potentials(n_steps: in
     def worth(observations: th.Tensor) -> np.ndarray:
         return 0.5 / (1.0 - GAMMA) * (3.0 * np.sin(observations[..., 0].numpy()) * task + 1.0)
 
-    expected = rewards.numpy() + discounts.numpy() * worth(after) - worth(plain.transitions.observations)
+    expected = (
+        rewards.numpy() + discounts.numpy() * worth(after) - worth(plain.transitions.observations)
+    )
     np.testing.assert_allclose(batch.bootstraps.rewards, expected, rtol=1e-4, atol=1e-4)
     th.testing.assert_close(batch.bootstraps.observations, after)
     th.testing.assert_close(batch.bootstraps.discounts, discounts)
@@ -73,15 +77,22 @@ def test_the_vectorised_and_the_process_family_have_the_potential_of_the_single_
     np.testing.assert_allclose(single.compute_rewards(tasks, standing), [-3.0, -1.5])
     vec_env = TaskVecEnv.from_id("poem/AntGoal-v0", 2)
     assert vec_env.get_attr("has_potential") == [True, True]
-    np.testing.assert_allclose(vec_env.env_method("compute_potential", tasks, observations, indices=[0])[0], [-3.0, -1.5])
+    np.testing.assert_allclose(
+        vec_env.env_method("compute_potential", tasks, observations, indices=[0])[0], [-3.0, -1.5]
+    )
     processes = ProcessFamilyVector(Shaped, num_envs=2, nthread=1)
     assert processes.has_potential
-    np.testing.assert_allclose(processes.compute_potential([[2.0]], [[0.5]]), [6.0 * np.sin(0.5) + 1.0])
+    np.testing.assert_allclose(
+        processes.compute_potential([[2.0]], [[0.5]]), [6.0 * np.sin(0.5) + 1.0]
+    )
     assert not ProcessFamilyVector(Walk, num_envs=2, nthread=1).has_potential
 
 
 def test_it_needs_a_potential_and_a_discount() -> None:
-    with pytest.raises(ValueError, match=r"shaping_coef must be 0: .*has no potential; a family defines one by _potential"):
+    with pytest.raises(
+        ValueError,
+        match=r"shaping_coef must be 0: .*has no potential; a family defines one by _potential",
+    ):
         small(PEARLSAC, walks(6), horizon=10, n_train_tasks=6, shaping_coef=1.0)
     with pytest.raises(ValueError, match="shaping_coef must be 0 with gamma=1"):
         small(PEARLSAC, walks(6, Shaped), horizon=10, n_train_tasks=6, shaping_coef=1.0, gamma=1.0)

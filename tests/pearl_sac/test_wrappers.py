@@ -44,7 +44,9 @@ class Own(gym.Wrapper):
         super().__init__(env)
         self.what = what
         if what == "observation_space":
-            self.observation_space = gym.spaces.Box(-1.0, 1.0, env.observation_space.shape, np.float64)
+            self.observation_space = gym.spaces.Box(
+                -1.0, 1.0, env.observation_space.shape, np.float64
+            )
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(**kwargs)
@@ -70,11 +72,17 @@ class OwnVec(VecEnvWrapper):
 @pytest.mark.parametrize(
     ("wrap", "name"),
     [
-        (functools.partial(wrappers.TransformReward, func=lambda reward: reward), "TransformReward"),
+        (
+            functools.partial(wrappers.TransformReward, func=lambda reward: reward),
+            "TransformReward",
+        ),
         (wrappers.NormalizeObservation, "NormalizeObservation"),
         (wrappers.NormalizeReward, "NormalizeReward"),
         (functools.partial(wrappers.FrameStackObservation, stack_size=2), "FrameStackObservation"),
-        (functools.partial(wrappers.RescaleAction, min_action=-2.0, max_action=2.0), "RescaleAction"),
+        (
+            functools.partial(wrappers.RescaleAction, min_action=-2.0, max_action=2.0),
+            "RescaleAction",
+        ),
         (wrappers.ClipAction, "ClipAction"),
         (wrappers.TimeAwareObservation, "TimeAwareObservation"),
         (functools.partial(wrappers.RepeatAction, num_repeats=2), "RepeatAction"),
@@ -93,14 +101,21 @@ def test_known_wrappers_are_refused_by_name(wrap: Wrap, name: str, monitor: bool
 
 @pytest.mark.parametrize("wrap", [VecNormalize, functools.partial(VecFrameStack, n_stack=2)])
 @pytest.mark.parametrize("make", [make_vec_env, TaskVecEnv.from_id])
-def test_sb3s_wrappers_are_refused_by_name(wrap: Callable[[VecEnv], VecEnv], make: Callable[[str, int], VecEnv]) -> None:
+def test_sb3s_wrappers_are_refused_by_name(
+    wrap: Callable[[VecEnv], VecEnv], make: Callable[[str, int], VecEnv]
+) -> None:
     for env in (wrap(make(POINT_GOAL, 2)), VecMonitor(wrap(make(POINT_GOAL, 2)))):
-        with pytest.raises(ValueError, match=r"must not be wrapped in Vec(Normalize|FrameStack) .*in YAML: no `normalize`"):
+        with pytest.raises(
+            ValueError,
+            match=r"must not be wrapped in Vec(Normalize|FrameStack) .*in YAML: no `normalize`",
+        ):
             small(PEARLSAC, env)
 
 
 def test_one_copy_is_enough() -> None:
-    env = DummyVecEnv([lambda: gym.make(POINT_GOAL), lambda: wrappers.NormalizeReward(gym.make(POINT_GOAL))])
+    env = DummyVecEnv(
+        [lambda: gym.make(POINT_GOAL), lambda: wrappers.NormalizeReward(gym.make(POINT_GOAL))]
+    )
     with pytest.raises(ValueError, match="must not be wrapped in NormalizeReward"):
         small(POEMSAC, env)
 
@@ -113,7 +128,10 @@ def make_wrapped(wrap: Wrap) -> gym.Env:
     ("wrap", "message"),
     [
         (wrappers.NormalizeObservation, "must not be wrapped in NormalizeObservation"),
-        (functools.partial(Own, what="observation"), r"env's wrappers Own change what is seen or done"),
+        (
+            functools.partial(Own, what="observation"),
+            r"env's wrappers Own change what is seen or done",
+        ),
         (functools.partial(Own, what="reward"), r"env paid .* by one of its wrappers Own"),
     ],
     ids=["known", "observation", "reward"],
@@ -133,11 +151,16 @@ def test_in_subprocesses(wrap: Wrap, message: str) -> None:
         ("observation", "env's wrappers Own change what is seen or done"),
         ("start", "env's wrappers Own change what is seen or done"),
         ("action", "env's wrappers Own change what is seen or done"),
-        ("reward", r"env paid .* at step 0 of copy 0, but compute_rewards.* is .*, by one of its wrappers Own"),
+        (
+            "reward",
+            r"env paid .* at step 0 of copy 0, but compute_rewards.* is .*, by one of its wrappers Own",
+        ),
     ],
 )
 @pytest.mark.parametrize("registered", [True, False])
-def test_unknown_wrappers_are_refused_by_the_first_experience(what: str, message: str, registered: bool) -> None:
+def test_unknown_wrappers_are_refused_by_the_first_experience(
+    what: str, message: str, registered: bool
+) -> None:
     """Before a gradient step: there is no such experience among what is learned from."""
     family = gym.make(POINT_GOAL) if registered else gym.wrappers.TimeLimit(EvenWalk(edge=0.5), 25)
     model = small(POEMSAC, Own(family, what), horizon=25)
@@ -154,7 +177,9 @@ def test_unknown_wrappers_around_the_vectorised_environment() -> None:
 
 
 def test_another_space_is_refused_at_once() -> None:
-    with pytest.raises(ValueError, match=r"env's wrappers \(Monitor, Own, .*\) must leave observation_space Box"):
+    with pytest.raises(
+        ValueError, match=r"env's wrappers \(Monitor, Own, .*\) must leave observation_space Box"
+    ):
         small(POEMSAC, Own(gym.make(POINT_GOAL), "observation_space"))
 
 
@@ -164,7 +189,9 @@ def test_a_family_that_does_not_pay_what_it_computes() -> None:
             observation, reward, *rest = super().step(action)
             return observation, reward + 1.0, *rest
 
-    with pytest.raises(ValueError, match=r"env paid .*, but compute_rewards.* is .*; .*check_task_family"):
+    with pytest.raises(
+        ValueError, match=r"env paid .*, but compute_rewards.* is .*; .*check_task_family"
+    ):
         small(POEMSAC, Bribed(), horizon=5).learn(EPOCH)
 
 
@@ -173,7 +200,9 @@ def test_a_reward_that_does_not_broadcast() -> None:
         def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
             return -np.abs(features[0] - tasks[0]) if features.ndim == 1 else np.zeros(3)
 
-    with pytest.raises(ValueError, match=r"compute_rewards must give .* rewards of shape \(1, 5\), but gave \(3,\)"):
+    with pytest.raises(
+        ValueError, match=r"compute_rewards must give .* rewards of shape \(1, 5\), but gave \(3,\)"
+    ):
         small(POEMSAC, OneByOne(), horizon=5).learn(EPOCH)
 
 
@@ -183,4 +212,6 @@ def test_what_changes_nothing_is_taken() -> None:
 
     wrapped = small(POEMSAC, VecCheckNan(VecMonitor(DummyVecEnv([make] * 3)))).learn(EPOCH)
     assert_same_model(wrapped, small(POEMSAC, make_vec_env(POINT_GOAL, 3)).learn(EPOCH))
-    small(POEMSAC, DummyVecEnv([lambda: wrappers.RecordEpisodeStatistics(gym.make(POINT_GOAL))])).learn(1)
+    small(
+        POEMSAC, DummyVecEnv([lambda: wrappers.RecordEpisodeStatistics(gym.make(POINT_GOAL))])
+    ).learn(1)

@@ -30,7 +30,9 @@ def rng() -> np.random.Generator:
 
 @pytest.fixture(autouse=True)
 def gymnasiums_own_time_limit(monkeypatch):
-    """An import of rl_zoo3, by a test before, replaces TimeLimit by one that hides a time limit behind a termination."""
+    """An import of rl_zoo3, by a test before, replaces TimeLimit by one that hides a time limit
+    behind a termination.
+    """
     kind = wrappers.TimeLimit
     if kind.__module__.startswith("rl_zoo3"):
         monkeypatch.setattr(wrappers, "TimeLimit", kind.__base__)

@@ -1,4 +1,6 @@
-"""The families that step in batches, beyond the contract of all families (tests/test_family_contract.py)."""
+"""The families that step in batches, beyond the contract of all families
+(tests/test_family_contract.py).
+"""
 
 import warnings
 
@@ -44,8 +46,11 @@ def two_tasks(env, rng):
 def test_checkers_find_nothing(env_id):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        # Gymnasium's own MuJoCo environments raise these: unbounded observations, and Humanoid's torques up to 0.4.
-        warnings.filterwarnings("ignore", message=".*A Box observation space m.*imum value is -?infinity")
+        # Gymnasium's own MuJoCo environments raise these: unbounded observations, and Humanoid's
+        # torques up to 0.4.
+        warnings.filterwarnings(
+            "ignore", message=".*A Box observation space m.*imum value is -?infinity"
+        )
         warnings.filterwarnings("ignore", message=".*recommend.*symmetric and normalized")
         gymnasium_check_env(make(env_id), skip_render_check=True)
         sb3_check_env(make(env_id))
@@ -54,7 +59,14 @@ def test_checkers_find_nothing(env_id):
 def test_spaces_and_horizon(env_id):
     env = gym.make(env_id)
     horizon = 25 if "PointGoal" in env_id else 200
-    dims = {"Point": (2, 2), "HalfC": (17, 6), "AntGo": (29, 8), "AntVe": (27, 8), "AntFw": (27, 8), "AntDi": (27, 8)}
+    dims = {
+        "Point": (2, 2),
+        "HalfC": (17, 6),
+        "AntGo": (29, 8),
+        "AntVe": (27, 8),
+        "AntFw": (27, 8),
+        "AntDi": (27, 8),
+    }
     obs_dim, action_dim = dims.get(env_id.removeprefix("poem/")[:5], (376, 17))
     assert env.spec.max_episode_steps == horizon
     assert env.observation_space.shape == (obs_dim,)
@@ -80,7 +92,9 @@ def test_tasks_are_uniform_on_the_documented_interval(env_id, low, high, rng):
     assert tasks.shape == (4000, 1)
     assert tasks.dtype == np.float64
     ranks = np.sort(tasks[:, 0] - low) / (high - low)
-    assert np.abs(ranks - (np.arange(4000) + 0.5) / 4000).max() < 0.03  # Kolmogorov-Smirnov, far beyond its 1 % point
+    assert (
+        np.abs(ranks - (np.arange(4000) + 0.5) / 4000).max() < 0.03
+    )  # Kolmogorov-Smirnov, far beyond its 1 % point
 
 
 def test_ant_goals_are_uniform_on_the_disc(rng):
@@ -91,7 +105,8 @@ def test_ant_goals_are_uniform_on_the_disc(rng):
 
 
 @pytest.mark.parametrize(
-    ("env_id", "members"), [("poem/HalfCheetahFwdBack-v0", {1.0, -1.0}), ("poem/AntFwdBack-v0", {0.0, np.pi})]
+    ("env_id", "members"),
+    [("poem/HalfCheetahFwdBack-v0", {1.0, -1.0}), ("poem/AntFwdBack-v0", {0.0, np.pi})],
 )
 def test_finite_families(env_id, members, rng):
     env = make(env_id)
@@ -144,7 +159,9 @@ def test_a_seed_determines_an_unchosen_task(env_id):
     assert len(set(drawn)) > 1
 
 
-@pytest.mark.parametrize("wrong", [np.zeros(3), np.full(1, 99.0), np.array([np.nan]), np.zeros((1, 1)), "fast", None])
+@pytest.mark.parametrize(
+    "wrong", [np.zeros(3), np.full(1, 99.0), np.array([np.nan]), np.zeros((1, 1)), "fast", None]
+)
 def test_wrong_tasks(env_id, wrong):
     env = make(env_id)
     env.reset(seed=0)
@@ -165,7 +182,9 @@ def test_compute_rewards_broadcasts_to_the_same_bits(env_id, rng):
     together = env.compute_rewards(tasks[:, None, None], features)
     assert together.shape == (40, 7, 5)
     assert together.dtype == np.float64
-    one_by_one = [[[float(env.compute_rewards(t, f)) for f in row] for row in features] for t in tasks]
+    one_by_one = [
+        [[float(env.compute_rewards(t, f)) for f in row] for row in features] for t in tasks
+    ]
     assert np.array_equal(together, one_by_one)
     strided = env.compute_rewards(tasks[::2], np.asfortranarray(features)[0, 0])
     assert np.array_equal(strided, together[::2, 0, 0])
@@ -187,7 +206,9 @@ def test_episodes_are_reproducible(env_id, rng):
     first, second = run(env, actions, seed=9), run(other, actions, seed=9)
     for one, two in zip(first, second, strict=True):
         assert np.array_equal(one, two)
-    assert not np.array_equal(run(env, actions)[0][0], first[0][0])  # without a seed the random numbers go on
+    assert not np.array_equal(
+        run(env, actions)[0][0], first[0][0]
+    )  # without a seed the random numbers go on
 
 
 def test_wrong_actions(env_id):

@@ -1,4 +1,6 @@
-"""The base class, on a family that only has a single environment, and what importing the package costs."""
+"""The base class, on a family that only has a single environment, and what importing the package
+costs.
+"""
 
 import subprocess
 import sys
@@ -62,7 +64,9 @@ def test_a_minimal_family_in_sb3s_own_vec_env():
     _, rewards, _, infos = vec_env.step(np.zeros((2, 1), dtype=np.float32))
     assert rewards == pytest.approx(-np.abs(start - tasks)[:, 0])
     features = np.stack([info["reward_features"] for info in infos])
-    assert vec_env.env_method("compute_rewards", tasks, features, indices=[0])[0] == pytest.approx(rewards)
+    assert vec_env.env_method("compute_rewards", tasks, features, indices=[0])[0] == pytest.approx(
+        rewards
+    )
 
 
 @pytest.mark.filterwarnings("error", "ignore:.*A Box observation space m.*imum value is")
@@ -110,7 +114,9 @@ def test_what_a_family_lacks_is_said_when_it_is_made(family, message):
 
 
 def run_python(code):
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    return subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout
 
 
 def test_the_import_is_light_and_quick():

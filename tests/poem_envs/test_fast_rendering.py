@@ -11,11 +11,19 @@ from poem_envs.headless import can_draw
 
 
 @pytest.mark.skipif(not can_draw(), reason="no off-screen OpenGL")
-@pytest.mark.parametrize("env_id", ["poem/HalfCheetahVel-v0", "poem/AntGoal-v0", "poem/MetaWorldML1-v0"])
+@pytest.mark.parametrize(
+    "env_id", ["poem/HalfCheetahVel-v0", "poem/AntGoal-v0", "poem/MetaWorldML1-v0"]
+)
 def test_the_same_scene_from_the_same_camera(env_id: str) -> None:
     images = {}
     for quality in ("full", "fast"):
-        options = {"width": 160, "height": 120, "render_mode": "rgb_array", "render_quality": quality, "render_task": True}
+        options = {
+            "width": 160,
+            "height": 120,
+            "render_mode": "rgb_array",
+            "render_quality": quality,
+            "render_task": True,
+        }
         env = gym.make(env_id, **options)
         env.reset(seed=1)
         for _ in range(10):
@@ -25,7 +33,10 @@ def test_the_same_scene_from_the_same_camera(env_id: str) -> None:
     full, fast = images["full"], images["fast"]
     assert fast.shape == full.shape == (120, 160, 3)
     assert np.corrcoef(full.ravel(), fast.ravel())[0, 1] > 0.85  # shadows and edges differ
-    assert np.corrcoef(full.ravel(), fast[:, ::-1].ravel())[0, 1] < np.corrcoef(full.ravel(), fast.ravel())[0, 1]
+    assert (
+        np.corrcoef(full.ravel(), fast[:, ::-1].ravel())[0, 1]
+        < np.corrcoef(full.ravel(), fast.ravel())[0, 1]
+    )
 
 
 @pytest.mark.parametrize("env_id", ["poem/AntVel-v0", "poem/MetaWorldML1-v0"])

@@ -26,11 +26,15 @@ def test_rewards_are_the_environments_own(env_id, own_id, reward_type, rng):
     assert np.array_equal(observation, own_observation["observation"])
     own.goal = other
     for _ in range(20):
-        action = np.append(np.clip(10 * (other - family.env._get_obs()["achieved_goal"]), -1, 1), 0.0).astype(np.float32)
+        action = np.append(
+            np.clip(10 * (other - family.env._get_obs()["achieved_goal"]), -1, 1), 0.0
+        ).astype(np.float32)
         observation, _, _, _, info = family.step(action)
         own_observation, own_reward, _, _, _ = own.step(action)
         assert np.array_equal(observation, own_observation["observation"])
-        assert family.compute_rewards(other, info["reward_features"]) == pytest.approx(float(own_reward), abs=1e-12)
+        assert family.compute_rewards(other, info["reward_features"]) == pytest.approx(
+            float(own_reward), abs=1e-12
+        )
 
 
 def test_the_goal_is_reached_where_the_task_says(rng):
@@ -78,19 +82,27 @@ class Reach(gym.Env):
         return -np.abs(achieved_goal - desired_goal).sum(axis=-1)
 
     def _observation(self):
-        return {"observation": self.x.copy(), "achieved_goal": self.x.copy(), "desired_goal": self.goal.copy()}
+        return {
+            "observation": self.x.copy(),
+            "achieved_goal": self.x.copy(),
+            "desired_goal": self.goal.copy(),
+        }
 
 
 class OneRewardAtATime(Reach):
     def compute_reward(self, achieved_goal, desired_goal, info):
-        return -float(abs(achieved_goal.ravel()[0] - desired_goal.ravel()[0]) + abs(achieved_goal.ravel()[1]))
+        return -float(
+            abs(achieved_goal.ravel()[0] - desired_goal.ravel()[0]) + abs(achieved_goal.ravel()[1])
+        )
 
 
 def test_a_reward_function_for_one_goal_at_a_time_is_called_for_one_after_another(rng):
     family = GoalFamily(OneRewardAtATime)
     goals, achieved = rng.uniform(-1, 1, (5, 2)), rng.uniform(-1, 1, (4, 2))
     expected = [[-(abs(a[0] - g[0]) + abs(a[1])) for a in achieved] for g in goals]
-    assert family.compute_rewards(goals[:, None], achieved[None]) == pytest.approx(np.array(expected))
+    assert family.compute_rewards(goals[:, None], achieved[None]) == pytest.approx(
+        np.array(expected)
+    )
 
 
 def test_what_the_observation_holds():
@@ -143,7 +155,10 @@ class RewardOfTheInfo(Reach):
     ("env", "message"),
     [
         (NoReward, r"has no compute_reward\(achieved_goal, desired_goal, info\)"),
-        (NoGoals, r"observation space must be a Dict of .*'desired_goal', but is a Dict of \['observation'\]"),
+        (
+            NoGoals,
+            r"observation space must be a Dict of .*'desired_goal', but is a Dict of \['observation'\]",
+        ),
         (lambda: gym.make("CartPole-v1"), "observation space must be a Dict"),
         (Pixels, "the space of 'observation' must be a flat Box"),
         (GoalsOfAnotherWidth, "must have the same shape"),
@@ -168,7 +183,11 @@ def length_of_an_episode(env):
 def reach_id():
     family = functools.partial(GoalFamily, "test/Reach-v0")
     gym.register("test/Reach-v0", Reach, max_episode_steps=7)
-    gym.register("test/ReachFamily-v0", family, vector_entry_point=functools.partial(ProcessFamilyVector, family))
+    gym.register(
+        "test/ReachFamily-v0",
+        family,
+        vector_entry_point=functools.partial(ProcessFamilyVector, family),
+    )
     gym.register("test/LongReachFamily-v0", family, max_episode_steps=11)
     yield "test/ReachFamily-v0"
     for name in ("test/Reach-v0", "test/ReachFamily-v0", "test/LongReachFamily-v0"):
@@ -215,13 +234,19 @@ class TargetInPlaceOfGoal(Reach):
         return self._observation(), self.compute_reward(self.x, self.target, {}), False, False, {}
 
     def _observation(self):
-        return {"observation": self.x.copy(), "achieved_goal": self.x.copy(), "desired_goal": self.target.copy()}
+        return {
+            "observation": self.x.copy(),
+            "achieved_goal": self.x.copy(),
+            "desired_goal": self.target.copy(),
+        }
 
 
 def test_a_goal_that_is_set_in_another_way():
     with pytest.raises(ValueError, match="has no attribute 'goal' to set; pass set_goal=f"):
         GoalFamily(TargetInPlaceOfGoal)
-    family = GoalFamily(TargetInPlaceOfGoal, set_goal=lambda env, goal: setattr(env, "target", goal))
+    family = GoalFamily(
+        TargetInPlaceOfGoal, set_goal=lambda env, goal: setattr(env, "target", goal)
+    )
     family.reset(seed=0, options={"task": [0.5, -0.5]})
     _, reward, *_ = family.step(np.zeros(2))
     assert reward == -1.0
@@ -241,7 +266,10 @@ class RewardWithCosts(Reach):
 
 @pytest.mark.parametrize(
     ("env", "message"),
-    [(GoalThatMoves, "the goal must stay for the whole episode"), (RewardWithCosts, "must depend on the two goals alone")],
+    [
+        (GoalThatMoves, "the goal must stay for the whole episode"),
+        (RewardWithCosts, "must depend on the two goals alone"),
+    ],
 )
 def test_episodes_that_cannot_be_relabelled(env, message):
     family = GoalFamily(env)

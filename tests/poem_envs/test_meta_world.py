@@ -13,7 +13,15 @@ from poem_envs import sawyer
 from poem_envs.testing import check_task_family
 
 # The last four have starts that Meta-World computes from data that is out of date.
-MANIPULATIONS = ["reach", "push", "door-open", "box-close", "dial-turn", "lever-pull", "window-close"]
+MANIPULATIONS = [
+    "reach",
+    "push",
+    "door-open",
+    "box-close",
+    "dial-turn",
+    "lever-pull",
+    "window-close",
+]
 
 
 def make(name="ML1", **kwargs):
@@ -30,7 +38,9 @@ def metaworlds_own(manipulation, placement):
 
 
 def placement_of_the_episode(env):
-    """Meta-World's rand_vec of the episode under way; for reaching its puck was drawn by the episode's generator."""
+    """Meta-World's rand_vec of the episode under way; for reaching its puck was drawn by the
+    episode's generator.
+    """
     if not env.shared_dynamics:
         return env.task
     return np.concatenate([env._sawyer.env.obj_init_pos, env.task])
@@ -60,7 +70,9 @@ def test_starts_steps_and_rewards_are_metaworlds(manipulation, rng):
 
 
 @pytest.mark.parametrize("manipulation", ["reach", "reach-wall"])
-def test_relabelled_rewards_of_reaching_are_those_of_metaworld_with_the_other_goal(manipulation, rng):
+def test_relabelled_rewards_of_reaching_are_those_of_metaworld_with_the_other_goal(
+    manipulation, rng
+):
     env = make(env_name=manipulation)
     played, other = env.sample_tasks(2, rng)
     env.reset(seed=3, options={"task": played})
@@ -68,10 +80,16 @@ def test_relabelled_rewards_of_reaching_are_those_of_metaworld_with_the_other_go
     own.reset()
     # Towards the goal and beyond it, so that the tolerance around it is met too.
     for step in range(60):
-        action = np.append(np.clip(10 * (other - env._sawyer.env.tcp_center), -1, 1), 0.0) if step < 50 else np.ones(4)
+        action = (
+            np.append(np.clip(10 * (other - env._sawyer.env.tcp_center), -1, 1), 0.0)
+            if step < 50
+            else np.ones(4)
+        )
         _, _, _, _, info = env.step(action)
         _, own_reward, _, _, _ = own.step(action)
-        assert env.compute_rewards(other, info["reward_features"]) == pytest.approx(own_reward, rel=1e-13)
+        assert env.compute_rewards(other, info["reward_features"]) == pytest.approx(
+            own_reward, rel=1e-13
+        )
         if step == 49:
             assert own_reward == 10.0
 
@@ -100,7 +118,9 @@ def test_tasks_of_a_manipulation_are_those_that_metaworld_accepts(rng):
     assert np.array_equal(env.task_space.low, box.low)
     assert np.array_equal(env.task_space.high, box.high)
     assert np.linalg.norm(tasks[:, :2] - tasks[:, 3:5], axis=1).min() >= 0.15
-    assert tasks.std(axis=0)[[0, 1, 3, 4]] == pytest.approx((box.high - box.low)[[0, 1, 3, 4]] / np.sqrt(12), rel=0.15)
+    assert tasks.std(axis=0)[[0, 1, 3, 4]] == pytest.approx(
+        (box.high - box.low)[[0, 1, 3, 4]] / np.sqrt(12), rel=0.15
+    )
     near = tasks[0].copy()
     near[:2], near[3:5] = [0.05, 0.7], [0.05, 0.8]
     with pytest.raises(ValueError, match=r"refuses the placement.*too near"):
@@ -112,7 +132,9 @@ ML10_TRAIN = "reach push pick-place door-open drawer-close button-press-topdown 
 ML10_TEST = "drawer-open door-close shelf-place sweep-into lever-pull"
 
 
-@pytest.mark.parametrize(("split", "names"), [("train", ML10_TRAIN), ("test", ML10_TRAIN), ("held-out", ML10_TEST)])
+@pytest.mark.parametrize(
+    ("split", "names"), [("train", ML10_TRAIN), ("test", ML10_TRAIN), ("held-out", ML10_TEST)]
+)
 def test_ml10_has_metaworlds_manipulations_in_equal_parts(split, names, rng):
     env = make("ML10", split=split)
     tasks = env.sample_tasks(4 * len(names.split()), rng)
@@ -122,15 +144,21 @@ def test_ml10_has_metaworlds_manipulations_in_equal_parts(split, names, rng):
     for task in tasks[:2]:
         env.set_task(task)
         env.reset(seed=0)
-        assert isinstance(env._sawyer.env, ALL_V3_ENVIRONMENTS[f"{env.manipulations[int(task[0])]}-v3"])
+        assert isinstance(
+            env._sawyer.env, ALL_V3_ENVIRONMENTS[f"{env.manipulations[int(task[0])]}-v3"]
+        )
 
 
 def test_splits_are_other_placements_of_one_space():
     train, test, held_out = (make("ML10", split=split) for split in ("train", "test", "held-out"))
-    assert train.task_space == test.task_space == held_out.task_space  # so that a model adapts to all of them
+    assert (
+        train.task_space == test.task_space == held_out.task_space
+    )  # so that a model adapts to all of them
     one, other = (env.sample_tasks(20, np.random.default_rng(0)) for env in (train, test))
     assert not set(map(tuple, one[:, 1:])) & set(map(tuple, other[:, 1:]))
-    one, other = (make(split=split).sample_tasks(50, np.random.default_rng(0)) for split in ("train", "test"))
+    one, other = (
+        make(split=split).sample_tasks(50, np.random.default_rng(0)) for split in ("train", "test")
+    )
     assert not set(map(tuple, one)) & set(map(tuple, other))
 
 
@@ -142,7 +170,10 @@ def test_names_with_and_without_their_version(env_name):
 @pytest.mark.parametrize(
     ("env_name", "message"),
     [
-        ("door-opn", "env_name='door-opn' is none of .* 50 manipulations; did you mean 'door-open'"),
+        (
+            "door-opn",
+            "env_name='door-opn' is none of .* 50 manipulations; did you mean 'door-open'",
+        ),
         ("pusch-v3", "did you mean 'push'"),
         ("xyzzy", "choose one of assembly, .*window-open"),
         (3, "env_name=3 is none of"),
@@ -156,7 +187,10 @@ def test_an_unknown_manipulation_lists_near_ones(env_name, message):
 @pytest.mark.parametrize("found", ["2.0.0", "3.0.0", "4.0.1"])
 def test_another_version_of_metaworld(monkeypatch, found):
     monkeypatch.setattr(sawyer, "version", lambda name: found)
-    with pytest.raises(ImportError, match=rf"metaworld >= 3.1, < 4, but metaworld {found} is installed.*pip install"):
+    with pytest.raises(
+        ImportError,
+        match=rf"metaworld >= 3.1, < 4, but metaworld {found} is installed.*pip install",
+    ):
         make()
 
 
@@ -166,12 +200,16 @@ def test_no_metaworld(monkeypatch):
 
     monkeypatch.setattr(sawyer, "version", absent)
     for name in ("ML1", "ML10"):
-        with pytest.raises(ImportError, match=r"need metaworld >= 3.1, < 4; install it: pip install 'metaworld"):
+        with pytest.raises(
+            ImportError, match=r"need metaworld >= 3.1, < 4; install it: pip install 'metaworld"
+        ):
             make(name)
 
 
 def test_splits_that_there_are_not():
-    with pytest.raises(ValueError, match="poem/MetaWorldML1-v0 has one manipulation and holds none back"):
+    with pytest.raises(
+        ValueError, match="poem/MetaWorldML1-v0 has one manipulation and holds none back"
+    ):
         make(split="held-out")
     for name, splits in (("ML1", "'train', 'test'"), ("ML10", "'train', 'test', 'held-out'")):
         with pytest.raises(ValueError, match=f"split='validation': .* it has {splits}"):
@@ -180,8 +218,14 @@ def test_splits_that_there_are_not():
 
 def test_wrong_tasks_of_ml10(rng):
     env = make("ML10")
-    three_numbers = next(task for task in env.sample_tasks(10, rng) if env.manipulations[int(task[0])] == "door-open")
-    for index, value, message in ((0, 3.5, "a whole one"), (6, 0.1, "is 3 numbers, then zeros"), (1, 0.15, "must be inside")):
+    three_numbers = next(
+        task for task in env.sample_tasks(10, rng) if env.manipulations[int(task[0])] == "door-open"
+    )
+    for index, value, message in (
+        (0, 3.5, "a whole one"),
+        (6, 0.1, "is 3 numbers, then zeros"),
+        (1, 0.15, "must be inside"),
+    ):
         wrong = three_numbers.copy()
         wrong[index] = value
         with pytest.raises(ValueError, match=message):
@@ -192,7 +236,9 @@ def test_a_simulation_that_diverges_says_where():
     env = make()
     env.reset(seed=7)
     env._sawyer.env.data.qvel[:] = 1e12
-    with pytest.raises(RuntimeError, match=r"MetaWorldML1Env diverged at step 1 of episode 1 since reset\(seed=7\)"):
+    with pytest.raises(
+        RuntimeError, match=r"MetaWorldML1Env diverged at step 1 of episode 1 since reset\(seed=7\)"
+    ):
         env.step(np.zeros(4))
 
 
@@ -227,7 +273,9 @@ def test_images_are_upright():
     heights = []
     for _ in range(2):
         red, green, blue = env.render().astype(float).transpose(2, 0, 1)
-        heights.append(np.nonzero((red > 60) & (red > 2 * green) & (red > 2 * blue))[0].min())  # the arm's uppermost row
+        heights.append(
+            np.nonzero((red > 60) & (red > 2 * green) & (red > 2 * blue))[0].min()
+        )  # the arm's uppermost row
         for _ in range(40):
             env.step(np.array([0.0, 0.0, 1.0, 0.0]))
     env.close()

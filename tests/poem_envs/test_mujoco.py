@@ -46,13 +46,20 @@ def velocity(before, after, dt):
     return (after[1:3] - before[1:3]) / dt
 
 
-# What each family pays for a step, written from the description of the families: state before and after, action, task.
+# What each family pays for a step, written from the description of the families: state before and
+# after, action, task.
 REWARDS = {
     "poem/HalfCheetahVel-v0": lambda b, a, u, g: -abs((a[1] - b[1]) / 0.05 - g[0]) - 0.05 * u @ u,
     "poem/HalfCheetahFwdBack-v0": lambda b, a, u, g: g[0] * (a[1] - b[1]) / 0.05 - 0.05 * u @ u,
-    "poem/AntVel-v0": lambda b, a, u, g: 1 - abs(velocity(b, a, 0.05)[0] - g[0]) - 0.005 * u @ u + 0.05,
-    "poem/AntFwdBack-v0": lambda b, a, u, g: velocity(b, a, 0.05) @ [np.cos(g[0]), np.sin(g[0])] - 0.5 * u @ u + 1,
-    "poem/AntDir2D-v0": lambda b, a, u, g: velocity(b, a, 0.05) @ [np.cos(g[0]), np.sin(g[0])] - 0.5 * u @ u + 1,
+    "poem/AntVel-v0": lambda b, a, u, g: (
+        1 - abs(velocity(b, a, 0.05)[0] - g[0]) - 0.005 * u @ u + 0.05
+    ),
+    "poem/AntFwdBack-v0": lambda b, a, u, g: (
+        velocity(b, a, 0.05) @ [np.cos(g[0]), np.sin(g[0])] - 0.5 * u @ u + 1
+    ),
+    "poem/AntDir2D-v0": lambda b, a, u, g: (
+        velocity(b, a, 0.05) @ [np.cos(g[0]), np.sin(g[0])] - 0.5 * u @ u + 1
+    ),
     "poem/AntGoal-v0": lambda b, a, u, g: -abs(a[1] - g[0]) - abs(a[2] - g[1]) - 0.1 * u @ u,
 }
 
@@ -61,8 +68,12 @@ REWARDS = {
 def test_rewards(env_id, rng):
     env = make(env_id)
     for task in env.sample_tasks(2, rng):
-        for before, after, action, reward, _ in transitions(env, random_actions(env, 20, rng), seed=1, options={"task": task}):
-            assert reward == pytest.approx(REWARDS[env_id](before, after, action, task), rel=1e-10, abs=1e-10)
+        for before, after, action, reward, _ in transitions(
+            env, random_actions(env, 20, rng), seed=1, options={"task": task}
+        ):
+            assert reward == pytest.approx(
+                REWARDS[env_id](before, after, action, task), rel=1e-10, abs=1e-10
+            )
 
 
 def centre_of_mass(model, state):
@@ -90,7 +101,10 @@ def test_humanoid_rewards(rng):
     [
         ("poem/HalfCheetahVel-v0", {"forward_reward_weight": 0.0}),
         ("poem/HalfCheetahFwdBack-v0", {"forward_reward_weight": 0.0}),
-        ("poem/AntVel-v0", {"forward_reward_weight": 0.0, "forward_reward_offset": 0.0, "healthy_reward": 0.0}),
+        (
+            "poem/AntVel-v0",
+            {"forward_reward_weight": 0.0, "forward_reward_offset": 0.0, "healthy_reward": 0.0},
+        ),
         ("poem/AntFwdBack-v0", {"forward_reward_weight": 0.0, "healthy_reward": 0.0}),
         ("poem/AntDir2D-v0", {"forward_reward_weight": 0.0, "healthy_reward": 0.0}),
         ("poem/AntGoal-v0", {"distance_reward_weight": 0.0}),
@@ -98,13 +112,17 @@ def test_humanoid_rewards(rng):
     ],
 )
 def test_every_weight_is_an_argument(env_id, weights, rng):
-    """With all other weights at zero, minus the action cost is left; with that at zero too, nothing."""
+    """With all other weights at zero, minus the action cost is left; with that at zero too,
+    nothing.
+    """
     action = random_actions(make(env_id), 1, rng)[0]
     for ctrl_cost_weight in (2.0, 0.0):
         env = make(env_id, ctrl_cost_weight=ctrl_cost_weight, **weights)
         env.reset(seed=0)
         reward = env.step(action)[1]
-        assert reward == pytest.approx(-ctrl_cost_weight * float(np.sum(action.astype(np.float64) ** 2)))
+        assert reward == pytest.approx(
+            -ctrl_cost_weight * float(np.sum(action.astype(np.float64) ** 2))
+        )
 
 
 def ends_at(env, height):
@@ -130,13 +148,22 @@ def test_early_ends(env_id, default):
     assert env.healthy_z_range == default
     assert not ends_at(env, default[1] - 0.1)
     assert ends_at(env, default[1] + 0.1)
-    high_up = make(env_id, healthy_z_range=(3.0, 4.0))  # in free fall, where a step moves the torso by about a centimetre
-    assert [ends_at(high_up, height) for height in (2.95, 3.05, 3.95, 4.05)] == [True, False, False, True]
+    high_up = make(
+        env_id, healthy_z_range=(3.0, 4.0)
+    )  # in free fall, where a step moves the torso by about a centimetre
+    assert [ends_at(high_up, height) for height in (2.95, 3.05, 3.95, 4.05)] == [
+        True,
+        False,
+        False,
+        True,
+    ]
     careless = make(env_id, terminate_when_unhealthy=False)
     assert not ends_at(careless, default[1] + 0.1)
 
 
-@pytest.mark.parametrize("env_id", ["poem/HalfCheetahVel-v0", "poem/HalfCheetahFwdBack-v0", "poem/AntGoal-v0"])
+@pytest.mark.parametrize(
+    "env_id", ["poem/HalfCheetahVel-v0", "poem/HalfCheetahFwdBack-v0", "poem/AntGoal-v0"]
+)
 def test_families_without_an_early_end(env_id, rng):
     env = make(env_id)
     env.reset(seed=0)
@@ -151,7 +178,10 @@ GYMNASIUM = {
     "poem/AntVel-v0": ("Ant-v5", {"include_cfrc_ext_in_observation": False}),
     "poem/AntGoal-v0": (
         "Ant-v5",
-        {"include_cfrc_ext_in_observation": False, "exclude_current_positions_from_observation": False},
+        {
+            "include_cfrc_ext_in_observation": False,
+            "exclude_current_positions_from_observation": False,
+        },
     ),
 }
 
@@ -159,7 +189,9 @@ GYMNASIUM = {
 @pytest.mark.parametrize("env_id", GYMNASIUM)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_dynamics_are_gymnasiums(env_id, seed, rng):
-    """Same start for the same seed and the same observations over an episode, to the bit, given the same warm start."""
+    """Same start for the same seed and the same observations over an episode, to the bit, given the
+    same warm start.
+    """
     env = make(env_id)
     other_id, arguments = GYMNASIUM[env_id]
     other = make_gymnasium(other_id, **arguments)
@@ -176,7 +208,10 @@ def test_dynamics_are_gymnasiums(env_id, seed, rng):
 
 
 def test_humanoid_dynamics_are_gymnasiums(rng):
-    env, other = make("poem/HumanoidDir2D-v0"), make_gymnasium("Humanoid-v4", terminate_when_unhealthy=False)
+    env, other = (
+        make("poem/HumanoidDir2D-v0"),
+        make_gymnasium("Humanoid-v4", terminate_when_unhealthy=False),
+    )
     env.reset(seed=3)
     other.reset(seed=3)
     for action in random_actions(env, 60, rng):  # it falls and lies, with many contacts
@@ -220,7 +255,9 @@ def test_the_warm_start_matters_little(env_id, rng):
         other.step(action)
         env.step(action)
         _, qpos, qvel = split(env, env.get_physics_state())
-        worst = max(worst, np.abs(qpos - other.data.qpos).max(), np.abs(qvel - other.data.qvel).max())
+        worst = max(
+            worst, np.abs(qpos - other.data.qpos).max(), np.abs(qvel - other.data.qvel).max()
+        )
     assert worst < 1e-10
 
 
@@ -238,7 +275,9 @@ def test_divergence_is_an_error_that_names_the_episode(num_envs, tmp_path, monke
     state[1 + 9 :] = 1e9
     env.set_physics_state(*which, state)
     seed, copy = (40, "") if num_envs is None else (41, " in environment copy 1")
-    with pytest.raises(RuntimeError, match=rf"step 2 of episode 2 since reset\(seed={seed}\){copy}"):
+    with pytest.raises(
+        RuntimeError, match=rf"step 2 of episode 2 since reset\(seed={seed}\){copy}"
+    ):
         env.step(actions)
     env.reset(seed=0)
     env.step(actions)

@@ -48,7 +48,15 @@ def run(envs, actions, seed=3):
     seen = [observations[:, 0]]
     for action in actions:
         observations, rewards, terminations, truncations, infos = envs.step(action)
-        seen += [observations[:, 0], rewards, terminations, truncations, infos["success"], infos["is_success"], envs.tasks]
+        seen += [
+            observations[:, 0],
+            rewards,
+            terminations,
+            truncations,
+            infos["success"],
+            infos["is_success"],
+            envs.tasks,
+        ]
     return seen
 
 
@@ -56,7 +64,9 @@ def test_the_number_of_processes_changes_nothing(rng):
     actions = rng.uniform(-1, 1, (40, 5, 1)).astype(np.float32)
     results = []
     for nthread in (1, 2, 3, 9):
-        envs = ProcessFamilyVector(Walk, num_envs=5, nthread=nthread, max_episode_steps=15, step_length=0.2)
+        envs = ProcessFamilyVector(
+            Walk, num_envs=5, nthread=nthread, max_episode_steps=15, step_length=0.2
+        )
         processes = np.unique(envs.reset(seed=0)[0][:, 1])
         assert len(processes) == min(nthread, 5)
         assert os.getpid() in processes
@@ -160,14 +170,18 @@ def test_an_error_names_the_copy_and_leaves_nothing_behind(wrong):
     with pytest.raises(RuntimeError, match=message):
         envs.step(actions)
     expected = run(ProcessFamilyVector(Walk, num_envs=4, nthread=1), np.zeros((3, 4, 1)))
-    assert all(np.array_equal(a, b) for a, b in zip(run(envs, np.zeros((3, 4, 1))), expected, strict=True))
+    assert all(
+        np.array_equal(a, b) for a, b in zip(run(envs, np.zeros((3, 4, 1))), expected, strict=True)
+    )
     envs.close()
 
 
 def test_a_worker_that_was_killed_is_reported():
     envs = ProcessFamilyVector(Walk, num_envs=2, nthread=2)
     envs.reset(seed=0)
-    with pytest.raises(RuntimeError, match="worker process of the environment ended with exit status -9"):
+    with pytest.raises(
+        RuntimeError, match="worker process of the environment ended with exit status -9"
+    ):
         envs.step(np.array([[0.375], [0.0]]))
     envs.close()
 

@@ -61,7 +61,9 @@ def test_vector_environments_and_several_at_once(env_id):
     pictures = envs.render()
     assert not np.array_equal(pictures[0], pictures[1])
     assert np.array_equal(pictures[1], single.render())
-    assert np.array_equal(pictures[1], envs.render_copy(1))  # the other's rendering in between changed nothing
+    assert np.array_equal(
+        pictures[1], envs.render_copy(1)
+    )  # the other's rendering in between changed nothing
     single.close()
     assert np.array_equal(pictures[0], envs.render_copy(0))
     envs.close()
@@ -78,7 +80,9 @@ def test_a_recorded_state_renders_the_same(env_id):
     for _ in range(4):
         action = env.action_space.sample()
         observation = env.step(action)[0]
-        assert np.array_equal(observation, unseen.step(action)[0])  # rendering does not disturb the simulation
+        assert np.array_equal(
+            observation, unseen.step(action)[0]
+        )  # rendering does not disturb the simulation
         pictures.append(env.render())
         states.append(env.unwrapped.get_physics_state())
     assert not np.array_equal(pictures[0], pictures[3])
@@ -89,9 +93,13 @@ def test_a_recorded_state_renders_the_same(env_id):
     env.close()
 
 
-@pytest.mark.parametrize("env_id", ["poem/HalfCheetahVel-v0", "poem/AntVel-v0", "poem/HumanoidDir2D-v0"])
+@pytest.mark.parametrize(
+    "env_id", ["poem/HalfCheetahVel-v0", "poem/AntVel-v0", "poem/HumanoidDir2D-v0"]
+)
 def test_the_camera_follows_the_robot(env_id):
-    """Far from the start the picture is the same, but for the floor's pattern, as long as that has the same phase."""
+    """Far from the start the picture is the same, but for the floor's pattern, as long as that has
+    the same phase.
+    """
     env = gym.make(env_id, render_mode="rgb_array", **SIZE)
     env.reset(seed=0)
     here = env.render()
@@ -132,7 +140,9 @@ def test_rendering_without_a_mode(env_id):
         assert env.render() is None
 
 
-@pytest.mark.parametrize("env_id", ["poem/MetaWorldML1-v0", "poem/FetchReach-v0", "poem/AntMaze-v0"])
+@pytest.mark.parametrize(
+    "env_id", ["poem/MetaWorldML1-v0", "poem/FetchReach-v0", "poem/AntMaze-v0"]
+)
 def test_other_environments_that_render_or_close_change_nothing(env_id):
     def image(env):
         env.reset(seed=0)

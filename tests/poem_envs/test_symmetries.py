@@ -14,10 +14,14 @@ from poem_envs import SignedPermutation, Symmetry
 
 @pytest.mark.parametrize("env_id", ["poem/AntGoal-v0", "poem/AntFwdBack-v0"])
 @pytest.mark.parametrize("number", [0, 1, 2])
-def test_a_mirrored_step_of_the_ant_is_the_mirror_image_of_the_step(env_id: str, number: int) -> None:
+def test_a_mirrored_step_of_the_ant_is_the_mirror_image_of_the_step(
+    env_id: str, number: int
+) -> None:
     env, other = gym.make(env_id).unwrapped, gym.make(env_id).unwrapped
     symmetry: Symmetry = env.symmetries[number]
-    positions = gym.make("poem/AntGoal-v0").unwrapped.symmetries[number].observations  # of all coordinates
+    positions = (
+        gym.make("poem/AntGoal-v0").unwrapped.symmetries[number].observations
+    )  # of all coordinates
     obs, _ = env.reset(seed=3)
     other.reset(seed=4)
     env.action_space.seed(0)
@@ -30,7 +34,9 @@ def test_a_mirrored_step_of_the_ant_is_the_mirror_image_of_the_step(env_id: str,
         before, (obs, _, _, _, info) = obs, env.step(action)
         its_obs, _, _, _, its_info = other.step(symmetry.actions(action))
         np.testing.assert_allclose(its_obs, symmetry.observations(obs), atol=1e-6)
-        np.testing.assert_allclose(its_info["reward_features"], symmetry.features(info["reward_features"]), atol=1e-6)
+        np.testing.assert_allclose(
+            its_info["reward_features"], symmetry.features(info["reward_features"]), atol=1e-6
+        )
         moved = max(moved, np.abs(obs - before).max())
     assert moved > 0.5
     assert not np.allclose(its_obs, obs, atol=0.1)
@@ -49,12 +55,19 @@ def test_the_symmetries_of_the_ant_are_a_group() -> None:
     values = np.arange(1.0, 28.0)
     for symmetry in (half_turn, reflection, both):
         np.testing.assert_array_equal(symmetry.then(symmetry).observations(values), values)
-    np.testing.assert_array_equal(both.observations(values), reflection.observations(half_turn.observations(values)))
-    np.testing.assert_array_equal(both.observations(values), half_turn.observations(reflection.observations(values)))
+    np.testing.assert_array_equal(
+        both.observations(values), reflection.observations(half_turn.observations(values))
+    )
+    np.testing.assert_array_equal(
+        both.observations(values), half_turn.observations(reflection.observations(values))
+    )
 
 
 def test_then_is_one_after_the_other() -> None:
-    first, second = SignedPermutation((2, 0, 1), (1, -1, 1)), SignedPermutation((1, 0, 2), (-1, 1, 1))
+    first, second = (
+        SignedPermutation((2, 0, 1), (1, -1, 1)),
+        SignedPermutation((1, 0, 2), (-1, 1, 1)),
+    )
     values = np.array([[3.0, 5.0, 7.0]])
     np.testing.assert_array_equal(first(values), [[7.0, -3.0, 5.0]])
     np.testing.assert_array_equal(first.then(second)(values), second(first(values)))

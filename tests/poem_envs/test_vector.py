@@ -8,7 +8,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 import poem_envs  # noqa: F401 (registers)
 
-# Arguments under which random actions end some episodes early, within the steps that the tests take.
+# Arguments under which random actions end some episodes early, within the steps that the tests
+# take.
 EARLY_ENDS = {
     "poem/AntVel-v0": {"healthy_z_range": (0.45, 0.9)},
     "poem/AntFwdBack-v0": {"healthy_z_range": (0.45, 0.9)},
@@ -18,12 +19,16 @@ EARLY_ENDS = {
 
 
 def make_vec(env_id, num_envs, **kwargs):
-    return gym.make_vec(env_id, num_envs=num_envs, vectorization_mode="vector_entry_point", **kwargs)
+    return gym.make_vec(
+        env_id, num_envs=num_envs, vectorization_mode="vector_entry_point", **kwargs
+    )
 
 
 def random_actions(envs, steps, rng):
     space = envs.single_action_space
-    return rng.uniform(space.low, space.high, size=(steps, envs.num_envs, *space.shape)).astype(np.float32)
+    return rng.uniform(space.low, space.high, size=(steps, envs.num_envs, *space.shape)).astype(
+        np.float32
+    )
 
 
 def test_equals_single_environments_to_the_bit(env_id, rng):
@@ -34,7 +39,9 @@ def test_equals_single_environments_to_the_bit(env_id, rng):
     singles = [gym.make(env_id, **arguments) for _ in range(num_envs)]
     observations, infos = envs.reset(seed=21)
     assert infos == {}
-    assert np.array_equal(observations, [env.reset(seed=21 + i)[0] for i, env in enumerate(singles)])
+    assert np.array_equal(
+        observations, [env.reset(seed=21 + i)[0] for i, env in enumerate(singles)]
+    )
     ends = {"terminated": 0, "truncated": 0}
     for step, actions in enumerate(random_actions(envs, steps, rng)):
         if step == 40:
@@ -61,9 +68,14 @@ def test_equals_single_environments_to_the_bit(env_id, rng):
     assert ends["truncated"] > 0
 
 
-@pytest.mark.parametrize("env_id", ["poem/HalfCheetahVel-v0", "poem/AntGoal-v0", "poem/HumanoidDir2D-v0"])
+@pytest.mark.parametrize(
+    "env_id", ["poem/HalfCheetahVel-v0", "poem/AntGoal-v0", "poem/HumanoidDir2D-v0"]
+)
 def test_the_number_of_threads_and_copies_changes_nothing(env_id, rng):
-    variants = [make_vec(env_id, n, nthread=nthread) for n, nthread in [(7, 1), (7, 2), (7, 3), (7, 20), (9, 2)]]
+    variants = [
+        make_vec(env_id, n, nthread=nthread)
+        for n, nthread in [(7, 1), (7, 2), (7, 3), (7, 20), (9, 2)]
+    ]
     actions = random_actions(variants[-1], 25, rng)
     results = []
     for envs in variants:
@@ -133,7 +145,12 @@ def test_arrays_are_not_reused(env_id, rng):
     arrays = [first]
     for actions in random_actions(envs, 4, rng):
         observations, rewards, _, _, infos = envs.step(actions)
-        arrays += [observations, rewards, infos["reward_features"], *([infos["final_obs"]] if "final_obs" in infos else [])]
+        arrays += [
+            observations,
+            rewards,
+            infos["reward_features"],
+            *([infos["final_obs"]] if "final_obs" in infos else []),
+        ]
     for i, one in enumerate(arrays):
         assert not any(np.shares_memory(one, other) for other in arrays[i + 1 :])
 

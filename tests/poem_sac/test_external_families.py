@@ -13,7 +13,13 @@ SMALL = {"net_arch": {"pi": [16], "qf": [16], "encoder": [16], "decoder": [16], 
 
 def make_model(env_id, n_tasks=4, n_envs=4, **env_kwargs):
     env = TaskVecEnv.from_id(env_id, n_envs, nthread=1, max_episode_steps=HORIZON, **env_kwargs)
-    options = {"batch_size": 8, "context_size": 8, "meta_batch_size": 4, "gradient_steps": 2, "policy_kwargs": SMALL}
+    options = {
+        "batch_size": 8,
+        "context_size": 8,
+        "meta_batch_size": 4,
+        "gradient_steps": 2,
+        "policy_kwargs": SMALL,
+    }
     return POEMSAC("MlpPolicy", env, n_train_tasks=n_tasks, seed=0, **options)
 
 
@@ -26,7 +32,9 @@ def test_preferences_are_relabelled_where_dynamics_are_shared(env_id):
 
 
 def test_preferences_of_ml10_are_measured_by_rollouts_that_count(monkeypatch):
-    """An epoch runs four tasks, and the twelve pairs of the one group, each once; its returns are theirs."""
+    """An epoch runs four tasks, and the twelve pairs of the one group, each once; its returns are
+    theirs.
+    """
     model = make_model("poem/MetaWorldML10-v0")
     returns: dict[tuple[int, int], float] = {}
     collected = EpochCollector.roll_out
@@ -37,7 +45,9 @@ def test_preferences_of_ml10_are_measured_by_rollouts_that_count(monkeypatch):
         if not latents:
             latents.extend(given_latents)  # the epoch's own, one a task
         for row, task in enumerate(task_ids):
-            policy = next(j for j, latent in enumerate(latents) if np.array_equal(latent, given_latents[row]))
+            policy = next(
+                j for j, latent in enumerate(latents) if np.array_equal(latent, given_latents[row])
+            )
             assert (int(task), policy) not in returns, "a pair was measured twice in an epoch"
             returns[int(task), policy] = segment.rewards[row].sum()
         return segment
@@ -52,7 +62,9 @@ def test_preferences_of_ml10_are_measured_by_rollouts_that_count(monkeypatch):
 
 
 def test_what_a_deterministic_rollout_measures_is_what_a_single_environment_gives():
-    """Returns and successes of one latent in tasks with different dynamics, against a loop over one environment."""
+    """Returns and successes of one latent in tasks with different dynamics, against a loop over one
+    environment.
+    """
     import gymnasium as gym
 
     model = make_model("poem/MetaWorldML10-v0")
@@ -64,7 +76,9 @@ def test_what_a_deterministic_rollout_measures_is_what_a_single_environment_give
         observation, _ = env.reset(seed=5 + i, options={"task": tasks[i]})
         total, successes, truncated = 0.0, [], False
         while not truncated:
-            action, _ = model.predict(observation[None], state=latents[i : i + 1], deterministic=True)
+            action, _ = model.predict(
+                observation[None], state=latents[i : i + 1], deterministic=True
+            )
             observation, reward, _, truncated, info = env.step(action[0])
             total += reward
             successes.append(info["success"])

@@ -15,24 +15,35 @@ from sb3_poem.poem_sac.policies import POEMPolicy
 
 
 def brute_force(similarity: np.ndarray, returns: np.ndarray) -> tuple[float, float]:
-    """Cross-entropy and accuracy over all (i, j, k) with j != k whose order is known: eqs. 6 and 7, word by word."""
+    """Cross-entropy and accuracy over all (i, j, k) with j != k whose order is known: eqs. 6 and 7,
+    word by word.
+    """
     losses, right = [], []
     n = len(similarity)
     for i in range(n):
         for j in range(n):
             for k in range(n):
-                if j == k or not np.isfinite(returns[i, j] - returns[i, k]) or returns[i, j] == returns[i, k]:
+                if (
+                    j == k
+                    or not np.isfinite(returns[i, j] - returns[i, k])
+                    or returns[i, j] == returns[i, k]
+                ):
                     continue
                 probability = 1.0 / (1.0 + math.exp(-(similarity[i, j] - similarity[i, k])))
                 preferred = float(returns[i, j] > returns[i, k])
-                losses.append(-preferred * math.log(probability) - (1.0 - preferred) * math.log(1.0 - probability))
+                losses.append(
+                    -preferred * math.log(probability)
+                    - (1.0 - preferred) * math.log(1.0 - probability)
+                )
                 right.append((probability > 0.5) == (preferred == 1.0) and probability != 0.5)
     return (float(np.mean(losses)), float(np.mean(right))) if losses else (0.0, float("nan"))
 
 
 def make(n: int, seed: int = 0) -> tuple[th.Tensor, th.Tensor]:
     rng = np.random.default_rng(seed)
-    return th.from_numpy(rng.normal(size=(n, n)) * 3.0), th.from_numpy(rng.normal(size=(n, n)) * 100.0)
+    return th.from_numpy(rng.normal(size=(n, n)) * 3.0), th.from_numpy(
+        rng.normal(size=(n, n)) * 100.0
+    )
 
 
 @pytest.mark.parametrize("n", [2, 3, 7])
@@ -77,7 +88,9 @@ def test_equal_similarities_are_not_right() -> None:
     assert accuracy.item() == 0.0
 
 
-@pytest.mark.parametrize("returns", [th.tensor([[3.0]]), th.full((2, 2), 5.0), th.full((3, 3), math.nan)])
+@pytest.mark.parametrize(
+    "returns", [th.tensor([[3.0]]), th.full((2, 2), 5.0), th.full((3, 3), math.nan)]
+)
 def test_without_any_pair_the_loss_is_zero_and_gradients_are_finite(returns: th.Tensor) -> None:
     """One task in the batch; policies that are the same; nothing measured."""
     latents = th.randn(len(returns), 4, requires_grad=True)
@@ -108,17 +121,26 @@ def test_the_loss_falls_where_the_gradient_says() -> None:
 
 # ---------------------------------------------------------------- Proposition 1
 
-# Three goals on a circle that is only walked one way: overshooting by a third is a detour of two thirds. So task i prefers its
-# own policy to that of i + 1, and that to the one of i + 2.
+# Three goals on a circle that is only walked one way: overshooting by a third is a detour of two
+# thirds. So task i prefers its own policy to that of i + 1, and that to the one of i + 2.
 ANGLES = np.array([0.0, 120.0, 240.0])
 CYCLIC_RETURNS = th.from_numpy(-((ANGLES[None, :] - ANGLES[:, None]) % 360.0))
 
 
 def train_embedding(two_encoder: bool, latent_dim: int, seed: int) -> tuple[float, th.Tensor]:
-    """Fit latents and embeddings to the preferences of the three tasks alone; returns the accuracy and S."""
+    """Fit latents and embeddings to the preferences of the three tasks alone; returns the accuracy
+    and S.
+    """
     th.manual_seed(seed)
     box = spaces.Box(-1.0, 1.0, (1,))
-    policy = POEMPolicy(box, box, lambda _: 1e-3, net_arch={"embedding": [16]}, latent_dim=latent_dim, two_encoder=two_encoder)
+    policy = POEMPolicy(
+        box,
+        box,
+        lambda _: 1e-3,
+        net_arch={"embedding": [16]},
+        latent_dim=latent_dim,
+        two_encoder=two_encoder,
+    )
     latents = nn.Parameter(th.randn(3, latent_dim))
     optimizer = th.optim.Adam([latents, *policy.parameters()], lr=0.03)
     for _ in range(150):
@@ -132,9 +154,9 @@ def train_embedding(two_encoder: bool, latent_dim: int, seed: int) -> tuple[floa
 
 @pytest.mark.parametrize("seed", range(2))
 def test_two_encoders_order_what_no_symmetric_similarity_can(seed: int) -> None:
-    """
-    The preferences demand S12 > S13, S23 > S21, S31 > S32. With S symmetric: S12 > S13 = S31 > S32 = S23 > S21 = S12.
-    So an inner product of one embedding, of any dimension, misses one pair in nine at least; two embeddings need miss none.
+    """The preferences demand S12 > S13, S23 > S21, S31 > S32. With S symmetric: S12 > S13 = S31 >
+    S32 = S23 > S21 = S12. So an inner product of one embedding, of any dimension, misses one pair
+    in nine at least; two embeddings need miss none.
     """
     accuracy, similarity = train_embedding(two_encoder=False, latent_dim=5, seed=seed)
     th.testing.assert_close(similarity, similarity.T)
@@ -145,11 +167,15 @@ def test_two_encoders_order_what_no_symmetric_similarity_can(seed: int) -> None:
 
 
 def test_no_symmetric_matrix_orders_the_three_tasks() -> None:
-    """The same without training: of many symmetric matrices none gets all nine pairs right, and some get eight."""
+    """The same without training: of many symmetric matrices none gets all nine pairs right, and
+    some get eight.
+    """
     rng = np.random.default_rng(0)
     best = 0.0
     for _ in range(500):
         matrix = rng.normal(size=(3, 3))
-        symmetric = th.from_numpy(matrix + matrix.T + 10.0 * np.eye(3))  # own policies are the best: these pairs are right
+        symmetric = th.from_numpy(
+            matrix + matrix.T + 10.0 * np.eye(3)
+        )  # own policies are the best: these pairs are right
         best = max(best, preference_loss(symmetric, CYCLIC_RETURNS)[1].item())
     assert best == pytest.approx(8 / 9)

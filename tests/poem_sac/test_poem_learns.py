@@ -1,4 +1,6 @@
-"""POEMSAC learns: its policies know their tasks, and its embeddings order them as the tasks' preferences do."""
+"""POEMSAC learns: its policies know their tasks, and its embeddings order them as the tasks'
+preferences do.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +9,22 @@ import pytest
 from meta_toys import LEARN, LEARN_STEPS, POINT_GOAL, point_goal_bounds
 
 from sb3_poem import POEMSAC
-from sb3_poem.adaptation.evaluation import evaluate_latents, known_task_return, preference_order, return_matrix
+from sb3_poem.adaptation.evaluation import (
+    evaluate_latents,
+    known_task_return,
+    preference_order,
+    return_matrix,
+)
 from sb3_poem.common.vec_env import TaskVecEnv
 
 
 def preference_accuracy(model: POEMSAC, env: TaskVecEnv) -> float:
-    """Share of all (i, j, k) of the training tasks that S puts in the order of fresh episodes' returns."""
-    returns = return_matrix(model, env, model.train_tasks.tasks, model.task_latents, n_episodes=2, seed=9)
+    """Share of all (i, j, k) of the training tasks that S puts in the order of fresh episodes'
+    returns.
+    """
+    returns = return_matrix(
+        model, env, model.train_tasks.tasks, model.task_latents, n_episodes=2, seed=9
+    )
     similarity = model.similarities(model.task_latents, model.task_latents)
     truth = np.sign(returns[:, :, None] - returns[:, None, :])
     guess = np.sign(similarity[:, :, None] - similarity[:, None, :])
@@ -21,22 +32,30 @@ def preference_accuracy(model: POEMSAC, env: TaskVecEnv) -> float:
 
 
 def test_poem_learns_point_goal() -> None:
-    """Thresholds against figures measured with several seeds and numerics: 0.84 to 0.95, and 36 to 78 % of the way."""
+    """Thresholds against figures measured with several seeds and numerics: 0.84 to 0.95, and 36 to
+    78 % of the way.
+    """
     model = POEMSAC("MlpPolicy", POINT_GOAL, **LEARN).learn(LEARN_STEPS)
     env = TaskVecEnv.from_id(POINT_GOAL, 20)
-    own = evaluate_latents(model, env, model.task_latents, model.train_tasks.tasks, n_episodes=2, seed=5).mean()
+    own = evaluate_latents(
+        model, env, model.task_latents, model.train_tasks.tasks, n_episodes=2, seed=5
+    ).mean()
     blind, known = point_goal_bounds(model.train_tasks.tasks)
     assert own > blind + 0.35 * (known - blind)
     assert preference_accuracy(model, env) > 0.8
     # on tasks that it never saw, too (Property 1)
     unseen = model.family.sample_tasks(20, np.random.default_rng(77))
-    accuracy, tau = preference_order(model, known_task_return(model, env, unseen, n_latents=100, n_episodes=1))
+    accuracy, tau = preference_order(
+        model, known_task_return(model, env, unseen, n_latents=100, n_episodes=1)
+    )
     assert accuracy > 0.75
     assert tau > 0.5
 
 
 @pytest.mark.slow
 def test_preferences_are_ordered_by_the_preference_loss_alone() -> None:
-    """Without its loss, the embeddings order at random: actor, critics and decoder do not do it for them."""
+    """Without its loss, the embeddings order at random: actor, critics and decoder do not do it for
+    them.
+    """
     model = POEMSAC("MlpPolicy", POINT_GOAL, **LEARN, preference_coef=0.0).learn(LEARN_STEPS)
     assert preference_accuracy(model, TaskVecEnv.from_id(POINT_GOAL, 20)) < 0.7

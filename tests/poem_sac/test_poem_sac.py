@@ -8,7 +8,18 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from meta_toys import EPOCH, N_TASKS, POINT_GOAL, SMALL, TwoWalks, Walk, WindyWalk, parameters, small, walks
+from meta_toys import (
+    EPOCH,
+    N_TASKS,
+    POINT_GOAL,
+    SMALL,
+    TwoWalks,
+    Walk,
+    WindyWalk,
+    parameters,
+    small,
+    walks,
+)
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_poem import PEARLSAC, POEMSAC
@@ -21,13 +32,17 @@ from sb3_poem.poem_sac.objective import POEMObjective
 
 
 def transitions_of(model: PEARLSAC, start: int, stop: int) -> TaskBatch:
-    """Stored transitions of all tasks from slot ``start`` to ``stop``, fields (tasks, stop - start, ...)."""
+    """Stored transitions of all tasks from slot ``start`` to ``stop``, fields (tasks, stop - start,
+    ...).
+    """
     stored = [model.replay_buffer.transitions(task) for task in range(model.replay_buffer.n_tasks)]
     return TaskBatch(*(th.cat(parts)[:, start:stop] for parts in zip(*stored, strict=True)))
 
 
 def nearly_deterministic(model: PEARLSAC) -> PEARLSAC:
-    """Policies without noise (to float32), whose observations stay as they are: every rollout of a latent is the same."""
+    """Policies without noise (to float32), whose observations stay as they are: every rollout of a
+    latent is the same.
+    """
     with th.no_grad():
         actions = model.action_space.shape[0]
         model.policy.actor.mlp.output.weight[actions:] = 0.0
@@ -73,11 +88,20 @@ class Spy:
 
 @pytest.fixture(scope="module")
 def sources() -> dict[str, tuple[POEMSAC, Spy]]:
-    """Two epochs of policies that differ only by their latents: equal starts, no noise, no learning."""
+    """Two epochs of policies that differ only by their latents: equal starts, no noise, no
+    learning.
+    """
     result = {}
     for source in ("relabel", "rollout"):
         env = TaskVecEnv.from_id(POINT_GOAL, 4, reset_noise_scale=0.0)
-        model = small(POEMSAC, env, preference_source=source, gradient_steps=0, n_train_tasks=6, preference_group_size=3)
+        model = small(
+            POEMSAC,
+            env,
+            preference_source=source,
+            gradient_steps=0,
+            n_train_tasks=6,
+            preference_group_size=3,
+        )
         spy = Spy(nearly_deterministic(model))
         result[source] = model.learn(1), spy
         model.learn(1, reset_num_timesteps=False)
@@ -111,15 +135,24 @@ def test_returns_are_measured_within_groups_and_counted(sources: dict) -> None:
     for group in groups:
         expected[np.ix_(group, group)] = True
     assert np.array_equal(np.isfinite(spy.returns[1]), expected)
-    # an epoch: 6 tasks in waves of 4, and 2 groups of 3 * 2 pairs in waves of 4; all steps count, and fill the tasks' buffers
+    # an epoch: 6 tasks in waves of 4, and 2 groups of 3 * 2 pairs in waves of 4; all steps count,
+    # and fill the tasks' buffers
     assert model.num_timesteps == 2 * (2 + 3) * 4 * 25
     assert model.replay_buffer.counts.sum() == model.num_timesteps
     assert model.replay_buffer.counts.min() >= 2 * (1 + 2) * 25
-    assert sources["relabel"][0].num_timesteps == 2 * 2 * 4 * 25  # not a step beyond the collection's own
+    assert (
+        sources["relabel"][0].num_timesteps == 2 * 2 * 4 * 25
+    )  # not a step beyond the collection's own
 
 
 def test_meta_batches_are_whole_groups() -> None:
-    model = small(POEMSAC, preference_source="rollout", n_train_tasks=14, meta_batch_size=9, preference_group_size=4).learn(1)
+    model = small(
+        POEMSAC,
+        preference_source="rollout",
+        n_train_tasks=14,
+        meta_batch_size=9,
+        preference_group_size=4,
+    ).learn(1)
     assert [len(group) for group in model.groups] == [5, 5, 4]
     for _ in range(5):
         batch = model.make_sampler().sample(1, 8)[0]
@@ -131,7 +164,11 @@ def test_meta_batches_are_whole_groups() -> None:
         known = batch.returns.isfinite()
         assert set(known.sum(dim=1).tolist()) <= {4, 5}
         th.testing.assert_close(
-            batch.returns, model.epoch_context.returns[batch.task_ids][:, batch.task_ids], equal_nan=True, rtol=0, atol=0
+            batch.returns,
+            model.epoch_context.returns[batch.task_ids][:, batch.task_ids],
+            equal_nan=True,
+            rtol=0,
+            atol=0,
         )
 
 
@@ -179,10 +216,14 @@ class StillWindyWalk(WindyWalk):
 
 def test_trajectories_of_a_task_are_averaged() -> None:
     env = TaskVecEnv.from_id(POINT_GOAL, 3, reset_noise_scale=0.0)
-    model = nearly_deterministic(small(POEMSAC, env, gradient_steps=0, n_train_tasks=4, trajectories_per_task=2))
+    model = nearly_deterministic(
+        small(POEMSAC, env, gradient_steps=0, n_train_tasks=4, trajectories_per_task=2)
+    )
     spy = Spy(model)
     model.learn(2 * 3 * 3 * 25)
-    truth = policy_returns(model, gym.make(POINT_GOAL, reset_noise_scale=0.0), spy.latents[1])  # (4, 8)
+    truth = policy_returns(
+        model, gym.make(POINT_GOAL, reset_noise_scale=0.0), spy.latents[1]
+    )  # (4, 8)
     np.testing.assert_allclose(spy.returns[1], truth.reshape(4, 4, 2).mean(axis=2), atol=1e-3)
 
 
@@ -202,23 +243,32 @@ def test_contexts_are_standardised_transitions_with_the_critics_values() -> None
         for obs in (stored.observations, stored.next_observations)
     ]
     th.testing.assert_close(transitions[..., :2], standardised[0])
-    th.testing.assert_close(transitions[..., 2:4], stored.actions, atol=1.6e-5, rtol=0)  # the buffer's actions have 16 bits
+    th.testing.assert_close(
+        transitions[..., 2:4], stored.actions, atol=1.6e-5, rtol=0
+    )  # the buffer's actions have 16 bits
     th.testing.assert_close(transitions[..., 4:6], standardised[1])
     rewards = stored.rewards
     th.testing.assert_close(model.epoch_context.rewards, rewards)
-    th.testing.assert_close(transitions[..., 6], (rewards - rewards.mean()) / rewards.std(), atol=1e-5, rtol=0)
-    # Q of the critics before this epoch's updates, the smaller of two, each task under the latent that acted
+    th.testing.assert_close(
+        transitions[..., 6], (rewards - rewards.mean()) / rewards.std(), atol=1e-5, rtol=0
+    )
+    # Q of the critics before this epoch's updates, the smaller of two, each task under the latent
+    # that acted
     policy.critic.load_state_dict(before)
     with th.no_grad():
         values = th.stack(
             [
                 policy.critic(
-                    standardised[0][i], transitions[i, :, 2:4], th.tensor(spy.latents[0][i]).float().expand(25, -1)
+                    standardised[0][i],
+                    transitions[i, :, 2:4],
+                    th.tensor(spy.latents[0][i]).float().expand(25, -1),
                 ).min(dim=0)[0]
                 for i in range(N_TASKS)
             ]
         )
-    th.testing.assert_close(transitions[..., 7], (values - values.mean()) / values.std(), atol=1e-4, rtol=0)
+    th.testing.assert_close(
+        transitions[..., 7], (values - values.mean()) / values.std(), atol=1e-4, rtol=0
+    )
 
 
 def test_values_are_zero_before_the_first_update() -> None:
@@ -243,7 +293,9 @@ def test_the_context_is_the_last_epochs_only() -> None:
     latest = transitions_of(model, 50, 75).rewards
     th.testing.assert_close(model.epoch_context.rewards, latest)
     own = latest.double().sum(dim=1)
-    np.testing.assert_allclose(np.diagonal(model.epoch_context.returns.numpy()), own.numpy(), rtol=1e-5)
+    np.testing.assert_allclose(
+        np.diagonal(model.epoch_context.returns.numpy()), own.numpy(), rtol=1e-5
+    )
 
 
 def test_posteriors_are_the_encoders_of_the_context() -> None:
@@ -265,11 +317,19 @@ def test_a_share_of_every_batch_is_relabelled(fraction: float, n_foreign: int) -
     tasks = model.train_tasks.tasks[batch.task_ids.numpy()]
     features = batch.transitions.features.numpy()
     truth = -np.abs(features[..., 0] - tasks) - 0.01 * features[..., 1] ** 2
-    np.testing.assert_allclose(batch.transitions.rewards.numpy(), truth, atol=1e-5)  # own or relabelled, all fit the task
+    np.testing.assert_allclose(
+        batch.transitions.rewards.numpy(), truth, atol=1e-5
+    )  # own or relabelled, all fit the task
     own = [
-        set(map(tuple, model.replay_buffer.transitions(int(task)).observations[0, :10].tolist())) for task in batch.task_ids
+        set(map(tuple, model.replay_buffer.transitions(int(task)).observations[0, :10].tolist()))
+        for task in batch.task_ids
     ]
-    is_own = np.array([[tuple(obs) in own[i] for obs in row] for i, row in enumerate(batch.transitions.observations.tolist())])
+    is_own = np.array(
+        [
+            [tuple(obs) in own[i] for obs in row]
+            for i, row in enumerate(batch.transitions.observations.tolist())
+        ]
+    )
     assert is_own[:, : 16 - n_foreign].all()
     if n_foreign:
         assert not is_own[:, 16 - n_foreign :].all()
@@ -280,7 +340,10 @@ def test_a_share_of_every_batch_is_relabelled(fraction: float, n_foreign: int) -
 
 def test_similarity_is_the_inner_product_of_the_two_embeddings() -> None:
     model = small(POEMSAC)
-    tasks, policies = np.random.default_rng(0).normal(size=(4, 5)), np.random.default_rng(1).normal(size=(7, 5))
+    tasks, policies = (
+        np.random.default_rng(0).normal(size=(4, 5)),
+        np.random.default_rng(1).normal(size=(7, 5)),
+    )
     similarity = model.similarities(tasks, policies)
     assert similarity.shape == (4, 7)
     assert similarity.dtype == np.float64
@@ -312,12 +375,18 @@ def test_contexts_without_values() -> None:
 
 
 def test_without_its_parts_poem_is_pearl(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The ablations leave PEARLSAC's networks, and the same losses but for the actor's gradient to the encoder."""
+    """The ablations leave PEARLSAC's networks, and the same losses but for the actor's gradient to
+    the encoder.
+    """
     arguments = {"kl_coef": 0.3, "reward_coef": 0.7, "policy_coef": 1.0}
     pearl = small(PEARLSAC, **arguments)
     poem = small(POEMSAC, similarity="inner", context="pearl", preference_coef=0.0, **arguments)
     assert parameters(pearl).keys() == parameters(poem).keys()
-    monkeypatch.setattr(POEMObjective, "embed", lambda self, latents: TaskEmbeddings(latents, latents.detach(), latents))
+    monkeypatch.setattr(
+        POEMObjective,
+        "embed",
+        lambda self, latents: TaskEmbeddings(latents, latents.detach(), latents),
+    )
     pearl.learn(2 * EPOCH)
     poem.learn(2 * EPOCH)
     assert all(th.equal(value, parameters(pearl)[name]) for name, value in parameters(poem).items())
@@ -343,7 +412,9 @@ def gradients(model: PEARLSAC, **weights: float) -> set[str]:
 
 
 def test_each_loss_trains_what_the_paper_says() -> None:
-    """Figure 3 and section 5.3; the critics' loss (here always on) trains critics and, as in PEARL, the encoder."""
+    """Figure 3 and section 5.3; the critics' loss (here always on) trains critics and, as in PEARL,
+    the encoder.
+    """
     base = {"critic", "encoder"}
     poem = small(POEMSAC).learn(EPOCH)
     assert gradients(poem) == base
@@ -360,7 +431,9 @@ def encoder_gradient(model: PEARLSAC, batch: Any, name: str) -> float:
     latents, kl = objective.encode(batch)
     embeddings, transitions = objective.embed(latents), objective.standardised(batch.transitions)
     losses = {
-        "actor": lambda: actor_loss(model.policy, transitions, embeddings, alpha, batch.action_noise)[0],
+        "actor": lambda: actor_loss(
+            model.policy, transitions, embeddings, alpha, batch.action_noise
+        )[0],
         "decoder": lambda: objective.decoder_loss(batch, transitions, embeddings),
         "preference": lambda: objective.embedding_loss(batch, embeddings)[0],
         "critic": lambda: objective.critic_loss(batch, transitions, embeddings, alpha),
@@ -369,7 +442,9 @@ def encoder_gradient(model: PEARLSAC, batch: Any, name: str) -> float:
     model.policy.zero_grad()
     losses[name]().backward()
     return sum(
-        float(parameter.grad.abs().sum()) for parameter in model.policy.encoder.parameters() if parameter.grad is not None
+        float(parameter.grad.abs().sum())
+        for parameter in model.policy.encoder.parameters()
+        if parameter.grad is not None
     )
 
 
@@ -403,12 +478,16 @@ def test_kl_is_that_of_two_normals() -> None:
     with th.no_grad():
         mean, variance = model.policy.encoder(context)
         kl = kl_to_prior(mean, variance)
-    expected = kl_divergence(Normal(mean, variance.sqrt()), Normal(th.zeros(5), th.ones(5))).sum(dim=1)
+    expected = kl_divergence(Normal(mean, variance.sqrt()), Normal(th.zeros(5), th.ones(5))).sum(
+        dim=1
+    )
     th.testing.assert_close(kl, expected, rtol=1e-4, atol=1e-5)
 
 
 def test_targets_are_bootstrapped_except_at_an_early_end() -> None:
-    """The critics' loss against soft Bellman targets computed here, with gamma and alpha far from trivial."""
+    """The critics' loss against soft Bellman targets computed here, with gamma and alpha far from
+    trivial.
+    """
     model = small(POEMSAC, walks(4, edge=0.4), horizon=10, gamma=0.9, ent_coef=0.3).learn(120)
     meta_batch = model.make_sampler().sample(1, 16)[0]
     batch, noise = meta_batch.transitions, meta_batch.next_action_noise
@@ -416,7 +495,9 @@ def test_targets_are_bootstrapped_except_at_an_early_end() -> None:
     policy, latents = model.policy, th.randn(6, 5)
     alpha = model.entropy_coefficient.value
     objective = model.make_objective()
-    loss = objective.critic_loss(meta_batch, objective.standardised(batch), objective.embed(latents), alpha)
+    loss = objective.critic_loss(
+        meta_batch, objective.standardised(batch), objective.embed(latents), alpha
+    )
     total = 0.0
     with th.no_grad():
         for i in range(6):
@@ -426,8 +507,13 @@ def test_targets_are_bootstrapped_except_at_an_early_end() -> None:
                 for x in (batch.observations[i], batch.next_observations[i])
             )
             next_actions, log_prob = policy.actor(next_obs, policy.policy_mapping(z), noise[i])
-            next_values = policy.critic_target(next_obs, next_actions, z).min(dim=0).values - 0.3 * log_prob
-            target = batch.rewards[i] / policy.reward_norm.std + 0.9 * (1 - batch.terminated[i]) * next_values
+            next_values = (
+                policy.critic_target(next_obs, next_actions, z).min(dim=0).values - 0.3 * log_prob
+            )
+            target = (
+                batch.rewards[i] / policy.reward_norm.std
+                + 0.9 * (1 - batch.terminated[i]) * next_values
+            )
             for value in policy.critic(obs, batch.actions[i], z):
                 total += 0.5 * (value - target).pow(2).mean().item() / 6
     assert alpha.item() == pytest.approx(0.3)
@@ -439,10 +525,15 @@ def test_predicted_returns_are_sums_of_decoded_rewards(layer_norm: bool) -> None
     from sb3_poem.common.trajectory import Trajectory
 
     policy_kwargs = {**SMALL["policy_kwargs"], "layer_norm": layer_norm}
-    model = small(POEMSAC, walks(4), horizon=10, precision="fp32", policy_kwargs=policy_kwargs).learn(120)
+    model = small(
+        POEMSAC, walks(4), horizon=10, precision="fp32", policy_kwargs=policy_kwargs
+    ).learn(120)
     rng = np.random.default_rng(0)
     lengths, latents = (4, 9), rng.normal(size=(3, 5))
-    trajectories = [Trajectory(rng.normal(size=(n + 1, 2)), rng.uniform(-2.0, 4.0, size=(n, 1)), np.zeros(5)) for n in lengths]
+    trajectories = [
+        Trajectory(rng.normal(size=(n + 1, 2)), rng.uniform(-2.0, 4.0, size=(n, 1)), np.zeros(5))
+        for n in lengths
+    ]
     returns = model.predicted_returns(latents, trajectories)
     assert returns.shape == (3, 2)
     assert returns.dtype == np.float64
@@ -452,7 +543,10 @@ def test_predicted_returns_are_sums_of_decoded_rewards(layer_norm: bool) -> None
         for j, trajectory in enumerate(trajectories):
             total = 0.0
             for t in range(lengths[j]):
-                obs, next_obs = (policy.standardise(th.tensor(trajectory.observations[t + k]).float()) for k in (0, 1))
+                obs, next_obs = (
+                    policy.standardise(th.tensor(trajectory.observations[t + k]).float())
+                    for k in (0, 1)
+                )
                 action = th.tensor(2.0 * (trajectory.actions[t] + 2.0) / 6.0 - 1.0).float()
                 value = policy.decoder(obs, action, next_obs, z_r)
                 total += (value * policy.reward_norm.std + policy.reward_norm.mean).item()
@@ -462,9 +556,14 @@ def test_predicted_returns_are_sums_of_decoded_rewards(layer_norm: bool) -> None
 # ---------------------------------------------------------------- two tasks
 
 
-@pytest.mark.parametrize("arguments", [{}, {"meta_batch_size": 1}, {"preference_source": "rollout"}, {"similarity": "inner"}])
+@pytest.mark.parametrize(
+    "arguments",
+    [{}, {"meta_batch_size": 1}, {"preference_source": "rollout"}, {"similarity": "inner"}],
+)
 def test_a_family_of_two_tasks_trains_without_nan(arguments: dict[str, Any]) -> None:
-    model = small(POEMSAC, walks(2, TwoWalks), horizon=10, n_train_tasks=None, **arguments).learn(100)
+    model = small(POEMSAC, walks(2, TwoWalks), horizon=10, n_train_tasks=None, **arguments).learn(
+        100
+    )
     assert model._n_updates == 25 or arguments.get("preference_source") == "rollout"
     assert all(value.isfinite().all() for value in parameters(model).values())
     assert np.isfinite(model.train_tasks.latent_means).all()
@@ -473,7 +572,9 @@ def test_a_family_of_two_tasks_trains_without_nan(arguments: dict[str, Any]) -> 
 
 def test_one_task_is_a_family_too() -> None:
     for source in ("relabel", "rollout"):
-        model = small(POEMSAC, walks(2), horizon=10, n_train_tasks=1, preference_source=source).learn(60)
+        model = small(
+            POEMSAC, walks(2), horizon=10, n_train_tasks=1, preference_source=source
+        ).learn(60)
         assert all(value.isfinite().all() for value in parameters(model).values())
 
 
@@ -484,13 +585,20 @@ def test_half_cheetah_forwards_and_backwards(algorithm: type[PEARLSAC]) -> None:
     model = small(algorithm, env, n_train_tasks=None).learn(80)
     assert sorted(model.train_tasks.tasks.ravel()) == [-1.0, 1.0]
     assert all(value.isfinite().all() for value in parameters(model).values())
-    if isinstance(model, POEMSAC):  # what forwards earns, backwards pays for, but for the control cost
+    if isinstance(
+        model, POEMSAC
+    ):  # what forwards earns, backwards pays for, but for the control cost
         assert model.epoch_context.returns.isfinite().all()
 
 
 def test_environments_of_one_copy_and_many_tasks() -> None:
     env = DummyVecEnv([lambda: gym.wrappers.TimeLimit(Walk(), 10)])
-    assert small(POEMSAC, env, horizon=10, preference_source="rollout", n_train_tasks=4).learn(1).num_timesteps == 160
+    assert (
+        small(POEMSAC, env, horizon=10, preference_source="rollout", n_train_tasks=4)
+        .learn(1)
+        .num_timesteps
+        == 160
+    )
 
 
 def test_an_id_becomes_as_many_copies_as_an_epoch_has_trajectories() -> None:
@@ -498,4 +606,6 @@ def test_an_id_becomes_as_many_copies_as_an_epoch_has_trajectories() -> None:
     assert POEMSAC("MlpPolicy", finite).n_envs == 2
     assert POEMSAC("MlpPolicy", finite, trajectories_per_task=100).n_envs == 120  # in two waves
     assert POEMSAC("MlpPolicy", POINT_GOAL, n_train_tasks=7, trajectories_per_task=2).n_envs == 14
-    assert POEMSAC("MlpPolicy", POINT_GOAL, n_train_tasks=130, trajectories_per_task=2).n_envs == 130
+    assert (
+        POEMSAC("MlpPolicy", POINT_GOAL, n_train_tasks=130, trajectories_per_task=2).n_envs == 130
+    )
