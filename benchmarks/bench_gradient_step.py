@@ -30,7 +30,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_poem import POEMSAC
 from sb3_poem.common.precision import MixedPrecision
-from sb3_poem.pearl_sac import losses
+from sb3_poem.pearl_sac.objective import kl_to_prior
 
 SIZES: dict[str, dict[str, Any]] = {
     "small": {"tasks": 16, "batch": 128, "widths": [256, 256], "steps": 20},
@@ -97,18 +97,15 @@ def compare_losses(model: POEMSAC, plain: PlainPOEM, size: dict[str, Any]) -> di
         objective = model.make_objective()
         embeddings = objective.embed(mean + variance.sqrt() * noises[0])
         data, alpha = objective.standardised(batch.transitions), model.entropy_coefficient.value
-        scale = 1.0 / model.policy.reward_norm.std
-        critic = losses.critic_loss(
-            model.policy, data, embeddings, alpha, model.gamma, scale, noises[1]
-        )
-        actor, log_prob = losses.actor_loss(model.policy, data, embeddings, alpha, noises[2])
+        critic = objective.critic_loss(batch, data, embeddings, alpha)
+        actor, log_prob = objective.actor_loss(batch, data, embeddings, alpha)
         decoder = objective.decoder_loss(batch, data, embeddings)
         preference = objective.embedding_loss(batch, embeddings)[1]["preference_loss"]
         ours = [
             critic,
             actor,
             decoder,
-            losses.kl_to_prior(mean, variance).mean(),
+            kl_to_prior(mean, variance).mean(),
             preference,
             log_prob,
         ]

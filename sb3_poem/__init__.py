@@ -3,6 +3,7 @@
 Names load on first use, so that ``import sb3_poem`` and the command line's help do not wait for
 torch.
 """
+# ruff: noqa: F401
 
 from importlib import import_module
 from pathlib import Path
@@ -30,49 +31,26 @@ if TYPE_CHECKING:
 __version__ = Path(__file__).with_name("version.txt").read_text().strip()
 
 _HOME = {
-    "POEMSAC": "sb3_poem.poem_sac",
-    "PEARLSAC": "sb3_poem.pearl_sac",
-    "ANOLEAdapter": "sb3_poem.baselines",
-    "MAMLRewardAdapter": "sb3_poem.baselines",
-    "RewardOracleAdapter": "sb3_poem.baselines",
-    "PreferenceAdapter": "sb3_poem.adaptation",
-    "Preference": "sb3_poem.adaptation",
-    "Query": "sb3_poem.adaptation",
-    "ReturnOracle": "sb3_poem.adaptation",
-    "BoltzmannOracle": "sb3_poem.adaptation",
-    "MistakeOracle": "sb3_poem.adaptation",
-    "HumanOracle": "sb3_poem.adaptation",
-    "TaskVecEnv": "sb3_poem.common.vec_env",
-    "AdaptationEvalCallback": "sb3_poem.adaptation.callback",
-    "TrainingCheckpointCallback": "sb3_poem.pearl_sac.callbacks",
+    "sb3_poem.poem_sac": ("POEMSAC",),
+    "sb3_poem.pearl_sac": ("PEARLSAC",),
+    "sb3_poem.pearl_sac.callbacks": ("TrainingCheckpointCallback",),
+    "sb3_poem.common.vec_env": ("TaskVecEnv",),
+    "sb3_poem.baselines": ("ANOLEAdapter", "MAMLRewardAdapter", "RewardOracleAdapter"),
+    "sb3_poem.adaptation": (
+        *("PreferenceAdapter", "Preference", "Query"),
+        *("ReturnOracle", "BoltzmannOracle", "MistakeOracle", "HumanOracle"),
+    ),
+    "sb3_poem.adaptation.callback": ("AdaptationEvalCallback",),
 }
+_MODULE = {name: module for module, names in _HOME.items() for name in names}
 
-__all__ = [
-    "PEARLSAC",
-    "POEMSAC",
-    "ANOLEAdapter",
-    "AdaptationEvalCallback",
-    "BoltzmannOracle",
-    "HumanOracle",
-    "MAMLRewardAdapter",
-    "MistakeOracle",
-    "Preference",
-    "PreferenceAdapter",
-    "Query",
-    "ReturnOracle",
-    "RewardOracleAdapter",
-    "TaskVecEnv",
-    "TrainingCheckpointCallback",
-    "__version__",
-    "set_task",
-]
+__all__ = [*_MODULE, "__version__", "set_task"]
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME:
+    if name not in _MODULE:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(_HOME[name]), name)
-    globals()[name] = value
+    value = globals()[name] = getattr(import_module(_MODULE[name]), name)
     return value
 
 

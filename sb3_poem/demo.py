@@ -15,25 +15,14 @@ from pathlib import Path
 from poem_envs.headless import can_draw
 from sb3_poem.cli.outputs import check_writable
 
-ADAPTATION = [
-    "--oracle",
-    "return",
-    "--queries",
-    "10",
-    "--tasks",
-    "30",
-    "--record",
-    "0",
-    "1",
-    "2",
-    "5",
-    "10",
-]
+ADAPTATION = "--oracle return --queries 10 --tasks 30 --record 0 1 2 5 10"
+# one thread, as the time in the README was measured
+TRAINING = "--env poem/PointGoal-v0 --seed 0 --eval-freq -1 --verbose 0 --num-threads 1 -P"
 NEXT = """\
 Next:
   watch what ten answers change        {video}
-  answer yourself                      sb3-poem adapt --model HalfCheetahVel --oracle human
-  an oracle that errs                  sb3-poem adapt --model HalfCheetahVel --oracle mistake --mistake-rate 0.2
+  answer yourself                      {adapt} --oracle human
+  an oracle that errs                  {adapt} --oracle mistake --mistake-rate 0.2
   meta-train another family            sb3-poem train --env poem/HalfCheetahFwdBack-v0 -P
   from Python, and your own family     README.md
 (The program is {program}; activate its environment, or call it by this path.)
@@ -43,11 +32,15 @@ Next:
 def run(*arguments: str) -> None:
     """Show a command of ``sb3-poem``, and run it; stops the demonstration if it fails."""
     print(f"\n$ sb3-poem {shlex.join(arguments)}", flush=True)
-    status = subprocess.run(
-        [sys.executable, "-m", "sb3_poem.cli", *arguments], check=False
-    ).returncode
-    if status != 0:
+    command = [sys.executable, "-m", "sb3_poem.cli", *arguments]
+    if status := subprocess.run(command, check=False).returncode:
         sys.exit(status)
+
+
+def adapt(model: str, name: str, out: Path, *arguments: str) -> None:
+    """Adapt a model, and write the table and the plot of what that earned."""
+    files = ["--json", str(out / f"{name}.json"), "--plot", str(out / f"{name}.png")]
+    run("adapt", "--model", model, *shlex.split(ADAPTATION), *files, *arguments)
 
 
 def latest(pattern: str, folder: Path) -> Path:
@@ -58,61 +51,35 @@ def latest(pattern: str, folder: Path) -> Path:
 def main() -> None:
     """Run the demonstration."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path("out"),
-        help="folder for what is written (default: %(default)s)",
-    )
+    what = "folder for what is written (default: %(default)s)"
+    parser.add_argument("--out", type=Path, default=Path("out"), help=what)
     out: Path = parser.parse_args().out
     check_writable(out)
     started = time.perf_counter()
 
-    print(
-        "1. Meta-train a point that walks to goals on a half-circle. It sees some goals and their rewards."
-    )
-    run(
-        "train",
-        "--env",
-        "poem/PointGoal-v0",
-        "-f",
-        str(out / "logs"),
-        "--seed",
-        "0",
-        "--eval-freq",
-        "-1",
-        "--verbose",
-        "0",
-        "--num-threads",
-        "1",  # as the time in the README was measured
-        "-P",
-    )
+    print("1. Meta-train a point that walks to goals on a half-circle. It sees some goals and")
+    print("   their rewards.")
+    run("train", "-f", str(out / "logs"), *shlex.split(TRAINING))
     model = latest("poem-PointGoal-v0.zip", out / "logs")
 
-    print(
-        "\n2. Thirty new goals, hidden: each is found by ten answers to `which of these is better?`, without reward."
-    )
-    files = ["--json", str(out / "PointGoal.json"), "--plot", str(out / "PointGoal.png")]
-    run("adapt", "--model", str(model), *ADAPTATION, *files)
+    print("\n2. Thirty new goals, hidden: each is found by ten answers to `which of these is")
+    print("   better?`, without reward.")
+    adapt(str(model), "PointGoal", out)
 
-    print(
-        "\n3. The same with a model that ships with the package: a robot that runs at a speed nobody tells it."
-    )
-    files = ["--json", str(out / "HalfCheetahVel.json"), "--plot", str(out / "HalfCheetahVel.png")]
-    video = out / "HalfCheetahVel.mp4"
-    if can_draw():
-        files += ["--video", str(video)]
-    else:
-        print(
-            "(No video: there is neither a display nor off-screen OpenGL here; apt-get install libegl1 libgl1.)"
-        )
-    run("adapt", "--model", "HalfCheetahVel", *ADAPTATION, *files)
+    print("\n3. The same with a model that ships with the package: a robot that runs at a speed")
+    print("   nobody tells it.")
+    draws, video = can_draw(), out / "HalfCheetahVel.mp4"
+    if not draws:
+        print("(No video: there is neither a display nor off-screen OpenGL here; apt-get install")
+        print("libegl1 libgl1.)")
+    adapt("HalfCheetahVel", "HalfCheetahVel", out, *(["--video", str(video)] if draws else []))
 
-    print(
-        f"\nDone in {time.perf_counter() - started:.0f} s. The model is {model}; tables and plots are in {out}/.\n"
-    )
+    print(f"\nDone in {time.perf_counter() - started:.0f} s. The model is {model}; tables and")
+    print(f"plots are in {out}/.\n")
     program = Path(sys.executable).with_name("sb3-poem")
-    print(NEXT.format(video=video if can_draw() else "(needs off-screen OpenGL)", program=program))
+    shown = video if draws else "(needs off-screen OpenGL)"
+    adapts = "sb3-poem adapt --model HalfCheetahVel"
+    print(NEXT.format(video=shown, adapt=adapts, program=program))
 
 
 if __name__ == "__main__":

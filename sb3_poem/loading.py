@@ -25,14 +25,11 @@ def as_model(model: Any, device: th.device | str = "auto") -> Any:
         return load_model(model, device)
     if hasattr(model, "latent_dim") and not isinstance(model, type):
         return model
-    what = (
-        f"the class {model.__name__}"
-        if isinstance(model, type)
-        else f"of type {type(model).__name__}"
-    )
+    is_class = isinstance(model, type)
+    what = f"the class {model.__name__}" if is_class else f"of type {type(model).__name__}"
     raise TypeError(
-        f"`model` is {what}, but must be a trained POEMSAC or PEARLSAC, a file or folder of one, or the name of a model "
-        f"that ships: {', '.join(pretrained_names())}"
+        f"`model` is {what}, but must be a trained POEMSAC or PEARLSAC, a file or folder of one, "
+        f"or the name of a model that ships: {', '.join(pretrained_names())}"
     )
 
 
@@ -49,13 +46,13 @@ def load_model(name: str | Path, device: th.device | str = "auto") -> PEARLSAC:
     archive = path if path.is_file() else path.with_name(f"{path.name}.zip")
     if archive.suffix == ".safetensors":
         raise ValueError(
-            f"{name} holds no whole model: AdaptedPolicy.load reads a policy, and of a model name the folder"
+            f"{name} holds no whole model: AdaptedPolicy.load reads a policy, and of a model name "
+            "the folder"
         )
+    if archive.is_file() and is_checkpoint(archive):
+        algorithm = _class_named(read_checkpoint(archive)["algorithm"], archive)
+        return algorithm.load_checkpoint(archive, device=device)
     if archive.is_file():
-        if is_checkpoint(archive):
-            return _class_named(read_checkpoint(archive)["algorithm"], archive).load_checkpoint(
-                archive, device=device
-            )
         # where that cannot be told, POEMSAC.load says what is wrong with the file
         return BY_CLASS_NAME.get(algorithm_of(archive), POEMSAC).load(archive, device=device)
     path = find_folder(path)

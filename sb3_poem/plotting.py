@@ -27,27 +27,20 @@ def plot_returns(
     :param limit: (n_records,) the best that so many error-free answers allow
         (:func:`information_limit`)
     :param known_task: the return of the best policy for each task, had the task been known
-    :param title: of the figure
     :param label: of the adapted policy's line
     :param path: where to save the figure; the suffix names the format
-    :return: the figure
     :raises ValueError: if the shapes do not fit
     """
-    # The object interface: a figure of pyplot would stay in its global list, and choose a window
-    # system.
+    # the object interface: a figure of pyplot would stay in its list, and choose a window system
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    returns = np.asarray(returns, dtype=np.float64)
-    if returns.ndim != 2 or returns.shape[1] != len(queries) or len(returns) == 0:
-        raise ValueError(
-            f"returns must be (n_tasks, {len(queries)}), one column per entry of queries, got {returns.shape}"
-        )
-    if limit is not None and len(limit) != len(queries):
-        raise ValueError(
-            f"limit needs one value per entry of queries ({len(queries)}), got {len(limit)}"
-        )
-
+    returns, n = np.asarray(returns, dtype=np.float64), len(queries)
+    if returns.ndim != 2 or returns.shape[1] != n or len(returns) == 0:
+        needed = f"(n_tasks, {n}), one column per entry of queries"
+        raise ValueError(f"returns must be {needed}, got {returns.shape}")
+    if limit is not None and len(limit) != n:
+        raise ValueError(f"limit needs one value per entry of queries ({n}), got {len(limit)}")
     figure = Figure(figsize=(6.4, 4.0), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
@@ -58,9 +51,8 @@ def plot_returns(
         error = returns.std(axis=0, ddof=1) / np.sqrt(len(returns))
         axes.fill_between(queries, mean - error, mean + error, color="C0", alpha=0.2, linewidth=0)
     if limit is not None:
-        axes.plot(
-            queries, limit, linestyle="--", marker=".", color="C3", label="limit of so many answers"
-        )
+        words = "limit of so many answers"
+        axes.plot(queries, limit, linestyle="--", marker=".", color="C3", label=words)
     if known_task is not None:
         axes.axhline(known_task, linestyle=":", color="0.3", label="task known")
 

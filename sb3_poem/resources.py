@@ -8,10 +8,9 @@ _PACKAGE = Path(__file__).resolve().parent
 
 
 def shipped_folder(name: str) -> Path:
-    """The folder of shipped files of that name: inside the package when it was installed from a
-    wheel, beside it in a checkout.
+    """The folder of shipped files of that name, ``"zoo_configs"`` or ``"pretrained"``: inside the
+    package when it was installed from a wheel, beside it in a checkout.
 
-    :param name: ``"zoo_configs"`` or ``"pretrained"``
     :raises FileNotFoundError: if neither place has it, which means a broken installation
     """
     for root in (_PACKAGE, _PACKAGE.parent):
@@ -28,21 +27,19 @@ def config_file(algorithm: str) -> Path:
     :param algorithm: its name on the command line, such as ``"poem_sac"``
     :raises FileNotFoundError: if there is none; the message lists those that there are
     """
-    folder = shipped_folder("zoo_configs")
-    path = folder / f"{algorithm}.yml"
-    if not path.is_file():
-        names = ", ".join(sorted(file.stem for file in folder.glob("*.yml"))) or "none"
+    files = {file.stem: file for file in sorted(shipped_folder("zoo_configs").glob("*.yml"))}
+    if algorithm not in files:
+        names = ", ".join(files) or "none"
         raise FileNotFoundError(
             f"No hyperparameters are shipped for {algorithm!r}; there are: {names}"
         )
-    return path
+    return files[algorithm]
 
 
 def zoo_entry(file: Path, env_id: str, **changes: Any) -> dict[str, Any]:
     """An environment's entry of a file of hyperparameters.
 
     :param file: YAML in rl_zoo3's syntax; as there, Python in ``policy_kwargs`` is evaluated
-    :param env_id: the environment's id
     :param changes: what shall differ
     :raises ValueError: if the file has no entry for it; the message lists those that there are
     """
@@ -60,26 +57,21 @@ def zoo_entry(file: Path, env_id: str, **changes: Any) -> dict[str, Any]:
 
 def pretrained_names() -> list[str]:
     """The names of the trained models that are shipped."""
-    return sorted(
-        folder.name
-        for folder in shipped_folder("pretrained").iterdir()
-        if any(folder.glob("*.safetensors"))
-    )
+    weights = shipped_folder("pretrained").glob("*/*.safetensors")
+    return sorted({file.parent.name for file in weights})
 
 
 def pretrained_folder(name: str) -> Path:
     """The folder of a shipped model.
 
-    :param name: as :func:`pretrained_names` lists it
     :raises FileNotFoundError: if there is none of that name; the message lists those that there are
     """
     names = pretrained_names()
     if name not in names:
         close = difflib.get_close_matches(name, names, n=1)
         hint = f" Did you mean {close[0]!r}?" if close else ""
-        raise FileNotFoundError(
-            f"No model {name!r} is shipped; there are: {', '.join(names) or 'none'}.{hint}"
-        )
+        known = ", ".join(names) or "none"
+        raise FileNotFoundError(f"No model {name!r} is shipped; there are: {known}.{hint}")
     return shipped_folder("pretrained") / name
 
 
@@ -93,9 +85,8 @@ def find_folder(name: str | Path) -> Path:
     if path.is_dir():
         return path
     if path.exists():
-        raise FileNotFoundError(
-            f"{name} is a file, but must be the folder of a model; POEMSAC.load reads a model's file"
-        )
+        needed = "the folder of a model; POEMSAC.load reads a model's file"
+        raise FileNotFoundError(f"{name} is a file, but must be {needed}")
     if path.suffix == ".zip" or len(path.parts) > 1:
         raise FileNotFoundError(f"{name}: there is no such file or folder of a model")
     return pretrained_folder(str(name))

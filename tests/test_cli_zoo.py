@@ -29,7 +29,7 @@ from sb3_poem.cli.hyperparams import check_keys
 from sb3_poem.cli.hyperparams_opt import SAMPLERS
 from sb3_poem.cli.zoo import register_algorithms
 from sb3_poem.common.vec_env import make_task_vec_env
-from sb3_poem.pearl_sac.unsupported import UNSUPPORTED
+from sb3_poem.pearl_sac.arguments import UNSUPPORTED
 
 SMALL = {
     "policy": "MlpPolicy",

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from sb3_poem.loading import ALGORITHMS
-from sb3_poem.pearl_sac.unsupported import UNSUPPORTED
+from sb3_poem.pearl_sac.arguments import UNSUPPORTED
 
 # What rl_zoo3 takes out of an entry for itself before the rest goes to the algorithm.
 ZOO_KEYS = frozenset({"callback", "env_kwargs", "monitor_kwargs", "n_envs", "n_timesteps"})

@@ -14,8 +14,7 @@ class EpochCallback(BaseCallback):
     collection of the next.
 
     :param every: Epochs between two calls; the end of training is always one
-    :param verbose: 0 no output, 1 info
-    :raises ValueError: if ``every`` is below 1
+    :raises ValueError: if that is below 1
     """
 
     model: PEARLSAC
@@ -29,25 +28,24 @@ class EpochCallback(BaseCallback):
 
     def _init_callback(self) -> None:
         if not isinstance(self.model, PEARLSAC):
+            ours, other = type(self).__name__, type(self.model).__name__
             raise TypeError(
-                f"{type(self).__name__} is for POEMSAC and PEARLSAC, which train in epochs, not for "
-                f"{type(self.model).__name__}"
+                f"{ours} is for POEMSAC and PEARLSAC, which train in epochs, not for {other}"
             )
 
     def _on_training_start(self) -> None:
         self._last_epoch = self.model.epoch
 
     def _on_rollout_start(self) -> None:
-        if self.model.epoch - self._last_epoch >= self.every:
-            self._run()
+        self._run_after(self.every)
 
     def _on_training_end(self) -> None:
-        if self.model.epoch > self._last_epoch:
-            self._run()
+        self._run_after(1)
 
-    def _run(self) -> None:
-        self._last_epoch = self.model.epoch
-        self._on_epoch()
+    def _run_after(self, epochs: int) -> None:
+        if self.model.epoch >= self._last_epoch + epochs:
+            self._last_epoch = self.model.epoch
+            self._on_epoch()
 
     def _on_step(self) -> bool:
         return True
@@ -104,18 +102,16 @@ class TrainingCheckpointCallback(EpochCallback):
             super()._on_training_end()
 
     def _on_epoch(self) -> None:
-        started = time.monotonic()
+        started, steps = time.monotonic(), self.model.num_timesteps
         try:
             self.model.save_checkpoint(self.path)
         except OSError as error:
             if not self._paced:
                 raise
-            warnings.warn(
-                f"no checkpoint of {self.model.num_timesteps} steps: {error}", stacklevel=2
-            )
+            warnings.warn(f"no checkpoint of {steps} steps: {error}", stacklevel=2)
         else:
-            self.saved_steps = self.model.num_timesteps
+            self.saved_steps = steps
             if self.verbose > 0:
-                print(f"Checkpoint of {self.model.num_timesteps} steps: {self.path}")
+                print(f"Checkpoint of {steps} steps: {self.path}")
         if self._paced:
             self._not_before = time.monotonic() + 50 * (time.monotonic() - started)

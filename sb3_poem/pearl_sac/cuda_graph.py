@@ -1,11 +1,12 @@
 """A gradient step as one CUDA graph."""
 
 from collections.abc import Callable
+from itertools import chain
 from typing import Any
 
 import torch as th
 
-from sb3_poem.pearl_sac.losses import MetaBatch
+from sb3_poem.pearl_sac.sampler import MetaBatch, mapped
 
 EAGER_STEPS = 3
 
@@ -28,34 +29,32 @@ class GraphedStep:
         self._calls = 0
         self._stream = th.cuda.Stream()
         self._graph = th.cuda.CUDAGraph()
-        self._batch: MetaBatch | None = None
+        #: What the graph reads, and what it writes
+        self._inputs: list[th.Tensor] = []
         self._names: tuple[str, ...] = ()
-        self._values: th.Tensor | None = None
+        self._values = th.empty(0)
 
     def __call__(self, batch: MetaBatch) -> dict[str, th.Tensor]:
         self._calls += 1
-        if self._batch is not None and any(
-            old.shape != new.shape
-            for old, new in zip(tensors(self._batch), tensors(batch), strict=True)
-        ):
-            return self._step(batch)
-        if (
-            self._calls <= EAGER_STEPS
-        ):  # capture demands that libraries have been set up on a stream other than the default
+        inputs = tensors(batch)
+        if self._calls <= EAGER_STEPS:
+            # capture demands that libraries have been set up on a stream other than the default
             self._stream.wait_stream(th.cuda.current_stream())
             with th.cuda.stream(self._stream):
                 metrics = self._step(batch)
             th.cuda.current_stream().wait_stream(self._stream)
             return metrics
-        if self._batch is None:
-            self._batch = _cloned(batch)
+        if not self._inputs:
+            kept = mapped(th.clone, batch)
+            self._inputs = tensors(kept)
             with th.cuda.graph(self._graph):
-                metrics = self._step(self._batch)
+                metrics = self._step(kept)
                 self._names, self._values = tuple(metrics), th.stack(list(metrics.values()))
+        elif [part.shape for part in inputs] != [part.shape for part in self._inputs]:
+            return self._step(batch)
         else:
-            th._foreach_copy_(tensors(self._batch), tensors(batch))
+            th._foreach_copy_(self._inputs, inputs)
         self._graph.replay()
-        assert self._values is not None
         return dict(zip(self._names, self._values.clone().unbind(), strict=True))
 
 
@@ -70,22 +69,11 @@ def prepare_optimizers(optimizers: list[th.optim.Optimizer], device: th.device) 
                 group["capturable"] = device.type == "cuda"
         for parameter, state in optimizer.state.items():
             if "step" in state:
-                state["step"] = th.as_tensor(
-                    state["step"], dtype=th.float32, device=parameter.device
-                )
+                steps, place = state["step"], parameter.device
+                state["step"] = th.as_tensor(steps, dtype=th.float32, device=place)
 
 
 def tensors(batch: tuple[Any, ...]) -> list[th.Tensor]:
     """All tensors of a meta-batch."""
-    parts = (
-        tensors(field) if isinstance(field, tuple) else [field]
-        for field in batch
-        if field is not None
-    )
-    return [tensor for part in parts for tensor in part]
-
-
-def _cloned(batch: Any) -> Any:
-    if isinstance(batch, tuple):
-        return type(batch)(*map(_cloned, batch))
-    return None if batch is None else batch.clone()
+    parts = (tensors(part) if isinstance(part, tuple) else [part] for part in batch)
+    return [tensor for tensor in chain(*parts) if tensor is not None]

@@ -24,8 +24,6 @@ def vectorise(
     more; of a family without a vectorised version, as many as :func:`make_task_vec_env` steps in
     turn.
 
-    :param n_train_tasks: Training tasks; None takes :func:`default_train_tasks`
-    :param trajectories_per_task: Horizons of each in an epoch
     :raises TypeError: if it is no environment
     :raises ValueError: if it is Gymnasium's vectorised environment of no task family
     """

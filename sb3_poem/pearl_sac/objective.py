@@ -1,37 +1,51 @@
 """What a gradient step minimises: the losses of a meta-batch, weighted and added."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch as th
 
 from sb3_poem.common.buffers import TaskBatch
-from sb3_poem.pearl_sac import losses
-from sb3_poem.pearl_sac.losses import MetaBatch, TaskEmbeddings
 from sb3_poem.pearl_sac.policies import LatentPolicy
+from sb3_poem.pearl_sac.sampler import MetaBatch
 
 Metrics = dict[str, th.Tensor]
 
 
+class TaskEmbeddings(NamedTuple):
+    """Latents z of the tasks of a meta-batch, and what actor and decoder see of them; each (tasks,
+    latent_dim).
+    """
+
+    latents: th.Tensor
+    policy: th.Tensor
+    reward: th.Tensor
+
+
+def rows(latents: th.Tensor, n: int) -> th.Tensor:
+    """(tasks, d) -> (tasks, n, d)."""
+    return latents[:, None, :].expand(-1, n, -1)
+
+
+def kl_to_prior(mean: th.Tensor, variance: th.Tensor) -> th.Tensor:
+    """KL of the posteriors to N(0, I), (tasks,)."""
+    return 0.5 * (mean.pow(2) + variance - 1.0 - variance.log()).sum(dim=-1)
+
+
 @dataclass
 class Objective:
-    """PEARL's losses.
+    """PEARL's losses. Transitions that its methods take are standardised already, their actions
+    lie in [-1, 1]. Fields that are not described are PEARLSAC's.
 
-    :param policy: The networks
-    :param gamma: Discount factor
     :param reward_scale: Factor on the rewards that the critics learn
     :param reward_variance: By which the decoder's squared error is divided
-    :param decodes_replay: Whether the decoder learns on transitions of the replay buffer, which
-        hold other tasks' policies too, as adaptation asks it about; else on contexts
-    :param kl_coef: Weight of the posteriors' KL to the prior
-    :param reward_coef: Weight of the decoder's loss
-    :param policy_coef: Weight of the actor's loss
     """
 
     policy: LatentPolicy
     gamma: float
     reward_scale: th.Tensor | float
     reward_variance: th.Tensor
-    decodes_replay: bool
+    relabel_fraction: float
     kl_coef: float
     reward_coef: float
     policy_coef: float
@@ -39,7 +53,7 @@ class Objective:
     def loss(
         self, batch: MetaBatch, alpha: th.Tensor, whole: bool = True
     ) -> tuple[th.Tensor, Metrics]:
-        """Sum of the losses of a meta-batch, and what to log of them.
+        """Sum of the losses of a meta-batch, and what to log of them (Algorithm 1, lines 7 to 14).
 
         :param alpha: Entropy coefficient
         :param whole: False leaves out all but critics and encoder
@@ -48,12 +62,10 @@ class Objective:
         embeddings = self.embed(latents)
         transitions = self.standardised(batch.transitions)
         critic_loss = self.critic_loss(batch, transitions, embeddings, alpha)
-        loss, metrics = critic_loss + self.kl_coef * kl, {"critic_loss": critic_loss, "kl": kl}
+        metrics = {"critic_loss": critic_loss, "kl": kl}
         if not whole:
-            return loss, metrics
-        actor_loss, log_prob = losses.actor_loss(
-            self.policy, transitions, embeddings, alpha, batch.action_noise
-        )
+            return critic_loss + self.kl_coef * kl, metrics
+        actor_loss, log_prob = self.actor_loss(batch, transitions, embeddings, alpha)
         decoder_loss = self.decoder_loss(batch, transitions, embeddings)
         embedding_loss, embedding_metrics = self.embedding_loss(batch, embeddings)
         loss = (
@@ -63,14 +75,9 @@ class Objective:
             + self.kl_coef * kl
             + embedding_loss
         )
-        metrics |= {
-            "actor_loss": actor_loss,
-            "decoder_loss": decoder_loss,
-            "entropy": -log_prob,
-            "ent_coef": alpha,
-            **embedding_metrics,
-        }
-        return loss, metrics
+        metrics |= {"actor_loss": actor_loss, "decoder_loss": decoder_loss}
+        metrics |= {"entropy": -log_prob, "ent_coef": alpha}
+        return loss, metrics | embedding_metrics
 
     def encode(self, batch: MetaBatch) -> tuple[th.Tensor, th.Tensor]:
         """Latents (tasks, latent_dim) by reparameterisation, and the mean KL of their posteriors to
@@ -78,7 +85,7 @@ class Objective:
         """
         mean, variance = self.policy.encoder(batch.context)
         latents = mean + variance.sqrt() * batch.latent_noise
-        return latents, losses.kl_to_prior(mean, variance).mean()
+        return latents, kl_to_prior(mean, variance).mean()
 
     def embed(self, latents: th.Tensor) -> TaskEmbeddings:
         """What actor and decoder see of latents (tasks, latent_dim). PEARL's encoder learns nothing
@@ -89,48 +96,68 @@ class Objective:
             latents, policy.policy_embedding(latents.detach()), policy.reward_embedding(latents)
         )
 
-    def embedding_loss(
-        self, batch: MetaBatch, embeddings: TaskEmbeddings
-    ) -> tuple[th.Tensor | float, Metrics]:
-        """A further, weighted demand on the latents, and what to log of it; PEARL has none."""
-        return 0.0, {}
-
-    def critic_loss(
-        self, batch: MetaBatch, transitions: TaskBatch, embeddings: TaskEmbeddings, alpha: th.Tensor
-    ) -> th.Tensor:
-        bootstraps = batch.bootstraps
-        if bootstraps is not None:
-            ahead = self.policy.standardise(bootstraps.observations)
-            bootstraps = bootstraps._replace(observations=ahead)
-        return losses.critic_loss(
-            self.policy,
-            transitions,
-            embeddings,
-            alpha,
-            self.gamma,
-            self.reward_scale,
-            batch.next_action_noise,
-            bootstraps,
-        )
-
-    def decoder_loss(
-        self, batch: MetaBatch, transitions: TaskBatch, embeddings: TaskEmbeddings
-    ) -> th.Tensor:
-        if self.decodes_replay:
-            inputs = transitions.observations, transitions.actions, transitions.next_observations
-            rewards = transitions.rewards
-        else:
-            obs_dim, action_dim = transitions.observations.shape[-1], transitions.actions.shape[-1]
-            widths = [obs_dim, action_dim, obs_dim]
-            inputs = batch.context[..., : sum(widths)].split(widths, dim=-1)
-            rewards = batch.context_rewards
-        return losses.decoder_loss(
-            self.policy, *inputs, rewards, embeddings.reward, self.reward_variance
-        )
-
     def standardised(self, batch: TaskBatch) -> TaskBatch:
+        """The same with standardised observations."""
         standardise = self.policy.standardise
         return batch._replace(
             observations=standardise(batch.observations),
             next_observations=standardise(batch.next_observations),
         )
+
+    def critic_loss(
+        self, batch: MetaBatch, transitions: TaskBatch, embeddings: TaskEmbeddings, alpha: th.Tensor
+    ) -> th.Tensor:
+        """Half the squared soft Bellman error, summed over the critics; it trains the encoder too,
+        as in PEARL.
+        """
+        policy, n = self.policy, transitions.rewards.shape[1]
+        z = rows(embeddings.latents, n)
+        if batch.bootstraps is None:
+            rewards, next_obs = transitions.rewards, transitions.next_observations
+            discounts = self.gamma * (1.0 - transitions.terminated)
+        else:
+            rewards, next_obs, discounts = batch.bootstraps
+            next_obs = policy.standardise(next_obs)
+        with th.no_grad():
+            next_embedding, noise = rows(embeddings.policy, n), batch.next_action_noise
+            next_actions, next_log_prob = policy.actor(next_obs, next_embedding, noise)
+            next_values = policy.critic_target(next_obs, next_actions, z).amin(dim=0)
+            next_values = next_values - alpha * next_log_prob
+            targets = self.reward_scale * rewards + discounts * next_values
+        values = policy.critic(transitions.observations, transitions.actions, z)
+        return 0.5 * len(values) * (values - targets).pow(2).mean()
+
+    def actor_loss(
+        self, batch: MetaBatch, transitions: TaskBatch, embeddings: TaskEmbeddings, alpha: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """Soft policy improvement: the loss, and the mean log-probability of the actions."""
+        obs, n = transitions.observations, transitions.rewards.shape[1]
+        actions, log_prob = self.policy.actor(obs, rows(embeddings.policy, n), batch.action_noise)
+        # the latent is a task here, not a decision: the actor must not raise its value by moving it
+        z = rows(embeddings.latents.detach(), n)
+        values = self.policy.critic(obs, actions, z, frozen=True).amin(dim=0)
+        mean_log_prob = log_prob.mean()
+        return alpha * mean_log_prob - values.mean(), mean_log_prob
+
+    def decoder_loss(
+        self, batch: MetaBatch, transitions: TaskBatch, embeddings: TaskEmbeddings
+    ) -> th.Tensor:
+        """Squared error of the decoder, relative to ``reward_variance`` (eq. 4): on contexts or,
+        where batches are relabelled, on these: they hold other tasks' policies too, as adaptation
+        asks the decoder about.
+        """
+        inputs = transitions.observations, transitions.actions, transitions.next_observations
+        rewards = transitions.rewards
+        if self.relabel_fraction == 0:
+            widths = [part.shape[-1] for part in inputs]
+            inputs = batch.context[..., : sum(widths)].split(widths, dim=-1)
+            rewards = batch.context_rewards
+        embedding = rows(embeddings.reward, rewards.shape[1])
+        error = self.policy.decode_rewards(*inputs, embedding) - rewards
+        return error.pow(2).mean() / self.reward_variance
+
+    def embedding_loss(
+        self, batch: MetaBatch, embeddings: TaskEmbeddings
+    ) -> tuple[th.Tensor | float, Metrics]:
+        """A further, weighted demand on the latents, and what to log of it; PEARL has none."""
+        return 0.0, {}

@@ -6,6 +6,7 @@ import pathlib
 import time
 import warnings
 from collections.abc import Iterable, Mapping
+from dataclasses import fields
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -20,7 +21,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from poem_envs.registration import plain_id
 from sb3_poem.common.buffers import ContextStore, Segment, TaskReplayBuffer
-from sb3_poem.common.checks import check_number, check_number_or_auto, check_whole
+from sb3_poem.common.checks import check_number
 from sb3_poem.common.digest import digest_of
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.files import write_atomically
@@ -28,18 +29,19 @@ from sb3_poem.common.networks import RunningNorm
 from sb3_poem.common.precision import hidden_dtype
 from sb3_poem.common.random import Generators
 from sb3_poem.common.trajectory import Trajectory
-from sb3_poem.pearl_sac import losses, saving
+from sb3_poem.pearl_sac import saving
+from sb3_poem.pearl_sac.arguments import check_arguments, refuse_unknown
 from sb3_poem.pearl_sac.collector import EpochCollector, concatenate
 from sb3_poem.pearl_sac.environments import GivenEnv, vectorise
-from sb3_poem.pearl_sac.objective import Objective
+from sb3_poem.pearl_sac.objective import Objective, rows
 from sb3_poem.pearl_sac.policies import OBSERVATION_CLIP, LatentPolicy, MlpPolicy
 from sb3_poem.pearl_sac.sampler import MetaBatchSampler
 from sb3_poem.pearl_sac.train_tasks import TrainTasks
-from sb3_poem.pearl_sac.unsupported import refuse_unknown, refuse_unsupported
 from sb3_poem.pearl_sac.updater import EntropyCoefficient, Updater
 from sb3_poem.resources import config_file, zoo_entry
 
 SelfPEARLSAC = TypeVar("SelfPEARLSAC", bound="PEARLSAC")
+Part = TypeVar("Part")
 
 #: Transitions of each task on which the decoder is measured
 MEASURED_PER_TASK = 64
@@ -53,7 +55,8 @@ class PEARLSAC(SAC):
     under its own latest latent, and gradient steps on meta-batches of tasks. It keeps a replay
     buffer for every task and the contexts of the last epoch, and learns a context encoder, a
     latent-conditioned actor and critics, and a reward decoder together. Observations are
-    standardised by the mean and deviation of all that were collected.
+    standardised by the mean and deviation of all that were collected. Arguments that are not
+    described are SAC's.
 
     :param policy: The policy model to use: "MlpPolicy", or a subclass of its class
     :param env: A task family: an environment, a vectorised one of SB3 or Gymnasium, or a registered
@@ -63,13 +66,9 @@ class PEARLSAC(SAC):
     :param buffer_size: Transitions kept for each training task
     :param learning_starts: Environment steps with uniformly random actions before learning
     :param batch_size: Transitions of each task in a gradient step
-    :param tau: Soft update coefficient of the target critics
-    :param gamma: Discount factor
     :param gradient_steps: Gradient steps after each epoch's collection; -1: as many as environment
         steps
     :param ent_coef: Entropy coefficient; "auto" learns it, "auto_0.1" from 0.1 on
-    :param target_update_interval: Gradient steps between updates of the target critics
-    :param target_entropy: Target entropy when learning ``ent_coef``
     :param n_train_tasks: Training tasks, drawn once from the family with the model's seed; None:
         120, or all of a smaller finite family
     :param meta_batch_size: Tasks in a gradient step (all, if there are fewer)
@@ -107,22 +106,19 @@ class PEARLSAC(SAC):
         the actor, the decoder, the embeddings and the entropy coefficient (as in TD3)
     :param horizon: Steps of an episode; None takes the environment's time limit
     :param precision: "auto" (bfloat16 where the processor has it), "bf16", or "fp32"
-    :param stats_window_size: Episodes that the rollout logging averages over
-    :param tensorboard_log: Log location for TensorBoard
-    :param policy_kwargs: Additional arguments of the policy
     :param verbose: 0 no output, 1 how long an epoch is and a table after each, 2 debug
     :param seed: Seed of everything: tasks, networks, sampling, environments
-    :param device: "auto", "cpu", "cuda"
-    :param _init_setup_model: Whether to build the networks at creation
-    :param unsupported: Nothing: what SB3's SAC takes beyond these is refused
     :raises ValueError: for an environment that is no task family, and for arguments outside their
         range
-    :raises TypeError: for arguments that only SB3's SAC takes; the message says what to do instead
+    :raises TypeError: for arguments that it does not have; of those of SB3's SAC, the message says
+        what to do instead
     """
 
     #: The name of the algorithm on the command line, and of its file in ``zoo_configs/``
     zoo_name: ClassVar[str] = "pearl_sac"
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy}
+    sampler_class: ClassVar[type[MetaBatchSampler]] = MetaBatchSampler
+    objective_class: ClassVar[type[Objective]] = Objective
 
     policy: LatentPolicy
     replay_buffer: TaskReplayBuffer
@@ -173,57 +169,7 @@ class PEARLSAC(SAC):
         **unsupported: Any,
     ) -> None:
         refuse_unknown(unsupported, type(self))
-        if not isinstance(policy_kwargs, dict | None):
-            raise TypeError(
-                f"policy_kwargs must be a dictionary of the policy's arguments, but is {policy_kwargs!r}"
-            )
-        refuse_unsupported(policy_kwargs or (), f"{type(self).__name__}'s policy")
-        for name, value, least in (
-            ("batch_size", batch_size, 1),
-            ("meta_batch_size", meta_batch_size, 1),
-            ("context_size", context_size, 1),
-            ("trajectories_per_task", trajectories_per_task, 1),
-            ("latent_dim", latent_dim, 1),
-            ("buffer_size", buffer_size, 1),
-            ("n_train_tasks", 1 if n_train_tasks is None else n_train_tasks, 1),
-            ("gradient_steps", gradient_steps, -1),
-            ("learning_starts", learning_starts, 0),
-            ("target_update_interval", target_update_interval, 1),
-            ("n_steps", n_steps, 1),
-            ("policy_delay", policy_delay, 1),
-            ("seed", 0 if seed is None else seed, 0),
-        ):
-            check_whole(name, value, least)
-        for name, number, high in (
-            ("learning_rate", 0.0 if callable(learning_rate) else learning_rate, np.inf),
-            ("kl_coef", kl_coef, np.inf),
-            ("reward_coef", reward_coef, np.inf),
-            ("policy_coef", policy_coef, np.inf),
-            ("noise_color", noise_color, np.inf),
-            ("gamma", gamma, 1.0),
-            ("tau", tau, 1.0),
-            ("relabel_fraction", relabel_fraction, 1.0),
-            ("context_relabel_fraction", context_relabel_fraction, 1.0),
-            ("shaping_coef", shaping_coef, 1.0),
-            ("mirror_fraction", mirror_fraction, 1.0),
-        ):
-            check_number(name, number, 0.0, high)
-        check_number_or_auto("ent_coef", ent_coef, 0.0)
-        check_number_or_auto("target_entropy", target_entropy)
-        if reward_scale != "auto" and not (
-            isinstance(reward_scale, (int, float)) and reward_scale > 0
-        ):
-            raise ValueError(
-                f'reward_scale must be a positive number or "auto", got {reward_scale!r}'
-            )
-        hidden_dtype(precision, "cpu")  # refuses an unknown name now rather than at the first step
-        if (
-            str(device).startswith("cuda") and not th.cuda.is_available()
-        ):  # which SB3 says nothing of
-            warnings.warn(
-                f"device is {device!r}, but torch sees no CUDA device: the CPU is used",
-                stacklevel=2,
-            )
+        check_arguments(locals(), type(self))
         self.n_train_tasks = n_train_tasks
         self.meta_batch_size = meta_batch_size
         self.context_size = context_size
@@ -235,10 +181,6 @@ class PEARLSAC(SAC):
         self.relabel_fraction = relabel_fraction
         self.context_relabel_fraction = context_relabel_fraction
         self.reward_scale = reward_scale
-        if shaping_coef > 0 and gamma == 1:
-            raise ValueError(
-                "shaping_coef must be 0 with gamma=1: staying somewhere has no finite value then"
-            )
         self.shaping_coef = shaping_coef
         self.mirror_fraction = mirror_fraction
         self.noise_color = noise_color
@@ -267,19 +209,20 @@ class PEARLSAC(SAC):
         if _init_setup_model:
             if given is None:
                 raise TypeError(
-                    "env is None, but must be an environment of a task family, a vectorised one, or a registered id"
+                    "env is None, but must be an environment of a task family, a vectorised one, "
+                    "or a registered id"
                 )
             given = self._wrap_env(given, verbose)
             self._family = self._family_of(given)  # before SB3 speaks of other policies
         super().__init__(
             policy,
             given,  # type: ignore[arg-type]
-            learning_rate=learning_rate,
-            buffer_size=buffer_size,
-            learning_starts=learning_starts,
-            batch_size=batch_size,
-            tau=tau,
-            gamma=gamma,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
             gradient_steps=gradient_steps,
             replay_buffer_class=TaskReplayBuffer,
             n_steps=n_steps,
@@ -296,33 +239,27 @@ class PEARLSAC(SAC):
         )
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({getattr(self, 'env_id', None)}, {self.num_timesteps:,} steps trained)"
+        env_id, steps = getattr(self, "env_id", None), self.num_timesteps
+        return f"{type(self).__name__}({env_id}, {steps:,} steps trained)"
 
     def _setup_model(self) -> None:
+        generators = self.generators.to(self.device)
         if self.env is not None:
             self.horizon = self.family.horizon
-        self.generators.to(self.device)
         if not len(self.train_tasks):
-            self._draw_tasks()
+            family, rng = self.family, generators.child()
+            self.env_id, self.env_kwargs = family.env_id, family.env_kwargs
+            self.task_space, self.reward_feature_dim = family.task_space, family.reward_feature_dim
+            self.train_tasks = TrainTasks.draw(family, self.n_train_tasks, self.latent_dim, rng)
         self._complete_policy_kwargs()
-        self.replay_buffer_kwargs = {
-            "n_tasks": len(self.train_tasks),
-            "feature_dim": self.reward_feature_dim,
-        }
-        generators = self.generators
+        n_tasks, feature_dim = len(self.train_tasks), self.reward_feature_dim
+        self.replay_buffer_kwargs = {"n_tasks": n_tasks, "feature_dim": feature_dim}
         with warnings.catch_warnings():
             # SB3 says that it ignores n_steps with another replay buffer than its own; our sampler
             # does not
             warnings.filterwarnings("ignore", "`n_steps=")
             super()._setup_model()
         self.generators = generators  # a model that is loaded goes on with its own
-
-    def _draw_tasks(self) -> None:
-        family = self.family
-        self.env_id, self.env_kwargs = family.env_id, family.env_kwargs
-        self.task_space, self.reward_feature_dim = family.task_space, family.reward_feature_dim
-        rng = self.generators.child()
-        self.train_tasks = TrainTasks.draw(family, self.n_train_tasks, self.latent_dim, rng)
 
     def _complete_policy_kwargs(self) -> None:
         """Give the policy what follows from the model's own arguments."""
@@ -336,9 +273,10 @@ class PEARLSAC(SAC):
             return policy_name
         if policy_name != "MlpPolicy":
             raise ValueError(
-                f'policy is {policy_name!r}, but must be "MlpPolicy" or a subclass of {ours.__name__}: '
-                "observations are flat vectors. Put features of images into the family's observation; "
-                "poem_envs.GoalFamily flattens those of a goal-conditioned environment"
+                f'policy is {policy_name!r}, but must be "MlpPolicy" or a subclass of '
+                f"{ours.__name__}: observations are flat vectors. Put features of images into the "
+                "family's observation; poem_envs.GoalFamily flattens those of a goal-conditioned "
+                "environment"
             )
         return ours
 
@@ -368,6 +306,281 @@ class PEARLSAC(SAC):
         if seed is not None:
             self.generators = Generators(seed, self.device)
 
+    # ------------------------------------------------------------------ learning: Algorithm 1
+
+    def learn(
+        self: SelfPEARLSAC,
+        total_timesteps: int | None = None,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 1,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfPEARLSAC:
+        """Train, in whole epochs, until at least ``total_timesteps`` environment steps are done.
+
+        :param total_timesteps: None takes those of the entry that :meth:`from_zoo` read
+        :param callback: As SB3's
+        :param log_interval: Epochs between two dumps of the log; None never dumps
+        :param tb_log_name: None is the algorithm's name
+        :raises ValueError: if the number of steps is not known
+        """
+        steps, name = self._checked_steps(total_timesteps, callback), tb_log_name or self.algorithm
+        steps, callback = self._setup_learn(
+            steps, callback, reset_num_timesteps, name, progress_bar
+        )
+        callback.on_training_start(locals(), globals())
+        while self.num_timesteps < steps:
+            # between two epochs: evaluations and checkpoints belong here
+            self.policy.set_training_mode(False)
+            callback.on_rollout_start()
+            self._dump_pending_logs(log_interval)
+            # lines 2 and 16: every task's trajectories, of which the next contexts are made
+            collected = self._collect_epoch(callback)
+            if collected is None:  # a callback ended training
+                break
+            callback.on_rollout_end()
+            # lines 4 to 15
+            gradient_steps = self.gradient_steps if self.gradient_steps >= 0 else collected
+            if gradient_steps > 0 and self.num_timesteps > self.learning_starts:
+                self.train(gradient_steps=gradient_steps, batch_size=self.batch_size)
+        callback.on_training_end()
+        self._dump_pending_logs(log_interval)
+        return self
+
+    def _checked_steps(self, total_timesteps: int | None, callback: MaybeCallback) -> int:
+        """How many steps to train for, said aloud where ``verbose``."""
+        total = self.n_timesteps if total_timesteps is None else total_timesteps
+        if total is None:
+            raise ValueError(
+                "total_timesteps is missing, which only a model that from_zoo made knows: pass a "
+                f"number of environment steps; an epoch has {self.epoch_steps:,}"
+            )
+        check_number("total_timesteps", total, 0)
+        if isinstance(callback, type):
+            name = callback.__name__
+            raise TypeError(f"callback is the class {name}, but must be an object: {name}(...)")
+        if self.verbose > 0:
+            epoch, updates = self.epoch_steps, self.gradient_steps
+            print(
+                f"Training for {total:,.0f} steps in {-(-total // epoch):,.0f} epochs: each has "
+                f"{epoch:,} environment steps, then {updates if updates >= 0 else epoch:,} "
+                "gradient steps"
+            )
+        return total
+
+    def _collect_epoch(self, callback: BaseCallback) -> int | None:
+        """Roll out every training task under a latent of its own, and replace the contexts by what
+        was seen: environment steps, or None if a callback ended it.
+        """
+        started, steps_before = time.perf_counter(), self.num_timesteps
+        collector = self.make_collector(callback)
+        waves = collector.collect()
+        if waves is None:
+            return None
+        epoch = concatenate(waves, len(self.train_tasks) * self.trajectories_per_task)
+        returns = self.measure_returns(epoch, collector)
+        if returns is None:
+            return None
+        # after the returns, which the policies that collected the epoch must earn
+        self.policy.update_statistics(waves)
+        self._replace_context(epoch, returns)
+        self.epoch += 1
+        collected = self.num_timesteps - steps_before
+        self.logger.record("time/collection_fps", collected / (time.perf_counter() - started))
+        self.logger.record("rollout/train_task_return", np.nanmean(np.diagonal(returns)))
+        self._logs_pending = True
+        return collected
+
+    def measure_returns(self, epoch: Segment, collector: EpochCollector) -> np.ndarray | None:
+        """J[i, j]: the return of task j's policy on task i, (n_train_tasks, n_train_tasks); NaN
+        where unknown.
+
+        :param epoch: Rollouts of the tasks under their own policies
+        :param collector: For further rollouts
+        :return: None if a callback ended these
+        """
+        n_tasks = len(self.train_tasks)
+        own = (epoch.rewards * epoch.first_episode).sum(axis=1).reshape(n_tasks, -1).mean(axis=1)
+        returns = np.full((n_tasks, n_tasks), np.nan)
+        np.fill_diagonal(returns, own)
+        return returns
+
+    @th.no_grad()
+    def _replace_context(self, epoch: Segment, returns: np.ndarray) -> None:
+        policy, n_tasks = self.policy, len(returns)
+
+        def tensor(values: np.ndarray) -> th.Tensor:
+            return th.as_tensor(values, dtype=th.float32, device=self.device)
+
+        seen = map(tensor, (epoch.observations, epoch.next_observations))
+        obs, next_obs = map(policy.standardise, seen)
+        beyond = (obs.abs() == OBSERVATION_CLIP).any(dim=-1).float().mean()
+        self.logger.record("train/clipped_observations", beyond.item())
+        actions, rewards = tensor(epoch.actions), tensor(epoch.rewards)
+        deviation = max(float(rewards.std()), MIN_STD)
+        self.context_reward_statistics = float(rewards.mean()), deviation
+        parts = [obs, actions, next_obs, _standardised(rewards)[..., None]]
+        if policy.context_has_value:  # eq. 8; 0 before the first update (Algorithm 1, line 2)
+            values = th.zeros_like(rewards)
+            if self._n_updates > 0:
+                values = policy.action_values(obs, actions, epoch.latents)
+            parts.append(_standardised(values)[..., None])
+        transitions, features = th.cat(parts, dim=-1), None
+        if self.context_relabel_fraction > 0:
+            features = th.as_tensor(epoch.features, device=self.device)
+            features = features.reshape(n_tasks, -1, features.shape[-1])
+        self.epoch_context = ContextStore(
+            transitions.reshape(n_tasks, -1, transitions.shape[-1]),
+            rewards.reshape(n_tasks, -1),
+            tensor(returns),
+            features,
+        )
+
+    def train(self, gradient_steps: int, batch_size: int = 128) -> None:
+        """Gradient steps on meta-batches (Algorithm 1, lines 4 to 15), then a refresh of every
+        training task's posterior.
+        """
+        self.policy.set_training_mode(True)
+        optimizers = [self.policy.optimizer, *self.entropy_coefficient.optimizers]
+        self._update_learning_rate(optimizers)
+        started = time.perf_counter()
+        history: dict[str, list[th.Tensor]] = {}
+        with self.make_updater() as updater:
+            for block in self.make_sampler().blocks(gradient_steps, batch_size):
+                first = updater.n_updates
+                for batch in block:
+                    for name, value in updater.step(batch).items():
+                        history.setdefault(name, []).append(value)
+                    self._n_updates = updater.n_updates
+                updater.check_finite(history["gradient_norm"][-len(block) :], first)
+        self._refresh_posteriors()
+        seconds = max(time.perf_counter() - started, 1e-9)
+        self.logger.record("time/updates_per_second", gradient_steps / seconds)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        for name, values in history.items():
+            self.logger.record(f"train/{name}", th.stack(values).mean().item())
+        self.logger.record("train/kl_ideal", float(np.log(len(self.train_tasks))))
+        self.logger.record("train/aggregate_to_prior_kl", self.aggregate_to_prior_kl)
+        self._measure_decoder()
+
+    @th.no_grad()
+    def _refresh_posteriors(self) -> None:
+        """Posterior of every training task from its latest context: next epoch's latents, and the
+        aggregate.
+        """
+        self.policy.set_training_mode(False)
+        transitions, generator = self._known_context.transitions, self.generators.torch
+        picks = th.randperm(transitions.shape[1], generator=generator, device=self.device)
+        posteriors = self.policy.encoder(transitions[:, picks[: self.context_size]])
+        self.train_tasks.set_posteriors(*(part.double().cpu().numpy() for part in posteriors))
+
+    @th.no_grad()
+    def _measure_decoder(self) -> None:
+        """Residual deviation of the decoder, per step, on transitions of all training policies, in
+        units of reward. Where tasks do not share their dynamics it stays unknown: the decoder has
+        seen no rewards for what others' policies do.
+        """
+        if not self.family.shared_dynamics:
+            return
+        tasks, policy, device = self.train_tasks.tasks, self.policy, self.device
+        shape, generator = (len(tasks), MEASURED_PER_TASK), self.generators.torch
+        sources = th.randint(len(tasks), shape, generator=generator, device=device)
+        data = self.replay_buffer.sample_rows(sources, generator)
+        rewards = self.family.compute_rewards(tasks[:, None, :], data.features.cpu().numpy())
+        latents = th.as_tensor(self.task_latents, dtype=th.float32, device=device)
+        embedding = rows(policy.reward_embedding(latents), MEASURED_PER_TASK)
+        obs, next_obs = map(policy.standardise, (data.observations, data.next_observations))
+        predicted = policy.decode_rewards(obs, data.actions, next_obs, embedding).cpu().numpy()
+        self.predicted_rewards_error = float(np.sqrt(np.mean((predicted - rewards) ** 2)))
+        self.logger.record("train/decoder_error", self.predicted_rewards_error)
+
+    def resume(
+        self: SelfPEARLSAC,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 1,
+        progress_bar: bool = False,
+    ) -> SelfPEARLSAC:
+        """Finish the ``learn`` that a checkpoint interrupted, up to its own ``total_timesteps``."""
+        remaining = self._total_timesteps - self.num_timesteps
+        if remaining <= 0:
+            return self
+        return self.learn(remaining, callback, log_interval, None, False, progress_bar)
+
+    def _dump_pending_logs(self, log_interval: int | None) -> None:
+        if self._logs_pending and log_interval and self.epoch % log_interval == 0:
+            self.dump_logs()
+            self._logs_pending = False
+
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        """The last epoch may overshoot the total; a schedule must not turn negative there."""
+        steps = min(num_timesteps, total_timesteps)
+        super()._update_current_progress_remaining(steps, total_timesteps)
+
+    # ------------------------------------------------------------------ the parts
+
+    def _part(self, kind: type[Part], **others: Any) -> Part:
+        """A part of the model, whose fields are the model's attributes of these names."""
+        names = [field.name for field in fields(kind) if field.name not in others]  # type: ignore[arg-type]
+        return kind(**{name: getattr(self, name) for name in names}, **others)
+
+    def make_collector(self, callback: BaseCallback) -> EpochCollector:
+        """What collects an epoch, and tells a callback of every step."""
+        num_envs = self.family.num_envs
+
+        def on_step(step_locals: dict[str, Any]) -> bool:
+            self.num_timesteps += num_envs
+            callback.update_locals(step_locals)
+            if not callback.on_step():
+                return False
+            dones = step_locals["dones"]
+            if dones.any():  # what it looks for comes with an episode's end
+                self._update_info_buffer(step_locals["infos"], dones)
+            self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+            self._episode_num += int(dones.sum())
+            return True
+
+        return self._part(
+            EpochCollector,
+            explores=lambda: self.num_timesteps < self.learning_starts,
+            episode_count=lambda: self._episode_num,
+            on_step=on_step,
+        )
+
+    def make_sampler(self) -> MetaBatchSampler:
+        """What draws meta-batches."""
+        return self._part(self.sampler_class, epoch_context=self._known_context)
+
+    def make_objective(self) -> Objective:
+        """What gradient steps minimise."""
+        auto, variance = self.reward_scale == "auto", self._known_context.rewards.var()
+        scale = 1.0 / self.policy.reward_norm.std if auto else float(self.reward_scale)
+        variance = variance.clamp(min=MIN_STD**2)
+        return self._part(self.objective_class, reward_scale=scale, reward_variance=variance)
+
+    def make_updater(self) -> Updater:
+        """What takes gradient steps."""
+        return self._part(Updater, objective=self.make_objective(), n_updates=self._n_updates)
+
+    @property
+    def entropy_coefficient(self) -> EntropyCoefficient:
+        """SAC's entropy coefficient."""
+        tensor = self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef
+        return EntropyCoefficient(tensor, self.ent_coef_optimizer, float(self.target_entropy))
+
+    @property
+    def hidden_dtype(self) -> th.dtype:
+        """Type of the hidden layers' arithmetic in training."""
+        return hidden_dtype(self.precision, self.device.type)
+
+    @property
+    def _known_context(self) -> ContextStore:
+        if self.epoch_context is None:
+            raise ValueError(
+                "the model has no contexts before it has collected an epoch: call learn"
+            )
+        return self.epoch_context
+
     # ------------------------------------------------------------------ the task family
 
     @property
@@ -379,13 +592,14 @@ class PEARLSAC(SAC):
         if self._family is None:
             if self.env is None:
                 raise ValueError(
-                    "the model has no environment; give it one with set_env, or load it with env=..."
+                    "the model has no environment; give it one with set_env, or load it with "
+                    "env=..."
                 )
             self._family = self._family_of(self.env)
         return self._family
 
     def _family_of(self, env: VecEnv) -> FamilyView:
-        """View of an environment, which must be of the model's own family once the model has one."""
+        """View of an environment, which must be of the model's own family once it has one."""
         family = FamilyView.for_training(env, self.horizon)
         self._check_family(family)
         if len(self.train_tasks):
@@ -401,13 +615,13 @@ class PEARLSAC(SAC):
                 )
         if self.shaping_coef > 0 and not family.has_potential:
             raise ValueError(
-                f"shaping_coef must be 0: {family.env_id} has no potential; a family defines one by "
-                "_potential(tasks, observations)"
+                f"shaping_coef must be 0: {family.env_id} has no potential; a family defines one "
+                "by _potential(tasks, observations)"
             )
         if self.mirror_fraction > 0 and not family.symmetries:
             raise ValueError(
-                f"mirror_fraction must be 0: {family.env_id} names no symmetries; a family of them sets `symmetries`, "
-                "a tuple of poem_envs.Symmetry"
+                f"mirror_fraction must be 0: {family.env_id} names no symmetries; a family of them "
+                "sets `symmetries`, a tuple of poem_envs.Symmetry"
             )
 
     def set_env(self, env: GivenEnv, force_reset: bool = True) -> None:
@@ -456,366 +670,22 @@ class PEARLSAC(SAC):
         self, latents: np.ndarray, trajectories: Iterable[Trajectory], max_steps: int | None = None
     ) -> np.ndarray:
         """Returns that the reward decoder predicts for trajectories, if each latent were the
-        task's.
+        task's: (m, number of trajectories).
 
         :param latents: (m, latent_dim)
         :param max_steps: Of a longer trajectory only so many steps are decoded, evenly spaced, and
             the sum is scaled up; None decodes all
-        :return: (m, number of trajectories)
         """
         return self.policy.predicted_returns(latents, trajectories, max_steps, self.hidden_dtype)
 
     @property
     def digest(self) -> str:
-        """Of what adaptation uses: all networks but the critics, and the training tasks' latents."""
+        """Of what adaptation uses: all networks but the critics, and the tasks' latents."""
         state = self.policy.state_dict().items()
         used = {name: value for name, value in state if not name.startswith("critic")}
         used["latent_means"] = th.as_tensor(self.train_tasks.latent_means)
         used["latent_variances"] = th.as_tensor(self.train_tasks.latent_variances)
         return digest_of(used)
-
-    # ------------------------------------------------------------------ learning: Algorithm 1
-
-    def learn(
-        self: SelfPEARLSAC,
-        total_timesteps: int | None = None,
-        callback: MaybeCallback = None,
-        log_interval: int | None = 1,
-        tb_log_name: str | None = None,
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfPEARLSAC:
-        """Train, in whole epochs, until at least ``total_timesteps`` environment steps are done.
-
-        :param total_timesteps: None takes those of the entry that :meth:`from_zoo` read
-        :param callback: As SB3's
-        :param log_interval: Epochs between two dumps of the log; None never dumps
-        :param tb_log_name: None is the algorithm's name
-        :raises ValueError: if the number of steps is not known
-        """
-        total_timesteps = self._checked_steps(total_timesteps, callback)
-        total_timesteps, callback = self._setup_learn(
-            total_timesteps,
-            callback,
-            reset_num_timesteps,
-            tb_log_name or type(self).__name__,
-            progress_bar,
-        )
-        callback.on_training_start(locals(), globals())
-        while self.num_timesteps < total_timesteps and self._run_epoch(callback, log_interval):
-            pass
-        callback.on_training_end()
-        self._dump_pending_logs(log_interval)
-        return self
-
-    def _checked_steps(self, total_timesteps: int | None, callback: MaybeCallback) -> int:
-        """How many steps to train for, said aloud where ``verbose``."""
-        total_timesteps = self.n_timesteps if total_timesteps is None else total_timesteps
-        if total_timesteps is None:
-            raise ValueError(
-                "total_timesteps is missing, which only a model that from_zoo made knows: pass a "
-                f"number of environment steps; an epoch has {self.epoch_steps:,}"
-            )
-        check_number("total_timesteps", total_timesteps, 0)
-        if isinstance(callback, type):
-            raise TypeError(
-                f"callback is the class {callback.__name__}, but must be an object: {callback.__name__}(...)"
-            )
-        if self.verbose > 0:
-            epoch, updates = self.epoch_steps, self.gradient_steps
-            print(
-                f"Training for {total_timesteps:,.0f} steps in {-(-total_timesteps // epoch):,.0f} epochs: "
-                f"each has {epoch:,} environment steps, then {updates if updates >= 0 else epoch:,} "
-                "gradient steps"
-            )
-        return total_timesteps
-
-    def _run_epoch(self, callback: BaseCallback, log_interval: int | None) -> bool:
-        """One epoch; False if a callback ended training in it."""
-        self.policy.set_training_mode(False)
-        callback.on_rollout_start()  # between two epochs: evaluations and checkpoints belong here
-        self._dump_pending_logs(log_interval)
-        steps_before = self.num_timesteps
-        if not self._collect_epoch(callback):
-            return False
-        callback.on_rollout_end()
-        if self.num_timesteps > self.learning_starts:
-            collected = self.num_timesteps - steps_before
-            gradient_steps = self.gradient_steps if self.gradient_steps >= 0 else collected
-            if gradient_steps > 0:
-                self.train(gradient_steps=gradient_steps, batch_size=self.batch_size)
-        return True
-
-    def _collect_epoch(self, callback: BaseCallback) -> bool:
-        """Roll out every training task under a latent of its own, and replace the contexts
-        (Algorithm 1, lines 4 to 8); False if a callback ended it.
-        """
-        started, steps_before = time.perf_counter(), self.num_timesteps
-        collector = self.make_collector(callback)
-        waves = collector.collect()
-        if waves is None:
-            return False
-        epoch = concatenate(waves, len(self.train_tasks) * self.trajectories_per_task)
-        returns = self.measure_returns(epoch, collector)
-        if returns is None:
-            return False
-        # after the returns, which the policies that collected the epoch must earn
-        self.policy.update_statistics(waves)
-        self._replace_context(epoch, returns)
-        self.epoch += 1
-        collected = self.num_timesteps - steps_before
-        self.logger.record("time/collection_fps", collected / (time.perf_counter() - started))
-        self.logger.record("rollout/train_task_return", np.nanmean(np.diagonal(returns)))
-        self._logs_pending = True
-        return True
-
-    def train(self, gradient_steps: int, batch_size: int = 128) -> None:
-        """Gradient steps on meta-batches, then a refresh of every training task's posterior
-        (Algorithm 1, lines 9 to 14).
-        """
-        self.policy.set_training_mode(True)
-        coefficient = self.entropy_coefficient
-        self._update_learning_rate([self.policy.optimizer, *coefficient.optimizers])
-        started = time.perf_counter()
-        history: dict[str, list[th.Tensor]] = {}
-        with self.make_updater() as updater:
-            for block in self.make_sampler().blocks(gradient_steps, batch_size):
-                for batch in block:
-                    for name, value in updater.step(batch).items():
-                        history.setdefault(name, []).append(value)
-                    self._n_updates = updater.n_updates
-                updater.check_finite(
-                    history["gradient_norm"][-len(block) :], updater.n_updates - len(block)
-                )
-        self._refresh_posteriors()
-        self.logger.record(
-            "time/updates_per_second", gradient_steps / max(time.perf_counter() - started, 1e-9)
-        )
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        for name, values in history.items():
-            self.logger.record(f"train/{name}", th.stack(values).mean().item())
-        self.logger.record("train/kl_ideal", float(np.log(len(self.train_tasks))))
-        self.logger.record("train/aggregate_to_prior_kl", self.aggregate_to_prior_kl)
-        self._measure_decoder()
-
-    # ------------------------------------------------------------------ the parts
-
-    def make_collector(self, callback: BaseCallback) -> EpochCollector:
-        """What collects an epoch.
-
-        :param callback: Told of every step
-        """
-
-        def on_step(step_locals: dict[str, Any]) -> bool:
-            self.num_timesteps += self.family.num_envs
-            callback.update_locals(step_locals)
-            if not callback.on_step():
-                return False
-            if step_locals["dones"].any():  # what it looks for comes with an episode's end
-                self._update_info_buffer(step_locals["infos"], step_locals["dones"])
-            self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
-            self._episode_num += int(step_locals["dones"].sum())
-            return True
-
-        return EpochCollector(
-            self.family,
-            self.policy,
-            self.train_tasks,
-            self.replay_buffer,
-            self.generators,
-            self.trajectories_per_task,
-            self.noise_color,
-            explores=lambda: self.num_timesteps < self.learning_starts,
-            episode_count=lambda: self._episode_num,
-            on_step=on_step,
-        )
-
-    def make_sampler(self) -> MetaBatchSampler:
-        """What draws meta-batches."""
-        return MetaBatchSampler(
-            self.family,
-            self.train_tasks.tasks,
-            self.replay_buffer,
-            self._known_context,
-            self.generators,
-            self.latent_dim,
-            self.meta_batch_size,
-            self.context_size,
-            self.gamma,
-            self.n_steps,
-            self.relabel_fraction,
-            self.context_relabel_fraction,
-            self.shaping_coef,
-            self.mirror_fraction,
-        )
-
-    def make_objective(self) -> Objective:
-        """What gradient steps minimise."""
-        rewards = self._known_context.rewards
-        return Objective(
-            self.policy,
-            self.gamma,
-            1.0 / self.policy.reward_norm.std
-            if self.reward_scale == "auto"
-            else float(self.reward_scale),
-            rewards.var().clamp(min=MIN_STD**2),
-            self.relabel_fraction > 0,
-            self.kl_coef,
-            self.reward_coef,
-            self.policy_coef,
-        )
-
-    def make_updater(self) -> Updater:
-        """What takes gradient steps."""
-        return Updater(
-            self.policy,
-            self.make_objective(),
-            self.entropy_coefficient,
-            self.hidden_dtype,
-            self.tau,
-            self.target_update_interval,
-            self.policy_delay,
-            self._n_updates,
-        )
-
-    @property
-    def entropy_coefficient(self) -> EntropyCoefficient:
-        """SAC's entropy coefficient."""
-        tensor = self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef
-        return EntropyCoefficient(tensor, self.ent_coef_optimizer, float(self.target_entropy))
-
-    @property
-    def hidden_dtype(self) -> th.dtype:
-        """Type of the hidden layers' arithmetic in training."""
-        return hidden_dtype(self.precision, self.device.type)
-
-    @property
-    def _known_context(self) -> ContextStore:
-        if self.epoch_context is None:
-            raise ValueError(
-                "the model has no contexts before it has collected an epoch: call learn"
-            )
-        return self.epoch_context
-
-    # ------------------------------------------------------------------ an epoch's steps
-
-    def measure_returns(self, epoch: Segment, collector: EpochCollector) -> np.ndarray | None:
-        """J[i, j]: the return of task j's policy on task i, (n_train_tasks, n_train_tasks); NaN
-        where unknown.
-
-        :param epoch: Rollouts of the tasks under their own policies
-        :param collector: For further rollouts
-        :return: None if a callback ended these
-        """
-        n_tasks = len(self.train_tasks)
-        own = (epoch.rewards * epoch.first_episode).sum(axis=1).reshape(n_tasks, -1).mean(axis=1)
-        returns = np.full((n_tasks, n_tasks), np.nan)
-        np.fill_diagonal(returns, own)
-        return returns
-
-    def _replace_context(self, epoch: Segment, returns: np.ndarray) -> None:
-        n_tasks, policy = len(returns), self.policy
-        with th.no_grad():
-            obs, next_obs = (
-                policy.standardise(th.as_tensor(values, device=self.device))
-                for values in (epoch.observations, epoch.next_observations)
-            )
-            beyond = (obs.abs() == OBSERVATION_CLIP).any(dim=-1).float().mean()
-            self.logger.record("train/clipped_observations", beyond.item())
-            actions = th.as_tensor(epoch.actions, device=self.device)
-            rewards = th.as_tensor(epoch.rewards, dtype=th.float32, device=self.device)
-            self.context_reward_statistics = (
-                float(rewards.mean()),
-                max(float(rewards.std()), MIN_STD),
-            )
-            parts = [obs, actions, next_obs, _standardised(rewards)[..., None]]
-            if policy.context_has_value:  # eq. 8; 0 before the first update (Algorithm 1, line 2)
-                known = self._n_updates > 0
-                values = (
-                    policy.action_values(obs, actions, epoch.latents)
-                    if known
-                    else th.zeros_like(rewards)
-                )
-                parts.append(_standardised(values)[..., None])
-            transitions = th.cat(parts, dim=-1)
-        features = None
-        if self.context_relabel_fraction > 0:
-            features = th.as_tensor(epoch.features, device=self.device)
-            features = features.reshape(n_tasks, -1, features.shape[-1])
-        self.epoch_context = ContextStore(
-            transitions.reshape(n_tasks, -1, transitions.shape[-1]),
-            rewards.reshape(n_tasks, -1),
-            th.as_tensor(returns, dtype=th.float32, device=self.device),
-            features,
-        )
-
-    def _refresh_posteriors(self) -> None:
-        """Posterior of every training task from its latest context: next epoch's latents, and the
-        aggregate.
-        """
-        self.policy.set_training_mode(False)
-        transitions = self._known_context.transitions
-        with th.no_grad():
-            steps = transitions.shape[1]
-            picks = th.randperm(steps, generator=self.generators.torch, device=self.device)[
-                : self.context_size
-            ]
-            mean, variance = self.policy.encoder(transitions[:, picks])
-        self.train_tasks.set_posteriors(
-            mean.double().cpu().numpy(), variance.double().cpu().numpy()
-        )
-
-    def _measure_decoder(self) -> None:
-        """Residual deviation of the decoder, per step, on transitions of all training policies, in
-        units of reward. Where tasks do not share their dynamics it stays unknown: the decoder has
-        seen no rewards for what others' policies do.
-        """
-        if not self.family.shared_dynamics:
-            return
-        tasks, policy, device = self.train_tasks.tasks, self.policy, self.device
-        shape = (len(tasks), MEASURED_PER_TASK)
-        sources = th.randint(len(tasks), shape, generator=self.generators.torch, device=device)
-        data = self.replay_buffer.sample_rows(sources, self.generators.torch)
-        rewards = self.family.compute_rewards(tasks[:, None, :], data.features.cpu().numpy())
-        with th.no_grad():
-            latents = th.as_tensor(self.task_latents, dtype=th.float32, device=device)
-            obs, next_obs = (
-                policy.standardise(data.observations),
-                policy.standardise(data.next_observations),
-            )
-            embedding = losses.rows(policy.reward_embedding(latents), MEASURED_PER_TASK)
-            predicted = policy.decode_rewards(obs, data.actions, next_obs, embedding).cpu().numpy()
-        self.predicted_rewards_error = float(np.sqrt(np.mean((predicted - rewards) ** 2)))
-        self.logger.record("train/decoder_error", self.predicted_rewards_error)
-
-    def _dump_pending_logs(self, log_interval: int | None) -> None:
-        if self._logs_pending and log_interval and self.epoch % log_interval == 0:
-            self.dump_logs()
-            self._logs_pending = False
-
-    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
-        """The last epoch may overshoot the total; a schedule must not turn negative there."""
-        super()._update_current_progress_remaining(
-            min(num_timesteps, total_timesteps), total_timesteps
-        )
-
-    def resume(
-        self: SelfPEARLSAC,
-        callback: MaybeCallback = None,
-        log_interval: int | None = 1,
-        progress_bar: bool = False,
-    ) -> SelfPEARLSAC:
-        """Finish the ``learn`` that a checkpoint interrupted, up to its own ``total_timesteps``."""
-        remaining = self._total_timesteps - self.num_timesteps
-        if remaining <= 0:
-            return self
-        return self.learn(
-            remaining,
-            callback,
-            log_interval=log_interval,
-            reset_num_timesteps=False,
-            progress_bar=progress_bar,
-        )
 
     # ------------------------------------------------------------------ files
 
@@ -855,9 +725,8 @@ class PEARLSAC(SAC):
         data = saving.read_archive(path, cls, kwargs)
         if env is not None:
             env = vectorise(env, data["n_envs"])
-        model = super().load(
-            path, env, device, custom_objects, print_system_info, force_reset, **kwargs
-        )
+        others = (custom_objects, print_system_info, force_reset)
+        model = super().load(path, env, device, *others, **kwargs)
         if kwargs.get("seed") is not None:
             model.set_random_seed(kwargs["seed"])
         return model
@@ -870,9 +739,8 @@ class PEARLSAC(SAC):
         """
         archive = io.BytesIO()
         self.save(archive)
-        saving.write_checkpoint(
-            path, self.algorithm, archive.getvalue(), self.replay_buffer, self.epoch_context
-        )
+        content, context = archive.getvalue(), self.epoch_context
+        saving.write_checkpoint(path, self.algorithm, content, self.replay_buffer, context)
 
     @classmethod
     def load_checkpoint(
@@ -881,19 +749,17 @@ class PEARLSAC(SAC):
         env: GivenEnv | None = None,
         device: th.device | str = "auto",
     ) -> SelfPEARLSAC:
-        """Read a checkpoint; :meth:`resume` then continues the run.
+        """Read what :meth:`save_checkpoint` or :class:`TrainingCheckpointCallback` wrote;
+        :meth:`resume` then continues the run.
 
-        :param path: A file that :meth:`save_checkpoint` or :class:`TrainingCheckpointCallback`
-            wrote
         :param env: An environment like the run's own: the same family and number of copies
-        :param device: "auto", "cpu", "cuda"
         :raises ValueError: if the file is truncated or holds another algorithm's run, or env is of
             another family
         """
         state = saving.read_checkpoint(path, cls.__name__)
         model = cls.load(io.BytesIO(state["model"].numpy().tobytes()), env, device)
         model.replay_buffer.load_state(state["replay_buffer"])
-        if state["context"] is not None:
+        if state["context"]:
             stored = {name: value.to(model.device) for name, value in state["context"].items()}
             model.epoch_context = ContextStore(**stored)
         return model

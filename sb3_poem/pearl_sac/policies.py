@@ -26,6 +26,14 @@ from sb3_poem.common.networks import (
 from sb3_poem.common.trajectory import Trajectory
 
 OBSERVATION_CLIP = 10.0
+#: Widths of the hidden layers
+DEFAULT_NET_ARCH: dict[str, Sequence[int]] = {
+    "pi": (256, 256),
+    "qf": (256, 256),
+    "encoder": (200, 200, 200),
+    "decoder": (128, 128),
+    "embedding": (64,),
+}
 
 
 class LatentPolicy(SACPolicy):
@@ -34,9 +42,6 @@ class LatentPolicy(SACPolicy):
     ``predict(obs, state=z)`` acts for latent ``z``; SB3's ``state`` slot carries it from step to
     step. Without a state the prior's mean acts.
 
-    :param observation_space: Flat Box
-    :param action_space: Bounded Box
-    :param lr_schedule: Learning rate schedule
     :param net_arch: Hidden widths of actor and critics, or a dict with keys ``pi``, ``qf``,
         ``encoder``, ``decoder``, ``embedding`` for each
     :param activation_fn: Activation of actor, critics and decoder
@@ -75,17 +80,22 @@ class LatentPolicy(SACPolicy):
             raise TypeError(
                 f"activation_fn must be a class of torch.nn, as nn.ReLU, but is {activation_fn!r}"
             )
+        if optimizer_kwargs is None and optimizer_class is th.optim.Adam:
+            optimizer_kwargs = {"fused": True}
         BasePolicy.__init__(
             self,
             observation_space,
             action_space,
             optimizer_class=optimizer_class,
-            optimizer_kwargs={"fused": True}
-            if optimizer_kwargs is None and optimizer_class is th.optim.Adam
-            else optimizer_kwargs,
+            optimizer_kwargs=optimizer_kwargs,
             squash_output=True,
         )
-        self.net_arch = self._complete_net_arch(net_arch)
+        given = net_arch if isinstance(net_arch, dict) else {"pi": net_arch, "qf": net_arch}
+        if unknown := sorted(set(given) - set(DEFAULT_NET_ARCH)):
+            known = sorted(DEFAULT_NET_ARCH)
+            raise ValueError(f"net_arch has unknown keys {unknown}; known are {known}")
+        widths = DEFAULT_NET_ARCH | {key: part for key, part in given.items() if part is not None}
+        self.net_arch = {key: list(part) for key, part in widths.items()}
         self.activation_fn = activation_fn
         self.layer_norm = layer_norm
         self.latent_dim = latent_dim
@@ -94,56 +104,19 @@ class LatentPolicy(SACPolicy):
         self._warned_of_no_latent = False
         self._build(lr_schedule)
 
-    @staticmethod
-    def _complete_net_arch(
-        net_arch: Sequence[int] | dict[str, Sequence[int]] | None,
-    ) -> dict[str, list[int]]:
-        defaults: dict[str, Sequence[int]] = {
-            "pi": (256, 256),
-            "qf": (256, 256),
-            "encoder": (200, 200, 200),
-            "decoder": (128, 128),
-            "embedding": (64,),
-        }
-        if net_arch is None:
-            given: dict[str, Sequence[int]] = {}
-        elif isinstance(net_arch, dict):
-            given = net_arch
-        else:
-            given = {"pi": net_arch, "qf": net_arch}
-        unknown = set(given) - set(defaults)
-        if unknown:
-            raise ValueError(
-                f"net_arch has unknown keys {sorted(unknown)}; known are {sorted(defaults)}"
-            )
-        return {key: list(given.get(key, default)) for key, default in defaults.items()}
-
     def _build(self, lr_schedule: Schedule) -> None:
-        arch = self.net_arch
+        arch, latent_dim = self.net_arch, self.latent_dim
         obs_dim, action_dim = int(self.observation_space.shape[0]), int(self.action_space.shape[0])
+        hidden = self.activation_fn, self.layer_norm
         self.obs_norm = RunningNorm(obs_dim, clip=OBSERVATION_CLIP)
         self.reward_norm = RunningNorm(1)  # of the first epoch, in whose units the critics learn
         context_dim = 2 * obs_dim + action_dim + 1 + int(self.context_has_value)
-        self.encoder = ContextEncoder(context_dim, self.latent_dim, arch["encoder"])
+        self.encoder = ContextEncoder(context_dim, latent_dim, arch["encoder"])
         self._build_embeddings(arch["embedding"])
-        activation_fn, layer_norm = self.activation_fn, self.layer_norm
-        self.decoder = RewardDecoder(
-            obs_dim, action_dim, self.latent_dim, arch["decoder"], activation_fn, layer_norm
-        )
-        self.actor = LatentActor(
-            obs_dim, self.latent_dim, action_dim, arch["pi"], activation_fn, layer_norm
-        )
-        critic_args = (
-            obs_dim,
-            action_dim,
-            self.latent_dim,
-            arch["qf"],
-            activation_fn,
-            layer_norm,
-            self.n_critics,
-        )
-        self.critic = LatentCritic(*critic_args)
-        self.critic_target = LatentCritic(*critic_args)
+        self.decoder = RewardDecoder(obs_dim, action_dim, latent_dim, arch["decoder"], *hidden)
+        self.actor = LatentActor(obs_dim, latent_dim, action_dim, arch["pi"], *hidden)
+        critics = (obs_dim, action_dim, latent_dim, arch["qf"], *hidden, self.n_critics)
+        self.critic, self.critic_target = LatentCritic(*critics), LatentCritic(*critics)
         self.critic_target.load_state_dict(self.critic.state_dict())
         self.critic_target.requires_grad_(False)
         trained = [parameter for parameter in self.parameters() if parameter.requires_grad]
@@ -169,13 +142,11 @@ class LatentPolicy(SACPolicy):
         learned to run is far from what the first epoch's random actions showed. Rewards keep the
         first epoch's, in whose units the critics learn.
         """
-        obs = [
-            segment.observations.reshape(-1, segment.observations.shape[-1]) for segment in segments
-        ]
-        self.obs_norm.update(np.concatenate(obs))
+        obs = np.concatenate([segment.observations for segment in segments])
+        self.obs_norm.update(obs.reshape(-1, obs.shape[-1]))
         if self.reward_norm.count == 0:
-            rewards = [segment.rewards.reshape(-1, 1) for segment in segments]
-            self.reward_norm.update(np.concatenate(rewards))
+            rewards = np.concatenate([segment.rewards for segment in segments])
+            self.reward_norm.update(rewards.reshape(-1, 1))
 
     def action_values(self, obs: th.Tensor, actions: th.Tensor, latents: np.ndarray) -> th.Tensor:
         """Q(s, a) of the more doubtful critic, (copies, steps).
@@ -199,13 +170,14 @@ class LatentPolicy(SACPolicy):
         max_steps: int | None,
         dtype: th.dtype,
     ) -> np.ndarray:
-        """Returns (m, trajectories) that the decoder predicts under latents (m, latent_dim).
+        """See :meth:`PEARLSAC.predicted_returns`.
 
-        :param max_steps: Steps that are decoded of each trajectory, see
-            :meth:`PEARLSAC.predicted_returns`
         :param dtype: Of the hidden layers' arithmetic
         """
-        device = self.device
+
+        def tensor(values: np.ndarray) -> th.Tensor:
+            return th.as_tensor(values, dtype=th.float32, device=self.device)
+
         rows: list[th.Tensor] = []
         lengths: list[int] = []
         shares: list[float] = []  # of a trajectory's steps, one over
@@ -213,17 +185,13 @@ class LatentPolicy(SACPolicy):
             total = len(trajectory.actions)
             steps = _evenly_spaced(total, max_steps)
             obs, next_obs = (
-                self.standardise(
-                    th.as_tensor(trajectory.observations[at], dtype=th.float32, device=device)
-                )
-                for at in (steps, steps + 1)
+                self.standardise(tensor(trajectory.observations[at])) for at in (steps, steps + 1)
             )
-            actions = th.as_tensor(trajectory.actions[steps], dtype=th.float32, device=device)
-            rows.append(th.cat([obs, self.scale_action_batch(actions), next_obs], dim=1))
+            actions = self.scale_action_batch(tensor(trajectory.actions[steps]))
+            rows.append(th.cat([obs, actions, next_obs], dim=1))
             lengths.append(len(steps))
             shares.append(total / max(len(steps), 1))
-        latent_tensor = th.as_tensor(np.atleast_2d(latents), dtype=th.float32, device=device)
-        embeddings = self.reward_embedding(latent_tensor)
+        embeddings = self.reward_embedding(tensor(np.atleast_2d(latents)))
         sums = decoded_sums(self.decoder.mlp, th.cat(rows), lengths, embeddings, dtype).double()
         norm = self.reward_norm
         sums = sums * norm.std + norm.mean * sums.new_tensor(lengths)
@@ -238,40 +206,22 @@ class LatentPolicy(SACPolicy):
     def decode_rewards(
         self, obs: th.Tensor, actions: th.Tensor, next_obs: th.Tensor, reward_embedding: th.Tensor
     ) -> th.Tensor:
-        """Predicted rewards (...) in the environment's units.
-
-        :param obs: (..., obs_dim), standardised
-        :param actions: (..., action_dim) in [-1, 1]
-        :param next_obs: (..., obs_dim), standardised
-        :param reward_embedding: (..., latent_dim)
+        """Predicted rewards (...) in the environment's units, of standardised observations (...,
+        obs_dim), actions (..., action_dim) in [-1, 1] and embeddings (..., latent_dim).
         """
         return self.reward_norm.inverse(self.decoder(obs, actions, next_obs, reward_embedding))
-
-    def act(
-        self, obs: np.ndarray, latents: np.ndarray, noise: th.Tensor | None = None
-    ) -> np.ndarray:
-        """Actions in [-1, 1] for a batch.
-
-        :param obs: (n, obs_dim)
-        :param latents: (n, latent_dim)
-        :param noise: (n, action_dim) standard normal draws, None for the mean action
-        """
-        return self.acting_on(latents)(obs, noise)
 
     def acting_on(
         self, latents: np.ndarray
     ) -> Callable[[np.ndarray, th.Tensor | None], np.ndarray]:
-        """:meth:`act` for latents that stay the same over many steps: what depends on them alone is
-        computed once.
-
-        :param latents: (n, latent_dim)
-        :return: A function of ``obs`` and ``noise``
+        """How to act under latents (n, latent_dim): a function of observations (n, obs_dim) and
+        standard normal noise (n, action_dim), None for the mean action, that gives actions in [-1,
+        1]. What depends on the latents alone is computed once.
         """
         device = self.device
         with th.no_grad():
-            embedding = self.policy_embedding(
-                th.as_tensor(latents, dtype=th.float32, device=device)
-            )
+            z = th.as_tensor(latents, dtype=th.float32, device=device)
+            embedding = self.policy_embedding(z)
 
         def act(obs: np.ndarray, noise: th.Tensor | None) -> np.ndarray:
             with th.no_grad():
@@ -304,78 +254,67 @@ class LatentPolicy(SACPolicy):
         obs = np.asarray(observation, dtype=np.float32)
         single = obs.ndim == 1
         obs = np.atleast_2d(obs)
-        if obs.shape[1:] != self.observation_space.shape:
+        n, d, expected = len(obs), self.latent_dim, self.observation_space.shape
+        if obs.shape[1:] != expected:
             raise ValueError(
-                f"observation has shape {obs.shape[1:]}, but the policy takes {self.observation_space.shape}"
+                f"observation has shape {obs.shape[1:]}, but the policy takes {expected}"
             )
         if not np.all(np.isfinite(obs)):
-            raise ValueError(
-                f"observation {int(np.argwhere(~np.isfinite(obs))[0, 0])} holds NaN or infinity"
-            )
+            where = int(np.argwhere(~np.isfinite(obs))[0, 0])
+            raise ValueError(f"observation {where} holds NaN or infinity")
         if state is None and not self._warned_of_no_latent:
             self._warned_of_no_latent = True
             warnings.warn(
-                "predict was called without a latent (its state), and acts for latent 0, that is for no "
-                "task: what it earns says little of the model. PreferenceAdapter(model, env, ...).adapt() "
-                "gives a policy for a task; AdaptationEvalCallback evaluates such policies in training",
+                "predict was called without a latent (its state), and acts for latent 0, that is "
+                "for no task: what it earns says little of the model. PreferenceAdapter(model, "
+                "env, ...).adapt() gives a policy for a task; AdaptationEvalCallback evaluates "
+                "such policies in training",
                 stacklevel=3,
             )
-        latents = (
-            np.zeros(self.latent_dim) if state is None else np.asarray(state, dtype=np.float64)
-        )
-        if latents.shape not in (
-            (self.latent_dim,),
-            (obs.shape[0], self.latent_dim),
-            (1, self.latent_dim),
-        ):
+        latents = np.zeros(d) if state is None else np.asarray(state, dtype=np.float64)
+        if latents.shape not in ((d,), (n, d), (1, d)):
             raise ValueError(
-                f"state has shape {latents.shape}, but a latent is ({self.latent_dim},), "
-                f"or ({obs.shape[0]}, {self.latent_dim}) for these observations"
+                f"state has shape {latents.shape}, but a latent is ({d},), or ({n}, {d}) for these "
+                "observations"
             )
         if not np.all(np.isfinite(latents)):
             raise ValueError(f"state holds NaN or infinity: {latents}")
-        latents = np.array(np.broadcast_to(latents, (obs.shape[0], self.latent_dim)))
-        noise = None
-        if not deterministic:
-            noise = th.randn(
-                obs.shape[0], int(np.prod(self.action_space.shape)), device=self.device
-            )
-        actions = self.unscale_action(self.act(obs, latents, noise))
+        latents = np.array(np.broadcast_to(latents, (n, d)))
+        actions = self.unscale_action(self.acting_on(latents)(obs, self._noise(n, deterministic)))
         actions = np.clip(actions, self.action_space.low, self.action_space.high)
         return (actions[0] if single else actions), latents
 
+    def _noise(self, n: int, deterministic: bool) -> th.Tensor | None:
+        shape = (n, *self.action_space.shape)
+        return None if deterministic else th.randn(shape, device=self.device)
+
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         assert isinstance(observation, th.Tensor)
-        latents = np.zeros((observation.shape[0], self.latent_dim))
-        noise = (
-            None
-            if deterministic
-            else th.randn(observation.shape[0], *self.action_space.shape, device=self.device)
-        )
-        return th.as_tensor(self.act(observation.cpu().numpy(), latents, noise), device=self.device)
+        obs, n = observation.cpu().numpy(), len(observation)
+        act = self.acting_on(np.zeros((n, self.latent_dim)))
+        actions = act(obs, self._noise(n, deterministic))
+        return th.as_tensor(actions, device=self.device)
 
     def set_training_mode(self, mode: bool) -> None:
         """Put all networks in training or evaluation mode."""
         self.train(mode)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {
-            "observation_space": self.observation_space,
-            "action_space": self.action_space,
-            "lr_schedule": self._dummy_schedule,
-            "net_arch": self.net_arch,
-            "activation_fn": self.activation_fn,
-            "layer_norm": self.layer_norm,
-            "latent_dim": self.latent_dim,
-            "context_has_value": self.context_has_value,
-            "n_critics": self.n_critics,
-            "optimizer_class": self.optimizer_class,
-            "optimizer_kwargs": self.optimizer_kwargs,
-        }
+        names = [
+            *("observation_space", "action_space", "net_arch", "activation_fn", "layer_norm"),
+            *(
+                "latent_dim",
+                "context_has_value",
+                "n_critics",
+                "optimizer_class",
+                "optimizer_kwargs",
+            ),
+        ]
+        return {"lr_schedule": self._dummy_schedule} | {name: getattr(self, name) for name in names}
 
 
 def _evenly_spaced(total: int, count: int | None) -> np.ndarray:
-    """At most ``count`` of ``total`` indices, at one distance, with what is left over at both ends."""
+    """At most ``count`` of ``total`` indices, at one distance, what is left over at both ends."""
     if count is None or total <= count:
         return np.arange(total)
     distance = -(-total // count)

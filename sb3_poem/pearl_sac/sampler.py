@@ -2,7 +2,8 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from operator import itemgetter
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
@@ -10,9 +11,8 @@ import torch as th
 from poem_envs import SignedPermutation
 from sb3_poem.common.buffers import ContextStore, TaskBatch, TaskReplayBuffer
 from sb3_poem.common.family_view import FamilyView
-from sb3_poem.common.networks import RunningNorm
 from sb3_poem.common.random import Generators
-from sb3_poem.pearl_sac.losses import Bootstraps, MetaBatch
+from sb3_poem.pearl_sac.train_tasks import TrainTasks
 
 #: Bytes of transitions drawn at once: few enough for the cache; on a GPU the number of draws costs
 BYTES_AT_ONCE = {"cpu": 2**20, "cuda": 2**28}
@@ -21,53 +21,77 @@ BYTES_AT_ONCE = {"cpu": 2**20, "cuda": 2**28}
 FOREIGN_SOURCES = 2
 
 
+class Bootstraps(NamedTuple):
+    """What the critics' targets are made of where they look some steps ahead.
+
+    rewards (tasks, batch), their discounted sum until then; observations (tasks, batch, obs_dim)
+    after it; discounts (tasks, batch) of the value there, 0 where the episode terminated.
+    """
+
+    rewards: th.Tensor
+    observations: th.Tensor
+    discounts: th.Tensor
+
+
+class MetaBatch(NamedTuple):
+    """What one gradient step sees of a meta-batch of tasks.
+
+    task_ids (tasks,), transitions: a :class:`TaskBatch` (tasks, batch, ...), context (tasks,
+    context_size, context_dim), context_rewards (tasks, context_size), returns (tasks, tasks): J[i,
+    j], NaN where unknown; standard normal draws for the latents (tasks, latent_dim), the actions
+    and the next actions (tasks, batch, action_dim); bootstraps, None where targets look one step
+    ahead, which ``transitions`` tell.
+    """
+
+    task_ids: th.Tensor
+    transitions: TaskBatch
+    context: th.Tensor
+    context_rewards: th.Tensor
+    returns: th.Tensor
+    latent_noise: th.Tensor
+    action_noise: th.Tensor
+    next_action_noise: th.Tensor
+    bootstraps: Bootstraps | None = None
+
+
+def mapped(function: Callable[[th.Tensor], th.Tensor], batch: Any) -> Any:
+    """A meta-batch with what a function makes of each of its tensors."""
+    if isinstance(batch, tuple):
+        return type(batch)(*(mapped(function, part) for part in batch))
+    return None if batch is None else function(batch)
+
+
 @dataclass
 class MetaBatchSampler:
-    """Draws meta-batches from replay buffers and contexts.
-
-    Several are drawn at once: indices, relabelled rewards and noise then cost as many operations as
-    for one.
-
-    :param family: The environment, for relabelled rewards
-    :param tasks: The training tasks, (n, task_dim)
-    :param buffer: The tasks' transitions
-    :param context: The last epoch's contexts
-    :param generators: All draws come from them
-    :param latent_dim: Dimension of the latent
-    :param meta_batch_size: Tasks in a meta-batch
-    :param context_size: Transitions in a context
-    :param gamma: Discount factor
-    :param n_steps: Steps of rewards in the critics' targets
-    :param relabel_fraction: Share of a task's batch that is other tasks'
-    :param context_relabel_fraction: Share of contexts that are other tasks'
-    :param shaping_coef: Share of the family's potential in the critics' rewards
-    :param mirror_fraction: Share of a task's batch that is seen in a symmetry
+    """Draws meta-batches from replay buffers and contexts, several at once: indices, relabelled
+    rewards and noise then cost as many operations as for one. Its fields are those of PEARLSAC.
     """
 
     family: FamilyView
-    tasks: np.ndarray
-    buffer: TaskReplayBuffer
-    context: ContextStore
+    train_tasks: TrainTasks
+    replay_buffer: TaskReplayBuffer
+    epoch_context: ContextStore
+    context_reward_statistics: tuple[float, float]
     generators: Generators
     latent_dim: int
     meta_batch_size: int
     context_size: int
     gamma: float
-    n_steps: int = 1
-    relabel_fraction: float = 0.0
-    context_relabel_fraction: float = 0.0
-    shaping_coef: float = 0.0
-    mirror_fraction: float = 0.0
+    n_steps: int
+    relabel_fraction: float
+    context_relabel_fraction: float
+    shaping_coef: float
+    mirror_fraction: float
 
     @property
     def device(self) -> th.device:
-        return self.buffer.device
+        return self.replay_buffer.device
 
     def blocks(self, n: int, batch_size: int) -> Iterator[list[MetaBatch]]:
         """``n`` meta-batches of ``batch_size`` transitions a task, in blocks that are drawn at
         once.
         """
-        step_bytes = self.meta_batch_size * batch_size * 4 * sum(self.buffer.widths)
+        step_bytes = self.meta_batch_size * batch_size * 4 * sum(self.replay_buffer.widths)
         at_once = max(1, BYTES_AT_ONCE.get(self.device.type, BYTES_AT_ONCE["cpu"]) // step_bytes)
         for start in range(0, n, at_once):
             yield self.sample(min(at_once, n - start), batch_size)
@@ -75,54 +99,31 @@ class MetaBatchSampler:
     def sample(self, n: int, batch_size: int) -> list[MetaBatch]:
         """Draw ``n`` meta-batches of ``batch_size`` transitions a task."""
         choices = [self.choose_tasks() for _ in range(n)]
-        sizes = [len(choice) for choice in choices]
         chosen = np.concatenate(choices)
         task_ids = th.as_tensor(chosen, device=self.device)  # (n * tasks,)
         transitions, bootstraps = self._transitions(task_ids, chosen, batch_size)
         context, context_rewards = self.contexts(task_ids)
+        returns = self.epoch_context.returns[task_ids]
         action_dim = transitions.actions.shape[-1]
         widths = [self.latent_dim, batch_size * action_dim, batch_size * action_dim]
         shape = (len(chosen), sum(widths))
         noise = th.randn(shape, generator=self.generators.torch, device=self.device)
-        latent_noise, *action_noises = noise.split(widths, dim=1)
-        split = (
-            field.split(sizes)
-            for field in (
-                task_ids,
-                *transitions,
-                context,
-                context_rewards,
-                latent_noise,
-                *(part.reshape(-1, batch_size, action_dim) for part in action_noises),
-                *(bootstraps or ()),
-            )
-        )
-        n_fields = len(TaskBatch._fields)
-        batches = []
-        for ids, *rest in zip(*split, strict=True):
-            one, rest = TaskBatch(*rest[:n_fields]), rest[n_fields:]
-            own_context, own_rewards, of_latents, of_actions, of_next_actions, *ahead = rest
-            batches.append(
-                MetaBatch(
-                    ids,
-                    one,
-                    own_context,
-                    own_rewards,
-                    self.context.returns[ids][:, ids],
-                    of_latents,
-                    of_actions,
-                    of_next_actions,
-                    Bootstraps(*ahead) if ahead else None,
-                )
-            )
-        return batches
+        of_latents, *parts = noise.split(widths, dim=1)
+        of_actions, of_next = (part.reshape(-1, batch_size, action_dim) for part in parts)
+        known = (task_ids, transitions, context, context_rewards, returns)
+        whole = MetaBatch(*known, of_latents, of_actions, of_next, bootstraps)
+        stops = np.cumsum([len(choice) for choice in choices]).tolist()
+        rows = (slice(stop - len(one), stop) for one, stop in zip(choices, stops, strict=True))
+        batches = (mapped(itemgetter(some), whole) for some in rows)
+        return [batch._replace(returns=batch.returns[:, batch.task_ids]) for batch in batches]
 
     def choose_tasks(self) -> np.ndarray:
         """Indices of a meta-batch, without repetition: a task twice would be a pair without a
         difference.
         """
-        size = min(self.meta_batch_size, len(self.tasks))
-        return self.generators.numpy.choice(len(self.tasks), size=size, replace=False)
+        n_tasks = len(self.train_tasks)
+        size = min(self.meta_batch_size, n_tasks)
+        return self.generators.numpy.choice(n_tasks, size=size, replace=False)
 
     def _transitions(
         self, task_ids: th.Tensor, chosen: np.ndarray, batch_size: int
@@ -131,7 +132,7 @@ class MetaBatchSampler:
         the task's own rewards and ``mirror_fraction`` seen in a symmetry; and what the critics'
         targets are made of, if that is more than these.
         """
-        generator, buffer = self.generators.torch, self.buffer
+        generator, buffer = self.generators.torch, self.replay_buffer
         sources = task_ids[:, None].expand(-1, batch_size)
         n_foreign = round(self.relabel_fraction * batch_size)
         if n_foreign:
@@ -173,27 +174,24 @@ class MetaBatchSampler:
         # 0 is no symmetry
         which *= th.rand(shape, generator=generator, device=device) < self.mirror_fraction
 
-        def chosen(permutations: Sequence[SignedPermutation]) -> tuple[th.Tensor, th.Tensor]:
+        def mirror(permutations: Sequence[SignedPermutation]) -> Callable[[th.Tensor], th.Tensor]:
             width = len(permutations[0].order)
-            order = th.tensor([list(range(width)), *(p.order for p in permutations)], device=device)
+            orders = th.tensor([[*range(width)], *(p.order for p in permutations)], device=device)
             signs = th.tensor([[1.0] * width, *(p.signs for p in permutations)], device=device)
-            return order[which], signs[which]
+            order, sign = orders[which], signs[which]
+            return lambda values: values.gather(-1, order) * sign
 
-        of_observations, of_actions, of_features = map(chosen, zip(*symmetries, strict=True))
-
-        def seen(values: th.Tensor, order: th.Tensor, signs: th.Tensor) -> th.Tensor:
-            return values.gather(-1, order) * signs
-
+        observations, actions, features = map(mirror, zip(*symmetries, strict=True))
         return lambda transitions: transitions._replace(
-            observations=seen(transitions.observations, *of_observations),
-            actions=seen(transitions.actions, *of_actions),
-            next_observations=seen(transitions.next_observations, *of_observations),
-            features=seen(transitions.features, *of_features),
+            observations=observations(transitions.observations),
+            actions=actions(transitions.actions),
+            next_observations=observations(transitions.next_observations),
+            features=features(transitions.features),
         )
 
     def _potential(self, observations: th.Tensor, chosen: np.ndarray) -> th.Tensor:
         """What staying at observations (tasks, batch, obs_dim) would be worth, (tasks, batch)."""
-        tasks = self.tasks[chosen][:, None, :]
+        tasks = self.train_tasks.tasks[chosen][:, None, :]
         potential = self.family.compute_potential(tasks, observations.cpu().numpy())
         values = th.as_tensor(potential, dtype=th.float32, device=self.device)
         return values * (self.shaping_coef / (1.0 - self.gamma))
@@ -202,50 +200,45 @@ class MetaBatchSampler:
         """With the tasks' own rewards in the last ``n_foreign`` transitions of each."""
         if not n_foreign:
             return transitions
-        own = self._rewards(self.tasks[chosen], transitions.features[:, -n_foreign:])
         rewards = transitions.rewards.clone()
-        rewards[:, -n_foreign:] = own
+        rewards[:, -n_foreign:] = self._rewards(chosen, transitions.features[:, -n_foreign:])
         return transitions._replace(rewards=rewards)
 
-    def _rewards(self, tasks: np.ndarray, features: th.Tensor) -> th.Tensor:
+    def _rewards(self, chosen: np.ndarray, features: th.Tensor) -> th.Tensor:
         """Rewards (tasks, batch) of features (tasks, batch, feat_dim)."""
-        rewards = self.family.compute_rewards(tasks[:, None, :], features.cpu().numpy())
+        tasks = self.train_tasks.tasks[chosen][:, None, :]
+        rewards = self.family.compute_rewards(tasks, features.cpu().numpy())
         return th.as_tensor(rewards, dtype=th.float32, device=self.device)
 
     def contexts(self, task_ids: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """``context_size`` transitions of the last epoch for each task, and their rewards."""
-        transitions, rewards = self.context.transitions, self.context.rewards
+        transitions, rewards = self.epoch_context.transitions, self.epoch_context.rewards
         steps = transitions.shape[1]
         shape = (len(task_ids), self.context_size)
         picks = th.randint(steps, shape, generator=self.generators.torch, device=self.device)
         relabels = self.context_relabel_fraction > 0
         sources = self._context_sources(task_ids) if relabels else task_ids[:, None]
         rows = (sources * steps + picks).view(-1)
-        context = transitions.view(-1, transitions.shape[-1]).index_select(0, rows).view(*shape, -1)
-        features = self.context.features
+
+        def picked(values: th.Tensor) -> th.Tensor:
+            return values.flatten(0, 1).index_select(0, rows).view(*shape, *values.shape[2:])
+
+        context, features = picked(transitions), self.epoch_context.features
         if features is None:
-            return context, rewards.view(-1).index_select(0, rows).view(shape)
-        chosen = features.view(len(rewards) * steps, -1).index_select(0, rows).view(*shape, -1)
-        own = self._rewards(self.tasks[task_ids.cpu().numpy()], chosen)
-        centre, deviation = self._reward_statistics
+            return context, picked(rewards)
+        own = self._rewards(task_ids.cpu().numpy(), picked(features))
+        centre, deviation = self.context_reward_statistics
         context[..., -1] = (own - centre) / deviation
         return context, own
-
-    @cached_property
-    def _reward_statistics(self) -> tuple[float, float]:
-        """Mean and deviation by which rewards in contexts are standardised."""
-        rewards = self.context.rewards
-        return float(rewards.mean()), max(float(rewards.std()), RunningNorm.MIN_STD)
 
     def _context_sources(self, task_ids: th.Tensor) -> th.Tensor:
         """Whose transitions a context holds, (tasks, context_size): the task's own, or for
         ``context_relabel_fraction`` of the contexts a mixture of those of two random tasks.
         """
         generator, device, n = self.generators.torch, self.device, len(task_ids)
-        n_tasks, picked = len(self.tasks), (n, self.context_size)
+        n_tasks, picked = len(self.train_tasks), (n, self.context_size)
         pool = th.randint(n_tasks, (n, FOREIGN_SOURCES), generator=generator, device=device)
         picks = th.randint(FOREIGN_SOURCES, picked, generator=generator, device=device)
-        foreign = (
-            th.rand((n, 1), generator=generator, device=device) < self.context_relabel_fraction
-        )
+        uniform = th.rand((n, 1), generator=generator, device=device)
+        foreign = uniform < self.context_relabel_fraction
         return th.where(foreign, pool.gather(1, picks), task_ids[:, None])

@@ -2,7 +2,8 @@
 folders.
 
 A checkpoint holds all of a training run, so that it continues bit for bit. A pretrained folder
-holds safetensors, JSON and a model card: nothing in it can run code.
+holds safetensors, JSON and a model card: nothing in it can run code. A model is a PEARLSAC here, or
+of a subclass.
 """
 
 import inspect
@@ -13,7 +14,7 @@ import math
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 import torch as th
@@ -21,6 +22,7 @@ from gymnasium import spaces
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as tensors_to_bytes
+from stable_baselines3 import SAC
 from stable_baselines3.common.save_util import load_from_zip_file
 from torch import nn
 
@@ -28,14 +30,16 @@ from sb3_poem.common.buffers import ContextStore, TaskReplayBuffer
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.files import write_atomically
 from sb3_poem.common.foreign import check_env_id
-from sb3_poem.pearl_sac.policies import LatentPolicy
+from sb3_poem.pearl_sac.policies import DEFAULT_NET_ARCH
 from sb3_poem.pearl_sac.train_tasks import TrainTasks
-from sb3_poem.pearl_sac.updater import EntropyCoefficient
 from sb3_poem.resources import find_folder, pretrained_names
 
 CHECKPOINT_FORMAT = "sb3_poem checkpoint 2"
 FORMAT = "sb3_poem pretrained 2"
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
+#: What a configuration holds of a model, as it is, and of its policy
+FACTS = ("env_id", "env_kwargs", "reward_feature_dim", "num_timesteps", "n_envs")
+POLICY_FACTS = ("net_arch", "layer_norm", "n_critics", "optimizer_kwargs")
 SPACES = ("observation_space", "action_space", "task_space")
 ARRAYS = {
     "train_tasks": "tasks",
@@ -62,40 +66,7 @@ LARGEST = {
 }
 LARGEST_OF_OTHERS = 1_000_000
 
-
-class SavedModel(Protocol):
-    """What is saved of a model."""
-
-    policy: LatentPolicy
-    train_tasks: TrainTasks
-    observation_space: spaces.Box
-    action_space: spaces.Box
-    task_space: spaces.Box
-    algorithm: str
-    env_id: str | None
-    env_kwargs: Mapping[str, Any]
-    reward_feature_dim: int
-    predicted_rewards_error: float
-    context_reward_statistics: tuple[float, float] | None
-    num_timesteps: int
-    n_envs: int
-    latent_dim: int
-    learning_rate: Any
-    ent_coef: Any
-    target_entropy: Any
-    policy_class: Any
-    policy_kwargs: dict[str, Any]
-    _n_updates: int
-
-    @property
-    def entropy_coefficient(self) -> EntropyCoefficient: ...
-
-    def _complete_policy_kwargs(self) -> None: ...
-
-    def _setup_model(self) -> None: ...
-
-
-Model = TypeVar("Model", bound=SavedModel)
+Model = TypeVar("Model", bound=SAC)
 
 
 def kept_arguments(algorithm: type) -> list[str]:
@@ -112,40 +83,34 @@ def read_archive(
 ) -> dict[str, Any]:
     """The attributes in a zip that ``save`` wrote.
 
-    :param algorithm: Whose zip it must be
     :param changes: Arguments of the constructor that shall differ
     :raises ValueError: if it is a folder, the file is truncated or holds another algorithm's model,
         or a change is of what the networks are
     """
     if not isinstance(path, io.BufferedIOBase):
-        _check_is_file(Path(path), algorithm)
+        _check_is_file(Path(path), algorithm.__name__)
     try:
         data, _, _ = load_from_zip_file(path, device="cpu", load_data=True)
+        if data is None:
+            raise ValueError("it holds no data of a model")
     except (zipfile.BadZipFile, RuntimeError, EOFError, ValueError) as error:
-        raise ValueError(
-            f"{path} is truncated, or no model saved by {algorithm.__name__}: {error}"
-        ) from error
-    if data is None:
-        raise ValueError(
-            f"{path} is truncated, or no model saved by {algorithm.__name__}: it holds no data of a model"
-        )
+        name = algorithm.__name__
+        raise ValueError(f"{path} is truncated, or no model saved by {name}: {error}") from error
     if data.get("algorithm") != algorithm.__name__:
         raise ValueError(f"{path} holds a model of another algorithm, not of {algorithm.__name__}")
     if isinstance(path, io.BufferedIOBase):
         path.seek(0)
     found = {**data, "n_train_tasks": len(data["train_tasks"])}
     for name, value in changes.items():
-        fixed = name in FIXED or (name == "n_train_tasks" and value is not None)
+        fixed, why = name in FIXED or (name == "n_train_tasks" and value is not None), ""
+        if name == "ent_coef":
+            learned = [str(coef).startswith("auto") for coef in (value, found[name])]
+            fixed = learned[0] != learned[1]
+            why = ": a coefficient that is learned stays one, as does a fixed one"
         if fixed and value != found.get(name):
             raise ValueError(
-                f"{name} is {found.get(name)!r} in {path}, and cannot become {value!r}"
+                f"{name} is {found.get(name)!r} in {path}, and cannot become {value!r}{why}"
             )
-    learns = str(data["ent_coef"]).startswith("auto")
-    if "ent_coef" in changes and str(changes["ent_coef"]).startswith("auto") != learns:
-        raise ValueError(
-            f"ent_coef is {data['ent_coef']!r} in {path}, and cannot become {changes['ent_coef']!r}: a "
-            "coefficient that is learned stays one, as does a fixed one"
-        )
     return data
 
 
@@ -153,30 +118,25 @@ def algorithm_of(archive: Path) -> str:
     """Name of the class whose model a zip holds; empty where that cannot be told."""
     try:
         with zipfile.ZipFile(archive) as file:
-            name = json.loads(file.read("data")).get("algorithm")
+            return str(json.loads(file.read("data")).get("algorithm"))
     except (zipfile.BadZipFile, KeyError, ValueError, AttributeError):
         return ""
-    return str(name)
 
 
-def _check_is_file(path: Path, algorithm: type) -> None:
-    """:raises ValueError: if it is a checkpoint, a folder or a shipped model's name, for which there
-    are other methods
+def _check_is_file(path: Path, algorithm: str) -> None:
+    """:raises ValueError: if it is a checkpoint, a folder or a shipped model's name, which other
+    methods read
     """
+    what, method = "", "from_pretrained"
     if path.is_file():
         if is_checkpoint(path):
-            raise ValueError(
-                f"{path} is a checkpoint: use {algorithm.__name__}.load_checkpoint({str(path)!r})"
-            )
-        return
-    if not path.is_dir() and path.with_name(f"{path.name}.zip").is_file():
-        return
-    is_shipped = not path.exists() and str(path) in pretrained_names()
-    if path.is_dir() or is_shipped:
-        what = "the name of a model that ships" if is_shipped else "a folder"
-        raise ValueError(
-            f"{path} is {what}: use {algorithm.__name__}.from_pretrained({str(path)!r})"
-        )
+            what, method = "a checkpoint", "load_checkpoint"
+    elif path.is_dir():
+        what = "a folder"
+    elif not path.with_name(f"{path.name}.zip").is_file() and str(path) in pretrained_names():
+        what = "the name of a model that ships"
+    if what:
+        raise ValueError(f"{path} is {what}: use {algorithm}.{method}({str(path)!r})")
 
 
 # ---------------------------------------------------------------------- checkpoints
@@ -195,14 +155,13 @@ def write_checkpoint(
     :param archive: What the model's ``save`` writes
     :raises OSError: if it cannot be written; a previous checkpoint stays whole
     """
+    stored, kept = replay_buffer.state(), {} if context is None else vars(context)
     state: dict[str, Any] = {
         "format": CHECKPOINT_FORMAT,
         "algorithm": algorithm,
         "model": th.frombuffer(bytearray(archive), dtype=th.uint8),
-        "replay_buffer": {
-            name: th.as_tensor(value).cpu() for name, value in replay_buffer.state().items()
-        },
-        "context": None if context is None else _tensors(context),
+        "replay_buffer": {name: th.as_tensor(value).cpu() for name, value in stored.items()},
+        "context": {name: value.cpu() for name, value in kept.items() if value is not None},
     }
 
     def write(file: BinaryIO) -> None:
@@ -215,10 +174,6 @@ def write_checkpoint(
             raise
 
     write_atomically(path, write)
-
-
-def _tensors(context: ContextStore) -> dict[str, th.Tensor]:
-    return {name: value.cpu() for name, value in vars(context).items() if value is not None}
 
 
 def read_checkpoint(path: str | Path, algorithm: str | None = None) -> dict[str, Any]:
@@ -238,10 +193,9 @@ def read_checkpoint(path: str | Path, algorithm: str | None = None) -> dict[str,
         raise ValueError(
             f"{path} is no checkpoint of this version of sb3_poem (expected {CHECKPOINT_FORMAT!r})"
         )
-    if algorithm not in (None, state["algorithm"]):
-        raise ValueError(
-            f"{path} holds a {state['algorithm']}; load it with {state['algorithm']}.load_checkpoint"
-        )
+    found = state["algorithm"]
+    if algorithm not in (None, found):
+        raise ValueError(f"{path} holds a {found}; load it with {found}.load_checkpoint")
     return state
 
 
@@ -252,21 +206,16 @@ def is_checkpoint(path: str | Path) -> bool:
     with zipfile.ZipFile(path) as archive:
         entries = archive.infolist()
     # a model's file that is cut short may end with one of its parts, which looks the same
-    return (
-        any(Path(entry.filename).name == "data.pkl" for entry in entries)
-        and entries[0].header_offset == 0
-    )
+    pickled = any(Path(entry.filename).name == "data.pkl" for entry in entries)
+    return pickled and entries[0].header_offset == 0
 
 
 # ---------------------------------------------------------------------- pretrained folders
 
 
-def save_pretrained(
-    model: SavedModel, folder: str | Path, card: dict[str, Any] | None = None
-) -> None:
+def save_pretrained(model: Any, folder: str | Path, card: dict[str, Any] | None = None) -> None:
     """Write a model so that :func:`from_pretrained` can read it.
 
-    :param model: A trained model
     :param folder: Where; made if missing
     :param card: What the card should say: ``command``, ``seed``, ``commit``, ``machine``, ``note``,
         ``results``: any JSON
@@ -274,7 +223,6 @@ def save_pretrained(
     :raises ValueError: if the policy's activation is none of torch.nn's or its optimiser none of
         torch.optim's, which JSON could not name
     """
-    folder = Path(folder)
     config, tensors = model_contents(model, card)
     contents = {  # all made before the first is written
         WEIGHTS: tensors_to_bytes(tensors),
@@ -282,82 +230,58 @@ def save_pretrained(
         CARD: _card_text(config).encode(),
     }
     for name, content in contents.items():
-        write_atomically(folder / name, content)
+        write_atomically(Path(folder) / name, content)
 
 
 def model_contents(
-    model: SavedModel, card: dict[str, Any] | None = None
+    model: Any, card: dict[str, Any] | None = None
 ) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
-    """What a model is made of, from which :func:`build_model` makes it again.
+    """What a model is made of, from which :func:`build_model` makes it again: its configuration,
+    which :func:`config_text` writes, and its tensors by name.
 
-    :param model: A trained model
-    :param card: See :func:`save_pretrained`
-    :return: Its configuration, which :func:`config_text` writes, and its tensors by name
     :raises ValueError: see :func:`save_pretrained`
     """
-    activation, optimizer = model.policy.activation_fn, model.policy.optimizer_class
-    for argument, value, module in (
-        ("activation_fn", activation, nn),
-        ("optimizer_class", optimizer, th.optim),
-    ):
+    policy, error = model.policy, model.predicted_rewards_error
+    classes = {"activation_fn": nn, "optimizer_class": th.optim}
+    for argument, module in classes.items():
+        value = getattr(policy, argument)
         if getattr(module, value.__name__, None) is not value:
             raise ValueError(
                 f"{argument} must be one of {module.__name__} to be saved by its name, got {value}"
             )
-    error = model.predicted_rewards_error
-    tensors = {
-        f"policy.{name}": value
-        for name, value in model.policy.state_dict().items()
-        if not name.startswith(DERIVED)
-    }
-    tensors |= {
-        name: th.as_tensor(getattr(model.train_tasks, field)) for name, field in ARRAYS.items()
-    }
+    state, found = policy.state_dict(), [(name, getattr(model, name)) for name in SPACES]
+    tensors = {f"policy.{name}": state[name] for name in state if not name.startswith(DERIVED)}
+    arrays = {name: getattr(model.train_tasks, field) for name, field in ARRAYS.items()}
+    arrays |= {f"{name}.low": space.low for name, space in found}
+    arrays |= {f"{name}.high": space.high for name, space in found}
+    tensors |= {name: th.as_tensor(value) for name, value in arrays.items()}
     config: dict[str, Any] = {
         "format": FORMAT,
         "algorithm": model.algorithm,
-        "env_id": model.env_id,
-        "env_kwargs": dict(model.env_kwargs),
+        **{name: getattr(model, name) for name in FACTS},
+        "n_updates": model._n_updates,
         "arguments": _arguments(model),
-        "net_arch": model.policy.net_arch,
-        "activation_fn": activation.__name__,
-        "optimizer_class": optimizer.__name__,
-        "optimizer_kwargs": model.policy.optimizer_kwargs,
-        "layer_norm": model.policy.layer_norm,
-        "n_critics": model.policy.n_critics,
-        "reward_feature_dim": model.reward_feature_dim,
+        **{name: getattr(policy, name) for name in POLICY_FACTS},
+        **{name: getattr(policy, name).__name__ for name in classes},
         "predicted_rewards_error": None if np.isnan(error) else error,  # NaN is no JSON
         "context_reward_statistics": model.context_reward_statistics,
-        "num_timesteps": model.num_timesteps,
-        "n_updates": model._n_updates,
-        "n_envs": model.n_envs,
         "card": card or {},
+        **{name: {"dtype": str(space.dtype)} for name, space in found},
     }
-    for name in SPACES:
-        space = getattr(model, name)
-        tensors[f"{name}.low"], tensors[f"{name}.high"] = (
-            th.as_tensor(space.low),
-            th.as_tensor(space.high),
-        )
-        config[name] = {"dtype": str(space.dtype)}
     return config, {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
 
 
 def config_text(config: dict[str, Any]) -> str:
-    """A configuration as JSON.
-
-    :param config: What :func:`model_contents` gave
-    """
+    """A configuration as JSON."""
     return json.dumps(config, indent=2, default=_to_json)
 
 
-def _arguments(model: SavedModel) -> dict[str, Any]:
+def _arguments(model: Any) -> dict[str, Any]:
     """Arguments of the constructor with which training goes on as it stopped; a schedule's place
     takes its default.
     """
-    arguments = {name: getattr(model, name) for name in kept_arguments(type(model))}
-    arguments["target_entropy"] = model.target_entropy
-    arguments["ent_coef"] = model.ent_coef
+    names = [*kept_arguments(type(model)), "target_entropy", "ent_coef"]
+    arguments = {name: getattr(model, name) for name in names}
     coefficient = model.entropy_coefficient
     if coefficient.optimizer is not None:
         arguments["ent_coef"] = f"auto_{coefficient.value.item():.9g}"
@@ -373,32 +297,24 @@ def _to_json(value: Any) -> Any:
 
 
 def _card_text(config: dict[str, Any]) -> str:
-    card = config["card"]
-    lines = [
-        f"# {config['algorithm']} on `{config['env_id']}`",
-        "",
-        f"Trained with sb3_poem for {config['num_timesteps']:,} environment steps and {config['n_updates']:,} gradient steps.",
-        "",
-        "```python",
-        f"model = sb3_poem.{config['algorithm']}.from_pretrained(<this folder>)",
-        "```",
-        "",
-    ]
-    for key in ("command", "seed", "commit", "machine"):
-        if key in card:
-            lines.append(f"- {key}: `{card[key]}`")
+    card, algorithm = config["card"], config["algorithm"]
+    steps, updates = config["num_timesteps"], config["n_updates"]
+    text = f"""# {algorithm} on `{config["env_id"]}`
+
+Trained with sb3_poem for {steps:,} environment steps and {updates:,} gradient steps.
+
+```python
+model = sb3_poem.{algorithm}.from_pretrained(<this folder>)
+```
+
+"""
+    known = [key for key in ("command", "seed", "commit", "machine") if key in card]
+    text += "".join(f"- {key}: `{card[key]}`\n" for key in known)
     if "note" in card:
-        lines.append(f"- {card['note']}")
+        text += f"- {card['note']}\n"
     if "results" in card:
-        lines += [
-            "",
-            "Results:",
-            "",
-            "```json",
-            json.dumps(card["results"], indent=2, default=_to_json),
-            "```",
-        ]
-    return "\n".join(lines) + "\n"
+        text += f"\nResults:\n\n```json\n{config_text(card['results'])}\n```\n"
+    return text
 
 
 def read_config(folder: str | Path) -> dict[str, Any]:
@@ -424,20 +340,17 @@ def parse_config(text: str | bytes, source: str) -> dict[str, Any]:
     try:
         config = json.loads(text)
     except (ValueError, RecursionError) as error:  # of thousands of brackets
-        raise ValueError(
-            f"{source} is truncated, or no configuration of sb3_poem: {error}"
-        ) from error
+        what = f"truncated, or no configuration of sb3_poem: {error}"
+        raise ValueError(f"{source} is {what}") from error
     found = config.get("format") if isinstance(config, dict) else None
     if found != FORMAT:
-        raise ValueError(
-            f"{source} is not of this version of sb3_poem: its format is {found!r}, expected {FORMAT!r}"
-        )
+        what = f"its format is {found!r}, expected {FORMAT!r}"
+        raise ValueError(f"{source} is not of this version of sb3_poem: {what}")
     check_env_id(config.get("env_id"), source)
     for name in ("env_kwargs", "arguments", "card"):
         if not isinstance(config.get(name), dict):
-            raise ValueError(
-                f"{source}: {name} must be an object, but is a {type(config.get(name)).__name__}"
-            )
+            kind = type(config.get(name)).__name__
+            raise ValueError(f"{source}: {name} must be an object, but is a {kind}")
     if not isinstance(config.get("algorithm"), str):
         raise ValueError(f"{source} names no algorithm")
     return config
@@ -446,19 +359,15 @@ def parse_config(text: str | bytes, source: str) -> dict[str, Any]:
 def from_pretrained(algorithm: type[Model], folder: str | Path, device: th.device | str) -> Model:
     """Read a model that :func:`save_pretrained` wrote.
 
-    :param algorithm: Class of the model
     :param folder: The folder, or the name of a model that ships
-    :param device: "auto", "cpu", "cuda"
     :raises FileNotFoundError: if the folder does not hold a model
     :raises ValueError: if a file is truncated or foreign, or the model is of another algorithm
     """
     folder = find_folder(folder)
-    config = read_config(folder)
-    if config["algorithm"] != algorithm.__name__:
-        raise ValueError(
-            f"{folder} holds a {config['algorithm']}; load it with {config['algorithm']}.from_pretrained"
-        )
-    weights = folder / WEIGHTS
+    config, weights = read_config(folder), folder / WEIGHTS
+    found = config["algorithm"]
+    if found != algorithm.__name__:
+        raise ValueError(f"{folder} holds a {found}; load it with {found}.from_pretrained")
     try:
         tensors = load_tensors(weights.read_bytes())
     except SafetensorError as error:
@@ -478,134 +387,99 @@ def build_model(
     No memory is taken for networks before the configuration has been found to agree with the
     tensors.
 
-    :param algorithm: Class of the model
-    :param config: Its configuration
     :param source: Where they come from, for the message
-    :param device: "auto", "cpu", "cuda"
     :raises ValueError: if something is missing, does not fit, or is out of all proportion
     """
     try:
         _check_numbers(algorithm, config, tensors)
         make: Any = algorithm  # without an environment
-        model: Model = make(
-            "MlpPolicy", None, device=device, _init_setup_model=False, **config["arguments"]
-        )
+        arguments = {**config["arguments"], "device": device, "_init_setup_model": False}
+        model = make("MlpPolicy", None, **arguments)
         for name in SPACES:
             low, high = tensors[f"{name}.low"].numpy(), tensors[f"{name}.high"].numpy()
             setattr(model, name, spaces.Box(low, high, dtype=np.dtype(config[name]["dtype"]).type))
-        model.train_tasks = TrainTasks(
-            **{field: tensors[name].numpy() for name, field in ARRAYS.items()}
-        )
-        for name in ("env_id", "env_kwargs", "reward_feature_dim", "num_timesteps", "n_envs"):
+        arrays = {field: tensors[name].numpy() for name, field in ARRAYS.items()}
+        model.train_tasks = TrainTasks(**arrays)
+        for name in FACTS:
             setattr(model, name, config[name])
-        error = config["predicted_rewards_error"]
-        model.predicted_rewards_error = float("nan") if error is None else error
+        model._n_updates = config["n_updates"]
+        if config["predicted_rewards_error"] is not None:
+            model.predicted_rewards_error = config["predicted_rewards_error"]
         if config["context_reward_statistics"] is not None:
             model.context_reward_statistics = tuple(config["context_reward_statistics"])
-        model._n_updates = config["n_updates"]
         if model.target_entropy == "auto":  # which SAC would look up in the environment
             model.target_entropy = -float(np.prod(model.action_space.shape))
-        model.policy_kwargs |= {
-            name: config[name] for name in ("net_arch", "layer_norm", "n_critics")
-        }
-        model.policy_kwargs["activation_fn"] = _named(nn, config["activation_fn"], nn.Module)
-        model.policy_kwargs["optimizer_class"] = _named(
-            th.optim, config["optimizer_class"], th.optim.Optimizer
-        )
-        model.policy_kwargs["optimizer_kwargs"] = config["optimizer_kwargs"]
+        model.policy_kwargs |= {name: config[name] for name in POLICY_FACTS}
+        for name, module, base in (
+            ("activation_fn", nn, nn.Module),
+            ("optimizer_class", th.optim, th.optim.Optimizer),
+        ):
+            kind = getattr(module, config[name], None)
+            if not (isinstance(kind, type) and issubclass(kind, base)):
+                raise ValueError(f"{config[name]!r} is no {base.__name__} of {module.__name__}")
+            model.policy_kwargs[name] = kind
         _check_shapes(model, tensors)
         model._setup_model()
-        state = {
-            name.removeprefix("policy."): value
-            for name, value in tensors.items()
-            if name.startswith("policy.")
-        }
-        state |= {
-            f"{DERIVED}{name.removeprefix('critic.')}": v
-            for name, v in state.items()
-            if name.startswith("critic.")
-        }
+        of_policy = [name for name in tensors if name.startswith("policy.")]
+        state = {name.removeprefix("policy."): tensors[name] for name in of_policy}
+        critics = [name for name in state if name.startswith("critic.")]
+        state |= {DERIVED + name.removeprefix("critic."): state[name] for name in critics}
         model.policy.load_state_dict(state)
     except Exception as error:  # what foreign data may raise is no closed list
-        raise ValueError(
-            f"{source} does not hold a complete {algorithm.__name__}: {error}"
-        ) from error
+        what = f"does not hold a complete {algorithm.__name__}: {error}"
+        raise ValueError(f"{source} {what}") from error
     return model
-
-
-def _named(module: Any, name: str, base: type) -> Any:
-    found = getattr(module, name, None)
-    if not (isinstance(found, type) and issubclass(found, base)):
-        raise ValueError(f"{name!r} is no {base.__name__} of {module.__name__}")
-    return found
 
 
 def _check_numbers(algorithm: type, config: dict[str, Any], tensors: dict[str, th.Tensor]) -> None:
     """Refuse arguments that no model is saved with, and numbers of another size than a model's."""
-    parameters = inspect.signature(algorithm).parameters
-    for name, value in config["arguments"].items():
+    parameters, arguments = inspect.signature(algorithm).parameters, config["arguments"]
+    for name, value in arguments.items():
         if name not in (*kept_arguments(algorithm), *LEARNED):
             raise ValueError(f"`{name}` is no argument that a model is saved with")
         if type(parameters[name].default) is int or (name in LARGEST and value is not None):
             check_whole(name, value, -1, LARGEST.get(name, LARGEST_OF_OTHERS))
         elif isinstance(value, float) and not math.isfinite(value):
             raise ValueError(f"`{name}` must be finite, but is {value}")
-    n_tasks = len(tensors["train_tasks"])
-    if config["arguments"].get("n_train_tasks") not in (None, n_tasks):
-        raise ValueError(
-            f"`n_train_tasks` is {config['arguments']['n_train_tasks']}, but there are {n_tasks} train_tasks"
-        )
-    for name, least in (
-        ("n_envs", 1),
-        ("reward_feature_dim", 1),
-        ("num_timesteps", 0),
-        ("n_updates", 0),
-        ("n_critics", 1),
+    expected, n_tasks = arguments.get("n_train_tasks"), len(tensors["train_tasks"])
+    if expected not in (None, n_tasks):
+        raise ValueError(f"`n_train_tasks` is {expected}, but there are {n_tasks} train_tasks")
+    for name, least in zip(
+        ("n_envs", "reward_feature_dim", "n_critics", "num_timesteps", "n_updates"),
+        (1, 1, 1, 0, 0),
+        strict=True,
     ):
         check_whole(name, config[name], least, LARGEST.get(name))
     arch = config["net_arch"]
-    if (
-        not isinstance(arch, dict)
-        or not {"pi", "qf", "encoder", "decoder", "embedding"} <= arch.keys()
-    ):
-        raise ValueError(
-            f"net_arch must have the widths of pi, qf, encoder, decoder and embedding, but is {str(arch)[:60]}"
-        )
+    if not isinstance(arch, dict) or not DEFAULT_NET_ARCH.keys() <= arch.keys():
+        names = ", ".join(DEFAULT_NET_ARCH)
+        raise ValueError(f"net_arch must have the widths of {names}, but is {str(arch)[:60]}")
     for width in itertools.chain(*arch.values()):
         check_whole("net_arch", width, 1)
     n_layers = sum(map(len, arch.values())) + config["n_critics"] * (len(arch["qf"]) + 1)
     if n_layers > len(tensors):
-        raise ValueError(
-            f"net_arch and n_critics ask for {n_layers} layers, but there are {len(tensors)} tensors"
-        )
+        asked = f"net_arch and n_critics ask for {n_layers} layers"
+        raise ValueError(f"{asked}, but there are {len(tensors)} tensors")
 
 
-def _check_shapes(model: SavedModel, tensors: dict[str, th.Tensor]) -> None:
+def _check_shapes(model: Any, tensors: dict[str, th.Tensor]) -> None:
     """Refuse tensors of other shapes than the configured networks', of which an outline is made."""
     model._complete_policy_kwargs()
-    arguments = {
-        **model.policy_kwargs,
-        "optimizer_kwargs": {},
-    }  # a fused one does not take outlines
+    # a fused optimiser does not take outlines
+    arguments = {**model.policy_kwargs, "optimizer_kwargs": {}}
+    policy_class, action_space = model.policy_class, model.action_space
     with th.device("meta"):
-        outline = model.policy_class(
-            model.observation_space, model.action_space, lambda _: 0.0, **arguments
-        )
+        outline = policy_class(model.observation_space, action_space, lambda _: 0.0, **arguments)
     latents = (len(tensors["train_tasks"]), model.latent_dim)
-    expected = {
-        "train_tasks": (latents[0], *model.task_space.shape),
-        "latent_means": latents,
-        "latent_variances": latents,
-    }
-    state = outline.state_dict().items()
-    expected |= {
-        f"policy.{name}": tuple(value.shape)
-        for name, value in state
-        if not name.startswith(DERIVED)
-    }
+    expected = {"train_tasks": (latents[0], *model.task_space.shape)}
+    expected |= {"latent_means": latents, "latent_variances": latents}
+    for name, value in outline.state_dict().items():
+        if not name.startswith(DERIVED):
+            expected[f"policy.{name}"] = tuple(value.shape)
     for name, shape in expected.items():
         found = tuple(tensors[name].shape) if name in tensors else "missing"
         if found != shape:
             raise ValueError(
-                f"net_arch, latent_dim and the spaces make the tensor {name} {shape}, but it is {found}"
+                "net_arch, latent_dim and the spaces make the tensor "
+                f"{name} {shape}, but it is {found}"
             )

@@ -17,11 +17,8 @@ def default_train_tasks(all_tasks: np.ndarray | None) -> int:
 
 @dataclass(eq=False)
 class TrainTasks:
-    """Training tasks with the posterior of each one's latent, a Gaussian.
-
-    :param tasks: (n, task_dim)
-    :param latent_means: (n, latent_dim)
-    :param latent_variances: (n, latent_dim)
+    """Training tasks (n, task_dim) with the posterior of each one's latent, a Gaussian: means and
+    variances, (n, latent_dim).
     """
 
     tasks: np.ndarray
@@ -44,10 +41,11 @@ class TrainTasks:
         :raises ValueError: if a finite family has fewer
         """
         count = default_train_tasks(family.all_tasks) if n is None else n
-        if family.all_tasks is not None and count > len(family.all_tasks):
+        most = np.inf if family.all_tasks is None else len(family.all_tasks)
+        if count > most:
             raise ValueError(
-                f"n_train_tasks is {count}, but {family.env_id} is a finite family of "
-                f"{len(family.all_tasks)} tasks; use at most {len(family.all_tasks)}, or None for all"
+                f"n_train_tasks is {count}, but {family.env_id} is a finite family of {most} "
+                f"tasks; use at most {most}, or None for all"
             )
         return cls.of_prior(family.sample_tasks(count, rng), latent_dim)
 
@@ -71,16 +69,15 @@ class TrainTasks:
             covered but untrained regions are not
         :raises ValueError: for another source
         """
+        means = self.latent_means
         if source == "prior":
-            return rng.standard_normal((n, self.latent_means.shape[1]))
+            return rng.standard_normal((n, means.shape[1]))
         if source != "aggregate":
             raise ValueError(f'source must be "prior" or "aggregate", got {source!r}')
-        means = self.latent_means
         chosen = rng.integers(len(means), size=n)
         draws = means[chosen]
-        n_neighbours = min(
-            AGGREGATE_NEIGHBOURS, len(means) // 4
-        )  # few tasks have nothing in between
+        # few tasks have nothing in between
+        n_neighbours = min(AGGREGATE_NEIGHBOURS, len(means) // 4)
         if n_neighbours:
             distances = ((means[:, None, :] - means[None, :, :]) ** 2).sum(axis=2)
             picks = rng.integers(1, n_neighbours + 1, size=n)
@@ -90,7 +87,7 @@ class TrainTasks:
 
     @property
     def aggregate_to_prior_kl(self) -> float:
-        """How far the aggregate posterior is from N(0, I): KL of its moment-matched Gaussian, nats."""
+        """KL of the aggregate posterior (the Gaussian of its moments) to N(0, I), nats."""
         mean = self.latent_means.mean(axis=0)
         second = self.latent_variances.mean(axis=0) + self.latent_means.var(axis=0)
         return 0.5 * float((mean**2 + second - 1.0 - np.log(second)).sum())

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import partial
-from types import TracebackType
 from typing import Any
 
 import torch as th
@@ -10,9 +9,9 @@ from torch import nn
 
 from sb3_poem.common.precision import MixedPrecision
 from sb3_poem.pearl_sac.cuda_graph import GraphedStep, Step, prepare_optimizers
-from sb3_poem.pearl_sac.losses import MetaBatch
 from sb3_poem.pearl_sac.objective import Metrics, Objective
 from sb3_poem.pearl_sac.policies import LatentPolicy
+from sb3_poem.pearl_sac.sampler import MetaBatch
 
 
 @dataclass
@@ -48,64 +47,43 @@ class EntropyCoefficient:
             self.optimizer.step()
 
 
+@dataclass
 class Updater:
     """Changes the networks, one meta-batch at a time. Use it as a context, in which hidden layers
-    compute in ``dtype``.
+    compute in ``hidden_dtype``. Fields that are not described are PEARLSAC's.
 
-    :param policy: The networks
     :param objective: What is minimised
-    :param entropy: The entropy coefficient
-    :param dtype: Of the hidden layers' arithmetic
-    :param tau: Soft update coefficient of the target critics
-    :param target_update_interval: Steps between updates of the target critics
-    :param policy_delay: Steps of critics and encoder for each of everything else
     :param n_updates: Steps that the networks have had
     """
 
-    def __init__(
-        self,
-        policy: LatentPolicy,
-        objective: Objective,
-        entropy: EntropyCoefficient,
-        dtype: th.dtype,
-        tau: float,
-        target_update_interval: int,
-        policy_delay: int,
-        n_updates: int,
-    ) -> None:
-        self.policy, self.objective, self.entropy = policy, objective, entropy
-        self.tau, self.target_update_interval, self.policy_delay = (
-            tau,
-            target_update_interval,
-            policy_delay,
-        )
-        self.n_updates = n_updates
-        prepare_optimizers([policy.optimizer, *entropy.optimizers], policy.device)
-        learning = [
-            policy.encoder,
-            policy.decoder,
-            policy.actor,
-            policy.critic,
-            policy.critic_target,
-        ]
-        self._precision = MixedPrecision(nn.ModuleList(learning), dtype)
-        self._steps: dict[bool, Step] = {
-            whole: partial(self._step, whole) for whole in (True, False)
-        }
-        if policy.device.type == "cuda" and target_update_interval == 1:
+    policy: LatentPolicy
+    objective: Objective
+    entropy_coefficient: EntropyCoefficient
+    hidden_dtype: th.dtype
+    tau: float
+    target_update_interval: int
+    policy_delay: int
+    n_updates: int
+
+    def __post_init__(self) -> None:
+        policy, on_gpu = self.policy, self.policy.device.type == "cuda"
+        optimizers = [policy.optimizer, *self.entropy_coefficient.optimizers]
+        prepare_optimizers(optimizers, policy.device)
+        learning = [policy.encoder, policy.decoder, policy.actor]
+        learning += [policy.critic, policy.critic_target]
+        self._precision = MixedPrecision(nn.ModuleList(learning), self.hidden_dtype)
+        #: By whether everything learns
+        self._steps: dict[bool, Step]
+        self._steps = {whole: partial(self._step, whole) for whole in (True, False)}
+        if on_gpu and self.target_update_interval == 1:
             self._steps = {whole: GraphedStep(step) for whole, step in self._steps.items()}
 
     def __enter__(self) -> "Updater":
         self._precision.__enter__()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        where: TracebackType | None,
-    ) -> None:
-        self._precision.__exit__(kind, error, where)
+    def __exit__(self, *exception: Any) -> None:
+        self._precision.__exit__(*exception)
 
     def step(self, batch: MetaBatch) -> Metrics:
         """One step on a meta-batch: of everything or, in between, of critics and encoder. Returns
@@ -120,12 +98,16 @@ class Updater:
 
     def _step(self, whole: bool, batch: MetaBatch) -> Metrics:
         self._precision.refresh()
-        loss, metrics = self.objective.loss(batch, self.entropy.value, whole)
+        loss, metrics = self.objective.loss(batch, self.entropy_coefficient.value, whole)
         metrics["gradient_norm"] = self._descend(loss)
         if whole:
-            self.entropy.update(metrics["entropy"])
+            self.entropy_coefficient.update(metrics["entropy"])
         if self.n_updates % self.target_update_interval == 0:
-            self._update_targets()
+            targets, critics = self.policy.critic_target, self.policy.critic
+            with th.no_grad():
+                th._foreach_lerp_(
+                    tuple(targets.parameters()), tuple(critics.parameters()), self.tau
+                )
         return {name: value.detach() for name, value in metrics.items()}
 
     def _descend(self, loss: th.Tensor) -> th.Tensor:
@@ -140,7 +122,7 @@ class Updater:
         norm = nn.utils.get_total_norm(gradients, foreach=True) + 0.0 * loss.detach()
         if self.policy.device.type == "cpu":
             self.check_finite([norm], self.n_updates)
-        else:  # nobody waits for the device: it leaves out the step itself, and the block's end tells
+        else:  # nobody waits for the device: it leaves out the step, and the block's end tells
             optimizer.found_inf = (~th.isfinite(norm)).float()
         optimizer.step()
         return norm
@@ -157,8 +139,3 @@ class Updater:
                 f"{first + int(finite.int().argmin())}; no network was changed by it. "
                 "A lower learning_rate or reward_scale usually helps."
             )
-
-    def _update_targets(self) -> None:
-        targets = tuple(self.policy.critic_target.parameters())
-        with th.no_grad():
-            th._foreach_lerp_(targets, tuple(self.policy.critic.parameters()), self.tau)

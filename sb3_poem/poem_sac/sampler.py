@@ -1,6 +1,5 @@
 """Meta-batches of groups of tasks, within which returns are known."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,15 +12,15 @@ class GroupSampler(MetaBatchSampler):
     """Draws meta-batches of whole groups of tasks, where policies are compared within these only.
 
     :param groups: Indices of each group's tasks; empty where all policies are compared
-    :param group_size: Tasks that a group is to have
     """
 
-    groups: Sequence[np.ndarray] = ()
-    group_size: int = 1
+    groups: list[np.ndarray]
+    preference_group_size: int
 
     def choose_tasks(self) -> np.ndarray:
         if not len(self.groups):
             return super().choose_tasks()
-        count = max(1, min(self.meta_batch_size // self.group_size, len(self.groups)))
+        wanted = self.meta_batch_size // self.preference_group_size
+        count = max(1, min(wanted, len(self.groups)))
         chosen = self.generators.numpy.choice(len(self.groups), size=count, replace=False)
         return np.concatenate([self.groups[index] for index in chosen])

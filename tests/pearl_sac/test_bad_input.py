@@ -35,8 +35,8 @@ from poem_envs import TaskFamily
 from poem_envs.testing import check_task_family
 from sb3_poem import PEARLSAC, POEMSAC
 from sb3_poem.common.buffers import TaskBatch
+from sb3_poem.pearl_sac.arguments import UNSUPPORTED
 from sb3_poem.pearl_sac.policies import LatentPolicy
-from sb3_poem.pearl_sac.unsupported import UNSUPPORTED
 
 NAN = float("nan")
 FRACTIONS = ("gamma", "tau", "relabel_fraction", "shaping_coef", "mirror_fraction")
@@ -104,9 +104,9 @@ def test_arguments_of_both(
             "human",
             "preference_source must be one of 'auto', 'relabel', 'rollout', got 'human'",
         ),
-        ("preference_coef", -1.0, r"preference_coef must be at least 0, got -1\.0"),
-        ("preference_coef", NAN, "preference_coef must be at least 0, got nan"),
-        ("preference_group_size", 1, "preference_group_size must be at least 2, got 1"),
+        ("preference_coef", -1.0, r"`preference_coef` must be at least 0, but is -1\.0"),
+        ("preference_coef", NAN, "`preference_coef` must be a finite number, but is nan"),
+        ("preference_group_size", 1, "`preference_group_size` must be at least 2, but is 1"),
     ],
 )
 def test_arguments_of_poem(argument: str, value: Any, message: str) -> None:

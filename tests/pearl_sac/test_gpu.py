@@ -12,7 +12,7 @@ from meta_toys import EPOCH, POINT_GOAL, small
 
 from sb3_poem import PEARLSAC, POEMSAC, PreferenceAdapter, ReturnOracle
 from sb3_poem.pearl_sac import updater
-from sb3_poem.pearl_sac.losses import MetaBatch
+from sb3_poem.pearl_sac.sampler import MetaBatch
 
 pytestmark = [pytest.mark.gpu, pytest.mark.parametrize("algorithm", [PEARLSAC, POEMSAC])]
 

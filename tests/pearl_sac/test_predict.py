@@ -95,7 +95,7 @@ def test_actions_are_scaled_to_the_environment(algorithm: type[PEARLSAC]) -> Non
     model = small(algorithm, walks(2), horizon=10)
     latents = np.random.default_rng(1).normal(size=(6, 5))
     actions, _ = model.predict(OBS, state=latents, deterministic=True)
-    scaled = model.policy.act(OBS, latents)
+    scaled = model.policy.acting_on(latents)(OBS, None)
     np.testing.assert_allclose(actions, -2.0 + 3.0 * (scaled + 1.0), atol=1e-5)
     back = model.policy.scale_action_batch(th.as_tensor(actions))
     np.testing.assert_allclose(back.numpy(), scaled, atol=1e-6)

@@ -27,7 +27,7 @@ from sb3_poem.adaptation.bayes import BayesInference
 from sb3_poem.common.buffers import Segment, TaskBatch
 from sb3_poem.common.vec_env import TaskVecEnv
 from sb3_poem.pearl_sac.collector import EpochCollector
-from sb3_poem.pearl_sac.losses import TaskEmbeddings, actor_loss, kl_to_prior
+from sb3_poem.pearl_sac.objective import TaskEmbeddings, kl_to_prior
 from sb3_poem.poem_sac.objective import POEMObjective
 
 
@@ -431,9 +431,7 @@ def encoder_gradient(model: PEARLSAC, batch: Any, name: str) -> float:
     latents, kl = objective.encode(batch)
     embeddings, transitions = objective.embed(latents), objective.standardised(batch.transitions)
     losses = {
-        "actor": lambda: actor_loss(
-            model.policy, transitions, embeddings, alpha, batch.action_noise
-        )[0],
+        "actor": lambda: objective.actor_loss(batch, transitions, embeddings, alpha)[0],
         "decoder": lambda: objective.decoder_loss(batch, transitions, embeddings),
         "preference": lambda: objective.embedding_loss(batch, embeddings)[0],
         "critic": lambda: objective.critic_loss(batch, transitions, embeddings, alpha),
@@ -465,7 +463,7 @@ def test_the_actors_loss_does_not_train_the_critics() -> None:
     latents, _ = objective.encode(batch)
     model.policy.zero_grad()
     transitions, embeddings = objective.standardised(batch.transitions), objective.embed(latents)
-    actor_loss(model.policy, transitions, embeddings, th.ones(()), batch.action_noise)[0].backward()
+    objective.actor_loss(batch, transitions, embeddings, th.ones(()))[0].backward()
     assert all(parameter.grad is None for parameter in model.policy.critic.parameters())
     assert all(parameter.grad is None for parameter in model.policy.critic_target.parameters())
 

@@ -1,0 +1,142 @@
+"""Arguments of the algorithms: their ranges, and what SB3's SAC takes and these do not: why, and
+what to do instead.
+"""
+
+import difflib
+import inspect
+import warnings
+from collections.abc import Callable, Iterable, Mapping
+from itertools import takewhile
+from typing import Any
+
+import numpy as np
+import torch as th
+
+from sb3_poem.common.checks import check_number, check_number_or_auto, check_whole
+from sb3_poem.common.precision import hidden_dtype
+
+BY_NAME = inspect.Parameter.KEYWORD_ONLY
+
+#: The least of arguments that are whole numbers
+LEAST = {
+    **dict.fromkeys(("batch_size", "meta_batch_size", "context_size", "trajectories_per_task"), 1),
+    **dict.fromkeys(("latent_dim", "buffer_size", "target_update_interval", "n_steps"), 1),
+    **{"policy_delay": 1, "learning_starts": 0, "gradient_steps": -1},
+    **{"n_train_tasks": 1, "seed": 0},
+}
+#: Those of them that may be None
+OPTIONAL = ("n_train_tasks", "seed")
+#: The most of arguments that are numbers from 0 on
+MOST = {
+    **dict.fromkeys(("kl_coef", "reward_coef", "policy_coef", "noise_color"), np.inf),
+    **dict.fromkeys(("gamma", "tau", "shaping_coef", "mirror_fraction"), 1.0),
+    **dict.fromkeys(("relabel_fraction", "context_relabel_fraction"), 1.0),
+}
+
+_NOISE = "training explores by the policy's own noise; with noise_color=1 it keeps a direction"
+_BUFFER = (
+    "experience is kept for each training task, so that it can be relabelled for others, as HER "
+    "does for goals; see buffer_size, relabel_fraction, and poem_envs.GoalFamily for "
+    "goal-conditioned environments"
+)
+_FEATURES = "networks read flat observations; see net_arch, and put features into the observation"
+_WRAPPED = (
+    "it changes what is seen or paid, and rewards are computed for other tasks from what the "
+    "family itself gives; "
+)
+_DEVIATION = "the policy's deviation is learned, from 1 on; see ent_coef and target_entropy"
+
+#: Argument of SAC or of its policies, or key of rl_zoo3's files: why not, and what to do instead
+UNSUPPORTED = {
+    **dict.fromkeys(("action_noise", "noise_type", "noise_std"), _NOISE),
+    **dict.fromkeys(("use_sde", "sde_sample_freq", "use_sde_at_warmup"), _NOISE),
+    "train_freq": "an epoch is a rollout of every training task, then gradient steps; see "
+    "trajectories_per_task and gradient_steps",
+    "optimize_memory_usage": "relabelling needs all of a transition; a smaller buffer_size saves "
+    "memory",
+    **dict.fromkeys(("replay_buffer_class", "replay_buffer_kwargs"), _BUFFER),
+    **dict.fromkeys(("features_extractor_class", "features_extractor_kwargs"), _FEATURES),
+    **dict.fromkeys(("share_features_extractor", "normalize_images"), _FEATURES),
+    **dict.fromkeys(("env_wrapper", "vec_env_wrapper"), f"{_WRAPPED}write it into the family"),
+    "frame_stack": f"{_WRAPPED}write it into the family",
+    "normalize": f"{_WRAPPED}observations and rewards are standardised by the algorithm",
+    **dict.fromkeys(("log_std_init", "use_expln", "clip_mean"), _DEVIATION),
+}
+#: Arguments of the policy, which people give to the algorithm
+POLICY_ARGUMENTS = {
+    *("net_arch", "activation_fn", "layer_norm", "n_critics", "optimizer_class", "optimizer_kwargs")
+}
+
+
+def refuse_unsupported(names: Iterable[str], algorithm: str) -> None:
+    """:raises TypeError: at the first name of an argument that SAC takes and ours do not"""
+    for name in names:
+        if name in UNSUPPORTED:
+            raise TypeError(f"{algorithm} takes no {name!r}: {UNSUPPORTED[name]}")
+
+
+def refuse_unknown(names: Iterable[str], algorithm: type) -> None:
+    """:param names: Of arguments that the algorithm's constructor does not have
+    :raises TypeError: at the first; as :func:`refuse_unsupported`, or with a name like it
+    """
+    refuse_unsupported(names, algorithm.__name__)
+    for name in names:
+        if name in POLICY_ARGUMENTS:
+            instead = f"policy_kwargs: policy_kwargs=dict({name}=...)"
+            raise TypeError(f"{algorithm.__name__} takes {name!r} in {instead}")
+        close = difflib.get_close_matches(name, inspect.signature(algorithm).parameters, n=1)
+        hint = f"; did you mean {close[0]!r}?" if close else ""
+        raise TypeError(f"{algorithm.__name__} got an unexpected keyword argument {name!r}{hint}")
+
+
+def check_arguments(given: Mapping[str, Any], algorithm: type) -> None:
+    """:param given: PEARLSAC's arguments by name
+    :raises ValueError: at the first outside its range
+    :raises TypeError: for arguments of the policy that only SAC's takes
+    """
+    policy_kwargs, scale, device = given["policy_kwargs"], given["reward_scale"], given["device"]
+    if not isinstance(policy_kwargs, dict | None):
+        needed = "a dictionary of the policy's arguments"
+        raise TypeError(f"policy_kwargs must be {needed}, but is {policy_kwargs!r}")
+    refuse_unsupported(policy_kwargs or (), f"{algorithm.__name__}'s policy")
+    for name, least in LEAST.items():
+        if not (given[name] is None and name in OPTIONAL):
+            check_whole(name, given[name], least)
+    if not callable(given["learning_rate"]):
+        check_number("learning_rate", given["learning_rate"], 0.0)
+    for name, most in MOST.items():
+        check_number(name, given[name], 0.0, most)
+    check_number_or_auto("ent_coef", given["ent_coef"], 0.0)
+    check_number_or_auto("target_entropy", given["target_entropy"])
+    if scale != "auto" and not (isinstance(scale, int | float) and scale > 0):
+        raise ValueError(f'reward_scale must be a positive number or "auto", got {scale!r}')
+    if given["shaping_coef"] > 0 and given["gamma"] == 1:
+        raise ValueError(
+            "shaping_coef must be 0 with gamma=1: staying somewhere has no finite value then"
+        )
+    hidden_dtype(given["precision"], "cpu")  # refuses an unknown name
+    if str(device).startswith("cuda") and not th.cuda.is_available():  # which SB3 says nothing of
+        what = f"device is {device!r}, but torch sees no CUDA device: the CPU is used"
+        warnings.warn(what, stacklevel=3)
+
+
+def with_arguments_of(base: type, without: str) -> Callable[[Any], Any]:
+    """Of a constructor that passes ``*args`` and ``**kwargs`` on to its base class's: its signature
+    has the arguments of both.
+
+    :param without: An argument of the base class's that it does not take
+    """
+
+    def decorate(constructor: Any) -> Any:
+        theirs, ours = (inspect.signature(one).parameters for one in (base, constructor))
+        own = {name: one for name, one in ours.items() if one.kind is one.KEYWORD_ONLY}
+        by_place = {"self", *takewhile(lambda name: name not in own, theirs)}
+        merged = [
+            one if name in by_place or one.kind is one.VAR_KEYWORD else one.replace(kind=BY_NAME)
+            for name, one in {"self": ours["self"], **theirs, **own}.items()
+            if name != without
+        ]
+        constructor.__signature__ = inspect.Signature(sorted(merged, key=lambda one: one.kind))
+        return constructor
+
+    return decorate
