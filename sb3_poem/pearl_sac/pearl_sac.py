@@ -325,12 +325,15 @@ class PEARLSAC(SAC):
         :param tb_log_name: None is the algorithm's name
         :raises ValueError: if the number of steps is not known
         """
-        steps, name = self._checked_steps(total_timesteps, callback), tb_log_name or self.algorithm
-        steps, callback = self._setup_learn(
-            steps, callback, reset_num_timesteps, name, progress_bar
+        total_timesteps, callback = self._setup_learn(
+            self._checked_steps(total_timesteps, callback),
+            callback,
+            reset_num_timesteps,
+            tb_log_name or self.algorithm,
+            progress_bar,
         )
         callback.on_training_start(locals(), globals())
-        while self.num_timesteps < steps:
+        while self.num_timesteps < total_timesteps:
             # between two epochs: evaluations and checkpoints belong here
             self.policy.set_training_mode(False)
             callback.on_rollout_start()

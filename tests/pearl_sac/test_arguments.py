@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 import numpy as np
@@ -70,6 +71,22 @@ def test_tasks_come_from_the_family_and_the_seed(algorithm: type[PEARLSAC]) -> N
         120,
         1,
     )
+
+
+def test_the_signature_of_poem_has_the_arguments_of_pearl() -> None:
+    of_pearl, of_poem = (inspect.signature(kind).parameters for kind in (PEARLSAC, POEMSAC))
+    assert of_pearl.keys() - of_poem.keys() == {"context_relabel_fraction"}
+    own = {"similarity", "context"} | {name for name in of_poem if name.startswith("preference_")}
+    assert of_poem.keys() - of_pearl.keys() == own
+    defaults = {
+        name: (of_pearl[name].default, of_poem[name].default) for name in of_poem.keys() - own
+    }
+    changed = {name: new for name, (old, new) in defaults.items() if new != old}
+    assert changed == {"kl_coef": 1.0, "reward_coef": 0.2, "policy_coef": 0.5}
+    by_place = [name for name, one in of_poem.items() if one.kind is one.POSITIONAL_OR_KEYWORD]
+    assert by_place == list(of_pearl)[: len(by_place)]
+    model = POEMSAC("MlpPolicy", POINT_GOAL, 1e-3, 500, 7, device="cpu", _init_setup_model=False)
+    assert (model.learning_rate, model.buffer_size, model.learning_starts) == (1e-3, 500, 7)
 
 
 def test_the_callers_policy_kwargs_stay_as_they_are(algorithm: type[PEARLSAC]) -> None:
