@@ -43,11 +43,6 @@ def adapt(model: str, name: str, out: Path, *arguments: str) -> None:
     run("adapt", "--model", model, *shlex.split(ADAPTATION), *files, *arguments)
 
 
-def latest(pattern: str, folder: Path) -> Path:
-    """The newest file of that name below a folder."""
-    return max(folder.rglob(pattern), key=lambda path: path.stat().st_mtime)
-
-
 def main() -> None:
     """Run the demonstration."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -60,7 +55,8 @@ def main() -> None:
     print("1. Meta-train a point that walks to goals on a half-circle. It sees some goals and")
     print("   their rewards.")
     run("train", "-f", str(out / "logs"), *shlex.split(TRAINING))
-    model = latest("poem-PointGoal-v0.zip", out / "logs")
+    models = (out / "logs").rglob("poem-PointGoal-v0.zip")
+    model = max(models, key=lambda path: path.stat().st_mtime)
 
     print("\n2. Thirty new goals, hidden: each is found by ten answers to `which of these is")
     print("   better?`, without reward.")
@@ -70,8 +66,8 @@ def main() -> None:
     print("   nobody tells it.")
     draws, video = can_draw(), out / "HalfCheetahVel.mp4"
     if not draws:
-        print("(No video: there is neither a display nor off-screen OpenGL here; apt-get install")
-        print("libegl1 libgl1.)")
+        print("(No video: there is neither a display nor off-screen OpenGL here;")
+        print("apt-get install libegl1 libgl1.)")
     adapt("HalfCheetahVel", "HalfCheetahVel", out, *(["--video", str(video)] if draws else []))
 
     print(f"\nDone in {time.perf_counter() - started:.0f} s. The model is {model}; tables and")

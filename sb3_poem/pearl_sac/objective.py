@@ -1,7 +1,7 @@
 """What a gradient step minimises: the losses of a meta-batch, weighted and added."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch as th
 
@@ -40,6 +40,8 @@ class Objective:
     :param reward_scale: Factor on the rewards that the critics learn
     :param reward_variance: By which the decoder's squared error is divided
     """
+
+    actor_trains_encoder: ClassVar[bool] = False
 
     policy: LatentPolicy
     gamma: float
@@ -88,12 +90,10 @@ class Objective:
         return latents, kl_to_prior(mean, variance).mean()
 
     def embed(self, latents: th.Tensor) -> TaskEmbeddings:
-        """What actor and decoder see of latents (tasks, latent_dim). PEARL's encoder learns nothing
-        from the actor.
-        """
-        policy = self.policy
+        """What actor and decoder see of latents (tasks, latent_dim)."""
+        policy, seen = self.policy, latents if self.actor_trains_encoder else latents.detach()
         return TaskEmbeddings(
-            latents, policy.policy_embedding(latents.detach()), policy.reward_embedding(latents)
+            latents, policy.policy_embedding(seen), policy.reward_embedding(latents)
         )
 
     def standardised(self, batch: TaskBatch) -> TaskBatch:

@@ -1,7 +1,7 @@
 """PEARL's losses and the preference loss."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch as th
 from torch.autograd.function import once_differentiable
@@ -15,14 +15,11 @@ from sb3_poem.pearl_sac.sampler import MetaBatch
 class POEMObjective(Objective):
     """PEARL's losses and, weighted with ``preference_coef``, the preference loss."""
 
-    preference_coef: float
+    actor_trains_encoder: ClassVar[bool] = (
+        True  # L_policy trains f_pi and the encoder (section 5.3)
+    )
 
-    def embed(self, latents: th.Tensor) -> TaskEmbeddings:
-        """L_policy trains f_pi and the encoder (section 5.3)."""
-        policy = self.policy
-        return TaskEmbeddings(
-            latents, policy.policy_embedding(latents), policy.reward_embedding(latents)
-        )
+    preference_coef: float
 
     def embedding_loss(
         self, batch: MetaBatch, embeddings: TaskEmbeddings
