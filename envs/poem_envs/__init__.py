@@ -38,25 +38,20 @@ def __getattr__(name: str) -> Any:
     return getattr(import_module(f"poem_envs.{homes[name]}"), name)
 
 
-def _register(name: str, module: str, max_episode_steps: int) -> None:
-    register(
-        id=f"poem/{name}-v0",
-        entry_point=f"poem_envs.{module}:{name}Env",
-        vector_entry_point=f"poem_envs.{module}:{name}VectorEnv",
-        max_episode_steps=max_episode_steps,
-    )
+def _register(module: str, max_episode_steps: int, *names: str) -> None:
+    for name in names:
+        register(
+            id=f"poem/{name}-v0",
+            entry_point=f"poem_envs.{module}:{name}Env",
+            vector_entry_point=f"poem_envs.{module}:{name}VectorEnv",
+            max_episode_steps=max_episode_steps,
+        )
 
 
-_register("PointGoal", "point_goal", max_episode_steps=25)
-_register("HalfCheetahVel", "half_cheetah", max_episode_steps=200)
-_register("HalfCheetahFwdBack", "half_cheetah", max_episode_steps=200)
-_register("AntVel", "ant", max_episode_steps=200)
-_register("AntFwdBack", "ant", max_episode_steps=200)
-_register("AntDir2D", "ant", max_episode_steps=200)
-_register("AntGoal", "ant", max_episode_steps=200)
-_register("HumanoidDir2D", "humanoid", max_episode_steps=200)
-_register("MetaWorldML1", "meta_world", max_episode_steps=200)
-_register("MetaWorldML10", "meta_world", max_episode_steps=200)
-_register("FetchReach", "robotics", max_episode_steps=50)
-_register("FetchPush", "robotics", max_episode_steps=50)
-_register("AntMaze", "robotics", max_episode_steps=700)
+_register("point_goal", 25, "PointGoal")
+_register("half_cheetah", 200, "HalfCheetahVel", "HalfCheetahFwdBack")
+_register("ant", 200, "AntVel", "AntFwdBack", "AntDir2D", "AntGoal")
+_register("humanoid", 200, "HumanoidDir2D")
+_register("meta_world", 200, "MetaWorldML1", "MetaWorldML10")
+_register("robotics", 50, "FetchReach", "FetchPush")
+_register("robotics", 700, "AntMaze")

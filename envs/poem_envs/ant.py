@@ -8,7 +8,8 @@ import numpy as np
 from gymnasium import spaces
 
 from poem_envs.family import SignedPermutation, Symmetry
-from poem_envs.mujoco_family import MujocoFamily, MujocoTaskEnv, MujocoTaskVectorEnv
+from poem_envs.legged import DirectionFamily, LeggedFamily
+from poem_envs.mujoco_family import MujocoTaskEnv, MujocoTaskVectorEnv
 from poem_envs.mujoco_rendering import arrow, pole
 
 
@@ -22,17 +23,16 @@ def _symmetries(hidden_qpos: int) -> tuple[Symmetry, ...]:
     # the ankles reversed.
     half_turn = SignedPermutation((4, 5, 6, 7, 0, 1, 2, 3), (1, -1) * 4)
     reflection = SignedPermutation((6, 7, 4, 5, 2, 3, 0, 1), (-1, 1) * 4)
-    # the motors are hip_4, ankle_4, hip_1, ankle_1, ..., ankle_3
-    motors = (6, 7, 0, 1, 2, 3, 4, 5)
+    motors = (6, 7, 0, 1, 2, 3, 4, 5)  # hip_4, ankle_4, hip_1, ankle_1, ..., ankle_3
 
     def whole(
-        hinges: SignedPermutation,
-        position: tuple[int, ...],
-        quaternion: tuple[int, ...],
-        turning: tuple[int, ...],
+        hinges: SignedPermutation, position: tuple[int, ...], *root: tuple[int, ...]
     ) -> Symmetry:
-        placed, n = position[hidden_qpos:], 3 - hidden_qpos
-        order = [*range(n + 4), *(n + 4 + i for i in hinges.order)]
+        """:param root: signs of its quaternion and of its angular velocity"""
+        quaternion, turning = root
+        placed = position[hidden_qpos:]
+        order = [*range(len(placed) + 4)]
+        order += [len(order) + i for i in hinges.order]
         n = len(order)
         order += [*range(n, n + 6), *(n + 6 + i for i in hinges.order)]
         signs = (*placed, *quaternion, *hinges.signs, *position, *turning, *hinges.signs)
@@ -40,20 +40,16 @@ def _symmetries(hidden_qpos: int) -> tuple[Symmetry, ...]:
             tuple(motors.index(hinges.order[hinge]) for hinge in motors),
             tuple(hinges.signs[hinge] for hinge in motors),
         )
-        return Symmetry(
-            SignedPermutation(tuple(order), signs),
-            actions,
-            SignedPermutation((0, 1, 2), (*position[:2], 1)),
-        )
+        features = SignedPermutation((0, 1, 2), (*position[:2], 1))
+        return Symmetry(SignedPermutation(tuple(order), signs), actions, features)
 
     turned = whole(half_turn, (-1, -1, 1), (1, -1, -1, 1), (-1, -1, 1))
     reflected = whole(reflection, (1, -1, 1), (1, -1, 1, -1), (-1, 1, -1))
     return turned, reflected, turned.then(reflected)
 
 
-class _Ant(MujocoFamily):
-    hidden_qpos = 2
-    reward_feature_dim = 3
+class _Ant(LeggedFamily):
+    marker_height = 1.3
     camera_config = {"distance": 5.0, "elevation": -30.0, "lookat": np.array([0.0, 0.0, 0.5])}  # noqa: RUF012
 
     def __init__(
@@ -61,15 +57,15 @@ class _Ant(MujocoFamily):
         *,
         xml_file: str = "ant.xml",
         ctrl_cost_weight: float = 0.5,
-        terminate_when_unhealthy: bool = True,
         healthy_z_range: tuple[float, float] = (0.2, 1.0),
-        reset_noise_scale: float = 0.1,
         **kwargs: Any,
     ) -> None:
-        self.ctrl_cost_weight = ctrl_cost_weight
-        self.terminate_when_unhealthy = terminate_when_unhealthy
-        self.healthy_z_range = healthy_z_range
-        super().__init__(xml_file=xml_file, reset_noise_scale=reset_noise_scale, **kwargs)
+        super().__init__(
+            xml_file=xml_file,
+            ctrl_cost_weight=ctrl_cost_weight,
+            healthy_z_range=healthy_z_range,
+            **kwargs,
+        )
         if xml_file == "ant.xml":
             self.symmetries = _symmetries(self.hidden_qpos)
 
@@ -77,78 +73,47 @@ class _Ant(MujocoFamily):
         velocity = (self._qpos[:, :2] - qpos_before[:, :2]) / self.dt
         return np.column_stack([velocity, np.square(actions).sum(axis=1)])
 
-    def _unhealthy(self) -> np.ndarray:
-        if not self.terminate_when_unhealthy:
-            return super()._unhealthy()
-        lowest, highest = self.healthy_z_range
-        height = self._qpos[:, 2]
-        return ~((lowest <= height) & (height <= highest))
-
 
 class _AntVel(_Ant):
+    task_space = spaces.Box(0.0, 3.0, (1,), np.float64)
+
     def __init__(
         self,
         *,
         forward_reward_weight: float = 1.0,
         forward_reward_offset: float = 1.0,
-        ctrl_cost_weight: float = 0.005,
         healthy_reward: float = 0.05,
+        ctrl_cost_weight: float = 0.005,
         **kwargs: Any,
     ) -> None:
         self.forward_reward_weight = forward_reward_weight
         self.forward_reward_offset = forward_reward_offset
         self.healthy_reward = healthy_reward
-        self.task_space = spaces.Box(0.0, 3.0, (1,), np.float64)
         super().__init__(ctrl_cost_weight=ctrl_cost_weight, **kwargs)
 
     def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
-        forward = self.forward_reward_offset - self.forward_reward_weight * np.abs(
-            features[..., 0] - tasks[..., 0]
-        )
+        error = np.abs(features[..., 0] - tasks[..., 0])
+        forward = self.forward_reward_offset - self.forward_reward_weight * error
         return forward - self.ctrl_cost_weight * features[..., 2] + self.healthy_reward
 
     def _task_markers(self, task: np.ndarray, position: np.ndarray) -> list[dict[str, Any]]:
-        return [
-            arrow(np.array([position[0], position[1], 1.3]), (1.0, 0.0), length=float(task[0]) / 2)
-        ]
+        return [arrow(self._marker_place(position), (1.0, 0.0), length=float(task[0]) / 2)]
 
 
-class _AntDirection(_Ant):
-    """Ant that is to run in a direction, whichever directions there are."""
-
-    def __init__(
-        self, *, forward_reward_weight: float = 1.0, healthy_reward: float = 1.0, **kwargs: Any
-    ) -> None:
-        self.forward_reward_weight = forward_reward_weight
-        self.healthy_reward = healthy_reward
-        super().__init__(**kwargs)
-
-    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
-        forward = self.forward_reward_weight * speed_towards(tasks, features)
-        return forward - self.ctrl_cost_weight * features[..., 2] + self.healthy_reward
-
-    def _task_markers(self, task: np.ndarray, position: np.ndarray) -> list[dict[str, Any]]:
-        direction = (float(np.cos(task[0])), float(np.sin(task[0])))
-        return [arrow(np.array([position[0], position[1], 1.3]), direction, length=1.0)]
+class _AntFwdBack(_Ant, DirectionFamily):
+    task_space = spaces.Box(0.0, np.pi, (1,), np.float64)
+    all_tasks = np.array([[0.0], [np.pi]])
 
 
-class _AntFwdBack(_AntDirection):
-    def __init__(self, **kwargs: Any) -> None:
-        self.task_space = spaces.Box(0.0, np.pi, (1,), np.float64)
-        self.all_tasks = np.array([[0.0], [np.pi]])
-        super().__init__(**kwargs)
-
-
-class _AntDir2D(_AntDirection):
-    def __init__(self, **kwargs: Any) -> None:
-        self.task_space = spaces.Box(-np.pi / 2, np.pi / 2, (1,), np.float64)
-        super().__init__(**kwargs)
+class _AntDir2D(_Ant, DirectionFamily):
+    task_space = spaces.Box(-np.pi / 2, np.pi / 2, (1,), np.float64)
 
 
 class _AntGoal(_Ant):
     hidden_qpos = 0
-    camera_config = {"distance": 9.0, "elevation": -45.0, "lookat": np.array([0.0, 0.0, 0.5])}  # noqa: RUF012
+    camera_config = {**_Ant.camera_config, "distance": 9.0, "elevation": -45.0}  # noqa: RUF012
     goal_radius = 3.0
+    task_space = spaces.Box(-goal_radius, goal_radius, (2,), np.float64)
 
     def __init__(
         self,
@@ -159,7 +124,6 @@ class _AntGoal(_Ant):
         **kwargs: Any,
     ) -> None:
         self.distance_reward_weight = distance_reward_weight
-        self.task_space = spaces.Box(-self.goal_radius, self.goal_radius, (2,), np.float64)
         super().__init__(
             ctrl_cost_weight=ctrl_cost_weight,
             terminate_when_unhealthy=terminate_when_unhealthy,
@@ -167,9 +131,8 @@ class _AntGoal(_Ant):
         )
 
     def _draw_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        radius = self.goal_radius * np.sqrt(
-            rng.uniform(size=n)
-        )  # so that the density is even over the disc
+        # the root makes the density even over the disc
+        radius = self.goal_radius * np.sqrt(rng.uniform(size=n))
         angle = rng.uniform(0.0, 2 * np.pi, size=n)
         return np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
 
@@ -181,78 +144,63 @@ class _AntGoal(_Ant):
 
     def _potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
         # observations and features both begin with the position
-        distance = np.abs(observations[..., 0] - tasks[..., 0]) + np.abs(
-            observations[..., 1] - tasks[..., 1]
-        )
-        return -self.distance_reward_weight * distance
+        x, y = (np.abs(observations[..., i] - tasks[..., i]) for i in range(2))
+        return -self.distance_reward_weight * (x + y)
 
     def _task_markers(self, task: np.ndarray, position: np.ndarray) -> list[dict[str, Any]]:
         return [pole(float(task[0]), float(task[1]), height=1.0)]
 
 
-def speed_towards(angles: np.ndarray, velocities: np.ndarray) -> np.ndarray:
-    """The component of a velocity in a direction.
-
-    :param angles: ``(..., 1)``, in the plane, radians
-    :param velocities: ``(..., at least 2)``, the first two are taken
-    :return: ``(...)``
-    """
-    angle = np.array(
-        angles[..., 0]
-    )  # contiguous: strided input may take another, differently rounded path
-    return velocities[..., 0] * np.cos(angle) + velocities[..., 1] * np.sin(angle)
-
-
 class AntVelEnv(_AntVel, MujocoTaskEnv):
     r"""
     ## Description
-    The Ant, a quadruped with eight hinges, is to run forward (in x direction) at a speed that it cannot see. The
-    dynamics are those of Gymnasium's `Ant-v5`, but for the solver's warm start, which every step begins at zero (see
-    :class:`~poem_envs.mujoco_family.MujocoFamily`).
+    The Ant, a quadruped with eight hinges, is to run forward (in x direction) at a speed that it
+    cannot see. The dynamics are those of Gymnasium's `Ant-v5`, but for the solver's warm start,
+    which every step begins at zero (see :class:`~poem_envs.mujoco_family.MujocoFamily`).
 
     ## Task
-    The goal speed in m/s, uniform on [0, 3], hidden from the observation: `task_space` is `Box(0, 3, (1,), float64)`.
+    The goal speed in m/s, uniform on [0, 3], hidden from the observation: `task_space` is
+    `Box(0, 3, (1,), float64)`.
 
     ## Action Space
-    The action space is a `Box(-1, 1, (8,), float32)`: torques at the hinge joints, scaled by each motor's gear.
+    The action space is a `Box(-1, 1, (8,), float32)`: torques at the hinge joints in N m, scaled by
+    each motor's gear.
 
-    | Num | Action                          | Control Min | Control Max | XML name | Joint | Type (Unit)  |
-    | --- | ------------------------------- | ----------- | ----------- | -------- | ----- | ------------ |
-    | 0   | torque on the back right hip    | -1          | 1           | hip_4    | hinge | torque (N m) |
-    | 1   | torque on the back right ankle  | -1          | 1           | ankle_4  | hinge | torque (N m) |
-    | 2   | torque on the front left hip    | -1          | 1           | hip_1    | hinge | torque (N m) |
-    | 3   | torque on the front left ankle  | -1          | 1           | ankle_1  | hinge | torque (N m) |
-    | 4   | torque on the front right hip   | -1          | 1           | hip_2    | hinge | torque (N m) |
-    | 5   | torque on the front right ankle | -1          | 1           | ankle_2  | hinge | torque (N m) |
-    | 6   | torque on the back left hip     | -1          | 1           | hip_3    | hinge | torque (N m) |
-    | 7   | torque on the back left ankle   | -1          | 1           | ankle_3  | hinge | torque (N m) |
+    | Num  | Action                               | Control Min | Control Max | XML name       |
+    | ---- | ------------------------------------ | ----------- | ----------- | -------------- |
+    | 0, 1 | torques on back right hip and ankle  | -1          | 1           | hip_4, ankle_4 |
+    | 2, 3 | torques on front left hip and ankle  | -1          | 1           | hip_1, ankle_1 |
+    | 4, 5 | torques on front right hip and ankle | -1          | 1           | hip_2, ankle_2 |
+    | 6, 7 | torques on back left hip and ankle   | -1          | 1           | hip_3, ankle_3 |
 
     ## Observation Space
-    The observation space is a `Box(-Inf, Inf, (27,), float64)`: positions without x and y, then velocities, all unbounded.
-    Contact forces, which Gymnasium's Ant-v5 appends, are left out.
+    The observation space is a `Box(-Inf, Inf, (27,), float64)`: positions without x and y, then
+    velocities, all unbounded. Contact forces, which Gymnasium's Ant-v5 appends, are left out.
 
-    | Num      | Observation                                         | XML name            | Joint | Type (Unit) |
-    | -------- | --------------------------------------------------- | ------------------- | ----- | ----------- |
-    | 0        | z-coordinate of the torso                           | root                | free  | m           |
-    | 1 - 4    | orientation of the torso, a quaternion (w, x, y, z) | root                | free  | -           |
-    | 5, 6     | angles of the front left hip and ankle              | hip_1, ankle_1      | hinge | rad         |
-    | 7, 8     | angles of the front right hip and ankle             | hip_2, ankle_2      | hinge | rad         |
-    | 9, 10    | angles of the back left hip and ankle               | hip_3, ankle_3      | hinge | rad         |
-    | 11, 12   | angles of the back right hip and ankle              | hip_4, ankle_4      | hinge | rad         |
-    | 13 - 15  | velocity of the torso in x, y, z                    | root                | free  | m/s         |
-    | 16 - 18  | angular velocity of the torso about x, y, z         | root                | free  | rad/s       |
-    | 19 - 26  | angular velocities of the hinges, as 5 - 12         | hip_1, ..., ankle_4 | hinge | rad/s       |
-    | excluded | x- and y-coordinate of the torso                    | root                | free  | m           |
+    | Num      | Observation                             | XML name            | Joint | Unit  |
+    | -------- | --------------------------------------- | ------------------- | ----- | ----- |
+    | 0        | z-coordinate of the torso               | root                | free  | m     |
+    | 1 - 4    | orientation of the torso (w, x, y, z)   | root                | free  | -     |
+    | 5, 6     | angles of the front left hip and ankle  | hip_1, ankle_1      | hinge | rad   |
+    | 7, 8     | angles of the front right hip and ankle | hip_2, ankle_2      | hinge | rad   |
+    | 9, 10    | angles of the back left hip and ankle   | hip_3, ankle_3      | hinge | rad   |
+    | 11, 12   | angles of the back right hip and ankle  | hip_4, ankle_4      | hinge | rad   |
+    | 13 - 15  | velocity of the torso in x, y, z        | root                | free  | m/s   |
+    | 16 - 18  | angular velocity of the torso           | root                | free  | rad/s |
+    | 19 - 26  | velocities of the hinges, as 5 - 12     | hip_1, ..., ankle_4 | hinge | rad/s |
+    | excluded | x- and y-coordinate of the torso        | root                | free  | m     |
 
     ## Rewards
-    $offset - w_{forward} |v_x - v_{goal}| - w_{ctrl} \|action\|_2^2 + healthy$, where $v_x$ is the change of the
-    torso's x-coordinate over the step, divided by its duration `dt` = 0.05 s. Gymnasium's Ant-v5 takes the position
-    that lags by a physics step; here both ends are the integrated state. Every step earns `forward_reward_offset` and
-    `healthy_reward`, the last of an early end too. The reward features are $(v_x, v_y, \|action\|_2^2)$.
+    $offset - w_{forward} |v_x - v_{goal}| - w_{ctrl} \|action\|_2^2 + healthy$, where $v_x$ is the
+    change of the torso's x-coordinate over the step, divided by its duration `dt` = 0.05 s.
+    Gymnasium's Ant-v5 takes the position that lags by a physics step; here both ends are the
+    integrated state. Every step earns `forward_reward_offset` and `healthy_reward`, the last of an
+    early end too. The reward features are $(v_x, v_y, \|action\|_2^2)$.
 
     ## Starting State
-    The model's initial pose, 0.75 m above the floor, plus noise: uniform on [-`reset_noise_scale`, `reset_noise_scale`]
-    in every position, and normal with standard deviation `reset_noise_scale` in every velocity.
+    The model's initial pose, 0.75 m above the floor, plus noise: uniform on
+    [-`reset_noise_scale`, `reset_noise_scale`] in every position, and normal with standard
+    deviation `reset_noise_scale` in every velocity.
 
     ## Episode End
     An episode terminates when the torso's z-coordinate leaves `healthy_z_range`, unless
@@ -264,19 +212,19 @@ class AntVelEnv(_AntVel, MujocoTaskEnv):
     env = gym.make("poem_envs:poem/AntVel-v0", ctrl_cost_weight=0.005)
     ```
 
-    | Parameter                  | Type      | Default      | Description                                             |
-    | -------------------------- | --------- | ------------ | ------------------------------------------------------- |
-    | `forward_reward_weight`    | **float** | `1.0`        | Weight of the speed term                                |
-    | `forward_reward_offset`    | **float** | `1.0`        | Added to the reward of every step                       |
-    | `healthy_reward`           | **float** | `0.05`       | Added to the reward of every step                       |
-    | `ctrl_cost_weight`         | **float** | `0.005`      | Weight of the action cost                               |
-    | `terminate_when_unhealthy` | **bool**  | `True`       | Whether leaving the healthy range ends the episode      |
-    | `healthy_z_range`          | **tuple** | `(0.2, 1.0)` | Lowest and highest healthy z-coordinate of the torso, m |
-    | `reset_noise_scale`        | **float** | `0.1`        | Scale of the noise of the starting state                |
+    | Parameter                  | Type      | Default      | Description                       |
+    | -------------------------- | --------- | ------------ | --------------------------------- |
+    | `forward_reward_weight`    | **float** | `1.0`        | Weight of the speed term          |
+    | `forward_reward_offset`    | **float** | `1.0`        | Added to the reward of every step |
+    | `healthy_reward`           | **float** | `0.05`       | Added to the reward of every step |
+    | `ctrl_cost_weight`         | **float** | `0.005`      | Weight of the action cost         |
+    | `terminate_when_unhealthy` | **bool**  | `True`       | Whether a fall ends the episode   |
+    | `healthy_z_range`          | **tuple** | `(0.2, 1.0)` | Healthy heights of the torso, m   |
+    | `reset_noise_scale`        | **float** | `0.1`        | Scale of the noise of the start   |
 
-    Further arguments (`xml_file="ant.xml"`, `frame_skip=5`, `render_mode`, cameras, size of images) are those of
-    :class:`~poem_envs.mujoco_family.MujocoFamily`. `render_task=True` shows the hidden task: an arrow, half a metre
-    long for each m/s.
+    Further arguments (`xml_file="ant.xml"`, `frame_skip=5`, `render_mode`, cameras, size of images)
+    are those of :class:`~poem_envs.mujoco_family.MujocoFamily`. `render_task=True` shows the hidden
+    task: an arrow, half a metre long for each m/s.
 
     ## Version History
     * v0: Initial version
@@ -284,7 +232,7 @@ class AntVelEnv(_AntVel, MujocoTaskEnv):
 
 
 class AntVelVectorEnv(_AntVel, MujocoTaskVectorEnv):
-    """The vectorised :class:`AntVelEnv`: same arguments, and those of a vectorised MuJoCo family."""
+    """The vectorised :class:`AntVelEnv`, with the arguments of a vectorised MuJoCo family too."""
 
 
 class AntFwdBackEnv(_AntFwdBack, MujocoTaskEnv):
@@ -293,16 +241,17 @@ class AntFwdBackEnv(_AntFwdBack, MujocoTaskEnv):
     The Ant is to run as fast as it can forward or backward (in x direction), and cannot see which.
 
     ## Task
-    The direction as an angle, 0 (forward) or pi (backward), hidden from the observation: `all_tasks` holds these two,
-    and `task_space` is `Box(0, pi, (1,), float64)`.
+    The direction as an angle, 0 (forward) or pi (backward), hidden from the observation:
+    `all_tasks` holds these two, and `task_space` is `Box(0, pi, (1,), float64)`.
 
     ## Action Space, Observation Space, Starting State, Episode End
     As :class:`AntVelEnv`.
 
     ## Rewards
-    $w_{forward} \cdot (v_x \cos(angle) + v_y \sin(angle)) - w_{ctrl} \|action\|_2^2 + healthy$, where $v$ is the change
-    of the torso's position over the step, divided by its duration `dt` = 0.05 s. Every step earns `healthy_reward`, the
-    last of an early end too. The reward features are $(v_x, v_y, \|action\|_2^2)$.
+    $w_{forward} \cdot (v_x \cos(angle) + v_y \sin(angle)) - w_{ctrl} \|action\|_2^2 + healthy$,
+    where $v$ is the change of the torso's position over the step, divided by its duration
+    `dt` = 0.05 s. Every step earns `healthy_reward`, the last of an early end too. The reward
+    features are $(v_x, v_y, \|action\|_2^2)$.
 
     ## Arguments
     ```python
@@ -310,17 +259,14 @@ class AntFwdBackEnv(_AntFwdBack, MujocoTaskEnv):
     env = gym.make("poem_envs:poem/AntFwdBack-v0", ctrl_cost_weight=0.5)
     ```
 
-    | Parameter                  | Type      | Default      | Description                                             |
-    | -------------------------- | --------- | ------------ | ------------------------------------------------------- |
-    | `forward_reward_weight`    | **float** | `1.0`        | Weight of the speed term                                |
-    | `healthy_reward`           | **float** | `1.0`        | Added to the reward of every step                       |
-    | `ctrl_cost_weight`         | **float** | `0.5`        | Weight of the action cost                               |
-    | `terminate_when_unhealthy` | **bool**  | `True`       | Whether leaving the healthy range ends the episode      |
-    | `healthy_z_range`          | **tuple** | `(0.2, 1.0)` | Lowest and highest healthy z-coordinate of the torso, m |
-    | `reset_noise_scale`        | **float** | `0.1`        | Scale of the noise of the starting state                |
+    | Parameter               | Type      | Default | Description                       |
+    | ----------------------- | --------- | ------- | --------------------------------- |
+    | `forward_reward_weight` | **float** | `1.0`   | Weight of the speed term          |
+    | `healthy_reward`        | **float** | `1.0`   | Added to the reward of every step |
+    | `ctrl_cost_weight`      | **float** | `0.5`   | Weight of the action cost         |
 
-    Further arguments (`xml_file="ant.xml"`, `frame_skip=5`, `render_mode`, cameras, size of images) are those of
-    :class:`~poem_envs.mujoco_family.MujocoFamily`. `render_task=True` shows the hidden task: an arrow.
+    The others are those of :class:`AntVelEnv`, but for `forward_reward_offset`.
+    `render_task=True` shows the hidden task: an arrow.
 
     ## Version History
     * v0: Initial version
@@ -328,9 +274,7 @@ class AntFwdBackEnv(_AntFwdBack, MujocoTaskEnv):
 
 
 class AntFwdBackVectorEnv(_AntFwdBack, MujocoTaskVectorEnv):
-    """The vectorised :class:`AntFwdBackEnv`: same arguments, and those of a vectorised MuJoCo
-    family.
-    """
+    """The vectorised :class:`AntFwdBackEnv`."""
 
 
 class AntDir2DEnv(_AntDir2D, MujocoTaskEnv):
@@ -339,34 +283,14 @@ class AntDir2DEnv(_AntDir2D, MujocoTaskEnv):
     The Ant is to run as fast as it can in a direction of the plane that it cannot see.
 
     ## Task
-    The direction as an angle, uniform on [-pi/2, pi/2], 0 being the x direction, hidden from the observation:
-    `task_space` is `Box(-pi/2, pi/2, (1,), float64)`.
+    The direction as an angle, uniform on [-pi/2, pi/2], 0 being the x direction, hidden from the
+    observation: `task_space` is `Box(-pi/2, pi/2, (1,), float64)`.
 
     ## Action Space, Observation Space, Starting State, Episode End
     As :class:`AntVelEnv`.
 
-    ## Rewards
-    $w_{forward} \cdot (v_x \cos(angle) + v_y \sin(angle)) - w_{ctrl} \|action\|_2^2 + healthy$, where $v$ is the change
-    of the torso's position over the step, divided by its duration `dt` = 0.05 s. Every step earns `healthy_reward`, the
-    last of an early end too. The reward features are $(v_x, v_y, \|action\|_2^2)$.
-
-    ## Arguments
-    ```python
-    import gymnasium as gym
-    env = gym.make("poem_envs:poem/AntDir2D-v0", ctrl_cost_weight=0.5)
-    ```
-
-    | Parameter                  | Type      | Default      | Description                                             |
-    | -------------------------- | --------- | ------------ | ------------------------------------------------------- |
-    | `forward_reward_weight`    | **float** | `1.0`        | Weight of the speed term                                |
-    | `healthy_reward`           | **float** | `1.0`        | Added to the reward of every step                       |
-    | `ctrl_cost_weight`         | **float** | `0.5`        | Weight of the action cost                               |
-    | `terminate_when_unhealthy` | **bool**  | `True`       | Whether leaving the healthy range ends the episode      |
-    | `healthy_z_range`          | **tuple** | `(0.2, 1.0)` | Lowest and highest healthy z-coordinate of the torso, m |
-    | `reset_noise_scale`        | **float** | `0.1`        | Scale of the noise of the starting state                |
-
-    Further arguments (`xml_file="ant.xml"`, `frame_skip=5`, `render_mode`, cameras, size of images) are those of
-    :class:`~poem_envs.mujoco_family.MujocoFamily`. `render_task=True` shows the hidden task: an arrow.
+    ## Rewards, Arguments
+    As :class:`AntFwdBackEnv`.
 
     ## Version History
     * v0: Initial version
@@ -374,7 +298,7 @@ class AntDir2DEnv(_AntDir2D, MujocoTaskEnv):
 
 
 class AntDir2DVectorEnv(_AntDir2D, MujocoTaskVectorEnv):
-    """The vectorised :class:`AntDir2DEnv`: same arguments, and those of a vectorised MuJoCo family."""
+    """The vectorised :class:`AntDir2DEnv`."""
 
 
 class AntGoalEnv(_AntGoal, MujocoTaskEnv):
@@ -383,23 +307,24 @@ class AntGoalEnv(_AntGoal, MujocoTaskEnv):
     The Ant is to walk to a place that it cannot see, and to stay there.
 
     ## Task
-    The goal's x- and y-coordinate in m, uniform on the disc of radius 3 around the origin, hidden from the observation:
-    `task_space` is `Box(-3, 3, (2,), float64)`.
+    The goal's x- and y-coordinate in m, uniform on the disc of radius 3 around the origin, hidden
+    from the observation: `task_space` is `Box(-3, 3, (2,), float64)`.
 
     ## Action Space, Starting State
     As :class:`AntVelEnv`.
 
     ## Observation Space
-    The observation space is a `Box(-Inf, Inf, (29,), float64)`: the x- and y-coordinate of the torso, then the 27
-    elements of :class:`AntVelEnv`. Where the ant is belongs to it, since the goal is a place.
+    The observation space is a `Box(-Inf, Inf, (29,), float64)`: the x- and y-coordinate of the
+    torso, then the 27 elements of :class:`AntVelEnv`. Where the ant is belongs to it, since the
+    goal is a place.
 
     ## Rewards
-    $-w_{distance} (|x - x_{goal}| + |y - y_{goal}|) - w_{ctrl} \|action\|_2^2$, with the torso's position after the
-    step. The reward features are $(x, y, \|action\|_2^2)$.
+    $-w_{distance} (|x - x_{goal}| + |y - y_{goal}|) - w_{ctrl} \|action\|_2^2$, with the torso's
+    position after the step. The reward features are $(x, y, \|action\|_2^2)$.
 
     ## Episode End
-    There is no early end unless `terminate_when_unhealthy=True`, which works as in :class:`AntVelEnv`. `gymnasium.make`
-    truncates episodes after 200 steps.
+    There is no early end unless `terminate_when_unhealthy=True`, which works as in
+    :class:`AntVelEnv`. `gymnasium.make` truncates episodes after 200 steps.
 
     ## Arguments
     ```python
@@ -407,16 +332,14 @@ class AntGoalEnv(_AntGoal, MujocoTaskEnv):
     env = gym.make("poem_envs:poem/AntGoal-v0", ctrl_cost_weight=0.1)
     ```
 
-    | Parameter                  | Type      | Default      | Description                                             |
-    | -------------------------- | --------- | ------------ | ------------------------------------------------------- |
-    | `distance_reward_weight`   | **float** | `1.0`        | Weight of the distance term                             |
-    | `ctrl_cost_weight`         | **float** | `0.1`        | Weight of the action cost                               |
-    | `terminate_when_unhealthy` | **bool**  | `False`      | Whether leaving the healthy range ends the episode      |
-    | `healthy_z_range`          | **tuple** | `(0.2, 1.0)` | Lowest and highest healthy z-coordinate of the torso, m |
-    | `reset_noise_scale`        | **float** | `0.1`        | Scale of the noise of the starting state                |
+    | Parameter                  | Type      | Default | Description                     |
+    | -------------------------- | --------- | ------- | ------------------------------- |
+    | `distance_reward_weight`   | **float** | `1.0`   | Weight of the distance term     |
+    | `ctrl_cost_weight`         | **float** | `0.1`   | Weight of the action cost       |
+    | `terminate_when_unhealthy` | **bool**  | `False` | Whether a fall ends the episode |
 
-    Further arguments (`xml_file="ant.xml"`, `frame_skip=5`, `render_mode`, cameras, size of images) are those of
-    :class:`~poem_envs.mujoco_family.MujocoFamily`. `render_task=True` shows the hidden task: a pole at the goal.
+    `healthy_z_range`, `reset_noise_scale` and further arguments are those of :class:`AntVelEnv`.
+    `render_task=True` shows the hidden task: a pole at the goal.
 
     ## Version History
     * v0: Initial version
@@ -424,4 +347,4 @@ class AntGoalEnv(_AntGoal, MujocoTaskEnv):
 
 
 class AntGoalVectorEnv(_AntGoal, MujocoTaskVectorEnv):
-    """The vectorised :class:`AntGoalEnv`: same arguments, and those of a vectorised MuJoCo family."""
+    """The vectorised :class:`AntGoalEnv`."""

@@ -40,11 +40,8 @@ class SignedPermutation(NamedTuple):
 
     def then(self, other: SignedPermutation) -> SignedPermutation:
         """This one first, the other next."""
-        order = tuple(self.order[i] for i in other.order)
-        return SignedPermutation(
-            order,
-            tuple(sign * self.signs[i] for i, sign in zip(other.order, other.signs, strict=True)),
-        )
+        signs = (sign * self.signs[i] for i, sign in zip(other.order, other.signs, strict=True))
+        return SignedPermutation(tuple(self.order[i] for i in other.order), tuple(signs))
 
 
 class Symmetry(NamedTuple):
@@ -54,10 +51,6 @@ class Symmetry(NamedTuple):
     then the mirrored action takes it from the one's mirror image to the other's, with the mirrored
     features. Nothing is said of rewards: those of what is mirrored are computed from its features,
     for any task.
-
-    :param observations: of the entries of an observation
-    :param actions: of the entries of an action
-    :param features: of the reward features
     """
 
     observations: SignedPermutation
@@ -86,8 +79,7 @@ class TaskDefinition(ABC):
     #: Whether tasks differ in the reward alone, so that one task's trajectories can be relabelled
     #: with another's rewards.
     shared_dynamics: bool = True
-    #: Symmetries of the dynamics, by which training may see every transition in other forms too;
-    #: none unless a family says so.
+    #: Symmetries of the dynamics, by which training may see every transition in other forms too.
     symmetries: tuple[Symmetry, ...] = ()
     #: The names of the sets that tasks can be drawn from, of which the first is for training.
     splits: tuple[str, ...] = ("train",)
@@ -103,13 +95,15 @@ class TaskDefinition(ABC):
         :return: ``(n, task_dim)`` float64
         :raises ValueError: if ``n`` is below 1 or above the number of tasks of a finite family
         """
-        n = _checked_count(n)
+        if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1:
+            raise ValueError(f"n={n!r} must be a whole number, at least 1")
         if self.all_tasks is None:
-            return np.asarray(self._draw_tasks(n, rng), dtype=np.float64)
-        if n > len(self.all_tasks):
+            return np.asarray(self._draw_tasks(int(n), rng), dtype=np.float64)
+        size = len(self.all_tasks)
+        if n > size:
             raise ValueError(
-                f"n={n} tasks were asked for, but {type(self).__name__} is a finite family of {len(self.all_tasks)}; "
-                f"ask for at most {len(self.all_tasks)}"
+                f"n={n} tasks were asked for, but {type(self).__name__} is a finite family of "
+                f"{size}; ask for at most {size}"
             )
         return np.asarray(rng.permutation(self.all_tasks)[:n], dtype=np.float64)
 
@@ -127,15 +121,15 @@ class TaskDefinition(ABC):
         """
         tasks = np.asarray(tasks, dtype=np.float64)
         features = np.asarray(features, dtype=np.float64)
-        task_dim = self.task_space.shape[0]
+        task_dim, feature_dim = self.task_space.shape[0], self.reward_feature_dim
         if tasks.shape[-1:] != (task_dim,):
             raise ValueError(
                 f"tasks has shape {tasks.shape}, but its last dimension must be task_dim={task_dim}"
             )
-        if features.shape[-1:] != (self.reward_feature_dim,):
+        if features.shape[-1:] != (feature_dim,):
             raise ValueError(
                 f"features has shape {features.shape}, but its last dimension must be "
-                f"reward_feature_dim={self.reward_feature_dim}"
+                f"reward_feature_dim={feature_dim}"
             )
         return self._reward(tasks, features)
 
@@ -169,45 +163,42 @@ class TaskDefinition(ABC):
         """
 
     def _draw_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Draw from the distribution of an infinite family: uniform on ``task_space`` unless
-        overridden.
-        """
-        return rng.uniform(
-            self.task_space.low, self.task_space.high, size=(n, *self.task_space.shape)
-        )
+        """Draw from an infinite family: uniformly on ``task_space`` unless overridden."""
+        space = self.task_space
+        return rng.uniform(space.low, space.high, size=(n, *space.shape))
+
+    def _physics_state(self, copy: int) -> np.ndarray:
+        """Optional: all that determines how a copy goes on, ``(state_dim,)``, a new array."""
+        raise NotImplementedError(f"{type(self).__name__} defines no _physics_state(copy)")
+
+    def _set_physics_state(self, copy: int, state: np.ndarray) -> None:
+        """Put a copy into a state that :meth:`_physics_state` returned."""
+        raise NotImplementedError(f"{type(self).__name__} defines no _set_physics_state")
 
     @abstractmethod
     def _describe_episode(self, copy: int) -> str:
-        """Where a copy's episode is, for error messages. Defined by the environment classes."""
+        """Where a copy's episode is, for error messages."""
 
     def _choose_split(self, split: str) -> None:
         """Set :attr:`split`, or raise a ValueError that lists those that there are."""
         if split not in self.splits:
             raise ValueError(
                 f"split={split!r}: {type(self).__name__} has no such split of its tasks, it has "
-                f"{', '.join(map(repr, self.splits))}. Tasks that another generator draws are new ones too: "
-                "sample_tasks(n, np.random.default_rng(seed))"
+                f"{', '.join(map(repr, self.splits))}. Tasks that another generator draws are new "
+                "ones too: sample_tasks(n, np.random.default_rng(seed))"
             )
         self.split = split
 
     def _checked_tasks(self, tasks: npt.ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:
-        """Return ``tasks`` as a fresh float64 array, or raise a ValueError that says what is wrong
-        with them.
-        """
-        try:
-            array = np.array(tasks, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise ValueError(
-                f"{name}={tasks!r} is not an array of numbers of shape {shape}"
-            ) from error
-        if array.shape != shape:
-            raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
+        """``tasks`` as a new float64 array; a ValueError says what is wrong with them."""
+        array = _numbers(tasks, shape, name)
         low, high = self.task_space.low, self.task_space.high
         clipped = np.clip(array, low, high)
         inside = np.all(np.abs(array - clipped) <= BOUNDS_TOLERANCE, axis=-1)  # false for NaN
         if not inside.all():
             raise ValueError(
-                f"{_first(array, ~inside, name)} must be finite and inside task_space, from {low} to {high}"
+                f"{_first(array, ~inside, name)} must be finite and inside task_space, from {low} "
+                f"to {high}"
             )
         if self.all_tasks is None:
             return clipped
@@ -215,7 +206,8 @@ class TaskDefinition(ABC):
         member = distance.min(axis=-1) <= BOUNDS_TOLERANCE
         if not member.all():
             raise ValueError(
-                f"{_first(array, ~member, name)} is not among this family's tasks, which are {self.all_tasks.tolist()}"
+                f"{_first(array, ~member, name)} is not among this family's tasks, which are "
+                f"{self.all_tasks.tolist()}"
             )
         return self.all_tasks[distance.argmin(axis=-1)]
 
@@ -242,25 +234,27 @@ REQUIRED_ATTRIBUTES = {
 
 def definition_problem(family: Any) -> str | None:
     """What is wrong with a family's attributes, and what would be right; None if nothing is."""
-    given: dict[str, Any] = {name: getattr(family, name, None) for name in REQUIRED_ATTRIBUTES}
-    action_space, task_space = given["action_space"], given["task_space"]
-    feature_dim = given["reward_feature_dim"]
-    fits = {
-        "observation_space": _is_flat(given["observation_space"]),
-        "action_space": _is_flat(action_space) and action_space.is_bounded(),
-        "task_space": _is_flat(task_space) and task_space.dtype == np.float64,
-        "reward_feature_dim": isinstance(feature_dim, (int, np.integer)) and feature_dim >= 1,
-    }
-    for name, what in REQUIRED_ATTRIBUTES.items():
-        if not fits[name]:
-            return f"{name} must be {what}, but is {given[name]!r}"
-    all_tasks = getattr(family, "all_tasks", None)
-    if all_tasks is not None:
-        tasks, size = np.asarray(all_tasks), task_space.shape[0]
-        if tasks.shape[1:] != (size,) or not all(task in task_space for task in tasks):
-            return f"all_tasks must have shape (n, {size}) and lie in task_space {task_space}, but is {all_tasks}"
-        if len(np.unique(tasks, axis=0)) < len(tasks):
-            return f"all_tasks must hold every task once, but is {tasks.tolist()}"
+    given: list[Any] = [getattr(family, name, None) for name in REQUIRED_ATTRIBUTES]
+    observations, actions, tasks, features = given
+    fits = (
+        _is_flat(observations),
+        _is_flat(actions) and actions.is_bounded(),
+        _is_flat(tasks) and tasks.dtype == np.float64,
+        isinstance(features, (int, np.integer)) and features >= 1,
+    )
+    for (name, what), value, right in zip(REQUIRED_ATTRIBUTES.items(), given, fits, strict=True):
+        if not right:
+            return f"{name} must be {what}, but is {value!r}"
+    if getattr(family, "all_tasks", None) is None:
+        return None
+    all_tasks, size = np.asarray(family.all_tasks), tasks.shape[0]
+    if all_tasks.shape[1:] != (size,) or not all(task in tasks for task in all_tasks):
+        return (
+            f"all_tasks must have shape (n, {size}) and lie in task_space {tasks}, but is "
+            f"{family.all_tasks}"
+        )
+    if len(np.unique(all_tasks, axis=0)) < len(all_tasks):
+        return f"all_tasks must hold every task once, but is {all_tasks.tolist()}"
     return None
 
 
@@ -269,24 +263,20 @@ def _is_flat(space: Any) -> bool:
 
 
 class _FamilyType(ABCMeta):
-    """Looks at a family when it is made, whether or not its constructor called
-    ``super().__init__``.
-    """
+    """Looks at a family when it is made, whether or not its constructor called the base class's."""
 
     def __call__(cls, *args: Any, **kwargs: Any) -> Any:
         family = super().__call__(*args, **kwargs)
-        missing = {
-            name: what for name, what in REQUIRED_ATTRIBUTES.items() if not hasattr(family, name)
-        }
+        required = REQUIRED_ATTRIBUTES.items()
+        missing = [f"{name} ({what})" for name, what in required if not hasattr(family, name)]
         if missing:
-            wanted = ", ".join(f"{name} ({what})" for name, what in missing.items())
             raise TypeError(
-                f"the task family {cls.__name__} must set {wanted}; see poem_envs.TaskFamily"
+                f"the task family {cls.__name__} must set {', '.join(missing)}; see "
+                "poem_envs.TaskFamily"
             )
-        modes = [
-            mode for mode in family.metadata["render_modes"] if mode != "human" or has_display()
-        ]
-        family.metadata = {**family.metadata, "render_modes": modes}
+        if not has_display():  # Gymnasium's checker tries every mode that is named
+            modes = [mode for mode in family.metadata["render_modes"] if mode != "human"]
+            family.metadata = {**family.metadata, "render_modes": modes}
         return family
 
 
@@ -302,15 +292,15 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray], metaclass=_Fam
             task_space = spaces.Box(-1.0, 1.0, (1,), np.float64)
             reward_feature_dim = 1
 
-            def _begin_episode(self, rng):                  # -> observation
+            def _begin_episode(self, rng):           # -> observation
                 self.x = rng.normal(0.0, 0.1, size=1)
                 return self.x.copy()
 
-            def _simulate(self, action):                    # -> observation, reward features, terminated
+            def _simulate(self, action):             # -> observation, reward features, terminated
                 self.x = self.x + 0.1 * action
                 return self.x.copy(), self.x.copy(), False
 
-            def _reward(self, tasks, features):             # elementwise, broadcasting
+            def _reward(self, tasks, features):      # elementwise, broadcasting
                 return -np.abs(features[..., 0] - tasks[..., 0])
 
     The base class checks actions and tasks, draws and keeps the task, computes the reward and fills
@@ -323,11 +313,11 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray], metaclass=_Fam
     ``poem_envs.set_task(env, task)`` reaches through them. None of this touches the random numbers
     of the episode itself, so two tasks see the same start.
 
-    **The info** of every step holds ``"reward_features"``, ``(reward_feature_dim,)`` float64: everything that rewards of this
-    family depend on (see :meth:`~TaskDefinition.compute_rewards`). A family whose
-    :meth:`_step_info` gives ``"success"``, whether the step reached what the task asks for, has
-    ``"is_success"`` there too, as SB3 calls it: whether any step of the episode so far did.
-    Training, evaluation and the command line then report success rates.
+    **The info** of every step holds ``"reward_features"``, ``(reward_feature_dim,)`` float64:
+    everything that rewards of this family depend on (see :meth:`~TaskDefinition.compute_rewards`).
+    A family whose :meth:`_step_info` gives ``"success"``, whether the step reached what the task
+    asks for, has ``"is_success"`` there too, as SB3 calls it: whether any step of the episode so
+    far did. Training, evaluation and the command line then report success rates.
 
     :param render_mode: one of ``metadata["render_modes"]``, or None
     :param render_task: whether rendering shows the hidden task, for a developer who debugs
@@ -362,9 +352,8 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray], metaclass=_Fam
         return None if self._task is None else self._task.copy()
 
     def set_task(self, task: npt.ArrayLike) -> None:
-        """Choose the task of the episodes that begin from the next reset on.
+        """Choose the task, ``(task_dim,)``, of the episodes that begin from the next reset on.
 
-        :param task: ``(task_dim,)``, inside ``task_space``
         :raises ValueError: if it has another shape, is not finite, or lies outside ``task_space``
             (or the finite family)
         """
@@ -385,8 +374,7 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray], metaclass=_Fam
             self.set_task(options["task"])
         super().reset(seed=seed)
         self._episode = 1 if seed is not None else self._episode + 1
-        self._elapsed_steps = 0
-        self._succeeded = False
+        self._elapsed_steps, self._succeeded = 0, False
         if self._next_task is not None:
             self._task = self._next_task
         elif self._task is None or seed is not None:
@@ -432,14 +420,28 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray], metaclass=_Fam
         """
 
     def _step_info(self) -> dict[str, Any]:
-        """Further entries of the info of the step just taken, say ``{"success": True}``: none
-        unless overridden.
-        """
+        """Further entries of the info of the step just taken, say ``{"success": True}``."""
         return {}
 
+    def get_physics_state(self) -> np.ndarray:
+        """The simulator's state, ``(state_dim,)``: enough to render this moment, or to go on from
+        it, of families that have one.
+        """
+        return self._physics_state(0)
+
+    def set_physics_state(self, state: npt.ArrayLike) -> None:
+        """Put the simulator into a state of :meth:`get_physics_state`, say to render a recorded
+        trajectory. The task stays.
+
+        :raises ValueError: if it has another shape or is not finite
+        """
+        self._set_physics_state(0, checked_state(state, self._physics_state(0).shape))
+
     def _describe_episode(self, copy: int = 0) -> str:
-        """Where an episode is, for error messages."""
-        return f"step {self._elapsed_steps} of episode {self._episode} since reset(seed={self.np_random_seed})"
+        return (
+            f"step {self._elapsed_steps} of episode {self._episode} since "
+            f"reset(seed={self.np_random_seed})"
+        )
 
 
 def task_stream(rng: np.random.Generator) -> np.random.Generator:
@@ -448,20 +450,19 @@ def task_stream(rng: np.random.Generator) -> np.random.Generator:
 
 
 def check_render_mode(render_mode: str | None, metadata: dict[str, Any]) -> None:
-    """Raise an error unless the environment can render so.
+    """Refuse a mode in which an environment cannot render.
 
-    :param render_mode: what was asked for
     :param metadata: the environment's own
     :raises ValueError: if it can render, but not so, or not on this machine
     :raises TypeError: if it cannot render at all; upon that SB3's ``make_vec_env``, which always
         asks, makes it without
     """
     modes = metadata["render_modes"]
-    if render_mode is not None and not modes:
-        raise TypeError(
-            f"render_mode={render_mode!r} is not supported: this environment cannot be rendered"
-        )
-    if render_mode is not None and render_mode not in modes:
+    if render_mode is None:
+        return
+    if not modes:
+        raise TypeError(f"render_mode={render_mode!r}: this environment cannot be rendered")
+    if render_mode not in modes:
         raise ValueError(
             f"render_mode={render_mode!r} is not supported, choose None or one of {modes}"
         )
@@ -472,15 +473,16 @@ def check_render_mode(render_mode: str | None, metadata: dict[str, Any]) -> None
 
 
 def check_options(options: dict[str, Any] | None, known: frozenset[str]) -> dict[str, Any]:
-    """Return the options of a reset, or raise a ValueError that names an unknown one.
+    """The options of a reset.
 
-    :param options: as the user gave them
     :param known: the keys that mean something
+    :raises ValueError: if there are others, which it names
     """
     unknown = set(options or {}) - known
     if unknown:
         raise ValueError(
-            f"options={options!r} of reset holds unknown keys {sorted(unknown)}, known are {sorted(known)}"
+            f"options={options!r} of reset holds unknown keys {sorted(unknown)}, known are "
+            f"{sorted(known)}"
         )
     return options or {}
 
@@ -488,36 +490,54 @@ def check_options(options: dict[str, Any] | None, known: frozenset[str]) -> dict
 def checked_actions(
     actions: npt.ArrayLike, space: spaces.Box, num_envs: int | None = None
 ) -> np.ndarray:
-    """Return actions as a new float64 array inside the bounds, or raise a ValueError that says what
-    is wrong with them.
+    """Actions as a new float64 array inside the bounds.
 
     :param actions: ``space.shape``, or ``(num_envs, *space.shape)``
-    :param space: the bounds of one action
+    :param space: of one action
     :param num_envs: number of environment copies; None for a single environment
+    :raises ValueError: if they have another shape, or one is not finite or too large
     """
-    shape = space.shape if num_envs is None else (num_envs, *space.shape)
-    try:
-        array = np.asarray(actions, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(
-            f"action={actions!r} is not an array of numbers of shape {shape}"
-        ) from error
-    if array.shape != shape:
-        raise ValueError(f"action has shape {array.shape}, expected {shape}")
+    array = _numbers(
+        actions, space.shape if num_envs is None else (num_envs, *space.shape), "action"
+    )
     low, high = space.low.astype(np.float64), space.high.astype(np.float64)
     clipped = np.clip(array, low, high)
     acceptable = np.abs(array - clipped) <= BOUNDS_TOLERANCE  # false for NaN
-    if not acceptable.all():
-        index = tuple(int(i) for i in np.argwhere(~acceptable)[0])
-        copy, component = (
-            ("", index) if num_envs is None else (f" of environment copy {index[0]}", index[1:])
-        )
-        bounds = f"[{low[component]:g}, {high[component]:g}]"
+    if acceptable.all():
+        return clipped
+    index = tuple(int(i) for i in np.argwhere(~acceptable)[0])
+    component = index if num_envs is None else index[1:]
+    copy = "" if num_envs is None else f" of environment copy {index[0]}"
+    raise ValueError(
+        f"action{copy} is {array[index]} at component {', '.join(map(str, component))}, but it "
+        f"must be finite and inside [{low[component]:g}, {high[component]:g}]"
+    )
+
+
+def checked_state(state: npt.ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
+    """A simulator's state as a new array.
+
+    :raises ValueError: if it has another shape or is not finite
+    """
+    array = np.array(state, dtype=np.float64)
+    if array.shape != shape or not np.isfinite(array).all():
         raise ValueError(
-            f"action{copy} is {array[index]} at component {', '.join(map(str, component))}, "
-            f"but it must be finite and inside {bounds}"
+            f"state={state!r} must be finite and have shape {shape}, as get_physics_state() "
+            "returns it"
         )
-    return clipped
+    return array
+
+
+def _numbers(values: npt.ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:
+    try:
+        array = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"{name}={values!r} is not an array of numbers of shape {shape}"
+        ) from error
+    if array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
+    return array
 
 
 def _first(tasks: np.ndarray, wrong: npt.ArrayLike, name: str) -> str:
@@ -526,9 +546,3 @@ def _first(tasks: np.ndarray, wrong: npt.ArrayLike, name: str) -> str:
         return f"{name}={tasks.tolist()}"
     row = int(np.flatnonzero(wrong)[0])
     return f"{name}[{row}]={tasks[row].tolist()}"
-
-
-def _checked_count(n: int) -> int:
-    if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1:
-        raise ValueError(f"n={n!r} must be a whole number, at least 1")
-    return int(n)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
@@ -20,6 +21,7 @@ GOAL_SITE = "target"
 #: Wrappers whose work the family, or what is around it, does itself; by name, since rl_zoo3
 #: replaces Gymnasium's TimeLimit
 TAKEN_OFF = frozenset({"TimeLimit", "OrderEnforcing", "PassiveEnvChecker"})
+REWARD = "compute_reward(achieved_goal, desired_goal, info)"
 SetGoal = Callable[[gym.Env, np.ndarray], None]
 
 
@@ -30,14 +32,17 @@ class GoalFamily(TaskFamily):
     ``"achieved_goal"`` and ``"desired_goal"``, and ``compute_reward(achieved_goal, desired_goal,
     info)`` is its reward, sparse or dense. Then
 
-    - the observation is ``"observation"``, and ``"achieved_goal"`` behind it if asked for; ``"desired_goal"`` is left out;
+    - the observation is ``"observation"``, and ``"achieved_goal"`` behind it if asked for;
+      ``"desired_goal"`` is left out;
     - a task is a desired goal, drawn as the environment's own reset draws it;
-    - the reward features are the achieved goal, and rewards of any task are ``compute_reward`` of it;
+    - the reward features are the achieved goal, and rewards of any task are ``compute_reward`` of
+      it;
     - ``"is_success"`` or ``"success"`` of the environment's info is the family's ``"success"``.
 
     An example::
 
-        gym.register("my/FetchSlide-v0", entry_point=GoalFamily, kwargs={"env": "gymnasium_robotics:FetchSlide-v4"})
+        slide = {"env": "gymnasium_robotics:FetchSlide-v4"}
+        gym.register("my/FetchSlide-v0", entry_point=GoalFamily, kwargs=slide)
 
     The environment's resets must depend on their seed alone. Its time limit is the family's too
     (:attr:`max_episode_steps`), unless the family is registered with another or ``gym.make`` is
@@ -81,45 +86,33 @@ class GoalFamily(TaskFamily):
     ) -> None:
         if isinstance(env, gym.Env):
             raise ValueError(
-                f"env={env} is an environment, but goals are drawn from a second copy of it: pass its id, or a function that "
-                "makes it"
+                f"env={env} is an environment, but goals are drawn from a second copy of it: pass "
+                "its id, or a function that makes it"
             )
-        self._source, self._set_goal_function = env, set_goal
-        self._env_kwargs = (
-            env_kwargs if render_mode is None else {**env_kwargs, "render_mode": render_mode}
-        )
-        self._observe_achieved_goal = observe_achieved_goal
+        if render_mode is not None:
+            env_kwargs["render_mode"] = render_mode
+        self._source, self._env_kwargs = env, env_kwargs
+        self._set_goal_function = set_goal
+        self._observed = GOAL_KEYS[: 1 + observe_achieved_goal]
         self._goal_env: gym.Env | None = None
         self._success: bool | None = None
         self._achieved_goal = np.zeros(0)
         self.env = self._make()
         self.metadata = {**self.env.metadata}
         super().__init__(render_mode=render_mode, render_task=render_task, split=split)
-        self._define_spaces(goal_low, goal_high)
-        self._rewards_broadcast = self._check_reward()
-
-    def _define_spaces(
-        self, goal_low: npt.ArrayLike | None, goal_high: npt.ArrayLike | None
-    ) -> None:
-        space: Any = self.env.observation_space  # a Dict of flat boxes, as check_goal_env saw to
-        goal = space["desired_goal"]
-        low, high = (
-            np.broadcast_to(
-                np.asarray(own if given is None else given, dtype=np.float64), goal.shape
-            )
-            for own, given in ((goal.low, goal_low), (goal.high, goal_high))
-        )
+        own: Any = self.env.observation_space  # a Dict of flat boxes, as check_goal_env saw to
+        goal = own["desired_goal"]
+        low = goal.low if goal_low is None else goal_low
+        high = goal.high if goal_high is None else goal_high
+        low, high = (np.broadcast_to(np.array(b, np.float64), goal.shape) for b in (low, high))
         self.task_space = spaces.Box(low, high, dtype=np.float64)
         self.reward_feature_dim = goal.shape[0]
-        parts = [space[key] for key in GOAL_KEYS[: 1 + self._observe_achieved_goal]]
-        low, high = (
-            np.concatenate([getattr(part, bound) for part in parts]) for bound in ("low", "high")
-        )
-        self.observation_space = spaces.Box(
-            low.astype(np.float64), high.astype(np.float64), dtype=np.float64
-        )
+        boxes = [(own[key].low, own[key].high) for key in self._observed]
+        low, high = (np.concatenate(b).astype(np.float64) for b in zip(*boxes, strict=True))
+        self.observation_space = spaces.Box(low, high, dtype=np.float64)
         assert isinstance(self.env.action_space, spaces.Box)
         self.action_space = self.env.action_space
+        self._rewards_broadcast = self._check_reward()
 
     def _make(self) -> gym.Env:
         if isinstance(self._source, str):
@@ -127,18 +120,18 @@ class GoalFamily(TaskFamily):
         else:
             env = self._source(**self._env_kwargs)
         check_goal_env(env)
+        # The family checks actions itself, and a time limit of its own ends episodes.
         wrapper = env
         while isinstance(wrapper, gym.Wrapper):
             if TAKEN_OFF.isdisjoint(kind.__name__ for kind in type(wrapper).__mro__):
                 raise ValueError(
-                    f"env makes {env}: its {type(wrapper).__name__} would have no effect, since the family steps the "
-                    "environment inside all wrappers. Make it without, or put what it does into the environment itself"
+                    f"env makes {env}: its {type(wrapper).__name__} would have no effect, since "
+                    "the family steps the environment inside all wrappers. Make it without, or put "
+                    "what it does into the environment itself"
                 )
             self.max_episode_steps = getattr(wrapper, "_max_episode_steps", self.max_episode_steps)
             wrapper = wrapper.env
-        return (
-            wrapper  # the family checks actions itself, and a time limit of its own ends episodes
-        )
+        return wrapper
 
     @property  # type: ignore[override]
     def spec(self) -> EnvSpec | None:
@@ -172,8 +165,8 @@ class GoalFamily(TaskFamily):
             one_by_one = [self._own_reward(goals[i : i + 1], goals[:1]) for i in range(2)]
         except Exception as error:
             raise ValueError(
-                f"{self.env}.compute_reward(achieved_goal, desired_goal, info) fails for goals of shape (1, {goals.shape[1]}) "
-                f"and an empty info: {type(error).__name__}: {error}. It must be a function of the two goals"
+                f"{self.env}: {REWARD} fails for goals of shape (1, {goals.shape[1]}) and an empty "
+                f"info: {type(error).__name__}: {error}. It must be a function of the two goals"
             ) from error
         self._place_goal(goals[0])
         try:
@@ -191,12 +184,10 @@ class GoalFamily(TaskFamily):
         desired = np.ascontiguousarray(tasks).reshape(-1, tasks.shape[-1])
         achieved = np.ascontiguousarray(features).reshape(desired.shape)
         if self._rewards_broadcast:
-            rewards = self._own_reward(achieved, desired)
-        else:
-            rows = [
-                self._own_reward(a[None], d[None]) for a, d in zip(achieved, desired, strict=True)
-            ]
-            rewards = np.concatenate(rows) if rows else np.empty(0)
+            return self._own_reward(achieved, desired).reshape(tasks.shape[:-1])
+        rewards = np.empty(len(desired))
+        for i in range(len(desired)):
+            rewards[i : i + 1] = self._own_reward(achieved[i : i + 1], desired[i : i + 1])
         return rewards.reshape(tasks.shape[:-1])
 
     def _draw_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
@@ -206,16 +197,14 @@ class GoalFamily(TaskFamily):
 
     def _goals_of_resets(self, env: gym.Env, seeds: Iterable[int]) -> np.ndarray:
         """The goals that the environment draws itself, ``(seeds, goal_dim)``."""
-        goals = np.stack([env.reset(seed=seed)[0]["desired_goal"] for seed in seeds]).astype(
-            np.float64
-        )
-        outside = (goals < self.task_space.low - BOUNDS_TOLERANCE) | (
-            goals > self.task_space.high + BOUNDS_TOLERANCE
-        )
+        drawn = [env.reset(seed=seed)[0]["desired_goal"] for seed in seeds]
+        goals, space = np.stack(drawn).astype(np.float64), self.task_space
+        low, high = space.low - BOUNDS_TOLERANCE, space.high + BOUNDS_TOLERANCE
+        outside = ((goals < low) | (goals > high)).any(axis=1)
         if outside.any():
             raise ValueError(
-                f"goal_low and goal_high span {self.task_space}, but {self.env} draws the goal "
-                f"{goals[outside.any(axis=1)][0].tolist()}; widen them"
+                f"goal_low and goal_high span {space}, but {self.env} draws the goal "
+                f"{goals[outside][0].tolist()}; widen them"
             )
         return goals
 
@@ -225,16 +214,15 @@ class GoalFamily(TaskFamily):
             return
         if not hasattr(self.env, "goal"):
             raise ValueError(
-                f"{self.env} has no attribute 'goal' to set; pass set_goal=f, a function that gives the environment a goal: "
-                "f(env, goal)"
+                f"{self.env} has no attribute 'goal' to set; pass set_goal=f, a function that "
+                "gives the environment a goal: f(env, goal)"
             )
         self.env.goal = goal.astype(np.asarray(self.env.goal).dtype)
         if hasattr(self.env, "update_target_site_pos"):
             self.env.update_target_site_pos()
 
     def _observation(self, observation: dict[str, np.ndarray]) -> np.ndarray:
-        keys = GOAL_KEYS[: 1 + self._observe_achieved_goal]
-        return np.concatenate([observation[key] for key in keys]).astype(np.float64)
+        return np.concatenate([observation[key] for key in self._observed]).astype(np.float64)
 
     def _begin_episode(self, rng: np.random.Generator) -> np.ndarray:
         assert self._task is not None
@@ -244,36 +232,30 @@ class GoalFamily(TaskFamily):
         return self._observation(observation)
 
     def _simulate(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
-        assert self._task is not None
-        observation, reward, terminated, _, info = self.env.step(
-            action.astype(self.action_space.dtype)
-        )
-        self._check_step(observation, float(reward))
-        success = info.get("success", info.get("is_success"))
-        self._success, self._achieved_goal = (
-            None if success is None else bool(success),
-            observation["achieved_goal"].copy(),
-        )
-        return (
-            self._observation(observation),
-            observation["achieved_goal"].astype(np.float64),
-            bool(terminated),
-        )
-
-    def _check_step(self, observation: dict[str, np.ndarray], reward: float) -> None:
-        assert self._task is not None
-        if not np.allclose(observation["desired_goal"], self._task, rtol=0.0, atol=1e-5):
-            raise RuntimeError(
-                f"{self.env} was given the goal {self._task}, but {self._describe_episode()} shows the desired goal "
-                f"{observation['desired_goal']}: the goal must stay for the whole episode (in gymnasium-robotics' mazes: "
-                "reset_target=False), and set_goal must set what 'desired_goal' shows"
-            )
+        action = action.astype(self.action_space.dtype)
+        observation, reward, terminated, _, info = self.env.step(action)
         features = observation["achieved_goal"].astype(np.float64)
+        self._check_step(observation["desired_goal"], features, float(reward))
+        success = info.get("success", info.get("is_success"))
+        self._success = None if success is None else bool(success)
+        self._achieved_goal = observation["achieved_goal"].copy()
+        return self._observation(observation), features, bool(terminated)
+
+    def _check_step(self, shown_goal: np.ndarray, features: np.ndarray, reward: float) -> None:
+        assert self._task is not None
+        if not np.allclose(shown_goal, self._task, rtol=0.0, atol=1e-5):
+            raise RuntimeError(
+                f"{self.env} was given the goal {self._task}, but {self._describe_episode()} shows "
+                f"the desired goal {shown_goal}: the goal must stay for the whole episode (in "
+                "gymnasium-robotics' mazes: reset_target=False), and set_goal must set what "
+                "'desired_goal' shows"
+            )
         expected = float(self._reward(self._task, features))
         if not np.isclose(reward, expected, rtol=1e-4, atol=1e-5):
             raise RuntimeError(
-                f"{self.env} gave the reward {reward} at {self._describe_episode()}, but its compute_reward(achieved_goal, "
-                f"desired_goal, info) gives {expected}: rewards must depend on the two goals alone to be relabelled"
+                f"{self.env} gave the reward {reward} at {self._describe_episode()}, but its "
+                f"{REWARD} gives {expected}: rewards must depend on the two goals alone to be "
+                "relabelled"
             )
 
     def _step_info(self) -> dict[str, Any]:
@@ -311,8 +293,6 @@ def unchanged_physics(env: gym.Env) -> Iterator[None]:
     if model is None or data is None:
         yield
         return
-    import mujoco
-
     spec = mujoco.mjtState.mjSTATE_INTEGRATION
     state = np.empty(mujoco.mj_stateSize(model, spec))
     mujoco.mj_getState(model, data, state, spec)
@@ -337,28 +317,28 @@ def check_goal_env(env: gym.Env) -> None:
         what is needed
     """
     bare, space = env.unwrapped, env.observation_space
-    if not isinstance(space, spaces.Dict) or any(key not in space.spaces for key in GOAL_KEYS):
-        found = (
-            f"a Dict of {sorted(space.spaces)}" if isinstance(space, spaces.Dict) else str(space)
-        )
+    parts = space.spaces if isinstance(space, spaces.Dict) else {}
+    if not set(GOAL_KEYS) <= set(parts):
+        found = f"a Dict of {sorted(parts)}" if parts else str(space)
         raise ValueError(
-            f"{bare} is not goal-conditioned: its observation space must be a Dict of {', '.join(map(repr, GOAL_KEYS))}, "
-            f"but is {found}"
+            f"{bare} is not goal-conditioned: its observation space must be a Dict of "
+            f"{', '.join(map(repr, GOAL_KEYS))}, but is {found}"
         )
     for key in GOAL_KEYS:
-        if not isinstance(space[key], spaces.Box) or len(space[key].shape or ()) != 1:
+        if not isinstance(parts[key], spaces.Box) or len(parts[key].shape or ()) != 1:
             raise ValueError(
-                f"{bare}: the space of {key!r} must be a flat Box, but is {space[key]}"
+                f"{bare}: the space of {key!r} must be a flat Box, but is {parts[key]}"
             )
-    if space["achieved_goal"].shape != space["desired_goal"].shape:
+    achieved, desired = parts["achieved_goal"].shape, parts["desired_goal"].shape
+    if achieved != desired:
         raise ValueError(
             f"{bare}: 'achieved_goal' and 'desired_goal' must have the same shape, but have "
-            f"{space['achieved_goal'].shape} and {space['desired_goal'].shape}"
+            f"{achieved} and {desired}"
         )
     if not isinstance(env.action_space, spaces.Box):
         raise ValueError(f"{bare}: the action space must be a Box, but is {env.action_space}")
     if not callable(getattr(bare, "compute_reward", None)):
         raise ValueError(
-            f"{bare} has no compute_reward(achieved_goal, desired_goal, info), by which rewards of other goals are computed; "
-            "define it as gymnasium_robotics.core.GoalEnv does"
+            f"{bare} has no {REWARD}, by which rewards of other goals are computed; define it as "
+            "gymnasium_robotics.core.GoalEnv does"
         )

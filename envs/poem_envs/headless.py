@@ -41,7 +41,8 @@ def choose_headless_backend() -> None:
         _logger.info("no display: rendering with MUJOCO_GL=%s", backend)
         return
     raise RuntimeError(
-        "rendering on a machine without a display needs libEGL or libOSMesa: install libegl1 or libosmesa6"
+        "rendering on a machine without a display needs libEGL or libOSMesa: install libegl1 or "
+        "libosmesa6"
     )
 
 

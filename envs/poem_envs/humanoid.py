@@ -9,38 +9,45 @@ import mujoco
 import numpy as np
 from gymnasium import spaces
 
-from poem_envs.ant import speed_towards
-from poem_envs.mujoco_family import MujocoFamily, MujocoTaskEnv, MujocoTaskVectorEnv
-from poem_envs.mujoco_rendering import arrow
+from poem_envs.legged import DirectionFamily
+from poem_envs.mujoco_family import MujocoTaskEnv, MujocoTaskVectorEnv
+
+TORSO = 1  # its subtree is the whole robot
 
 
-class _Humanoid(MujocoFamily):
-    hidden_qpos = 2
-    reward_feature_dim = 3
+class _HumanoidDir2D(DirectionFamily):
+    within = np.less
+    marker_height = 2.0
     camera_config = {"distance": 5.0, "elevation": -20.0, "lookat": np.array([0.0, 0.0, 1.2])}  # noqa: RUF012
-    _torso = 1  # its subtree is the whole robot
+    task_space = spaces.Box(-np.pi / 2, np.pi / 2, (1,), np.float64)
     _forward_data: mujoco.MjData | None = None
 
     def __init__(
         self,
         *,
         xml_file: str = "humanoid.xml",
+        forward_reward_weight: float = 1.25,
         ctrl_cost_weight: float = 0.1,
-        terminate_when_unhealthy: bool = True,
+        healthy_reward: float = 5.0,
         healthy_z_range: tuple[float, float] = (1.0, 2.0),
         reset_noise_scale: float = 1e-2,
         **kwargs: Any,
     ) -> None:
-        self.ctrl_cost_weight = ctrl_cost_weight
-        self.terminate_when_unhealthy = terminate_when_unhealthy
-        self.healthy_z_range = healthy_z_range
-        super().__init__(xml_file=xml_file, reset_noise_scale=reset_noise_scale, **kwargs)
-
-    def _observation_dim(self) -> int:
-        return super()._observation_dim() + self._derived_dim()
+        super().__init__(
+            xml_file=xml_file,
+            forward_reward_weight=forward_reward_weight,
+            ctrl_cost_weight=ctrl_cost_weight,
+            healthy_reward=healthy_reward,
+            healthy_z_range=healthy_z_range,
+            reset_noise_scale=reset_noise_scale,
+            **kwargs,
+        )
 
     def _derived_dim(self) -> int:
         return (10 + 6 + 6) * self.model.nbody + self.model.nv
+
+    def _observation_dim(self) -> int:
+        return super()._observation_dim() + self._derived_dim()
 
     def _allocate(self, n: int) -> None:
         super()._allocate(n)
@@ -67,38 +74,23 @@ class _Humanoid(MujocoFamily):
         velocity = (self._centre_of_mass - before) / self.dt
         return np.column_stack([velocity, np.square(actions).sum(axis=1)])
 
-    def _unhealthy(self) -> np.ndarray:
-        if not self.terminate_when_unhealthy:
-            return super()._unhealthy()
-        lowest, highest = self.healthy_z_range
-        height = self._qpos[:, 2]
-        return ~((lowest < height) & (height < highest))
-
     def _observations(self) -> np.ndarray:
         return np.concatenate([super()._observations(), self._derived], axis=1)
 
     def _derive(self, copies: np.ndarray, controls: np.ndarray) -> None:
-        """Compute what the observation and the reward take from the simulator, at the copies'
-        current states.
-
-        :param copies: their numbers
-        :param controls: the actions that are applied, ``(len(copies), nu)``
+        """Compute what the observation and the reward take from the simulator, at the current
+        states of some copies, given by number, under the actions applied, ``(len(copies), nu)``.
         """
         model = self.model
         if self._forward_data is None:
             self._forward_data = mujoco.MjData(model)
         data = self._forward_data
-        derived = [
-            data.cinert.reshape(-1),
-            data.cvel.reshape(-1),
-            data.qfrc_actuator,
-            data.cfrc_ext.reshape(-1),
-        ]
-        ctrl, warm_start, centre_of_mass = (
-            data.ctrl,
-            data.qacc_warmstart,
-            data.subtree_com[self._torso, :2],
+        cinert, cvel, cfrc_ext = (
+            field.reshape(-1) for field in (data.cinert, data.cvel, data.cfrc_ext)
         )
+        derived = [cinert, cvel, data.qfrc_actuator, cfrc_ext]  # views, as are those below
+        ctrl, warm_start = data.ctrl, data.qacc_warmstart
+        centre_of_mass = data.subtree_com[TORSO, :2]
         for copy, control in zip(copies.tolist(), controls, strict=True):
             mujoco.mj_setState(model, data, self._states[copy], mujoco.mjtState.mjSTATE_FULLPHYSICS)
             ctrl[:] = control
@@ -108,49 +100,34 @@ class _Humanoid(MujocoFamily):
             np.concatenate(derived, out=self._derived[copy])
             self._centre_of_mass[copy] = centre_of_mass
 
-    def _task_markers(self, task: np.ndarray, position: np.ndarray) -> list[dict[str, Any]]:
-        direction = (float(np.cos(task[0])), float(np.sin(task[0])))
-        return [arrow(np.array([position[0], position[1], 2.0]), direction, length=1.0)]
-
-
-class _HumanoidDir2D(_Humanoid):
-    def __init__(
-        self, *, forward_reward_weight: float = 1.25, healthy_reward: float = 5.0, **kwargs: Any
-    ) -> None:
-        self.forward_reward_weight = forward_reward_weight
-        self.healthy_reward = healthy_reward
-        self.task_space = spaces.Box(-np.pi / 2, np.pi / 2, (1,), np.float64)
-        super().__init__(**kwargs)
-
-    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
-        forward = self.forward_reward_weight * speed_towards(tasks, features)
-        return forward - self.ctrl_cost_weight * features[..., 2] + self.healthy_reward
-
 
 class HumanoidDir2DEnv(_HumanoidDir2D, MujocoTaskEnv):
     r"""
     ## Description
-    The Humanoid, a robot with 17 hinges, is to run in a direction of the plane that it cannot see, and not to fall. The
-    positions and velocities follow Gymnasium's `Humanoid-v4`, but for the solver's warm start, which every step begins
-    at zero (see :class:`~poem_envs.mujoco_family.MujocoFamily`).
+    The Humanoid, a robot with 17 hinges, is to run in a direction of the plane that it cannot see,
+    and not to fall. The positions and velocities follow Gymnasium's `Humanoid-v4`, but for the
+    solver's warm start, which every step begins at zero (see
+    :class:`~poem_envs.mujoco_family.MujocoFamily`).
 
     ## Task
-    The direction as an angle, uniform on [-pi/2, pi/2], 0 being the x direction, hidden from the observation:
-    `task_space` is `Box(-pi/2, pi/2, (1,), float64)`.
+    The direction as an angle, uniform on [-pi/2, pi/2], 0 being the x direction, hidden from the
+    observation: `task_space` is `Box(-pi/2, pi/2, (1,), float64)`.
 
     ## Action Space
-    The action space is a `Box(-0.4, 0.4, (17,), float32)`: torques at the hinge joints, scaled by each motor's gear.
+    The action space is a `Box(-0.4, 0.4, (17,), float32)`: torques at the hinge joints in N m,
+    scaled by each motor's gear.
 
-    | Num     | Action                                         | Control Min | Control Max | Type (Unit)  |
-    | ------- | ---------------------------------------------- | ----------- | ----------- | ------------ |
-    | 0 - 2   | torques on the abdomen (y, z, x)               | -0.4        | 0.4         | torque (N m) |
-    | 3 - 6   | torques on the right hip (x, z, y) and knee    | -0.4        | 0.4         | torque (N m) |
-    | 7 - 10  | torques on the left hip (x, z, y) and knee     | -0.4        | 0.4         | torque (N m) |
-    | 11 - 13 | torques on the right shoulder (1, 2) and elbow | -0.4        | 0.4         | torque (N m) |
-    | 14 - 16 | torques on the left shoulder (1, 2) and elbow  | -0.4        | 0.4         | torque (N m) |
+    | Num     | Action                                         | Control Min | Control Max |
+    | ------- | ---------------------------------------------- | ----------- | ----------- |
+    | 0 - 2   | torques on the abdomen (y, z, x)               | -0.4        | 0.4         |
+    | 3 - 6   | torques on the right hip (x, z, y) and knee    | -0.4        | 0.4         |
+    | 7 - 10  | torques on the left hip (x, z, y) and knee     | -0.4        | 0.4         |
+    | 11 - 13 | torques on the right shoulder (1, 2) and elbow | -0.4        | 0.4         |
+    | 14 - 16 | torques on the left shoulder (1, 2) and elbow  | -0.4        | 0.4         |
 
     ## Observation Space
-    The observation space is a `Box(-Inf, Inf, (376,), float64)`, in the layout of Gymnasium's Humanoid-v4.
+    The observation space is a `Box(-Inf, Inf, (376,), float64)`, in the layout of Gymnasium's
+    Humanoid-v4.
 
     | Num       | Observation                                                                   |
     | --------- | ----------------------------------------------------------------------------- |
@@ -161,22 +138,24 @@ class HumanoidDir2DEnv(_HumanoidDir2D, MujocoTaskEnv):
     | 269 - 291 | `qfrc_actuator`: generalised forces of the actuators                          |
     | 292 - 375 | `cfrc_ext`: external forces and torques on the 14 bodies, 6 each              |
 
-    `cinert` to `cfrc_ext` are those of the state that the observation shows, under the action just applied. Gymnasium
-    reads what MuJoCo computed at the start of the last physics step, and has no `cfrc_ext` at a reset.
+    `cinert` to `cfrc_ext` are those of the state that the observation shows, under the action just
+    applied. Gymnasium reads what MuJoCo computed at the start of the last physics step, and has no
+    `cfrc_ext` at a reset.
 
     ## Rewards
-    $w_{forward} \cdot (v_x \cos(angle) + v_y \sin(angle)) - w_{ctrl} \|action\|_2^2 + healthy$, where $v$ is the change
-    of the centre of mass over the step, divided by its duration `dt` = 0.015 s; Gymnasium's Humanoid-v4 takes centres
-    that lag by a physics step. Every step earns `healthy_reward`, the last of an early end too. The reward features are
+    $w_{forward} \cdot (v_x \cos(angle) + v_y \sin(angle)) - w_{ctrl} \|action\|_2^2 + healthy$,
+    where $v$ is the change of the centre of mass over the step, divided by its duration
+    `dt` = 0.015 s; Gymnasium's Humanoid-v4 takes centres that lag by a physics step. Every step
+    earns `healthy_reward`, the last of an early end too. The reward features are
     $(v_x, v_y, \|action\|_2^2)$.
 
     ## Starting State
-    The model's initial pose, standing, plus noise: uniform on [-`reset_noise_scale`, `reset_noise_scale`] in every
-    position and velocity.
+    The model's initial pose, standing, plus noise: uniform on
+    [-`reset_noise_scale`, `reset_noise_scale`] in every position and velocity.
 
     ## Episode End
-    An episode terminates when the torso's z-coordinate is not strictly inside `healthy_z_range`, unless
-    `terminate_when_unhealthy=False`. `gymnasium.make` truncates episodes after 200 steps.
+    An episode terminates when the torso's z-coordinate is not strictly inside `healthy_z_range`,
+    unless `terminate_when_unhealthy=False`. `gymnasium.make` truncates episodes after 200 steps.
 
     ## Arguments
     ```python
@@ -184,17 +163,18 @@ class HumanoidDir2DEnv(_HumanoidDir2D, MujocoTaskEnv):
     env = gym.make("poem_envs:poem/HumanoidDir2D-v0", ctrl_cost_weight=0.1)
     ```
 
-    | Parameter                  | Type      | Default      | Description                                             |
-    | -------------------------- | --------- | ------------ | ------------------------------------------------------- |
-    | `forward_reward_weight`    | **float** | `1.25`       | Weight of the speed term                                |
-    | `ctrl_cost_weight`         | **float** | `0.1`        | Weight of the action cost                               |
-    | `healthy_reward`           | **float** | `5.0`        | Added to the reward of every step                       |
-    | `terminate_when_unhealthy` | **bool**  | `True`       | Whether falling ends the episode                        |
-    | `healthy_z_range`          | **tuple** | `(1.0, 2.0)` | Lowest and highest healthy z-coordinate of the torso, m |
-    | `reset_noise_scale`        | **float** | `0.01`       | Scale of the noise of the starting state                |
+    | Parameter                  | Type      | Default      | Description                       |
+    | -------------------------- | --------- | ------------ | --------------------------------- |
+    | `forward_reward_weight`    | **float** | `1.25`       | Weight of the speed term          |
+    | `ctrl_cost_weight`         | **float** | `0.1`        | Weight of the action cost         |
+    | `healthy_reward`           | **float** | `5.0`        | Added to the reward of every step |
+    | `terminate_when_unhealthy` | **bool**  | `True`       | Whether falling ends the episode  |
+    | `healthy_z_range`          | **tuple** | `(1.0, 2.0)` | Healthy heights of the torso, m   |
+    | `reset_noise_scale`        | **float** | `0.01`       | Scale of the noise of the start   |
 
-    Further arguments (`xml_file="humanoid.xml"`, `frame_skip=5`, `render_mode`, cameras, size of images) are those of
-    :class:`~poem_envs.mujoco_family.MujocoFamily`. `render_task=True` shows the hidden task: an arrow.
+    Further arguments (`xml_file="humanoid.xml"`, `frame_skip=5`, `render_mode`, cameras, size of
+    images) are those of :class:`~poem_envs.mujoco_family.MujocoFamily`. `render_task=True` shows
+    the hidden task: an arrow.
 
     ## Version History
     * v0: Initial version

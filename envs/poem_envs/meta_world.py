@@ -12,7 +12,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from poem_envs.family import TaskFamily
-from poem_envs.mujoco_fast_rendering import renders_fast
+from poem_envs.mujoco_rendering import renders_fast
 from poem_envs.process_vector import ProcessFamilyVector
 from poem_envs.sawyer import (
     PlacementRefusedError,
@@ -35,9 +35,6 @@ PUCK_TO_GOAL = 0.15
 class MetaWorldEnv(TaskFamily):
     """What ML1 and ML10 have in common: observations, actions, simulators and their rendering.
 
-    :param render_mode: ``"rgb_array"``, ``"human"`` or ``"depth_array"``
-    :param render_task: whether rendering shows the goal
-    :param split: which tasks to draw
     :param width: of rendered images, pixels
     :param height: of rendered images, pixels
     :param camera_name: one of Meta-World's cameras
@@ -55,7 +52,6 @@ class MetaWorldEnv(TaskFamily):
         render_quality: str = "full",
         **kwargs: Any,
     ) -> None:
-        load_metaworld()
         super().__init__(**kwargs)
         self.observation_space = spaces.Box(-np.inf, np.inf, (OBSERVATION_DIM,), np.float64)
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
@@ -66,6 +62,8 @@ class MetaWorldEnv(TaskFamily):
             "height": height,
             "camera_name": camera_name,
         }
+        # Meta-World's models have these cameras upside down.
+        self._upside_down = (camera_name or "").startswith("corner")
         self._success = False
         self._sawyer: Sawyer | None = None
 
@@ -74,8 +72,12 @@ class MetaWorldEnv(TaskFamily):
         raise NotImplementedError
 
     def _features(self, reward: float) -> np.ndarray:
-        """The reward features of the step just taken, of which Meta-World's own reward is given."""
-        raise NotImplementedError
+        """The reward features of the step just taken; here, Meta-World's own reward of it."""
+        return np.array([reward])
+
+    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
+        shape = np.broadcast_shapes(tasks.shape[:-1], features.shape[:-1])
+        return np.broadcast_to(features[..., 0], shape).copy()
 
     def _begin_episode(self, rng: np.random.Generator) -> np.ndarray:
         assert self._task is not None
@@ -92,48 +94,32 @@ class MetaWorldEnv(TaskFamily):
             observation, reward, self._success = self._sawyer.step(action)
         except FloatingPointError as error:
             raise RuntimeError(
-                f"the simulation of {type(self).__name__} diverged at {self._describe_episode()}: {error}"
+                f"the simulation of {type(self).__name__} diverged at {self._describe_episode()}: "
+                f"{error}"
             ) from error
         return observation, self._features(reward), False
 
     def _step_info(self) -> dict[str, Any]:
         return {"success": self._success}
 
-    def get_physics_state(self) -> np.ndarray:
-        """The simulator's state, ``(state_dim,)``: enough to go on from it in an episode of the
-        same task and start.
-        """
+    def _begun(self, method: str) -> Sawyer:
         if self._sawyer is None:
-            raise RuntimeError("get_physics_state() was called before the first reset()")
-        return self._sawyer.get_state()
+            raise RuntimeError(f"{method}() was called before the first reset()")
+        return self._sawyer
 
-    def set_physics_state(self, state: npt.ArrayLike) -> None:
-        """Put the simulator into a state of :meth:`get_physics_state`. The task stays.
+    def _physics_state(self, copy: int) -> np.ndarray:
+        return self._begun("get_physics_state").get_state()
 
-        :param state: ``(state_dim,)``
-        :raises ValueError: if it has another shape or is not finite
-        """
-        shape = self.get_physics_state().shape
-        array = np.array(state, dtype=np.float64)
-        if array.shape != shape or not np.isfinite(array).all():
-            raise ValueError(
-                f"state={state!r} must be finite and have shape {shape}, as get_physics_state() returns it"
-            )
-        assert self._sawyer is not None
-        self._sawyer.set_state(array)
+    def _set_physics_state(self, copy: int, state: np.ndarray) -> None:
+        self._begun("set_physics_state").set_state(state)
 
     def render(self) -> Any:
         """Render the current state as ``render_mode`` says: an image ``(height, width, 3)`` for
         ``"rgb_array"``.
         """
-        if self._sawyer is None:
-            raise RuntimeError("render() was called before the first reset()")
-        image = self._sawyer.render()
-        # Meta-World's models have these cameras upside down.
-        upside_down = isinstance(image, np.ndarray) and (
-            self._sawyer_arguments["camera_name"] or ""
-        ).startswith("corner")
-        return image[::-1, ::-1].copy() if upside_down else image
+        image = self._begun("render").render()
+        turn = self._upside_down and isinstance(image, np.ndarray)
+        return image[::-1, ::-1].copy() if turn else image
 
     def close(self) -> None:
         """Free what rendering and simulation hold."""
@@ -150,47 +136,51 @@ class MetaWorldEnv(TaskFamily):
 class MetaWorldML1Env(MetaWorldEnv):
     r"""
     ## Description
-    One manipulation of Meta-World (Yu et al. 2019), with a Sawyer arm, in many placements of its object and its goal: the
-    benchmark ML1. The goal is hidden as Meta-World hides it, by zeros in the observation.
+    One manipulation of Meta-World (Yu et al. 2019), with a Sawyer arm, in many placements of its
+    object and its goal: the benchmark ML1. The goal is hidden as Meta-World hides it, by zeros in
+    the observation.
 
     ## Task
-    For `reach` and `reach-wall` the position of the goal, `(x, y, z)` in metres, drawn as Meta-World draws it: uniform on its
-    box, but for goals close to the puck that it draws with them. The puck, which the reward of these two does not depend on,
-    is placed anew in every episode.
+    For `reach` and `reach-wall` the position of the goal, `(x, y, z)` in metres, drawn as
+    Meta-World draws it: uniform on its box, but for goals close to the puck that it draws with
+    them. The puck, which the reward of these two does not depend on, is placed anew in every
+    episode.
 
-    For every other manipulation the placement that Meta-World calls `rand_vec`: the position of the object and, for some,
-    that of the goal. It is drawn as Meta-World draws it. Observations show the object, as Meta-World's do.
+    For every other manipulation the placement that Meta-World calls `rand_vec`: the position of the
+    object and, for some, that of the goal. It is drawn as Meta-World draws it. Observations show
+    the object, as Meta-World's do.
 
-    `split="train"` and `split="test"` are different draws from the same distribution; the benchmark takes 50 of each:
-    `sample_tasks(50, rng)`.
+    `split="train"` and `split="test"` are different draws from the same distribution; the benchmark
+    takes 50 of each: `sample_tasks(50, rng)`.
 
     ## Action Space
-    The action space is a `Box(-1, 1, (4,), float32)`: a movement of the hand in x, y and z, by up to a centimetre, and the
-    effort that closes the gripper.
+    The action space is a `Box(-1, 1, (4,), float32)`: a movement of the hand in x, y and z, by up
+    to a centimetre, and the effort that closes the gripper.
 
     ## Observation Space
     The observation space is a `Box(-Inf, Inf, (39,), float64)`, that of Meta-World.
 
-    | Num   | Observation                                                                     |
-    | ----- | ------------------------------------------------------------------------------- |
-    | 0-2   | position of the hand                                                            |
-    | 3     | how far the gripper is open                                                     |
-    | 4-17  | positions and quaternions of up to two objects, padded with zeros               |
-    | 18-35 | the same of the step before                                                     |
-    | 36-38 | zeros, in place of the goal                                                     |
+    | Num   | Observation                                                       |
+    | ----- | ----------------------------------------------------------------- |
+    | 0-2   | position of the hand                                              |
+    | 3     | how far the gripper is open                                       |
+    | 4-17  | positions and quaternions of up to two objects, padded with zeros |
+    | 18-35 | the same of the step before                                       |
+    | 36-38 | zeros, in place of the goal                                       |
 
     ## Rewards
     Meta-World's own (version 2), between 0 and 10, and its `success` in the info.
 
-    For `reach` and `reach-wall` the tasks share their dynamics and the reward features are the position of the gripper's
-    centre, `(x, y, z)`: the reward of any goal is a function of it. The rewards of the other manipulations depend on the
-    placement through the simulator's state, and so does what follows an action. There `shared_dynamics` is False and the
-    one reward feature is the reward of the task that was played, which says nothing about other tasks.
+    For `reach` and `reach-wall` the tasks share their dynamics and the reward features are the
+    position of the gripper's centre, `(x, y, z)`: the reward of any goal is a function of it. The
+    rewards of the other manipulations depend on the placement through the simulator's state, and so
+    does what follows an action. There `shared_dynamics` is False and the one reward feature is the
+    reward of the task that was played, which says nothing about other tasks.
 
     ## Starting State
-    Meta-World's: the hand moves to its initial position. It depends on the task alone, but for the puck of `reach` and
-    `reach-wall`. The puck's box is cut to where Meta-World accepts it together with any goal (at least 0.15 m away), so that
-    the start says nothing about the goal.
+    Meta-World's: the hand moves to its initial position. It depends on the task alone, but for the
+    puck of `reach` and `reach-wall`. The puck's box is cut to where Meta-World accepts it together
+    with any goal (at least 0.15 m away), so that the start says nothing about the goal.
 
     ## Episode End
     There is no early end. `gymnasium.make` truncates episodes after 200 steps.
@@ -201,15 +191,15 @@ class MetaWorldML1Env(MetaWorldEnv):
     env = gym.make("poem_envs:poem/MetaWorldML1-v0", env_name="push")
     ```
 
-    | Parameter         | Type     | Default     | Description                                                     |
-    | ----------------- | -------- | ----------- | --------------------------------------------------------------- |
-    | `env_name`        | **str**  | `"reach"`   | One of Meta-World's 50 manipulations, with or without `-v3`     |
-    | `split`           | **str**  | `"train"`   | `"train"` or `"test"`                                           |
-    | `render_mode`     | **str**  | `None`      | `"rgb_array"`, `"human"` or `"depth_array"`                     |
-    | `render_task`     | **bool** | `False`     | Whether rendering shows the goal                                |
-    | `width`, `height` | **int**  | `480`       | Size of the rendered image, pixels                              |
-    | `camera_name`     | **str**  | `"corner2"` | One of Meta-World's cameras                                     |
-    | `render_quality`  | **str**  | `"full"`    | `"fast"` leaves out shadows and antialiasing of RGB images      |
+    | Parameter         | Type     | Default     | Description                                  |
+    | ----------------- | -------- | ----------- | -------------------------------------------- |
+    | `env_name`        | **str**  | `"reach"`   | One of 50, with or without `-v3`             |
+    | `split`           | **str**  | `"train"`   | `"train"` or `"test"`                        |
+    | `render_mode`     | **str**  | `None`      | `"rgb_array"`, `"human"` or `"depth_array"`  |
+    | `render_task`     | **bool** | `False`     | Whether rendering shows the goal             |
+    | `width`, `height` | **int**  | `480`       | Size of the rendered image, pixels           |
+    | `camera_name`     | **str**  | `"corner2"` | One of Meta-World's cameras                  |
+    | `render_quality`  | **str**  | `"full"`    | `"fast"` leaves out shadows and antialiasing |
 
     ## Version History
     * v0: Initial version
@@ -218,18 +208,17 @@ class MetaWorldML1Env(MetaWorldEnv):
     splits = ("train", "test")
 
     def __init__(self, *, env_name: str = "reach", split: str = "train", **kwargs: Any) -> None:
-        load_metaworld()
         self.env_name = checked_manipulation(env_name)
         if split == "held-out":
             raise ValueError(
-                "split='held-out': poem/MetaWorldML1-v0 has one manipulation and holds none back; it has 'train' and 'test' "
-                "placements. poem/MetaWorldML10-v0 holds back five manipulations"
+                "split='held-out': poem/MetaWorldML1-v0 has one manipulation and holds none back; "
+                "it has 'train' and 'test' placements. poem/MetaWorldML10-v0 holds back five "
+                "manipulations"
             )
         super().__init__(split=split, **kwargs)
         placements = placements_of(self.env_name)
         low, high = placements.low, placements.high
-        self._reaching = self.env_name in REACHING
-        self.shared_dynamics = self._reaching
+        self._reaching = self.shared_dynamics = self.env_name in REACHING
         self.reward_feature_dim = 3 if self._reaching else 1
         if self._reaching:
             self._puck_low, self._puck_high = low[:3].copy(), high[:3].copy()
@@ -256,42 +245,43 @@ class MetaWorldML1Env(MetaWorldEnv):
         return self.env_name, np.concatenate([rng.uniform(self._puck_low, self._puck_high), task])
 
     def _features(self, reward: float) -> np.ndarray:
-        assert self._sawyer is not None
-        return self._sawyer.env.tcp_center.copy() if self._reaching else np.array([reward])
+        if not self._reaching:
+            return super()._features(reward)
+        return self._begun("step").env.tcp_center.copy()
 
     def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
         if not self._reaching:
-            return np.broadcast_to(
-                features[..., 0], np.broadcast_shapes(tasks.shape[:-1], features.shape[:-1])
-            ).copy()
+            return super()._reward(tasks, features)
         beyond = np.maximum(_distance(features, tasks) - TARGET_RADIUS, 0.0)
         relative = beyond / _distance(self._hand_init_pos, tasks)
-        return 10.0 / (
-            1.0 + 9.0 * relative * relative
-        )  # 0.1 of the full reward at the distance of the start
+        return 10.0 / (1.0 + 9.0 * relative * relative)  # a tenth at the distance of the start
 
 
 class MetaWorldML10Env(MetaWorldEnv):
     r"""
     ## Description
-    Ten manipulations of Meta-World (Yu et al. 2019), each in many placements: the benchmark ML10. Which of them it is, and
-    where the goal is, is hidden; see :class:`MetaWorldML1Env` for observations, actions, start and end, which are the same.
+    Ten manipulations of Meta-World (Yu et al. 2019), each in many placements: the benchmark ML10.
+    Which of them it is, and where the goal is, is hidden; see :class:`MetaWorldML1Env` for
+    observations, actions, start and end, which are the same.
 
     ## Task
-    `(manipulation, placement)`, a `Box` of shape `(7,)`: the number of the manipulation in `manipulations`, and Meta-World's
-    `rand_vec` for it, padded with zeros. `sample_tasks` draws manipulations in equal parts.
+    `(manipulation, placement)`, a `Box` of shape `(7,)`: the number of the manipulation in
+    `manipulations`, and Meta-World's `rand_vec` for it, padded with zeros. `sample_tasks` draws
+    manipulations in equal parts.
 
-    | `split`      | Manipulations                                                                                 |
-    | ------------ | --------------------------------------------------------------------------------------------- |
-    | `"train"`    | 0-9: reach, push, pick-place, door-open, drawer-close, button-press-topdown, peg-insert-side, |
-    |              | window-open, sweep, basketball                                                                |
-    | `"test"`     | the same ten, in other placements                                                             |
-    | `"held-out"` | 10-14, which ML10 keeps back: drawer-open, door-close, shelf-place, sweep-into, lever-pull    |
+    | `split`      | Manipulations                                                         |
+    | ------------ | --------------------------------------------------------------------- |
+    | `"train"`    | 0-9: reach, push, pick-place, door-open, drawer-close,                |
+    |              | button-press-topdown, peg-insert-side, window-open, sweep, basketball |
+    | `"test"`     | the same ten, in other placements                                     |
+    | `"held-out"` | 10-14, which ML10 keeps back: drawer-open, door-close, shelf-place,   |
+    |              | sweep-into, lever-pull                                                |
 
     ## Rewards
-    Meta-World's own (version 2), between 0 and 10, and its `success` in the info. The tasks have different dynamics:
-    `shared_dynamics` is False, and the one reward feature is the reward of the task that was played, which says nothing about
-    other tasks. POEM measures what one task's policy earns in another by running it there (`preference_source="rollout"`).
+    Meta-World's own (version 2), between 0 and 10, and its `success` in the info. The tasks have
+    different dynamics: `shared_dynamics` is False, and the one reward feature is the reward of the
+    task that was played, which says nothing about other tasks. POEM measures what one task's policy
+    earns in another by running it there (`preference_source="rollout"`).
 
     ## Arguments
     `split`, and those of :class:`MetaWorldML1Env` but `env_name`.
@@ -307,36 +297,27 @@ class MetaWorldML10Env(MetaWorldEnv):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         table = load_metaworld().ML10_V3
-        trained, held_out = (
-            [name.removesuffix("-v3") for name in table[part]] for part in ("train", "test")
-        )
+        names = [*table["train"], *table["test"]]
         #: The names of the manipulations, by number.
-        self.manipulations = [*trained, *held_out]
-        self._numbers = (
-            np.arange(len(trained), len(self.manipulations))
-            if self.split == "held-out"
-            else np.arange(len(trained))
-        )
+        self.manipulations = [name.removesuffix("-v3") for name in names]
+        numbers = np.arange(len(names))
+        trained, held_out = np.split(numbers, [len(table["train"])])
+        self._numbers = held_out if self.split == "held-out" else trained
         bounds = [placements_of(name) for name in self.manipulations]
         self._placement_dims = [len(placements.low) for placements in bounds]
         width = max(self._placement_dims)
         low = np.min([_padded(placements.low, width) for placements in bounds], axis=0)
         high = np.max([_padded(placements.high, width) for placements in bounds], axis=0)
-        last = len(self.manipulations) - 1.0
-        self.task_space = spaces.Box(
-            np.concatenate([[0.0], low]), np.concatenate([[last], high]), dtype=np.float64
-        )
+        low, high = np.append(numbers[0], low), np.append(numbers[-1], high)
+        self.task_space = spaces.Box(low, high, dtype=np.float64)
 
     def _draw_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
         rng = split_stream(rng, self.splits.index(self.split))
         rounds = -(-n // len(self._numbers))
         numbers = np.concatenate([rng.permutation(self._numbers) for _ in range(rounds)])[:n]
         width = self.task_space.shape[0] - 1
-        draws = [
-            _padded(placements_of(self.manipulations[number]).draw(rng), width)
-            for number in numbers
-        ]
-        return np.column_stack([numbers, draws])
+        places = [placements_of(self.manipulations[number]) for number in numbers]
+        return np.column_stack([numbers, [_padded(place.draw(rng), width) for place in places]])
 
     def _checked_tasks(self, tasks: npt.ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:
         checked = super()._checked_tasks(tasks, shape, name)
@@ -348,7 +329,8 @@ class MetaWorldML10Env(MetaWorldEnv):
             manipulation, placement = self._place(task, np.random.default_rng(0))
             if np.any(task[1 + len(placement) :] != 0.0):
                 raise ValueError(
-                    f"{name}={task.tolist()}: a placement of {manipulation!r} is {len(placement)} numbers, then zeros"
+                    f"{name}={task.tolist()}: a placement of {manipulation!r} is {len(placement)} "
+                    "numbers, then zeros"
                 )
             check_placement(manipulation, placement, name)
         return checked
@@ -356,14 +338,6 @@ class MetaWorldML10Env(MetaWorldEnv):
     def _place(self, task: np.ndarray, rng: np.random.Generator) -> tuple[str, np.ndarray]:
         number = round(task[0])
         return self.manipulations[number], task[1 : 1 + self._placement_dims[number]].copy()
-
-    def _features(self, reward: float) -> np.ndarray:
-        return np.array([reward])
-
-    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
-        return np.broadcast_to(
-            features[..., 0], np.broadcast_shapes(tasks.shape[:-1], features.shape[:-1])
-        ).copy()
 
 
 #: The vectorised :class:`MetaWorldML1Env`: same arguments, and those of ``ProcessFamilyVector``.
@@ -373,29 +347,22 @@ MetaWorldML10VectorEnv = functools.partial(ProcessFamilyVector, MetaWorldML10Env
 
 
 def split_stream(rng: np.random.Generator, split: int) -> np.random.Generator:
-    """A generator of a split's own, so that equal generators give different tasks in different
-    splits.
-
-    :param rng: which determines it; the first split draws from it directly
-    :param split: the number of the split
+    """A generator that another determines, and that differs from split to split; the first split
+    draws from the given one directly.
     """
     return rng if split == 0 else np.random.default_rng([split, *rng.integers(2**32, size=4)])
 
 
 def check_placement(manipulation: str, placement: np.ndarray, name: str) -> None:
     """:raises ValueError: if Meta-World has no such placement of the manipulation"""
-    placements = placements_of(manipulation)
-    low, high = placements.low, placements.high
-    if np.any(placement < low - 1e-6) or np.any(placement > high + 1e-6):
-        raise ValueError(
-            f"{name}: placement {placement.tolist()} of {manipulation!r} must be inside {low} to {high}"
-        )
+    places = placements_of(manipulation)
+    what = f"{name}: placement {placement.tolist()} of {manipulation!r}"
+    if np.any(placement < places.low - 1e-6) or np.any(placement > places.high + 1e-6):
+        raise ValueError(f"{what} must be inside {places.low} to {places.high}")
     try:
-        placements.check(placement)
+        places.check(placement)
     except PlacementRefusedError as error:
-        raise ValueError(
-            f"{name}: placement {placement.tolist()} of {manipulation!r}: {error}; draw one by sample_tasks"
-        ) from error
+        raise ValueError(f"{what}: {error}; draw one by sample_tasks") from error
 
 
 def _distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -405,4 +372,4 @@ def _distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _padded(values: np.ndarray, width: int) -> np.ndarray:
-    return np.concatenate([values, np.zeros(width - len(values))])
+    return np.pad(values, (0, width - len(values)))

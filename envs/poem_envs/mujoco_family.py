@@ -13,13 +13,11 @@ import mujoco
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
+from mujoco.rollout import Rollout
 
-from poem_envs.mujoco_fast_rendering import FastRenderer, renders_fast
-from poem_envs.mujoco_integrator import Integrator
-from poem_envs.mujoco_rendering import StateRenderer
-from poem_envs.vector import BatchFamily, BatchTaskFamily, TaskFamilyVector, available_cores
+from poem_envs.mujoco_rendering import FastRenderer, StateRenderer, renders_fast
+from poem_envs.vector import BatchFamily, BatchTaskFamily, TaskFamilyVector, checked_nthread
 
-DEFAULT_SIZE = 480
 RENDER_MODES = ["human", "rgb_array", "depth_array", "rgbd_tuple"]
 
 
@@ -30,29 +28,28 @@ class MujocoFamily(BatchFamily):
     where its start is another, and :meth:`_unhealthy` where it can fall. A family on top of it
     defines tasks, reward, and how a task is shown (:meth:`_task_markers`).
 
-    **A control step** sets MuJoCo's solver warm start (``qacc_warmstart``) to zero and makes ``frame_skip`` physics steps.
-    Gymnasium's environments let the warm start run on between control steps; it is no part of
-    MuJoCo's physics state (``mjSTATE_FULLPHYSICS``), and ``mujoco.rollout`` starts each call at
-    zero. So ours makes the next state a function of state and action alone, the same in one
-    environment as in many. It moves a step's result by the solver's tolerance (in tests by up to
-    1e-13 for HalfCheetah and Ant, and 1e-4 for Humanoid, whose model allows its solver few
-    iterations); apart from it the dynamics are Gymnasium's bit for bit.
+    **A control step** sets MuJoCo's solver warm start (``qacc_warmstart``) to zero and makes
+    ``frame_skip`` physics steps. Gymnasium's environments let the warm start run on between control
+    steps; it is no part of MuJoCo's physics state (``mjSTATE_FULLPHYSICS``), and ``mujoco.rollout``
+    starts each call at zero. So ours makes the next state a function of state and action alone, the
+    same in one environment as in many. It moves a step's result by the solver's tolerance
+    (most for Humanoid, whose model allows its solver few iterations); apart from it the dynamics
+    are Gymnasium's bit for bit.
 
-    **Velocities** of the reward are differences of positions over the control step, ``(after - before) / dt``, both taken from
-    the integrated state. Gymnasium's Ant and Humanoid read body positions, which MuJoCo updates one
-    physics step late.
+    **Velocities** of the reward are differences of positions over the control step, ``(after -
+    before) / dt``, both taken from the integrated state. Gymnasium's Ant and Humanoid read body
+    positions, which MuJoCo updates one physics step late.
+
+    Images have ``width`` and ``height`` in pixels; ``max_geom`` and ``visual_options`` are
+    Gymnasium's.
 
     :param xml_file: model file; a bare name is one of Gymnasium's
     :param frame_skip: physics steps in a control step
     :param reset_noise_scale: scale of the random start around the model's initial pose
-    :param width: of rendered images, pixels
-    :param height: of rendered images, pixels
     :param camera_id: camera of the model to render from; None for one that follows the robot
     :param camera_name: the same by name
     :param default_camera_config: attributes of the following camera, such as ``{"distance": 4.0}``,
         over the robot's own
-    :param max_geom: as in Gymnasium
-    :param visual_options: as in Gymnasium
     :param render_quality: "full", or "fast": without shadows, reflections and antialiasing, for RGB
         images alone
     :raises OSError: if there is no such model file
@@ -65,10 +62,9 @@ class MujocoFamily(BatchFamily):
     camera_config: dict[str, Any] = {"distance": 4.0}  # noqa: RUF012 (never changed)
 
     metadata: dict[str, Any]
-    _nthread: int = 0
-    _integrator: Integrator | None = None
-    _renderer: StateRenderer | None = None
-    _fast_renderer: FastRenderer | None = None
+    _nthread: int = 0  # the calling one
+    _rollout: Rollout | None = None
+    _renderer: StateRenderer | FastRenderer | None = None
 
     def __init__(
         self,
@@ -76,8 +72,8 @@ class MujocoFamily(BatchFamily):
         xml_file: str,
         frame_skip: int = 5,
         reset_noise_scale: float = 0.1,
-        width: int = DEFAULT_SIZE,
-        height: int = DEFAULT_SIZE,
+        width: int = 480,
+        height: int = 480,
         camera_id: int | None = None,
         camera_name: str | None = None,
         default_camera_config: dict[str, Any] | None = None,
@@ -89,7 +85,8 @@ class MujocoFamily(BatchFamily):
         self.model = mujoco.MjModel.from_xml_path(_model_path(xml_file))
         if self.model.na:
             raise ValueError(
-                f"xml_file={xml_file!r} has actuators with activations, which these environments do not handle"
+                f"xml_file={xml_file!r} has actuators with activations, which these environments "
+                "do not handle"
             )
         self.frame_skip = frame_skip
         self.reset_noise_scale = reset_noise_scale
@@ -101,10 +98,10 @@ class MujocoFamily(BatchFamily):
             "height": height,
             "camera_id": camera_id,
             "camera_name": camera_name,
-            "camera_config": {**self.camera_config, **(default_camera_config or {})},
+            "default_cam_config": {**self.camera_config, **(default_camera_config or {})},
+            "max_geom": max_geom,
+            "visual_options": visual_options,
         }
-        if not self._renders_fast:
-            self._render_arguments |= {"max_geom": max_geom, "visual_options": visual_options}
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.dt)}
         low, high = self.model.actuator_ctrlrange.astype(np.float32).T
         super().__init__(
@@ -124,8 +121,8 @@ class MujocoFamily(BatchFamily):
         return self._states[:, 1 : 1 + self.model.nq]
 
     def _draw_start(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Draw an episode's first ``qpos`` and ``qvel``: unless overridden, as Gymnasium's
-        HalfCheetah and Ant do.
+        """An episode's first ``qpos`` and ``qvel``; unless overridden, as Gymnasium's HalfCheetah
+        and Ant draw them.
         """
         scale = self.reset_noise_scale
         qpos = self.init_qpos + rng.uniform(low=-scale, high=scale, size=self.model.nq)
@@ -146,10 +143,8 @@ class MujocoFamily(BatchFamily):
         return np.zeros(len(self._states), dtype=bool)
 
     def _task_markers(self, task: np.ndarray, position: np.ndarray) -> list[dict[str, Any]]:
-        """Shapes that show a task, as ``MujocoRenderer``'s ``add_marker`` takes them.
-
-        :param task: ``(task_dim,)``
-        :param position: of the robot's root, ``(3,)``
+        """Shapes that show a task, as ``MujocoRenderer``'s ``add_marker`` takes them, where the
+        robot's root has a position, ``(3,)``.
         """
         raise NotImplementedError
 
@@ -157,24 +152,41 @@ class MujocoFamily(BatchFamily):
         return self.model.nq - self.hidden_qpos + self.model.nv
 
     def _allocate(self, n: int) -> None:
-        self._states = np.zeros(
-            (n, 1 + self.model.nq + self.model.nv)
-        )  # time, qpos, qvel: MuJoCo's mjSTATE_FULLPHYSICS
+        # time, qpos, qvel: MuJoCo's mjSTATE_FULLPHYSICS
+        self._states = np.zeros((n, 1 + self.model.nq + self.model.nv))
 
     def _begin_episodes(self, copies: np.ndarray, rngs: Sequence[np.random.Generator]) -> None:
         for copy, rng in zip(copies, rngs, strict=True):
             self._states[copy] = np.concatenate(([0.0], *self._draw_start(rng)))
 
     def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        if self._integrator is None:
-            self._integrator = Integrator(
-                self.model, self.frame_skip, len(self._states), self._nthread
-            )
-        after = self._integrator.advance(self._states, actions)
+        after = self._integrate(actions)
         self._check_divergence(after)
         qpos_before = self._qpos.copy()
         self._states[:] = after
         return self._reward_features(qpos_before, actions), self._unhealthy()
+
+    def _integrate(self, actions: np.ndarray) -> np.ndarray:
+        """The states after a control step, with a cold solver start: a view that the next call
+        overwrites.
+        """
+        n, steps = len(self._states), self.frame_skip
+        if self._rollout is None:
+            nthread = min(self._nthread, n)
+            self._rollout = Rollout(nthread=nthread if nthread > 1 else 0)
+            self._rollout_data = [mujoco.MjData(self.model) for _ in range(max(nthread, 1))]
+            self._after = np.empty((n, steps, self._states.shape[1]))
+        self._rollout.rollout(
+            [self.model] * n,
+            self._rollout_data,
+            self._states,
+            np.repeat(actions[:, None], steps, axis=1),
+            control_spec=mujoco.mjtState.mjSTATE_CTRL.value,
+            skip_checks=True,
+            nstep=steps,
+            state=self._after,
+        )
+        return self._after[:, -1]
 
     def _check_divergence(self, after: np.ndarray) -> None:
         # A simulation that blows up is reset by MuJoCo within the step, with no more than a
@@ -183,10 +195,12 @@ class MujocoFamily(BatchFamily):
         diverged = late | ~np.isfinite(after).all(axis=1)
         if diverged.any():
             copy = int(np.flatnonzero(diverged)[0])
+            qpos, qvel = np.split(np.abs(self._states[copy, 1:]), [self.model.nq])
             raise RuntimeError(
-                f"the simulation of {type(self).__name__} diverged at {self._describe_episode(copy)}: MuJoCo met a state "
-                f"that is not finite or too large; the state before had max|qpos|={np.abs(self._qpos[copy]).max():.3g} and "
-                f"max|qvel|={np.abs(self._states[copy, 1 + self.model.nq :]).max():.3g}"
+                f"the simulation of {type(self).__name__} diverged at "
+                f"{self._describe_episode(copy)}: MuJoCo met a state that is not finite or too "
+                f"large; the state before had max|qpos|={qpos.max():.3g} and "
+                f"max|qvel|={qvel.max():.3g}"
             )
 
     def _observations(self) -> np.ndarray:
@@ -200,30 +214,22 @@ class MujocoFamily(BatchFamily):
 
     def _render_copy(self, copy: int, render_mode: str, task: np.ndarray | None) -> Any:
         markers = [] if task is None else self._task_markers(task, self._qpos[copy, :3])
-        if self._renders_fast:
-            if self._fast_renderer is None:
-                self._fast_renderer = FastRenderer(self.model, **self._render_arguments)
-            return self._fast_renderer.render(self._states[copy], markers)
         if self._renderer is None:
-            self._renderer = StateRenderer(self.model, **self._render_arguments)
+            renderer = FastRenderer if self._renders_fast else StateRenderer
+            self._renderer = renderer(self.model, **self._render_arguments)
         return self._renderer.render(self._states[copy], render_mode, markers)
 
     def _release(self) -> None:
-        if self._integrator is not None:
-            self._integrator.close()
-            self._integrator = None
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
-        if self._fast_renderer is not None:
-            self._fast_renderer.close()
-            self._fast_renderer = None
+        for held in (self._rollout, self._renderer):
+            if held is not None:
+                held.close()
+        self._rollout = self._renderer = None
 
 
 class MujocoTaskEnv(MujocoFamily, BatchTaskFamily):
     """A single MuJoCo environment with a hidden task; see :class:`MujocoFamily`."""
 
-    metadata: dict[str, Any] = {"render_modes": RENDER_MODES}  # noqa: RUF012 (Gymnasium declares it so)
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES}  # noqa: RUF012 (Gymnasium's way)
 
 
 class MujocoTaskVectorEnv(MujocoFamily, TaskFamilyVector):
@@ -232,15 +238,10 @@ class MujocoTaskVectorEnv(MujocoFamily, TaskFamilyVector):
     :param nthread: number of threads; None for as many as this process may use cores
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012
-        "render_modes": RENDER_MODES,
-        "autoreset_mode": AutoresetMode.SAME_STEP,
-    }
+    metadata = {**MujocoTaskEnv.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
     def __init__(self, *, nthread: int | None = None, **kwargs: Any) -> None:
-        if nthread is not None and nthread < 1:
-            raise ValueError(f"nthread={nthread!r} must be at least 1, or None for all cores")
-        self._nthread = available_cores() if nthread is None else nthread
+        self._nthread = checked_nthread(nthread)
         super().__init__(**kwargs)
 
 
@@ -250,6 +251,7 @@ def _model_path(xml_file: str) -> str:
         path = os.path.join(os.path.dirname(gymnasium.__file__), "envs", "mujoco", "assets", path)
     if not os.path.exists(path):
         raise OSError(
-            f"xml_file={xml_file!r} does not exist; give a path, or the bare name of one of Gymnasium's models"
+            f"xml_file={xml_file!r} does not exist; give a path, or the bare name of one of "
+            "Gymnasium's models"
         )
     return path

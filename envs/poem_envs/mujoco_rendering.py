@@ -1,69 +1,48 @@
-"""Rendering of MuJoCo states, with a camera that follows the robot and markers for what is hidden."""
+"""Rendering of MuJoCo states, with a camera that follows the robot and markers for its task."""
 
 from __future__ import annotations
 
 import atexit
+import importlib
+import os
 import weakref
-from typing import Any, Protocol
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from poem_envs.headless import choose_headless_backend
 
-
-class _Closable(Protocol):
-    def close(self) -> None: ...
-
-
-_open_renderers: weakref.WeakSet[_Closable] = weakref.WeakSet()
-
+RENDER_QUALITIES = ("full", "fast")
 TASK_COLOUR = (0.16, 0.65, 0.27, 1.0)
+# Slices and stacks of a sphere, and quads of a plane: at the size of a web page nobody sees the
+# difference.
+COARSE = (12, 6, 1)
 
 
-class StateRenderer:
-    """Renders states of one model, whoever simulated them.
+class _Renderer:
+    """What the renderers below have in common.
 
-    :param model: the model that the states are of
+    :param model: the model that the states are of; its settings of rendering are changed
     :param width: of the image, pixels
     :param height: of the image, pixels
-    :param camera_id: camera of the model; None for one that follows the robot's root
-    :param camera_name: the same by name
-    :param camera_config: attributes of the following camera
-    :param max_geom: largest number of shapes in a scene
-    :param visual_options: flags of ``mujoco.MjvOption``
     """
 
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        *,
-        width: int,
-        height: int,
-        camera_id: int | None,
-        camera_name: str | None,
-        camera_config: dict[str, Any],
-        max_geom: int,
-        visual_options: dict[int, bool] | None,
-    ) -> None:
-        from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer  # loads the window system
+    def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
+        self._model, self._data = model, mujoco.MjData(model)
+        fit_buffer(model, width, height)
 
-        model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
-        model.vis.global_.offheight = max(model.vis.global_.offheight, height)
-        self._model = model
-        self._data = mujoco.MjData(model)
-        self._follows = camera_id is None and camera_name is None
-        self._renderer = MujocoRenderer(
-            model,
-            self._data,
-            camera_config,
-            width,
-            height,
-            max_geom,
-            camera_id,
-            camera_name,
-            visual_options,
-        )
+    def _show(self, state: np.ndarray) -> None:
+        """Bring the data up to date with time, positions and velocities, ``(1 + nq + nv,)``."""
+        mujoco.mj_setState(self._model, self._data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        mujoco.mj_forward(self._model, self._data)
+
+    def _close_at_exit(self) -> None:
+        # A graphics context must go before the library that made it, which ends itself at exit: so
+        # register after its import.
+        if not _open_renderers:
+            atexit.register(_close_open_renderers)
+        _open_renderers.add(self)
 
     def render(self, state: np.ndarray, render_mode: str, markers: list[dict[str, Any]]) -> Any:
         """Render one state.
@@ -73,13 +52,34 @@ class StateRenderer:
         :param markers: shapes to add, as ``MujocoRenderer``'s ``add_marker`` takes them
         :return: what Gymnasium returns in that mode
         """
-        mujoco.mj_setState(self._model, self._data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-        mujoco.mj_forward(self._model, self._data)
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Close windows and graphics contexts."""
+        _open_renderers.discard(self)
+
+
+class StateRenderer(_Renderer):
+    """Renders states of one model as Gymnasium does, whoever simulated them.
+
+    :param view: further arguments of Gymnasium's ``MujocoRenderer``; without a camera, one follows
+        the robot's root
+    """
+
+    def __init__(self, model: mujoco.MjModel, *, width: int, height: int, **view: Any) -> None:
+        from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer  # loads the window system
+
+        super().__init__(model, width, height)
+        self._follows = view.get("camera_id") is None and view.get("camera_name") is None
+        self._renderer = MujocoRenderer(model, self._data, width=width, height=height, **view)
+
+    def render(self, state: np.ndarray, render_mode: str, markers: list[dict[str, Any]]) -> Any:
+        self._show(state)
         if render_mode != "human":
             choose_headless_backend()
         viewer = self._renderer._get_viewer(render_mode)
         viewer.make_context_current()  # another environment may have rendered since
-        close_at_exit(self)
+        self._close_at_exit()
         if self._follows:
             viewer.cam.lookat[:2] = self._data.xpos[1, :2]
         for marker in markers:
@@ -88,16 +88,156 @@ class StateRenderer:
         return np.ascontiguousarray(image) if isinstance(image, np.ndarray) else image
 
     def close(self) -> None:
-        """Close windows and graphics contexts."""
         self._renderer.close()
-        stays_closed(self)
+        super().close()
+
+
+class FastRenderer(_Renderer):
+    """Renders RGB images without shadows, reflections or haze, and with coarse shapes. On a machine
+    without a graphics card an image takes a small part of what Gymnasium's takes. Arguments are
+    those of :class:`StateRenderer`.
+
+    A graphics context belongs to the thread that rendered first; render from no other.
+
+    :raises ValueError: if the model has no camera of that name
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        *,
+        width: int,
+        height: int,
+        camera_id: int | None = None,
+        camera_name: str | None = None,
+        default_cam_config: dict[str, Any] | None = None,
+        max_geom: int = 1000,
+        visual_options: dict[int, bool] | None = None,
+    ) -> None:
+        super().__init__(model, width, height)
+        quality = model.vis.quality
+        quality.offsamples = 0
+        quality.numslices, quality.numstacks, quality.numquads = COARSE
+        self._context = _make_context(width, height)
+        self._context.make_current()
+        self._scene = mujoco.MjvScene(model, max_geom)
+        flags = mujoco.mjtRndFlag
+        for flag in (flags.mjRND_SHADOW, flags.mjRND_REFLECTION, flags.mjRND_HAZE):
+            self._scene.flags[flag] = 0
+        self._resources = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        self._options = mujoco.MjvOption()
+        for option, shown in (visual_options or {}).items():
+            self._options.flags[option] = shown
+        self._viewport = mujoco.MjrRect(0, 0, width, height)
+        self._pixels = np.empty((height, width, 3), dtype=np.uint8)
+        self._camera = self._make_camera(camera_id, camera_name, default_cam_config or {})
+        self._close_at_exit()
+
+    def render(self, state: np.ndarray, render_mode: str, markers: list[dict[str, Any]]) -> Any:
+        self._show(state)
+        return self.render_data(self._data, markers)
+
+    def render_data(self, data: mujoco.MjData, markers: list[dict[str, Any]]) -> np.ndarray:
+        """Render what a simulation of the model has computed last, ``(height, width, 3)`` uint8."""
+        if self._camera.type == mujoco.mjtCamera.mjCAMERA_FREE:
+            self._camera.lookat[:2] = data.xpos[1, :2]
+        self._context.make_current()  # another environment may have rendered since
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._resources)
+        everything = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(
+            self._model, data, self._options, None, self._camera, everything, self._scene
+        )
+        for marker in markers:
+            self._add(marker)
+        mujoco.mjr_render(self._viewport, self._scene, self._resources)
+        mujoco.mjr_readPixels(self._pixels, None, self._viewport, self._resources)
+        return self._pixels[::-1].copy()
+
+    def close(self) -> None:
+        self._context.make_current()
+        self._resources.free()
+        self._context.free()
+        super().close()
+
+    def _make_camera(
+        self, camera_id: int | None, camera_name: str | None, config: dict[str, Any]
+    ) -> mujoco.MjvCamera:
+        camera = mujoco.MjvCamera()
+        if camera_name is not None:
+            camera_id = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_CAMERA, camera_name)
+            if camera_id < 0:
+                raise ValueError(
+                    f"camera_name={camera_name!r}: the model has no camera of this name"
+                )
+        if camera_id is not None and camera_id >= 0:
+            camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera_id
+            return camera
+        camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+        for name, value in {"azimuth": 90.0, **config}.items():  # 90 degrees: Gymnasium's viewer
+            if isinstance(value, np.ndarray):
+                getattr(camera, name)[:] = value
+            else:
+                setattr(camera, name, value)
+        return camera
+
+    def _add(self, marker: dict[str, Any]) -> None:
+        scene = self._scene
+        if scene.ngeom >= scene.maxgeom:
+            raise RuntimeError(f"a scene of more than max_geom={scene.maxgeom} shapes")
+        shape = {"size": (0.1, 0.1, 0.1), "mat": np.eye(3), "rgba": (1.0, 1.0, 1.0, 1.0), **marker}
+        sizes = (np.asarray(shape[key], np.float64).ravel() for key in ("size", "pos", "mat"))
+        colour = np.asarray(shape["rgba"], np.float32)
+        mujoco.mjv_initGeom(scene.geoms[scene.ngeom], shape["type"], *sizes, colour)
+        scene.ngeom += 1
+
+
+_open_renderers: weakref.WeakSet[_Renderer] = weakref.WeakSet()
+
+
+def _close_open_renderers() -> None:
+    for renderer in list(_open_renderers):
+        renderer.close()
+
+
+def renders_fast(render_quality: str, render_mode: str | None) -> bool:
+    """Whether images come from a :class:`FastRenderer`.
+
+    :param render_quality: "full" or "fast", as users give it
+    :raises ValueError: if the quality is another, or "fast" is asked of a mode that has no images
+        in colour
+    """
+    if render_quality not in RENDER_QUALITIES:
+        raise ValueError(
+            f"render_quality must be one of {RENDER_QUALITIES}, got {render_quality!r}"
+        )
+    if render_quality == "fast" and render_mode not in (None, "rgb_array"):
+        raise ValueError(
+            f'render_quality="fast" goes with render_mode="rgb_array" alone, got {render_mode!r}'
+        )
+    return render_quality == "fast"
+
+
+def fit_buffer(model: mujoco.MjModel, width: int, height: int) -> None:
+    """Let images of a model be as large as this."""
+    settings = model.vis.global_
+    settings.offwidth = max(settings.offwidth, width)
+    settings.offheight = max(settings.offheight, height)
+
+
+def _make_context(width: int, height: int) -> Any:
+    """A graphics context off screen. ``mujoco.GLContext`` itself is fixed when MuJoCo is imported,
+    which was long ago.
+    """
+    choose_headless_backend()
+    backend, module = os.environ.get("MUJOCO_GL", "").lower(), mujoco
+    if backend in ("egl", "osmesa"):
+        module = importlib.import_module(f"mujoco.{backend}")
+    return module.GLContext(width, height)
 
 
 def renderer_inside(env: Any) -> Any:
-    """The ``MujocoRenderer`` of an environment that renders by itself; None where there is none.
-
-    :param env: the bare environment; mazes of gymnasium-robotics keep the robot's environment one
-        deeper
+    """The ``MujocoRenderer`` of a bare environment that renders by itself; None where there is
+    none. Mazes of gymnasium-robotics keep the robot's environment one deeper.
     """
     for holder in (env, getattr(env, "ant_env", None), getattr(env, "point_env", None)):
         renderer = getattr(holder, "mujoco_renderer", None)
@@ -107,10 +247,8 @@ def renderer_inside(env: Any) -> Any:
 
 
 def prepare_to_render(env: Any, render_mode: str | None) -> None:
-    """Choose a backend, and make an environment's graphics context the current one: Gymnasium does
-    not when another environment has rendered since, and gives an image of nothing.
-
-    :param env: a bare environment that renders by itself
+    """Choose a backend, and make a bare environment's graphics context the current one: Gymnasium
+    does not when another environment has rendered since, and gives an image of nothing.
     """
     renderer = renderer_inside(env)
     if renderer is None or render_mode is None:
@@ -121,39 +259,19 @@ def prepare_to_render(env: Any, render_mode: str | None) -> None:
 
 
 def close_viewers(env: Any) -> None:
-    """Close what an environment renders with, so that a later rendering opens it anew: Gymnasium's
-    own ``close`` keeps what it has closed, and renders black with it.
-
-    :param env: a bare environment that renders by itself
+    """Close what a bare environment renders with, so that a later rendering opens it anew:
+    Gymnasium's own ``close`` keeps what it has closed, and renders black with it.
     """
     renderer = renderer_inside(env)
-    for viewer in [] if renderer is None else renderer._viewers.values():
+    if renderer is None:
+        return
+    for viewer in renderer._viewers.values():
         viewer.make_context_current()
         if hasattr(viewer, "opengl_context"):
             viewer.con.free()  # while its own context is current
         viewer.close()
-    if renderer is not None:
-        renderer._viewers.clear()
-        renderer.viewer = None
-
-
-def close_at_exit(renderer: _Closable) -> None:
-    """Close a renderer when the program ends, if it still is open then."""
-    # A graphics context must go before the library that made it, which ends itself at exit: so
-    # register after its import.
-    if not _open_renderers:
-        atexit.register(_close_open_renderers)
-    _open_renderers.add(renderer)
-
-
-def stays_closed(renderer: _Closable) -> None:
-    """Undo :func:`close_at_exit`."""
-    _open_renderers.discard(renderer)
-
-
-def _close_open_renderers() -> None:
-    for renderer in list(_open_renderers):
-        renderer.close()
+    renderer._viewers.clear()
+    renderer.viewer = None
 
 
 def arrow(start: np.ndarray, direction: tuple[float, float], length: float) -> dict[str, Any]:
@@ -161,28 +279,19 @@ def arrow(start: np.ndarray, direction: tuple[float, float], length: float) -> d
 
     :param start: where it begins, ``(3,)``
     :param direction: a unit vector in the plane
-    :param length: in metres
     """
     x, y = direction
-    rotation = np.array(
-        [[0.0, -y, x], [0.0, x, y], [-1.0, 0.0, 0.0]]
-    )  # columns; the arrow points along its own z axis
     return {
         "type": mujoco.mjtGeom.mjGEOM_ARROW,
         "pos": np.asarray(start, dtype=np.float64),
-        "mat": rotation.flatten(),
+        "mat": np.array([0.0, -y, x, 0.0, x, y, -1.0, 0.0, 0.0]),  # it points along its own z axis
         "size": np.array([0.03, 0.03, length]),
         "rgba": np.array(TASK_COLOUR),
     }
 
 
 def pole(x: float, y: float, height: float) -> dict[str, Any]:
-    """An upright pole on the floor, as a marker.
-
-    :param x: in metres
-    :param y: in metres
-    :param height: in metres
-    """
+    """An upright pole on the floor, as a marker."""
     return {
         "type": mujoco.mjtGeom.mjGEOM_CYLINDER,
         "pos": np.array([x, y, height / 2]),

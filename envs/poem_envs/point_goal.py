@@ -15,6 +15,7 @@ from poem_envs.vector import BatchFamily, BatchTaskFamily, TaskFamilyVector
 
 
 class _PointGoal(BatchFamily):
+    task_space = spaces.Box(0.0, np.pi, (1,), np.float64)
     reward_feature_dim = 2
     metadata: dict[str, Any]
     _window: ImageWindow | None = None
@@ -30,9 +31,7 @@ class _PointGoal(BatchFamily):
     ) -> None:
         self.step_length = step_length
         self.reset_noise_scale = reset_noise_scale
-        self.width = width
-        self.height = height
-        self.task_space = spaces.Box(0.0, np.pi, (1,), np.float64)
+        self.width, self.height = width, height
         super().__init__(
             observation_space=spaces.Box(-np.inf, np.inf, (2,), np.float64),
             action_space=spaces.Box(-1.0, 1.0, (2,), np.float32),
@@ -54,17 +53,13 @@ class _PointGoal(BatchFamily):
         return self._positions.copy()
 
     def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
-        angle = np.array(
-            tasks[..., 0]
-        )  # contiguous: strided input may take another, differently rounded path
+        angle = np.array(tasks[..., 0])  # contiguous: strided input may be rounded differently
         x = features[..., 0] - np.cos(angle)
         y = features[..., 1] - np.sin(angle)
         return -np.sqrt(x * x + y * y)
 
     def _potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
-        return self._reward(
-            tasks, observations
-        )  # the position is what the robot sees and what earns
+        return self._reward(tasks, observations)  # the position is seen, and it earns
 
     def _physics_state(self, copy: int) -> np.ndarray:
         return self._positions[copy].copy()
@@ -72,9 +67,7 @@ class _PointGoal(BatchFamily):
     def _set_physics_state(self, copy: int, state: np.ndarray) -> None:
         self._positions[copy] = state
 
-    def _render_copy(
-        self, copy: int, render_mode: str, task: np.ndarray | None
-    ) -> np.ndarray | None:
+    def _render_copy(self, copy: int, render_mode: str, task: np.ndarray | None) -> Any:
         canvas = Canvas(self.width, self.height, centre=(0.0, 0.4), extent=2.7)
         canvas.upper_half_circle(1.0, 0.015, (190, 190, 190))
         canvas.disc(0.0, 0.0, 0.02, (190, 190, 190))
@@ -99,32 +92,25 @@ class _PointGoal(BatchFamily):
 class PointGoalEnv(_PointGoal, BatchTaskFamily):
     r"""
     ## Description
-    A point starts near the origin of the plane and is to move to a goal on the upper unit half-circle that it cannot see.
-    It is the smallest environment on which meta-learning shows: where to go is in the task alone, and a policy for it takes
-    seconds to train. Use it for tests, documentation and first contact.
+    A point starts near the origin of the plane and is to move to a goal on the upper unit
+    half-circle that it cannot see. It is the smallest environment on which meta-learning shows:
+    where to go is in the task alone, and a policy for it takes seconds to train. Use it for tests,
+    documentation and first contact.
 
     ## Task
-    The angle of the goal, uniform on [0, pi], hidden from the observation: `task_space` is `Box(0, pi, (1,), float64)`, and
-    the goal lies at `(cos(angle), sin(angle))`.
+    The angle of the goal, uniform on [0, pi], hidden from the observation: `task_space` is
+    `Box(0, pi, (1,), float64)`, and the goal lies at `(cos(angle), sin(angle))`.
 
     ## Action Space
-    The action space is a `Box(-1, 1, (2,), float32)`.
-
-    | Num | Action                  | Control Min | Control Max | Unit                 |
-    | --- | ----------------------- | ----------- | ----------- | -------------------- |
-    | 0   | movement in x direction | -1          | 1           | `step_length` a step |
-    | 1   | movement in y direction | -1          | 1           | `step_length` a step |
+    The action space is a `Box(-1, 1, (2,), float32)`: the movement in x and in y direction, in
+    units of `step_length`.
 
     ## Observation Space
-    The observation space is a `Box(-Inf, Inf, (2,), float64)`.
-
-    | Num | Observation  | Min  | Max | Unit     |
-    | --- | ------------ | ---- | --- | -------- |
-    | 0   | x-coordinate | -Inf | Inf | position |
-    | 1   | y-coordinate | -Inf | Inf | position |
+    The observation space is a `Box(-Inf, Inf, (2,), float64)`: the x- and the y-coordinate.
 
     ## Rewards
-    Minus the Euclidean distance between goal and position after the move. The reward features are that position, `(x, y)`.
+    Minus the Euclidean distance between goal and position after the move. The reward features are
+    that position, `(x, y)`.
 
     ## Starting State
     $\mathcal{N}(0, reset\_noise\_scale^2)$ in either coordinate.
@@ -138,13 +124,13 @@ class PointGoalEnv(_PointGoal, BatchTaskFamily):
     env = gym.make("poem_envs:poem/PointGoal-v0", step_length=0.05)
     ```
 
-    | Parameter           | Type      | Default | Description                                            |
-    | ------------------- | --------- | ------- | ------------------------------------------------------ |
-    | `step_length`       | **float** | `0.05`  | Distance that the action 1 moves the point in one step |
-    | `reset_noise_scale` | **float** | `0.02`  | Standard deviation of the start around the origin      |
-    | `width`, `height`   | **int**   | `480`   | Size of the rendered image, pixels                     |
-    | `render_mode`       | **str**   | `None`  | `"rgb_array"` or `"human"`                             |
-    | `render_task`       | **bool**  | `False` | Whether rendering shows the goal                       |
+    | Parameter           | Type      | Default | Description                                  |
+    | ------------------- | --------- | ------- | -------------------------------------------- |
+    | `step_length`       | **float** | `0.05`  | Distance that an action of 1 moves the point |
+    | `reset_noise_scale` | **float** | `0.02`  | Standard deviation of the start              |
+    | `width`, `height`   | **int**   | `480`   | Size of the rendered image, pixels           |
+    | `render_mode`       | **str**   | `None`  | `"rgb_array"` or `"human"`                   |
+    | `render_task`       | **bool**  | `False` | Whether rendering shows the goal             |
 
     ## Version History
     * v0: Initial version

@@ -25,12 +25,14 @@ from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 
-from poem_envs.family import Symmetry, TaskFamily
-from poem_envs.vector import TaskFamilyVector, available_cores
+from poem_envs.family import TaskFamily
+from poem_envs.vector import TaskFamilyVector, checked_nthread
 
 
 class EpisodeStart(NamedTuple):
-    """What a copy needs to begin an episode as a single environment would."""
+    """What a copy, by its number within its group, needs to begin an episode as a single
+    environment would.
+    """
 
     copy: int
     rng: np.random.Generator
@@ -39,27 +41,36 @@ class EpisodeStart(NamedTuple):
     episode: int
 
 
-class GroupStep(NamedTuple):
-    """A step of a group: observations, reward features, early ends, and further infos, a row for
-    each of its copies.
-    """
-
-    observations: np.ndarray
-    features: np.ndarray
-    terminated: np.ndarray
-    infos: dict[str, np.ndarray]
-
-
 class CopyGroup:
     """Copies of a task family that one process steps in turn.
 
-    :param envs: the copies
+    :param make: makes one
+    :param n: how many
     :param first: the number of the first one among the copies of all groups, for messages
+    :param attributes: to set on each
     """
 
-    def __init__(self, envs: Sequence[TaskFamily], first: int) -> None:
-        self.envs = list(envs)
-        self.first = first
+    def __init__(
+        self, make: Callable[[], TaskFamily], n: int, first: int, attributes: dict[str, Any]
+    ) -> None:
+        self.envs, self.first = [make() for _ in range(n)], first
+        for name, value in attributes.items():
+            self.set_attribute(name, value)
+        self._answer: tuple[Any, Exception | None] = None, None
+
+    def send(self, method: str, *arguments: Any) -> None:
+        """As :meth:`RemoteGroup.send`, but what is called is done when this returns."""
+        try:
+            self._answer = getattr(self, method)(*arguments), None
+        except Exception as error:
+            self._answer = None, error
+
+    def receive(self) -> Any:
+        """The result of the last call, or its error."""
+        result, error = self._answer
+        if error is not None:
+            raise error
+        return result
 
     def begin(
         self, starts: Sequence[EpisodeStart]
@@ -75,20 +86,20 @@ class CopyGroup:
             observations.append(self.call(start.copy, "_begin_episode", start.rng))
         return observations, [start.rng for start in starts]
 
-    def step(self, actions: np.ndarray) -> GroupStep:
-        """Step every copy, ``(copies, action_dim)``."""
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+        """Step every copy, ``(copies, action_dim)``; returns observations, reward features, early
+        ends, and further infos, a row for each copy.
+        """
         results, infos = [], []
         for copy, (env, action) in enumerate(zip(self.envs, actions, strict=True)):
             env._elapsed_steps += 1
             results.append(self.call(copy, "_simulate", action))
             infos.append(env._step_info())
         observations, features, terminated = zip(*results, strict=True)
-        return GroupStep(
-            np.stack(observations),
-            np.stack(features),
-            np.array(terminated, dtype=bool),
-            {key: np.stack([info[key] for info in infos]) for key in infos[0]},
-        )
+        together = {key: np.stack([info[key] for info in infos]) for key in infos[0]}
+        return np.stack(observations), np.stack(features), np.array(terminated, bool), together
 
     def call(self, copy: int, method: str, *arguments: Any) -> Any:
         """Call a method of one copy."""
@@ -120,14 +131,11 @@ class WorkerError(Exception):
 
 
 class RemoteGroup:
-    """A :class:`CopyGroup` in a process of its own: calls are sent, and their results received
-    later.
-
-    :param make: what makes the copies there, pickled by ``cloudpickle``
-    :param first: the number of the first copy
+    """A :class:`CopyGroup`, with the same arguments, in a process of its own: calls are sent, and
+    their results received later. The first result is that of making it.
     """
 
-    def __init__(self, make: bytes, first: int) -> None:
+    def __init__(self, *arguments: Any) -> None:
         self._connection, theirs = Pipe()
         # The worker imports what the parent can import, and "" is the parent's working directory.
         paths = os.pathsep.join(path or os.getcwd() for path in sys.path)
@@ -138,15 +146,15 @@ class RemoteGroup:
             stdin=subprocess.DEVNULL,
         )
         theirs.close()
-        self._end = weakref.finalize(self, _end_worker, self._connection, self._process)
-        self.send("__init__", make, first)
+        self.close = weakref.finalize(self, _end_worker, self._connection, self._process)
+        self.send("__init__", *arguments)
 
     def send(self, method: str, *arguments: Any) -> None:
         """Begin a call of a group's method."""
         try:
             self._connection.send_bytes(cloudpickle.dumps((method, arguments)))
         except (BrokenPipeError, ConnectionResetError):
-            raise RuntimeError(self._gone()) from None
+            raise self._gone() from None
 
     def receive(self) -> Any:
         """The result of the oldest call that is under way.
@@ -156,19 +164,17 @@ class RemoteGroup:
         try:
             succeeded, result = pickle.loads(self._connection.recv_bytes())
         except (EOFError, ConnectionResetError):
-            raise RuntimeError(self._gone()) from None
+            raise self._gone() from None
         if not succeeded:
             message, trace = result
             raise RuntimeError(message) from WorkerError(trace)
         return result
 
-    def close(self) -> None:
-        """End the worker."""
-        self._end()
-
-    def _gone(self) -> str:
-        status = self._process.wait()
-        return f"a worker process of the environment ended with exit status {status} (negative: the signal that ended it)"
+    def _gone(self) -> RuntimeError:
+        return RuntimeError(
+            "a worker process of the environment ended with exit status "
+            f"{self._process.wait()} (negative: the signal that ended it)"
+        )
 
 
 def _end_worker(connection: Connection, process: subprocess.Popen[bytes]) -> None:
@@ -187,16 +193,15 @@ class ProcessFamilyVector(TaskFamilyVector):
     Results equal those of single environments bit for bit, whatever the number of processes.
     Register a family with it::
 
-        gym.register("my/Walk-v0", Walk1D, vector_entry_point=functools.partial(ProcessFamilyVector, Walk1D), ...)
+        vector = functools.partial(ProcessFamilyVector, Walk1D)
+        gym.register("my/Walk-v0", Walk1D, vector_entry_point=vector, max_episode_steps=50)
 
     :param family: a :class:`~poem_envs.TaskFamily` class, or a function that makes such an
         environment
-    :param num_envs: number of copies
     :param nthread: number of processes; None for as many as this process may use cores
     :param max_episode_steps: episodes are truncated after so many steps; None for as many as a
         :class:`GoalFamily`'s environment has, or never
     :param render_mode: as the family has them; ``"human"`` for one copy only
-    :param render_task: whether rendering shows the hidden tasks
     :param family_kwargs: further arguments of the family
     :raises TypeError: if what ``family`` makes is no task family
     """
@@ -212,62 +217,50 @@ class ProcessFamilyVector(TaskFamilyVector):
         render_task: bool = False,
         **family_kwargs: Any,
     ) -> None:
-        if nthread is not None and nthread < 1:
-            raise ValueError(f"nthread={nthread!r} must be at least 1, or None for all cores")
+        self._nthread = checked_nthread(nthread)
         if render_mode is not None:
             family_kwargs["render_mode"] = render_mode
         if render_task:
             family_kwargs["render_task"] = render_task
         self._make = functools.partial(family, **family_kwargs)
-        self._nthread = available_cores() if nthread is None else nthread
         self._groups: list[CopyGroup | RemoteGroup] = []
         self._interrupted = False
         self._attributes: dict[str, Any] = {}
-        self._template = self._make()
-        if not isinstance(self._template, TaskFamily):
+        self._template = template = self._make()
+        if not isinstance(template, TaskFamily):
             raise TypeError(
-                f"family={family!r} makes a {type(self._template).__name__}, but it must make a poem_envs.TaskFamily"
+                f"family={family!r} makes a {type(template).__name__}, but it must make a "
+                "poem_envs.TaskFamily"
             )
-        self.metadata = {**self._template.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}
+        self.metadata = {**template.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}
         if max_episode_steps is None:
-            max_episode_steps = getattr(self._template, "max_episode_steps", None)
-        self._copy_definition()
-        observation_space, action_space = (
-            self._template.observation_space,
-            self._template.action_space,
-        )
-        assert isinstance(observation_space, spaces.Box)
-        assert isinstance(action_space, spaces.Box)
+            max_episode_steps = getattr(template, "max_episode_steps", None)
+        self.task_space, self.all_tasks = template.task_space, template.all_tasks
+        self.reward_feature_dim = template.reward_feature_dim
+        self.shared_dynamics = template.shared_dynamics
+        self.symmetries, self.splits = template.symmetries, template.splits
+        assert isinstance(template.observation_space, spaces.Box)
+        assert isinstance(template.action_space, spaces.Box)
         super().__init__(
-            observation_space=observation_space,
-            action_space=action_space,
+            observation_space=template.observation_space,
+            action_space=template.action_space,
             num_envs=num_envs,
             max_episode_steps=max_episode_steps,
             render_mode=render_mode,
             render_task=render_task,
-            split=self._template.split,
+            split=template.split,
         )
-
-    def _copy_definition(self) -> None:
-        family = self._template
-        self.task_space, self.all_tasks = family.task_space, family.all_tasks
-        self.reward_feature_dim, self.shared_dynamics = (
-            family.reward_feature_dim,
-            family.shared_dynamics,
-        )
-        self.splits = family.splits
 
     def __getattr__(self, name: str) -> Any:
+        """What a family has of its own, as a single environment does."""
         if name.startswith("_"):
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        return getattr(
-            self._template, name
-        )  # what a family has of its own, as a single environment does
+        return getattr(self._template, name)
 
     def set_attribute(self, name: str, value: Any) -> None:
         setattr(self._template, name, value)
         self._attributes[name] = value  # for copies that are made anew
-        self._call("set_attribute", {index: (name, value) for index in range(len(self._sizes))})
+        self._call("set_attribute", dict.fromkeys(range(len(self._firsts)), (name, value)))
         if hasattr(type(self), name) or name in self.__dict__:
             setattr(self, name, value)
 
@@ -284,93 +277,60 @@ class ProcessFamilyVector(TaskFamilyVector):
     def _potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
         return self._template._potential(tasks, observations)
 
-    @property
-    def symmetries(self) -> tuple[Symmetry, ...]:  # type: ignore[override]
-        return self._template.symmetries
-
     def _checked_tasks(self, tasks: npt.ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:
         return self._template._checked_tasks(tasks, shape, name)
 
     def _allocate(self, n: int) -> None:
-        chunks = np.array_split(np.arange(n), min(self._nthread, n))
-        # Which copies each group has: (group, number within the group) of every copy.
+        groups = np.array_split(np.arange(n), min(self._nthread, n))
+        self._firsts = [int(copies[0]) for copies in groups]
+        # Where each copy is: its group, and its number there.
         self._places = [
-            (group, place) for group, chunk in enumerate(chunks) for place in range(len(chunk))
+            (group, k) for group, copies in enumerate(groups) for k in range(len(copies))
         ]
-        self._firsts = [int(chunk[0]) for chunk in chunks]
-        self._sizes = [len(chunk) for chunk in chunks]
-        space = self._template.observation_space
+        space = self.single_observation_space
         assert space.shape is not None
         self._last_observations = np.zeros((n, *space.shape), dtype=space.dtype)
         self._last_infos: dict[str, np.ndarray] = {}
 
     def _start(self) -> None:
         """Start the workers; this process has the last, smallest group."""
+        ends = [*self._firsts[1:], self.num_envs]
         try:
-            for index, (first, size) in enumerate(zip(self._firsts, self._sizes, strict=True)):
-                make = functools.partial(_make_copies, self._make, size, self._attributes)
-                last = index == len(self._sizes) - 1
-                self._groups.append(
-                    CopyGroup(make(), first)
-                    if last
-                    else RemoteGroup(cloudpickle.dumps(make), first)
-                )
-            self._receive({index: None for index in range(len(self._groups) - 1)})
+            for first, end in zip(self._firsts, ends, strict=True):
+                group = CopyGroup if end == self.num_envs else RemoteGroup
+                self._groups.append(group(self._make, end - first, first, self._attributes))
+            for remote in self._groups[:-1]:
+                remote.receive()
         except BaseException:  # the next call tries again, rather than to use what is half made
             self._end_groups()
             raise
 
-    def _receive(self, local: dict[int, Any]) -> dict[int, Any]:
-        """Collect the results of a call to the groups in ``local``, all of them even if one failed:
-        none may be left over.
-        """
-        results: dict[int, Any] = {}
-        failure: Exception | None = None
-        for index, result in local.items():
-            group = self._groups[index]
-            try:
-                results[index] = group.receive() if isinstance(group, RemoteGroup) else result
-                if isinstance(results[index], Exception):
-                    raise results[index]
-            except Exception as error:
-                failure = failure or error
-        if failure is not None:
-            raise failure
-        return results
-
     def _call(self, method: str, arguments: dict[int, tuple[Any, ...]]) -> dict[int, Any]:
-        """Call a method of some groups, all at once.
-
-        :param method: its name
-        :param arguments: by the number of the group
-        :return: results by the number of the group
-        """
+        """Call a method of some groups, all at once; arguments and results are by group."""
         if self._interrupted and method != "begin":
             raise ResetNeeded(
-                "a call of this environment was interrupted, and left its copies in the middle of it; reset it"
+                "a call of this environment was interrupted, and left its copies in the middle of "
+                "it; reset it"
             )
+        results: dict[int, Any] = {}
+        failure: Exception | None = None
         try:
             if not self._groups:
                 self._start()
-            local: dict[int, Any] = dict.fromkeys(arguments)
-            for index in sorted(
-                arguments
-            ):  # this process's own group is the last, so that the others work meanwhile
-                group = self._groups[index]
-                if isinstance(group, RemoteGroup):
-                    group.send(method, *arguments[index])
-                else:
-                    try:
-                        local[index] = getattr(group, method)(*arguments[index])
-                    except Exception as error:
-                        local[index] = error
-            results = self._receive(local)
-        except Exception:
+            for index in sorted(arguments):  # this process's own last: the others work meanwhile
+                self._groups[index].send(method, *arguments[index])
+            for index in arguments:  # all of them even if one failed: none may be left over
+                try:
+                    results[index] = self._groups[index].receive()
+                except Exception as problem:
+                    failure = failure or problem
+        except BaseException as error:
+            if not isinstance(error, Exception):  # answers under way would be taken for later ones
+                self._end_groups()
+                self._interrupted = True
             raise
-        except BaseException:  # Ctrl-C: answers may be under way, or half read, and would be taken for those of later calls
-            self._end_groups()
-            self._interrupted = True
-            raise
+        if failure is not None:
+            raise failure
         self._interrupted = False
         return results
 
@@ -381,35 +341,25 @@ class ProcessFamilyVector(TaskFamilyVector):
     def _begin_episodes(self, copies: np.ndarray, rngs: Sequence[np.random.Generator]) -> None:
         assert self._tasks is not None
         starts: dict[int, list[EpisodeStart]] = {}
-        members: dict[int, list[int]] = {}
         for copy, rng in zip(copies.tolist(), rngs, strict=True):
             group, place = self._places[copy]
-            start = EpisodeStart(
-                place, rng, self._tasks[copy].copy(), self._seeds[copy], int(self._episodes[copy])
-            )
+            task, seed, episode = self._tasks[copy].copy(), self._seeds[copy], self._episodes[copy]
+            start = EpisodeStart(place, rng, task, seed, int(episode))
             starts.setdefault(group, []).append(start)
-            members.setdefault(group, []).append(copy)
-        results = self._call(
-            "begin", {group: (group_starts,) for group, group_starts in starts.items()}
-        )
-        for group, (observations, generators) in results.items():
-            for copy, observation, generator in zip(
-                members[group], observations, generators, strict=True
-            ):
+        results = self._call("begin", {group: (own,) for group, own in starts.items()})
+        for group, answer in results.items():
+            for start, observation, rng in zip(starts[group], *answer, strict=True):
+                copy = self._firsts[group] + start.copy
                 self._last_observations[copy] = observation
-                self._rngs[copy] = generator  # which has drawn, in another process
+                self._rngs[copy] = rng  # which has drawn, in another process
 
     def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         chunks = np.split(actions, self._firsts[1:])
         results = self._call("step", {index: (chunk,) for index, chunk in enumerate(chunks)})
-        steps: list[GroupStep] = [results[index] for index in range(len(chunks))]
-        self._last_observations = np.concatenate([step.observations for step in steps])
-        self._last_infos = {
-            key: np.concatenate([step.infos[key] for step in steps]) for key in steps[0].infos
-        }
-        return np.concatenate([step.features for step in steps]), np.concatenate(
-            [step.terminated for step in steps]
-        )
+        observations, features, terminated, infos = zip(*results.values(), strict=True)
+        self._last_observations = np.concatenate(observations)
+        self._last_infos = {key: np.concatenate([info[key] for info in infos]) for key in infos[0]}
+        return np.concatenate(features), np.concatenate(terminated)
 
     def _step_infos(self) -> dict[str, np.ndarray]:
         return dict(self._last_infos)
@@ -434,13 +384,3 @@ class ProcessFamilyVector(TaskFamilyVector):
         for group in self._groups:
             group.close()
         self._groups = []
-
-
-def _make_copies(
-    make: Callable[[], TaskFamily], n: int, attributes: dict[str, Any]
-) -> list[TaskFamily]:
-    envs = [make() for _ in range(n)]
-    for env in envs:
-        for name, value in attributes.items():
-            setattr(env, name, value)
-    return envs

@@ -9,94 +9,103 @@ from poem_envs.goal_family import GoalFamily
 from poem_envs.process_vector import ProcessFamilyVector
 
 
-class FetchReachEnv(GoalFamily):
+class _RoboticsFamily(GoalFamily):
+    """A goal-conditioned environment whose reward is dense or sparse."""
+
+    def __init__(self, env: str, *, reward_type: str = "dense", **kwargs: Any) -> None:
+        if reward_type not in ("dense", "sparse"):
+            raise ValueError(f"reward_type={reward_type!r} must be 'dense' or 'sparse'")
+        super().__init__(f"gymnasium_robotics:{env}", reward_type=reward_type, **kwargs)
+
+
+class FetchReachEnv(_RoboticsFamily):
     r"""
     ## Description
-    The gripper of a Fetch arm is to reach a place in the air that it cannot see: `FetchReach-v4` of gymnasium-robotics, with
-    its desired goal as the hidden task.
+    The gripper of a Fetch arm is to reach a place in the air that it cannot see: `FetchReach-v4` of
+    gymnasium-robotics, with its desired goal as the hidden task.
 
     ## Task
-    The goal `(x, y, z)` in metres, drawn as the environment does: within 0.15 of the gripper's start in each direction.
+    The goal `(x, y, z)` in metres, drawn as the environment does: within 0.15 of the gripper's
+    start in each direction.
 
     ## Action Space
-    The action space is a `Box(-1, 1, (4,), float32)`: movements of the gripper in x, y and z, and of its fingers, which are
-    blocked.
+    The action space is a `Box(-1, 1, (4,), float32)`: movements of the gripper in x, y and z, and
+    of its fingers, which are blocked.
 
     ## Observation Space
-    The `"observation"` of `FetchReach-v4`, a `Box(-Inf, Inf, (10,), float64)`: position and velocity of gripper and fingers.
+    The `"observation"` of `FetchReach-v4`, a `Box(-Inf, Inf, (10,), float64)`: position and
+    velocity of gripper and fingers.
 
     ## Rewards
-    `reward_type="dense"`: minus the distance to the goal; `"sparse"`: 0 within 0.05 of it, else -1. The reward features are
-    the gripper's position, and `success` of the info is whether it is within 0.05.
+    `reward_type="dense"`: minus the distance to the goal; `"sparse"`: 0 within 0.05 of it, else -1.
+    The reward features are the gripper's position, and `success` of the info is whether it is
+    within 0.05.
 
     ## Episode End
-    There is no early end. `gymnasium.make` truncates episodes after 50 steps, as gymnasium-robotics does.
+    There is no early end. `gymnasium.make` truncates episodes after 50 steps, as gymnasium-robotics
+    does.
 
     ## Arguments
-    `reward_type` (`"dense"` or `"sparse"`), `render_mode`, `render_task`, and those of `FetchReach-v4`, such as `width`.
+    `reward_type` (`"dense"` or `"sparse"`), `render_mode`, `render_task`, and those of
+    `FetchReach-v4`, such as `width`.
 
     ## Version History
     * v0: Initial version
     """
 
-    def __init__(self, *, reward_type: str = "dense", **kwargs: Any) -> None:
+    def __init__(self, **kwargs: Any) -> None:
         super().__init__(
-            "gymnasium_robotics:FetchReach-v4",
+            "FetchReach-v4",
             observe_achieved_goal=False,  # it is in the observation already
             goal_low=(1.19, 0.59, 0.38),
             goal_high=(1.50, 0.90, 0.69),
-            reward_type=checked_reward_type(reward_type),
             **kwargs,
         )
 
 
-class FetchPushEnv(GoalFamily):
+class FetchPushEnv(_RoboticsFamily):
     r"""
     ## Description
-    A Fetch arm is to push a box on a table to a place that it cannot see: `FetchPush-v4` of gymnasium-robotics, with its
-    desired goal as the hidden task. The box starts anew in every episode.
+    A Fetch arm is to push a box on a table to a place that it cannot see: `FetchPush-v4` of
+    gymnasium-robotics, with its desired goal as the hidden task. The box starts anew in every
+    episode.
 
     ## Task
-    The goal `(x, y, z)` in metres, drawn as the environment does: within 0.15 of the gripper's start in x and y, on the table.
+    The goal `(x, y, z)` in metres, drawn as the environment does: within 0.15 of the gripper's
+    start in x and y, on the table.
 
-    ## Action Space
-    The action space is a `Box(-1, 1, (4,), float32)`: movements of the gripper in x, y and z, and of its fingers, which are
-    blocked.
+    ## Action Space, Episode End, Arguments
+    As :class:`FetchReachEnv`.
 
     ## Observation Space
-    The `"observation"` of `FetchPush-v4`, a `Box(-Inf, Inf, (25,), float64)`: positions and velocities of gripper, fingers and
-    box.
+    The `"observation"` of `FetchPush-v4`, a `Box(-Inf, Inf, (25,), float64)`: positions and
+    velocities of gripper, fingers and box.
 
     ## Rewards
-    `reward_type="dense"`: minus the distance of the box to the goal; `"sparse"`: 0 within 0.05 of it, else -1. The reward
-    features are the box's position, and `success` of the info is whether it is within 0.05.
-
-    ## Episode End
-    There is no early end. `gymnasium.make` truncates episodes after 50 steps, as gymnasium-robotics does.
-
-    ## Arguments
-    `reward_type` (`"dense"` or `"sparse"`), `render_mode`, `render_task`, and those of `FetchPush-v4`, such as `width`.
+    `reward_type="dense"`: minus the distance of the box to the goal; `"sparse"`: 0 within 0.05 of
+    it, else -1. The reward features are the box's position, and `success` of the info is whether it
+    is within 0.05.
 
     ## Version History
     * v0: Initial version
     """
 
-    def __init__(self, *, reward_type: str = "dense", **kwargs: Any) -> None:
+    def __init__(self, **kwargs: Any) -> None:
         super().__init__(
-            "gymnasium_robotics:FetchPush-v4",
+            "FetchPush-v4",
             observe_achieved_goal=False,
             goal_low=(1.19, 0.59, 0.42),
             goal_high=(1.50, 0.90, 0.43),
-            reward_type=checked_reward_type(reward_type),
             **kwargs,
         )
 
 
-class AntMazeEnv(GoalFamily):
+class AntMazeEnv(_RoboticsFamily):
     r"""
     ## Description
-    An ant in a U-shaped maze is to walk to a place that it cannot see: `AntMaze_UMaze-v5` of gymnasium-robotics, with its
-    desired goal as the hidden task. The ant starts anew in every episode, wherever the goal is.
+    An ant in a U-shaped maze is to walk to a place that it cannot see: `AntMaze_UMaze-v5` of
+    gymnasium-robotics, with its desired goal as the hidden task. The ant starts anew in every
+    episode, wherever the goal is.
 
     ## Task
     The goal `(x, y)` in metres, drawn as the environment does: in a free cell of the maze.
@@ -105,30 +114,28 @@ class AntMazeEnv(GoalFamily):
     The action space is a `Box(-1, 1, (8,), float32)`, the torques of Ant.
 
     ## Observation Space
-    A `Box(-Inf, Inf, (107,), float64)`: the 105 numbers of Ant-v5 without its position, and the position `(x, y)` behind them.
+    A `Box(-Inf, Inf, (107,), float64)`: the 105 numbers of Ant-v5 without its position, and the
+    position `(x, y)` behind them.
 
     ## Rewards
-    `reward_type="dense"`: `exp(-distance to the goal)`; `"sparse"`: 1 within 0.45 of it, else 0. The reward features are the
-    ant's position, and `success` of the info is whether it is within 0.45.
+    `reward_type="dense"`: `exp(-distance to the goal)`; `"sparse"`: 1 within 0.45 of it, else 0.
+    The reward features are the ant's position, and `success` of the info is whether it is within
+    0.45.
 
     ## Episode End
-    There is no early end. `gymnasium.make` truncates episodes after 700 steps, as gymnasium-robotics does.
+    There is no early end. `gymnasium.make` truncates episodes after 700 steps, as
+    gymnasium-robotics does.
 
     ## Arguments
-    `reward_type` (`"dense"` or `"sparse"`), `render_mode`, `render_task`, and those of `AntMaze_UMaze-v5`.
+    `reward_type` (`"dense"` or `"sparse"`), `render_mode`, `render_task`, and those of
+    `AntMaze_UMaze-v5`.
 
     ## Version History
     * v0: Initial version
     """
 
-    def __init__(self, *, reward_type: str = "dense", **kwargs: Any) -> None:
-        super().__init__(
-            "gymnasium_robotics:AntMaze_UMaze-v5",
-            goal_low=-6.0,
-            goal_high=6.0,
-            reward_type=checked_reward_type(reward_type),
-            **kwargs,
-        )
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("AntMaze_UMaze-v5", goal_low=-6.0, goal_high=6.0, **kwargs)
 
 
 #: The vectorised families: same arguments, and those of
@@ -136,10 +143,3 @@ class AntMazeEnv(GoalFamily):
 FetchReachVectorEnv = functools.partial(ProcessFamilyVector, FetchReachEnv)
 FetchPushVectorEnv = functools.partial(ProcessFamilyVector, FetchPushEnv)
 AntMazeVectorEnv = functools.partial(ProcessFamilyVector, AntMazeEnv)
-
-
-def checked_reward_type(reward_type: str) -> str:
-    """:raises ValueError: for anything but ``"dense"`` and ``"sparse"``"""
-    if reward_type not in ("dense", "sparse"):
-        raise ValueError(f"reward_type={reward_type!r} must be 'dense' or 'sparse'")
-    return reward_type

@@ -11,30 +11,26 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from poem_envs.headless import choose_headless_backend
-from poem_envs.mujoco_fast_rendering import FastRenderer
-from poem_envs.mujoco_rendering import close_viewers, prepare_to_render
+from poem_envs.mujoco_rendering import FastRenderer, close_viewers, fit_buffer, prepare_to_render
 
-SUPPORTED = "metaworld >= 3.1, < 4"
+INSTALL = "install it: pip install 'metaworld>=3.1,<4'"
 
 
 def load_metaworld() -> Any:
-    """Meta-World's table of environments.
+    """Meta-World's table of environments, the module ``metaworld.env_dict``.
 
-    :return: the module ``metaworld.env_dict``
     :raises ImportError: if Meta-World is absent, or of a version whose environments differ
     """
+    needed = "the Meta-World families need metaworld >= 3.1, < 4"
     try:
         found = version("metaworld")
     except PackageNotFoundError:
-        raise ImportError(
-            f"the Meta-World families need {SUPPORTED}; install it: pip install 'metaworld>=3.1,<4'"
-        ) from None
+        raise ImportError(f"{needed}; {INSTALL}") from None
     major, minor = (int(part) for part in found.split(".")[:2])
     if major != 3 or minor < 1:
         raise ImportError(
-            f"the Meta-World families need {SUPPORTED}, but metaworld {found} is installed, whose rewards and placements are "
-            "others; install it: pip install 'metaworld>=3.1,<4'"
+            f"{needed}, but metaworld {found} is installed, whose rewards and placements are "
+            f"others; {INSTALL}"
         )
     import metaworld.env_dict
 
@@ -52,11 +48,10 @@ def checked_manipulation(env_name: str) -> str:
     :param env_name: with it or without
     :raises ValueError: if there is none of that name; the message lists the nearest
     """
-    known = manipulation_names()
-    name = env_name.removesuffix("-v3") if isinstance(env_name, str) else env_name
+    known, name = manipulation_names(), str(env_name).removesuffix("-v3")
     if name in known:
         return name
-    near = difflib.get_close_matches(str(name), known, n=5, cutoff=0.4)
+    near = difflib.get_close_matches(name, known, n=5, cutoff=0.4)
     hint = (
         f"did you mean {', '.join(map(repr, near))}?"
         if near
@@ -82,8 +77,7 @@ class Sawyer:
     was used before.
 
     :param manipulation: its name, without ``-v3``
-    :param renders_fast: whether images are made by
-        :class:`~poem_envs.mujoco_fast_rendering.FastRenderer`
+    :param renders_fast: by :class:`~poem_envs.mujoco_rendering.FastRenderer`
     :param render_arguments: ``render_mode``, ``camera_name``, ``width`` and ``height``, as
         Meta-World has them
     """
@@ -93,13 +87,11 @@ class Sawyer:
     ) -> None:
         self.manipulation = manipulation
         self.arguments = {"renders_fast": renders_fast, **render_arguments}
-        self.env = _environment_class(manipulation)(**render_arguments)
+        self.env = env = _environment_class(manipulation)(**render_arguments)
         self._fast_renderer: FastRenderer | None = None
-        self.env._set_task_called = (
-            True  # placements are set here, without Meta-World's pickled tasks
-        )
-        self.env.max_path_length = np.inf  # time limits are a wrapper's
-        self.env._get_state_rand_vec = self._take_placement
+        env._set_task_called = True  # placements are set here, without Meta-World's pickled tasks
+        env.max_path_length = np.inf  # time limits are a wrapper's
+        env._get_state_rand_vec = self._take_placement
         self._placement: np.ndarray | None = None
 
     def reset(self, placement: np.ndarray, show_goal: bool = False) -> np.ndarray:
@@ -143,21 +135,14 @@ class Sawyer:
         """What Meta-World returns in its ``render_mode``; an image ``(height, width, 3)``, uint8,
         where it renders fast.
         """
+        env = self.env
         if not self.arguments["renders_fast"]:
-            prepare_to_render(self.env, self.env.render_mode)
-            return self.env.render()
-        choose_headless_backend()
+            prepare_to_render(env, env.render_mode)
+            return env.render()
         if self._fast_renderer is None:
-            env = self.env
-            self._fast_renderer = FastRenderer(
-                env.model,
-                width=env.width,
-                height=env.height,
-                camera_id=None,
-                camera_name=env.camera_name,
-                camera_config={},
-            )
-        return self._fast_renderer.render_data(self.env.data, [])
+            size = {"width": env.width, "height": env.height}
+            self._fast_renderer = FastRenderer(env.model, camera_name=env.camera_name, **size)
+        return self._fast_renderer.render_data(env.data, [])
 
     def close(self) -> None:
         """Close windows and graphics contexts, which a later rendering would open again."""
@@ -168,26 +153,21 @@ class Sawyer:
 
     def get_state(self) -> np.ndarray:
         """All that determines how the episode goes on, besides the placement, ``(state_dim,)``."""
-        return np.concatenate([self._get_mujoco_state(), self.env._prev_obs])
+        env, spec = self.env, mujoco.mjtState.mjSTATE_INTEGRATION
+        state = np.empty(mujoco.mj_stateSize(env.model, spec))
+        mujoco.mj_getState(env.model, env.data, state, spec)
+        return np.concatenate([state, env._prev_obs])
 
     def set_state(self, state: np.ndarray) -> None:
         """Put the simulator into a state of :meth:`get_state`, within an episode of the same
         placement.
         """
         env, spec = self.env, mujoco.mjtState.mjSTATE_INTEGRATION
-        n_previous = len(env._prev_obs)
-        mujoco.mj_setState(env.model, env.data, state[:-n_previous], spec)
-        mujoco.mj_forward(
-            env.model, env.data
-        )  # brings positions up to date, and changes the solver's warm start
-        mujoco.mj_setState(env.model, env.data, state[:-n_previous], spec)
-        env._prev_obs = state[-n_previous:].copy()
-
-    def _get_mujoco_state(self) -> np.ndarray:
-        spec = mujoco.mjtState.mjSTATE_INTEGRATION
-        state = np.empty(mujoco.mj_stateSize(self.env.model, spec))
-        mujoco.mj_getState(self.env.model, self.env.data, state, spec)
-        return state
+        physics, env._prev_obs = np.split(state.copy(), [-len(env._prev_obs)])
+        mujoco.mj_setState(env.model, env.data, physics, spec)
+        # brings positions up to date, and changes the solver's warm start
+        mujoco.mj_forward(env.model, env.data)
+        mujoco.mj_setState(env.model, env.data, physics, spec)
 
     def _take_placement(self) -> np.ndarray:
         if self._placement is None:
@@ -224,8 +204,6 @@ def _key(manipulation: str, arguments: dict[str, Any]) -> tuple[Any, ...]:
 class Placements:
     """Which placements a manipulation has, as Meta-World draws them. It needs an environment for
     that, whose arm stays still.
-
-    :param manipulation: its name, without ``-v3``
     """
 
     def __init__(self, manipulation: str) -> None:
@@ -255,28 +233,22 @@ class Placements:
         self._sawyer.env.reset_model()
 
 
-@functools.cache
-def placements_of(manipulation: str) -> Placements:
-    """The placements of a manipulation; they are kept, since an environment takes long to make."""
-    return Placements(manipulation)
+#: The placements of a manipulation; they are kept, since an environment takes long to make.
+placements_of = functools.cache(Placements)
 
 
 @functools.cache
 def _environment_class(manipulation: str) -> type:
-    """Meta-World's class, with models that are copied rather than compiled anew: 16 ms in place of
-    230.
-    """
+    """Meta-World's class, with models that are copied rather than compiled anew, which is slow."""
     base: Any = load_metaworld().ALL_V3_ENVIRONMENTS[f"{manipulation}-v3"]
     compiled: dict[str, mujoco.MjModel] = {}
 
     class Environment(base):
         def _initialize_simulation(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
             if self.fullpath not in compiled:
-                model, _ = super()._initialize_simulation()
-                compiled[self.fullpath] = model
+                compiled[self.fullpath], _ = super()._initialize_simulation()
             model = copy.deepcopy(compiled[self.fullpath])
-            model.vis.global_.offwidth = max(model.vis.global_.offwidth, self.width)
-            model.vis.global_.offheight = max(model.vis.global_.offheight, self.height)
+            fit_buffer(model, self.width, self.height)
             return model, mujoco.MjData(model)
 
     return Environment

@@ -26,8 +26,11 @@ from poem_envs.family import (
     check_options,
     check_render_mode,
     checked_actions,
+    checked_state,
     task_stream,
 )
+
+NO_RENDER_MODE = "without a render_mode; pass one to the constructor, say 'rgb_array'"
 
 
 class BatchFamily(TaskDefinition):
@@ -36,9 +39,9 @@ class BatchFamily(TaskDefinition):
 
     A family writes this once, and combines it twice::
 
-        class _Walk1D(BatchFamily): ...                        # the methods below, and those of TaskDefinition
-        class Walk1DEnv(_Walk1D, BatchTaskFamily): ...         # one copy, a Gymnasium environment
-        class Walk1DVectorEnv(_Walk1D, TaskFamilyVector): ...  # n copies, a Gymnasium vector environment
+        class _Walk1D(BatchFamily): ...  # the methods below, and those of TaskDefinition
+        class Walk1DEnv(_Walk1D, BatchTaskFamily): ...  # one copy, a Gymnasium environment
+        class Walk1DVectorEnv(_Walk1D, TaskFamilyVector): ...  # n copies, a vector environment
 
     Its constructor hands ``observation_space`` and ``action_space`` (of one copy) and all that it
     does not know to ``super().__init__``.
@@ -54,11 +57,7 @@ class BatchFamily(TaskDefinition):
 
     @abstractmethod
     def _begin_episodes(self, copies: np.ndarray, rngs: Sequence[np.random.Generator]) -> None:
-        """Put some copies into a start state.
-
-        :param copies: their numbers
-        :param rngs: a generator for each of them
-        """
+        """Put some copies, given by number, into a start state, each with its own generator."""
 
     @abstractmethod
     def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -70,65 +69,32 @@ class BatchFamily(TaskDefinition):
         """
 
     def _step_infos(self) -> dict[str, np.ndarray]:
-        """Further entries of the infos of the step just taken, a row for each copy: none unless
-        overridden.
-        """
+        """Further entries of the infos of the step just taken, a row for each copy."""
         return {}
 
     @abstractmethod
     def _observations(self) -> np.ndarray:
         """The observations of all copies, ``(n, obs_dim)``, a new array."""
 
-    def _physics_state(self, copy: int) -> np.ndarray:
-        """All that determines how a copy goes on, ``(state_dim,)``, a new array."""
-        raise NotImplementedError
-
-    def _set_physics_state(self, copy: int, state: np.ndarray) -> None:
-        """Put a copy into a state that :meth:`_physics_state` returned."""
-        raise NotImplementedError
-
     def _render_copy(self, copy: int, render_mode: str, task: np.ndarray | None) -> Any:
-        """Render one copy.
-
-        :param copy: its number
-        :param render_mode: as in Gymnasium
-        :param task: the hidden task, to be drawn; None if it is to stay hidden
-        """
+        """Render one copy, in one of Gymnasium's modes, with its task unless that is None."""
         raise NotImplementedError
 
     def _release(self) -> None:
         """Free threads, windows and the like. Called by ``close``, possibly more than once."""
 
-    def _checked_physics_state(self, state: npt.ArrayLike, copy: int) -> np.ndarray:
-        array = np.array(state, dtype=np.float64)
-        shape = self._physics_state(copy).shape
-        if array.shape != shape or not np.isfinite(array).all():
-            raise ValueError(
-                f"state={state!r} must be finite and have shape {shape}, as get_physics_state() returns it"
-            )
-        return array
-
 
 class BatchTaskFamily(BatchFamily, TaskFamily):
     """A single environment: a batch of one copy.
 
-    :param observation_space: of the environment
-    :param action_space: of the environment
-    :param render_mode: one of ``metadata["render_modes"]``, or None
-    :param render_task: whether rendering shows the hidden task
-    :param split: which tasks to draw, one of :attr:`splits`
+    :param observation_space: of one copy, as is ``action_space``
+    :param kwargs: those of :class:`~poem_envs.TaskFamily`
     """
 
     def __init__(
-        self,
-        *,
-        observation_space: spaces.Box,
-        action_space: spaces.Box,
-        render_mode: str | None = None,
-        render_task: bool = False,
-        split: str = "train",
+        self, *, observation_space: spaces.Box, action_space: spaces.Box, **kwargs: Any
     ) -> None:
-        super().__init__(render_mode=render_mode, render_task=render_task, split=split)
+        super().__init__(**kwargs)
         self.observation_space = observation_space
         self.action_space = action_space
         self._allocate(1)
@@ -144,29 +110,12 @@ class BatchTaskFamily(BatchFamily, TaskFamily):
     def _step_info(self) -> dict[str, Any]:
         return {key: values[0] for key, values in self._step_infos().items()}
 
-    def get_physics_state(self) -> np.ndarray:
-        """The simulator's state, ``(state_dim,)``: enough to render this moment again, or to go on
-        from it.
-        """
-        return self._physics_state(0)
-
-    def set_physics_state(self, state: npt.ArrayLike) -> None:
-        """Put the simulator into a state of :meth:`get_physics_state`, say to render a recorded
-        trajectory. The task stays.
-
-        :param state: ``(state_dim,)``
-        :raises ValueError: if it has another shape or is not finite
-        """
-        self._set_physics_state(0, self._checked_physics_state(state, 0))
-
     def render(self) -> Any:
         """Render the current state as ``render_mode`` says: an image ``(height, width, 3)`` for
         ``"rgb_array"``.
         """
         if self.render_mode is None:
-            gym.logger.warn(
-                "render() was called without a render_mode; pass one to the constructor, say 'rgb_array'"
-            )
+            gym.logger.warn(f"render() was called {NO_RENDER_MODE}")
             return None
         return self._render_copy(0, self.render_mode, self._task if self.render_task else None)
 
@@ -182,23 +131,30 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
+def checked_nthread(nthread: int | None) -> int:
+    """How many threads (or processes) to use; None takes as many as there are cores."""
+    if nthread is not None and nthread < 1:
+        raise ValueError(f"nthread={nthread!r} must be at least 1, or None for all cores")
+    return available_cores() if nthread is None else nthread
+
+
 class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """A vectorised task family, each copy with a task of its own.
 
-    - A copy whose episode ends is reset in the same step (``AutoresetMode.SAME_STEP``). ``infos["final_obs"]`` then holds
-      ``(num_envs, obs_dim)``: the observation that each copy's step led to, which differs from the returned one for copies
-      that were reset (``infos["_final_obs"]``, a mask). The key is there only if some copy was reset.
-    - ``infos["reward_features"]``, ``(num_envs, reward_feature_dim)``, is always that of the step just taken, as are
-      ``"success"`` and ``"is_success"``, ``(num_envs,)``, of a family that has them.
-    - ``reset(seed=s)`` seeds copy ``i`` with ``s + i``; results equal those of single environments bit for bit.
+    - A copy whose episode ends is reset in the same step (``AutoresetMode.SAME_STEP``).
+      ``infos["final_obs"]`` then holds ``(num_envs, obs_dim)``: the observation that each copy's
+      step led to, which differs from the returned one for copies that were reset
+      (``infos["_final_obs"]``, a mask). The key is there only if some copy was reset.
+    - ``infos["reward_features"]``, ``(num_envs, reward_feature_dim)``, is always that of the step
+      just taken, as are ``"success"`` and ``"is_success"``, ``(num_envs,)``, of a family that has
+      them.
+    - ``reset(seed=s)`` seeds copy ``i`` with ``s + i``; results equal those of single environments
+      bit for bit.
 
-    :param num_envs: number of copies
+    Its arguments are those of :class:`BatchTaskFamily`, and
+
     :param max_episode_steps: episodes are truncated after so many steps; None for never
-    :param observation_space: of one copy
-    :param action_space: of one copy
     :param render_mode: ``"rgb_array"`` and the like; ``"human"`` for one copy only
-    :param render_task: whether rendering shows the hidden tasks
-    :param split: which tasks to draw, one of :attr:`splits`
     """
 
     metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
@@ -226,7 +182,8 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         check_render_mode(render_mode, self.metadata)
         if render_mode == "human" and num_envs > 1:
             raise ValueError(
-                f"render_mode='human' shows one environment, but num_envs={num_envs}; use 'rgb_array'"
+                f"render_mode='human' shows one environment, but num_envs={num_envs}; use "
+                "'rgb_array'"
             )
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps
@@ -260,13 +217,11 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
 
         :param tasks: ``(num_envs, task_dim)``, or one row for each of ``copies``
         :param copies: numbers of the copies to set; None for all
-        :raises ValueError: if a task has another shape, is not finite, or lies outside
-            ``task_space`` (or the finite family)
+        :raises ValueError: as :meth:`TaskFamily.set_task`
         """
         index = np.arange(self.num_envs) if copies is None else np.asarray(copies, dtype=np.intp)
-        self._next_tasks[index] = self._checked_tasks(
-            tasks, (len(index), *self.task_space.shape), "tasks"
-        )
+        shape = (len(index), *self.task_space.shape)
+        self._next_tasks[index] = self._checked_tasks(tasks, shape, "tasks")
         self._task_chosen[index] = True
 
     def keep_tasks(self) -> None:
@@ -295,25 +250,22 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         """
         options = check_options(options, self._reset_options)
         seeds = self._seed_of_each_copy(seed)
+        seeded = np.array([s is not None for s in seeds])
         if "tasks" in options:
             self.set_tasks(options["tasks"])
         if not self._rngs:
-            self._rngs, self._seeds = map(
-                list, zip(*(seeding.np_random(s) for s in seeds), strict=True)
-            )
-            self._episodes[:] = 0
-        for copy, copy_seed in enumerate(seeds):
-            if copy_seed is not None:
-                self._rngs[copy], self._seeds[copy] = seeding.np_random(copy_seed)
-                self._episodes[copy] = 0
+            generators = [seeding.np_random(s) for s in seeds]
+            self._rngs, self._seeds = map(list, zip(*generators, strict=True))
+        else:
+            for copy in np.flatnonzero(seeded):
+                self._rngs[copy], self._seeds[copy] = seeding.np_random(seeds[copy])
+        self._episodes[seeded] = 0
+        undecided = ~self._task_chosen
         if self._tasks is None:
             self._tasks = self._next_tasks.copy()
-            undecided = ~self._task_chosen
         else:
-            undecided = (
-                ~self._task_chosen & ~self._tasks_kept & np.array([s is not None for s in seeds])
-            )
-        for copy in np.flatnonzero(undecided).tolist():
+            undecided &= seeded & ~self._tasks_kept
+        for copy in np.flatnonzero(undecided):
             self._tasks[copy] = self.sample_tasks(1, task_stream(self._rngs[copy]))[0]
         self._begin(np.arange(self.num_envs))
         if self.render_mode == "human":
@@ -323,14 +275,11 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
     def step(
         self, actions: npt.ArrayLike
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Step every copy.
+        """Step every copy; errors as of :meth:`TaskFamily.step`, and they name the copy.
 
-        :param actions: ``(num_envs, action_dim)``; a tiny excess over the bounds (1e-6) is clipped
+        :param actions: ``(num_envs, action_dim)``
         :return: observations ``(num_envs, obs_dim)``, rewards, terminations, truncations
             ``(num_envs,)`` and infos
-        :raises ValueError: if an action has another shape, is not finite or lies outside its space;
-            it names the copy
-        :raises gymnasium.error.ResetNeeded: before the first reset
         """
         if self._tasks is None:
             raise ResetNeeded("step() was called before the first reset()")
@@ -340,10 +289,8 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         features, terminations = self._advance(checked)
         rewards = self.compute_rewards(self._tasks, features)
         observations = self._observations()
-        if self.max_episode_steps is None:
-            truncations = np.zeros(self.num_envs, dtype=bool)
-        else:
-            truncations = self._elapsed_steps >= self.max_episode_steps
+        limit = np.inf if self.max_episode_steps is None else self.max_episode_steps
+        truncations = self._elapsed_steps >= limit
         infos: dict[str, Any] = {"reward_features": features, **self._step_infos()}
         if "success" in infos:
             self._succeeded |= infos["success"].astype(bool)
@@ -358,10 +305,8 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         return observations, rewards, terminations, truncations, infos
 
     def get_physics_state(self, copy: int) -> np.ndarray:
-        """The simulator's state of one copy, ``(state_dim,)``, which a single environment's
-        ``set_physics_state`` takes.
-
-        :param copy: its number
+        """The simulator's state of one copy, by number, ``(state_dim,)``, which a single
+        environment's ``set_physics_state`` takes.
         """
         return self._physics_state(copy)
 
@@ -369,44 +314,35 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         """Put one copy into a state of :meth:`get_physics_state`. Its task and the number of its
         step stay.
 
-        :param copy: its number
-        :param state: ``(state_dim,)``
-        :raises ValueError: if it has another shape or is not finite
+        :raises ValueError: if the state has another shape or is not finite
         """
-        self._set_physics_state(copy, self._checked_physics_state(state, copy))
+        self._set_physics_state(copy, checked_state(state, self._physics_state(copy).shape))
 
     def render(self) -> tuple[Any, ...] | None:
         """Render every copy as ``render_mode`` says, and return the images."""
         if self.render_mode is None:
-            gym.logger.warn(
-                "render() was called without a render_mode; pass one to the constructor, say 'rgb_array'"
-            )
+            gym.logger.warn(f"render() was called {NO_RENDER_MODE}")
             return None
         return tuple(self.render_copy(copy) for copy in range(self.num_envs))
 
     def render_copy(self, copy: int) -> Any:
-        """Render one copy.
-
-        :param copy: its number
-        :return: what :meth:`render` would hold for it
-        """
+        """What :meth:`render` would hold for one copy, by number."""
         if self.render_mode is None:
-            raise ValueError("render_mode is None; pass one to the constructor, say 'rgb_array'")
+            raise ValueError(f"render_copy() was called {NO_RENDER_MODE}")
         task = self._tasks[copy] if self.render_task and self._tasks is not None else None
         return self._render_copy(copy, self.render_mode, task)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Free what rendering and simulation hold."""
         self._release()
 
     @property  # type: ignore[misc]
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
-        """The generator of each copy; empty before the first reset."""
+        """Of each copy; empty before the first reset."""
         return tuple(self._rngs)
 
     @property
     def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
-        """The seed of each copy's generator; empty before the first reset."""
+        """Of each copy; empty before the first reset."""
         return tuple(self._seeds)
 
     def _seed_of_each_copy(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
@@ -416,7 +352,8 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
             return [int(seed) + copy for copy in range(self.num_envs)]
         if len(seed) != self.num_envs:
             raise ValueError(
-                f"seed={seed!r} holds {len(seed)} seeds, expected one for each of num_envs={self.num_envs}"
+                f"seed={seed!r} holds {len(seed)} seeds, expected one for each of "
+                f"num_envs={self.num_envs}"
             )
         return [None if s is None else int(s) for s in seed]
 
@@ -432,8 +369,8 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
 
     def _describe_episode(self, copy: int) -> str:
         return (
-            f"step {self._elapsed_steps[copy]} of episode {self._episodes[copy]} since reset(seed={self._seeds[copy]}) "
-            f"in environment copy {copy}"
+            f"step {self._elapsed_steps[copy]} of episode {self._episodes[copy]} since "
+            f"reset(seed={self._seeds[copy]}) in environment copy {copy}"
         )
 
 
@@ -453,15 +390,13 @@ def set_task(env: Any, task: npt.ArrayLike) -> None:
             set_task(single, row)
     elif isinstance(env, gym.vector.VectorEnv) and isinstance(env.unwrapped, TaskFamilyVector):
         env.unwrapped.set_tasks(_task_of_each(task, env.num_envs))
-    elif hasattr(env, "env_method") and env.has_attr(
-        "set_task"
-    ):  # SB3's, which is not imported here
+    elif hasattr(env, "env_method") and env.has_attr("set_task"):  # SB3's, not imported here
         for copy, row in enumerate(_task_of_each(task, env.num_envs)):
             env.env_method("set_task", row, indices=[copy])
     else:
         raise TypeError(
-            f"env={env!r} must be a task family (poem_envs.TaskFamily), by itself, inside wrappers, or "
-            "vectorised within this process"
+            f"env={env!r} must be a task family (poem_envs.TaskFamily), by itself, inside "
+            "wrappers, or vectorised within this process"
         )
 
 
@@ -472,6 +407,7 @@ def _task_of_each(task: npt.ArrayLike, num_envs: int) -> np.ndarray:
         return np.tile(tasks, (num_envs, 1))
     if tasks.shape[:-1] != (num_envs,):
         raise ValueError(
-            f"task has shape {tasks.shape}, expected (task_dim,) or (num_envs, task_dim) with num_envs={num_envs}"
+            f"task has shape {tasks.shape}, expected (task_dim,) or (num_envs, task_dim) with "
+            f"num_envs={num_envs}"
         )
     return tasks

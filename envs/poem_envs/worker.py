@@ -26,29 +26,24 @@ def serve(connection: Connection) -> None:
     group: CopyGroup | None = None
     while True:
         try:
-            method, arguments = pickle.loads(connection.recv_bytes())
-        except (EOFError, ConnectionResetError):
-            break
-        answer: tuple[bool, Any]
-        try:
-            if method == "__init__":
-                make, first = arguments
-                group, result = CopyGroup(pickle.loads(make)(), first), None
-            else:
-                result = getattr(group, method)(*arguments)
-            answer = True, result
-        except Exception as error:
-            answer = False, (str(error), traceback.format_exc())
-        try:
+            call = connection.recv_bytes()
+            answer: tuple[bool, Any]
+            try:
+                method, arguments = pickle.loads(call)
+                if method == "__init__":
+                    group, answer = CopyGroup(*arguments), (True, None)
+                else:
+                    answer = True, getattr(group, method)(*arguments)
+            except Exception as error:
+                answer = False, (str(error), traceback.format_exc())
             connection.send_bytes(cloudpickle.dumps(answer))
-        except (BrokenPipeError, ConnectionResetError):
+        except (EOFError, BrokenPipeError, ConnectionResetError):
             break
     if group is not None:
         group.close()
 
 
 if __name__ == "__main__":
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # Ctrl-C reaches all processes; the parent's end ends this one
+    # Ctrl-C reaches all processes; the parent's end ends this one.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     serve(Connection(int(sys.argv[1])))

@@ -1,0 +1,75 @@
+"""What Ant and Humanoid have in common: they can fall, and may run in a hidden direction."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from poem_envs.mujoco_family import MujocoFamily
+from poem_envs.mujoco_rendering import arrow
+
+
+class LeggedFamily(MujocoFamily):
+    """A robot whose episode ends when its torso leaves a range of heights.
+
+    :param ctrl_cost_weight: weight of the action cost, the last reward feature
+    :param terminate_when_unhealthy: whether it ends then
+    :param healthy_z_range: lowest and highest z-coordinate of the torso, m
+    """
+
+    hidden_qpos = 2
+    reward_feature_dim = 3
+    #: Height at which the task is shown, m.
+    marker_height: float
+    #: How a healthy height compares to the ends of the range.
+    within: np.ufunc = np.less_equal
+
+    def __init__(
+        self,
+        *,
+        ctrl_cost_weight: float,
+        healthy_z_range: tuple[float, float],
+        terminate_when_unhealthy: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        self.ctrl_cost_weight = ctrl_cost_weight
+        self.terminate_when_unhealthy = terminate_when_unhealthy
+        self.healthy_z_range = healthy_z_range
+        super().__init__(**kwargs)
+
+    def _unhealthy(self) -> np.ndarray:
+        if not self.terminate_when_unhealthy:
+            return super()._unhealthy()
+        (lowest, highest), height = self.healthy_z_range, self._qpos[:, 2]
+        return ~(self.within(lowest, height) & self.within(height, highest))
+
+    def _marker_place(self, position: np.ndarray) -> np.ndarray:
+        """Above the robot, ``(3,)``."""
+        return np.array([position[0], position[1], self.marker_height])
+
+
+class DirectionFamily(LeggedFamily):
+    """A legged robot that is to run in a direction, whichever directions there are. The reward
+    features are the velocity in x and y, and the square of the action.
+
+    :param forward_reward_weight: of the speed in the direction, an angle in radians
+    :param healthy_reward: of every step
+    """
+
+    def __init__(
+        self, *, forward_reward_weight: float = 1.0, healthy_reward: float = 1.0, **kwargs: Any
+    ) -> None:
+        self.forward_reward_weight = forward_reward_weight
+        self.healthy_reward = healthy_reward
+        super().__init__(**kwargs)
+
+    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
+        angle = np.array(tasks[..., 0])  # contiguous: strided input may be rounded differently
+        speed = features[..., 0] * np.cos(angle) + features[..., 1] * np.sin(angle)
+        forward = self.forward_reward_weight * speed
+        return forward - self.ctrl_cost_weight * features[..., 2] + self.healthy_reward
+
+    def _task_markers(self, task: np.ndarray, position: np.ndarray) -> list[dict[str, Any]]:
+        direction = (float(np.cos(task[0])), float(np.sin(task[0])))
+        return [arrow(self._marker_place(position), direction, length=1.0)]
