@@ -5,9 +5,8 @@ like SB3's ``check_env``.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
-from typing import Any
+from functools import cached_property, partial
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -16,8 +15,6 @@ from gymnasium import spaces
 from poem_envs.family import TaskFamily, definition_problem
 from poem_envs.registration import plain_id
 from poem_envs.vector import TaskFamilyVector
-
-MakeFamily = Callable[..., Any]
 
 #: Steps whose images are compared: drawing is slow.
 N_IMAGES = 3
@@ -51,130 +48,177 @@ def check_task_family(
         raise TypeError(
             f"env is {env!r}, but must be a class or a function that makes it, or a registered id"
         )
-    make = partial(_make, env, **env_kwargs)
-    check_spaces(make, seed)
-    check_sampling(make, seed)
-    check_seeds(make, n_steps, seed)
-    check_set_task(make, seed)
-    check_hidden_task(make, n_steps, seed)
-    check_relabelling(make, n_steps, seed)
-    check_potential(make, n_steps, seed)
-    check_symmetries(make)
+    case = Case(partial(_make, env, **env_kwargs), n_steps, seed)
+    check_spaces(case)
+    check_sampling(case)
+    check_seeds(case)
+    check_set_task(case)
+    check_hidden_task(case)
+    check_relabelling(case)
+    check_potential(case)
+    check_symmetries(case)
     if isinstance(env, str):
-        check_registration(env)
+        assert gym.spec(env).max_episode_steps is not None, (
+            f"{env} must have a time limit, the horizon of training: register it with "
+            "max_episode_steps=<steps>"
+        )
         if gym.spec(env).vector_entry_point is not None:
-            check_vector_parity(env, env_kwargs, n_steps, seed)
+            check_vector_parity(case, env, env_kwargs)
     if render:
-        check_rendering(make, n_steps, seed)
-    check_closing(make, seed)
+        check_rendering(case)
+    check_closing(case)
 
 
-@dataclass
-class Episode:
+class Episode(NamedTuple):
     """What a run of actions gave: arrays with one row a step, and of observations one more."""
 
     observations: np.ndarray
     rewards: np.ndarray
     features: np.ndarray
 
+    def equals(self, other: Episode) -> bool:
+        """To the bit."""
+        return all(np.array_equal(one, two) for one, two in zip(self, other, strict=True))
 
-def check_spaces(make: MakeFamily, seed: int) -> None:
+
+class Case:
+    """A family that is checked: how it is made, and what its copies are made to do."""
+
+    def __init__(self, make: Callable[..., Any], n_steps: int, seed: int) -> None:
+        self.make, self.n_steps, self.seed = make, n_steps, seed
+
+    @cached_property
+    def player(self) -> Any:
+        """The one that played :attr:`episodes`."""
+        return self.make()
+
+    @cached_property
+    def actions(self) -> np.ndarray:
+        return self.draw_actions(self.n_steps, self.seed)
+
+    def draw_actions(self, n: int, seed: int) -> np.ndarray:
+        space, rng = self.player.action_space, np.random.default_rng([seed, 1])
+        return rng.uniform(space.low, space.high, size=(n, *space.shape)).astype(space.dtype)
+
+    @cached_property
+    def tasks(self) -> np.ndarray:
+        """Two."""
+        return self.player.sample_tasks(2, np.random.default_rng([self.seed, 2]))
+
+    @cached_property
+    def episodes(self) -> list[Episode]:
+        """One in each of the two tasks, with the same seed and the same actions."""
+        return [self.play(self.player, task) for task in self.tasks]
+
+    def play(
+        self,
+        env: TaskFamily,
+        task: np.ndarray | None = None,
+        actions: np.ndarray | None = None,
+        each_step: Callable[[], Any] = lambda: None,
+        seed: int | None = None,
+    ) -> Episode:
+        """An episode, whose arrays are kept as they came: one that the environment reuses is caught
+        by the comparison.
+        """
+        options = None if task is None else {"task": task}
+        observation, _ = env.reset(seed=self.seed if seed is None else seed, options=options)
+        observations, rewards, features = [observation], [], []
+        each_step()
+        for action in self.actions if actions is None else actions:
+            observation, reward, terminated, _, info = env.step(action)
+            observations.append(observation)
+            rewards.append(reward)
+            features.append(info["reward_features"])
+            each_step()
+            if terminated:
+                break
+        return Episode(np.array(observations), np.array(rewards), np.array(features))
+
+
+def check_spaces(case: Case) -> None:
     """Boxes of the right shapes and types, which hold what the environment returns."""
-    env = make()
+    env = case.make()
     problem = definition_problem(env)
     assert problem is None, problem
-    dim = env.reward_feature_dim
-    observation, _ = env.reset(seed=seed)
+    observation, _ = env.reset(seed=case.seed)
     _check_observation(observation, env, "reset")
-    observation, reward, _, _, info = env.step(_actions(env, 1, seed)[0])
+    observation, reward, _, _, info = env.step(case.actions[0])
     _check_observation(observation, env, "step")
     ok = isinstance(reward, float) and np.isfinite(reward)
     assert ok, f"step must return a finite float as reward, but gave {reward!r}"
-    features = info["reward_features"]
-    ok = (
-        isinstance(features, np.ndarray)
-        and features.dtype == np.float64
-        and features.shape == (dim,)
+    features, shape = info["reward_features"], (env.reward_feature_dim,)
+    assert _is_array(features, shape, np.float64), (
+        f'info["reward_features"] must be a float64 array of shape (reward_feature_dim,) = {shape},'
+        f" but is {features!r}; return it from _simulate"
     )
-    assert ok, (
-        f'info["reward_features"] must be a float64 array of shape (reward_feature_dim,) = ({dim},), but is {features!r}; '
-        "return it from _simulate"
-    )
-    if "success" in info:
-        ok = isinstance(info["success"], (bool, np.bool_))
-        assert ok, (
-            f'info["success"] must be a bool, but is {info["success"]!r}; convert it in _step_info'
-        )
+    success = info.get("success", True)
+    ok = isinstance(success, (bool, np.bool_))
+    assert ok, f'info["success"] must be a bool, but is {success!r}; convert it in _step_info'
 
 
-def check_sampling(make: MakeFamily, seed: int) -> None:
+def check_sampling(case: Case) -> None:
     """Tasks come from the given generator alone, and are tasks."""
-    env = make()
-    env.reset(seed=seed)
+    env = case.make()
+    env.reset(seed=case.seed)
     before = env.np_random.bit_generator.state
     n = 8 if env.all_tasks is None else len(env.all_tasks)
-    tasks = env.sample_tasks(n, np.random.default_rng(seed))
-    expected = (n, *env.task_space.shape)
-    ok = isinstance(tasks, np.ndarray) and tasks.shape == expected and tasks.dtype == np.float64
-    assert ok, (
-        f"sample_tasks({n}, rng) must return a float64 array of shape {expected}, but gave {tasks!r}"
+    tasks = env.sample_tasks(n, np.random.default_rng(case.seed))
+    shape = (n, *env.task_space.shape)
+    assert _is_array(tasks, shape, np.float64), (
+        f"sample_tasks({n}, rng) must return a float64 array of shape {shape}, but gave {tasks!r}"
     )
     for task in tasks:
         assert task in env.task_space, (
-            f"sample_tasks drew {task}, which is not in task_space {env.task_space}; widen task_space"
+            f"sample_tasks drew {task}, which is not in task_space {env.task_space}; widen it"
         )
     assert len(np.unique(tasks, axis=0)) > 1, (
         "sample_tasks must draw different tasks, but all of them are equal"
     )
-    again = env.sample_tasks(n, np.random.default_rng(seed))
+    again = env.sample_tasks(n, np.random.default_rng(case.seed))
     assert np.array_equal(tasks, again), (
-        "sample_tasks must draw from the generator that it is given, but gave other tasks for an equal one; "
-        "use no other randomness in _draw_tasks"
+        "sample_tasks must draw from the generator that it is given, but gave other tasks for an "
+        "equal one; use no other randomness in _draw_tasks"
     )
     assert env.np_random.bit_generator.state == before, (
-        "sample_tasks must leave the environment's own generator alone; draw from its argument rng in place of self.np_random"
+        "sample_tasks must leave the environment's own generator alone; draw from its argument rng "
+        "in place of self.np_random"
     )
 
 
-def check_seeds(make: MakeFamily, n_steps: int, seed: int) -> None:
+def check_seeds(case: Case) -> None:
     """A seed determines the task and the episode, in this environment as in another, whatever was
     done before.
     """
-    env, other = make(), make()
-    actions = _actions(env, n_steps, seed)
-    first = _run(env, actions, seed=seed)
-    task = env.task
-    _run(other, actions[::-1], seed=seed + 1)
-    for again, where in (
-        (_run(env, actions, seed=seed), "again"),
-        (_run(other, actions, seed=seed), "in another copy"),
-    ):
-        assert _equal(first, again), (
-            f"reset(seed={seed}) and the same actions must give the same episode {where}, but did not: draw all randomness "
-            "from the rng that _begin_episode is given, and reset the whole state of the simulator there"
+    env, other = case.make(), case.make()
+    first, task = case.play(env), env.task
+    case.play(other, actions=case.actions[::-1], seed=case.seed + 1)
+    for family, where in ((env, "again"), (other, "in another copy")):
+        assert case.play(family).equals(first), (
+            f"reset(seed={case.seed}) and the same actions must give the same episode {where}, but "
+            "did not: draw all randomness from the rng that _begin_episode is given, and reset the "
+            "whole state of the simulator there"
         )
-    for family in (env, other):
         assert np.array_equal(family.task, task), (
-            f"reset(seed={seed}) must draw the same task every time"
+            f"reset(seed={case.seed}) must draw the same task every time"
         )
 
 
-def check_set_task(make: MakeFamily, seed: int) -> None:
+def check_set_task(case: Case) -> None:
     """A task takes effect at the next reset, and stays."""
-    env = make()
-    first, second = _two_tasks(env, seed)
-    actions = _actions(env, 2, seed)
+    env = case.make()
+    first, second = case.tasks
     env.set_task(first)
-    env.reset(seed=seed)
+    env.reset(seed=case.seed)
     assert np.array_equal(env.task, first), (
         f"after set_task and reset, task must be {first}, but is {env.task}"
     )
+    actions = case.draw_actions(2, case.seed)
     env.step(actions[0])
     env.set_task(second)
     _, reward, _, _, info = env.step(actions[1])
-    kept, changed = (
-        float(env.compute_rewards(task, info["reward_features"])) for task in (first, second)
-    )
+    features = info["reward_features"]
+    kept, changed = (float(env.compute_rewards(task, features)) for task in (first, second))
     ok = np.array_equal(env.task, first) and not (reward == changed != kept)
     assert ok, (
         "set_task must take effect at the next reset only, but it changed the episode under way"
@@ -183,7 +227,7 @@ def check_set_task(make: MakeFamily, seed: int) -> None:
     assert np.array_equal(env.task, second), (
         "a reset after set_task must bring the new task into effect, but it did not"
     )
-    env.reset(seed=seed)
+    env.reset(seed=case.seed)
     assert np.array_equal(env.task, second), (
         "a chosen task must stay chosen over resets with a seed, but another was drawn"
     )
@@ -193,318 +237,237 @@ def check_set_task(make: MakeFamily, seed: int) -> None:
     )
 
 
-def check_hidden_task(make: MakeFamily, n_steps: int, seed: int) -> None:
+def check_hidden_task(case: Case) -> None:
     """Where tasks differ in the reward alone, nothing that the agent sees depends on them."""
-    env = make()
-    if not env.shared_dynamics:
+    if not case.player.shared_dynamics:
         return
-    actions = _actions(env, n_steps, seed)
-    first, second = (
-        _run(env, actions, seed=seed, options={"task": task}) for task in _two_tasks(env, seed)
-    )
+    first, second = case.episodes
     n = min(len(first.rewards), len(second.rewards))
+    two = "depend on the task, but two tasks with the same seed and actions"
+    or_not = "or set shared_dynamics = False"
     assert np.array_equal(first.observations[0], second.observations[0]), (
-        "the first observation must not depend on the task, but two tasks with the same seed begin differently: leave the "
-        "task out of the observation and out of the start, or set shared_dynamics = False"
+        f"the first observation must not {two} begin differently: leave the task out of the "
+        f"observation and out of the start, {or_not}"
     )
     assert np.array_equal(first.observations[: n + 1], second.observations[: n + 1]), (
-        "observations must not depend on the task, but two tasks with the same seed and actions give different ones: leave "
-        "the task out of the observation and the dynamics, or set shared_dynamics = False"
+        f"observations must not {two} give different ones: leave the task out of the observation "
+        f"and the dynamics, {or_not}"
     )
     assert np.array_equal(first.features[:n], second.features[:n]), (
-        "reward features must not depend on the task, but two tasks with the same seed and actions give different ones: "
-        "return what the reward is computed from, and let _reward combine it with the task (or set shared_dynamics = False)"
+        f"reward features must not {two} give different ones: return what the reward is computed "
+        f"from, and let _reward combine it with the task ({or_not})"
     )
     assert len(first.rewards) == len(second.rewards), (
-        "an episode's end must not depend on the task, but two tasks with the same seed and actions end differently: leave "
-        "the task out of `terminated`, or set shared_dynamics = False"
+        f"an episode's end must not {two} end differently: leave the task out of `terminated`, "
+        f"{or_not}"
     )
 
 
-def check_relabelling(make: MakeFamily, n_steps: int, seed: int) -> None:
+def check_relabelling(case: Case) -> None:
     """Rewards are exactly a pure function of task and features."""
-    env, other = make(), make()
-    other.reset(seed=seed + 1)
-    actions = _actions(env, n_steps, seed)
-    tasks = np.stack(_two_tasks(env, seed))
-    episodes = [_run(env, actions, seed=seed, options={"task": task}) for task in tasks]
-    for task, episode in zip(tasks, episodes, strict=True):
-        for source, name in ((env, "this"), (other, "another")):
-            rewards = np.array(
-                [float(source.compute_rewards(task, row)) for row in episode.features]
-            )
+    other = case.make()
+    other.reset(seed=case.seed + 1)
+    for task, episode in zip(case.tasks, case.episodes, strict=True):
+        for source, name in ((case.player, "this"), (other, "another")):
+            rewards = np.array([float(source.compute_rewards(task, f)) for f in episode.features])
             assert np.array_equal(rewards, episode.rewards), (
-                f"step must return exactly compute_rewards(task, info['reward_features']), but {name} environment's gives "
-                f"{rewards.tolist()} for the rewards {episode.rewards.tolist()}: compute the reward in _reward alone, from "
-                "its arguments alone, with no state of the environment, and return new arrays of features"
+                "step must return exactly compute_rewards(task, info['reward_features']), but "
+                f"{name} environment's gives {rewards.tolist()} for the rewards "
+                f"{episode.rewards.tolist()}: compute the reward in _reward alone, from its "
+                "arguments alone, with no state of the environment, and return new arrays of "
+                "features"
             )
-    features = episodes[0].features
-    try:
-        together = env.compute_rewards(tasks[:, None, :], features[None, :, :])
-    except Exception as error:
-        raise AssertionError(
-            "compute_rewards must broadcast tasks (n, 1, task_dim) against features (1, m, reward_feature_dim), but raised "
-            f"{type(error).__name__}: {error}; index the last dimension in _reward by tasks[..., i] and features[..., i]"
-        ) from error
-    one_by_one = np.array(
-        [[float(env.compute_rewards(task, row)) for row in features] for task in tasks]
-    )
-    assert np.array_equal(together, one_by_one), (
-        "compute_rewards must give many rewards at once exactly as one after another, but does not: "
-        "use elementwise operations in _reward, on the last dimension by tasks[..., i] and features[..., i]"
+    features = case.episodes[0].features
+    together = _together(case.player, "compute_rewards", case.tasks, features)
+    assert np.array_equal(together, _one_by_one(other.compute_rewards, case.tasks, features)), (
+        "compute_rewards must give many rewards at once exactly as one after another, but does "
+        "not: use elementwise operations in _reward, on the last dimension by tasks[..., i] and "
+        "features[..., i]"
     )
 
 
-def check_potential(make: MakeFamily, n_steps: int, seed: int) -> None:
-    """A potential is a finite, pure function of task and observation, for many at once as for one."""
-    env = make()
+def check_potential(case: Case) -> None:
+    """A potential is a finite, pure function of task and observation, which broadcasts."""
+    env = case.player
     if not env.has_potential:
         return
-    tasks = np.stack(_two_tasks(env, seed))
-    observations = _run(
-        env, _actions(env, n_steps, seed), seed=seed, options={"task": tasks[0]}
-    ).observations
-    try:
-        together = np.asarray(env.compute_potential(tasks[:, None, :], observations[None, :, :]))
-    except Exception as error:
-        raise AssertionError(
-            "compute_potential must broadcast tasks (n, 1, task_dim) against observations (1, m, obs_dim), but raised "
-            f"{type(error).__name__}: {error}; in _potential index the last dimension, as in tasks[..., i]"
-        ) from error
-    env.reset(seed=seed + 1)
-    one_by_one = np.array(
-        [[float(env.compute_potential(task, row)) for row in observations] for task in tasks]
-    )
+    observations = case.episodes[0].observations
+    together = _together(env, "compute_potential", case.tasks, observations)
+    env.reset(seed=case.seed + 1)
+    one_by_one = _one_by_one(env.compute_potential, case.tasks, observations)
     ok = together.shape == one_by_one.shape and np.allclose(together, one_by_one, rtol=1e-6)
     assert ok, (
-        "compute_potential must give many potentials at once as one after another, but does not: compute them in _potential "
-        "from its arguments alone, by elementwise operations on the last dimension"
+        "compute_potential must give many potentials at once as one after another, but does not: "
+        "compute them in _potential from its arguments alone, by elementwise operations on the "
+        "last dimension"
     )
     assert np.isfinite(together).all(), (
         f"compute_potential must give finite numbers, but gave {together.tolist()}"
     )
 
 
-def check_symmetries(make: MakeFamily) -> None:
+def check_symmetries(case: Case) -> None:
     """Symmetries fit the spaces. Whether the dynamics have them cannot be seen from outside:
     compare steps from a state and from its mirror image in a test of your own.
     """
-    env = make()
-    observation_space, action_space = env.observation_space, env.action_space
-    parts = (
-        (
-            "observations",
-            observation_space.shape[0],
-            (observation_space.low, observation_space.high),
-        ),
-        ("actions", action_space.shape[0], (action_space.low, action_space.high)),
-        ("features", env.reward_feature_dim, None),
-    )
+    env = case.player
+    given: dict[str, spaces.Box] = {
+        "observations": env.observation_space,
+        "actions": env.action_space,
+        "features": spaces.Box(-np.inf, np.inf, (env.reward_feature_dim,)),
+    }
     for number, symmetry in enumerate(env.symmetries):
-        for name, width, bounds in parts:
-            what, permutation = f"symmetries[{number}].{name}", getattr(symmetry, name)
-            assert sorted(permutation.order) == list(range(width)), (
-                f"{what}.order must hold each of the indices 0 to {width - 1} once, but is {permutation.order}"
+        for (name, space), permutation in zip(given.items(), symmetry, strict=True):
+            what, width = f"symmetries[{number}].{name}", space.shape[0]
+            order, signs = permutation
+            assert sorted(order) == list(range(width)), (
+                f"{what}.order must hold each of the indices 0 to {width - 1} once, but is {order}"
             )
-            assert (
-                len(permutation.signs) == width == sum(abs(sign) == 1 for sign in permutation.signs)
-            ), f"{what}.signs must be {width} of 1 and -1, but is {permutation.signs}"
-            if bounds is not None:
-                given, mirrored = (
-                    np.stack(bounds),
-                    np.sort([permutation(bound) for bound in bounds], axis=0),
-                )
-                assert np.array_equal(mirrored, given), (
-                    f"{what} must leave the bounds of the space as they are, but makes {mirrored.tolist()} of {given.tolist()}"
-                )
+            assert [abs(sign) for sign in signs] == [1] * width, (
+                f"{what}.signs must be {width} of 1 and -1, but is {signs}"
+            )
+            bounds = [space.low, space.high]
+            mirrored = np.sort([permutation(bound) for bound in bounds], axis=0)
+            assert np.array_equal(mirrored, bounds), (
+                f"{what} must leave the bounds of the space as they are, but makes "
+                f"{mirrored.tolist()} of {np.array(bounds).tolist()}"
+            )
 
 
-def check_registration(env_id: str) -> None:
-    """An id says how long episodes are."""
-    assert gym.spec(env_id).max_episode_steps is not None, (
-        f"{env_id} must have a time limit, the horizon of training: register it with max_episode_steps=<steps>"
-    )
-
-
-def check_vector_parity(env_id: str, env_kwargs: dict[str, Any], n_steps: int, seed: int) -> None:
+def check_vector_parity(case: Case, env_id: str, env_kwargs: dict[str, Any]) -> None:
     """The vectorised version equals single environments bit for bit, over ends of episodes and a
     change of tasks.
     """
-    n, horizon = 3, max(2, n_steps // 2)
+    n, horizon = 3, max(2, case.n_steps // 2)
     arguments = {**env_kwargs, "max_episode_steps": horizon}
-    vector_env = gym.make_vec(
-        env_id, num_envs=n, vectorization_mode="vector_entry_point", **arguments
-    )
+    vector_env = gym.make_vec(env_id, n, vectorization_mode="vector_entry_point", **arguments)
     assert isinstance(vector_env, TaskFamilyVector), (
-        f"the vector_entry_point of {env_id} must make a poem_envs.TaskFamilyVector, but makes a {type(vector_env).__name__}; "
-        "use functools.partial(poem_envs.ProcessFamilyVector, YourFamily)"
+        f"the vector_entry_point of {env_id} must make a poem_envs.TaskFamilyVector, but makes a "
+        f"{type(vector_env).__name__}; use functools.partial(poem_envs.ProcessFamilyVector, "
+        "YourFamily)"
     )
-    singles = [_make(env_id, **env_kwargs) for _ in range(n)]  # whose time limit is counted here
+
+    def compare(mine: Any, its: Any, what: str, where: str = "") -> None:
+        assert np.array_equal(mine, its), (
+            f"{what} of the vectorised version{where} must equal the single environment's bit for "
+            "bit, but do not: let both run the same code"
+        )
+
+    singles = [case.make() for _ in range(n)]  # whose time limit is counted here
     lengths = np.zeros(n, dtype=int)
-    advice = (
-        "must equal the single environment's bit for bit, but do not: let both run the same code"
-    )
-    tasks = np.stack([*_two_tasks(singles[0], seed)] * 2)[:n]
-    observations, _ = vector_env.reset(seed=seed)
-    expected = np.stack([single.reset(seed=seed + i)[0] for i, single in enumerate(singles)])
-    assert np.array_equal(observations, expected), (
-        f"observations of the vectorised version's reset {advice}"
-    )
-    for step, actions in enumerate(
-        np.stack([_actions(singles[0], n_steps + 2, seed + i) for i in range(n)], axis=1)
-    ):
+    observations, _ = vector_env.reset(seed=case.seed)
+    for i, single in enumerate(singles):
+        compare(single.reset(seed=case.seed + i)[0], observations[i], "observations", "'s reset")
+    actions = [case.draw_actions(case.n_steps + 2, case.seed + i) for i in range(n)]
+    for step in range(case.n_steps + 2):
         if step == 1:
+            tasks = case.tasks[[0, 1, 0]]
             vector_env.set_tasks(tasks)
             for single, task in zip(singles, tasks, strict=True):
                 single.set_task(task)
-        observations, rewards, terminations, truncations, infos = vector_env.step(actions)
+        together = vector_env.step(np.stack([own[step] for own in actions]))
+        observations, rewards, terminations, truncations, infos = together
         for i, single in enumerate(singles):
-            observation, reward, terminated, _, info = single.step(actions[i])
+            observation, reward, terminated, _, info = single.step(actions[i][step])
             lengths[i] += 1
             truncated = lengths[i] == horizon
-            assert reward == rewards[i], f"rewards of the vectorised version {advice}"
-            assert (terminated, truncated) == (terminations[i], truncations[i]), (
-                f"ends of the vectorised version {advice}"
-            )
+            compare(reward, rewards[i], "rewards")
+            compare((terminated, truncated), (terminations[i], truncations[i]), "ends")
             for key, value in info.items():
-                assert np.array_equal(value, infos[key][i]), (
-                    f"infos[{key!r}] of the vectorised version {advice}"
-                )
+                compare(value, infos[key][i], f"infos[{key!r}]")
             if terminated or truncated:
                 observation, _ = single.reset()
                 lengths[i] = 0
-            assert np.array_equal(observation, observations[i]), (
-                f"observations of the vectorised version {advice}"
-            )
-    vector_env.close()
-    for single in singles:
-        single.close()
+            compare(observation, observations[i], "observations")
+    for env in (vector_env, *singles):
+        env.close()
 
 
-def check_rendering(make: MakeFamily, n_steps: int, seed: int) -> None:
+def check_rendering(case: Case) -> None:
     """Images are images, show no task unless asked to, and drawing them changes nothing."""
-    plain = make()
+    plain = case.make()
     if "rgb_array" not in plain.metadata.get("render_modes", []):
         return
-    env = make(render_mode="rgb_array")
-    actions = _actions(env, n_steps, seed)[:N_IMAGES]
-    first, second = _two_tasks(env, seed)
-    silent = _run(plain, actions, seed=seed, options={"task": first})
-    images: list[np.ndarray] = []
-    drawn = _run(
-        env,
-        actions,
-        seed=seed,
-        options={"task": first},
-        each_step=lambda: images.append(env.render()),
-    )
+    env, actions = case.make(render_mode="rgb_array"), case.actions[:N_IMAGES]
+    drawn: list[Episode] = []
+    images: list[list[np.ndarray]] = []
+    for task in case.tasks:
+        images.append([])
+        each_step = lambda: images[-1].append(env.render())  # noqa: E731
+        drawn.append(case.play(env, task, actions, each_step))
     ok = all(
         isinstance(image, np.ndarray) and image.dtype == np.uint8 and image.shape[2:] == (3,)
-        for image in images
+        for image in images[0]
     )
     assert ok, (
-        'render() with render_mode="rgb_array" must return a uint8 array of shape (height, width, 3)'
+        'render() with render_mode="rgb_array" must return a uint8 array of shape (height, width, '
+        "3)"
     )
-    assert _equal(silent, drawn), (
-        "rendering must not change the episode, but it did: leave the simulator's state in render() as it was"
+    assert case.play(plain, case.tasks[0], actions).equals(drawn[0]), (
+        "rendering must not change the episode, but it did: leave the simulator's state in "
+        "render() as it was"
     )
     if env.shared_dynamics and not env.render_task:
-        others: list[np.ndarray] = []
-        _run(
-            env,
-            actions,
-            seed=seed,
-            options={"task": second},
-            each_step=lambda: others.append(env.render()),
-        )
-        assert np.array_equal(images[: len(others)], others[: len(images)]), (
-            "images must not show the task unless render_task=True, but two tasks with the same seed and actions look "
-            "different: draw what marks the task only if self.render_task"
+        assert all(map(np.array_equal, *images)), (
+            "images must not show the task unless render_task=True, but two tasks with the same "
+            "seed and actions look different: draw what marks the task only if self.render_task"
         )
     env.close()
 
 
-def check_closing(make: MakeFamily, seed: int) -> None:
+def check_closing(case: Case) -> None:
     """``close`` can be called twice."""
-    env = make()
-    env.reset(seed=seed)
+    env = case.make()
+    env.reset(seed=case.seed)
     env.close()
     try:
         env.close()
     except Exception as error:
         raise AssertionError(
-            f"close() must be callable twice, but the second call raised {type(error).__name__}: {error}; release what is "
-            "held and forget it"
+            f"close() must be callable twice, but the second call raised {type(error).__name__}: "
+            f"{error}; release what is held and forget it"
         ) from error
 
 
 def _make(env: str | Callable[..., gym.Env], **kwargs: Any) -> TaskFamily:
-    made = (
-        gym.make(env, disable_env_checker=True, **kwargs) if isinstance(env, str) else env(**kwargs)
-    )
+    make = partial(gym.make, env, disable_env_checker=True) if isinstance(env, str) else env
+    made = make(**kwargs)
     family = made.unwrapped
     assert isinstance(family, TaskFamily), (
-        f"{made} must be a task family, but is a {type(family).__name__}: subclass poem_envs.TaskFamily, or turn a "
-        "goal-conditioned environment into one with poem_envs.GoalFamily"
+        f"{made} must be a task family, but is a {type(family).__name__}: subclass "
+        "poem_envs.TaskFamily, or turn a goal-conditioned environment into one with "
+        "poem_envs.GoalFamily"
     )
     return family
 
 
+def _is_array(value: Any, shape: tuple[int, ...], dtype: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.shape == shape and value.dtype == dtype
+
+
 def _check_observation(observation: Any, env: TaskFamily, origin: str) -> None:
-    space = env.observation_space
-    ok = (
-        isinstance(observation, np.ndarray)
-        and observation.shape == space.shape
-        and observation.dtype == space.dtype
-    )
-    assert ok, (
-        f"{origin} must return an observation of observation_space's shape {space.shape} and dtype {space.dtype}, but gave "
-        f"{getattr(observation, 'shape', type(observation))} of dtype {getattr(observation, 'dtype', None)}"
+    space: Any = env.observation_space
+    assert _is_array(observation, space.shape, space.dtype), (
+        f"{origin} must return an observation of observation_space's shape {space.shape} and dtype "
+        f"{space.dtype}, but gave {getattr(observation, 'shape', type(observation))} of dtype "
+        f"{getattr(observation, 'dtype', None)}"
     )
     assert observation in space, (
         f"{origin} returned {observation}, which is not inside observation_space {space}; widen it"
     )
 
 
-def _actions(env: gym.Env, n: int, seed: int) -> np.ndarray:
-    space = env.action_space
-    assert isinstance(space, spaces.Box)
-    draws = np.random.default_rng([seed, 1]).uniform(space.low, space.high, size=(n, *space.shape))
-    return draws.astype(space.dtype)
+def _together(family: Any, method: str, tasks: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """What a method gives for all tasks and all rows, ``(tasks, rows)``."""
+    try:
+        return np.asarray(getattr(family, method)(tasks[:, None, :], rows[None, :, :]))
+    except Exception as error:
+        raise AssertionError(
+            f"{method} must broadcast tasks {tasks[:, None, :].shape} against "
+            f"{rows[None, :, :].shape}, but raised {type(error).__name__}: {error}; index the last "
+            "dimension, as in tasks[..., i]"
+        ) from error
 
 
-def _two_tasks(env: Any, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    first, second = env.sample_tasks(2, np.random.default_rng([seed, 2]))
-    return first, second
-
-
-def _run(
-    env: TaskFamily,
-    actions: np.ndarray,
-    each_step: Callable[[], Any] = lambda: None,
-    **reset_arguments: Any,
-) -> Episode:
-    """An episode, whose arrays are kept as they came: one that the environment reuses is caught by
-    the comparison.
-    """
-    observation, _ = env.reset(**reset_arguments)
-    observations, rewards, features = [observation], [], []
-    each_step()
-    for action in actions:
-        observation, reward, terminated, _, info = env.step(action)
-        observations.append(observation)
-        rewards.append(reward)
-        features.append(info["reward_features"])
-        each_step()
-        if terminated:
-            break
-    return Episode(np.array(observations), np.array(rewards), np.array(features))
-
-
-def _equal(one: Episode, other: Episode) -> bool:
-    pairs = (
-        (one.observations, other.observations),
-        (one.rewards, other.rewards),
-        (one.features, other.features),
-    )
-    return all(np.array_equal(a, b) for a, b in pairs)
+def _one_by_one(function: Callable[..., Any], tasks: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    return np.array([[float(function(task, row)) for row in rows] for task in tasks])
