@@ -11,11 +11,32 @@ from gymnasium import spaces
 from scipy.special import ndtr
 from stable_baselines3.common.vec_env import VecEnv
 
+from poem_envs import TaskFamily
 from sb3_poem.common.trajectory import Trajectory
 
 TOP_SPEED = 3.0
 HORIZON = 20
 STEP_WEIGHT = 200.0 / HORIZON  # returns as over HalfCheetahVel's 200 steps
+
+
+class Walk1D(TaskFamily):
+    """The example of TaskFamily's docstring, but that its episodes end beyond 2."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+    task_space = spaces.Box(-1.0, 1.0, (1,), np.float64)
+    reward_feature_dim = 1
+
+    def _begin_episode(self, rng):
+        self.x = rng.normal(0.0, 0.1, size=1)
+        return self.x.copy()
+
+    def _simulate(self, action):
+        self.x = self.x + 0.1 * action
+        return self.x.copy(), self.x.copy(), bool(abs(self.x[0]) > 2)
+
+    def _reward(self, tasks, features):
+        return -np.abs(features[..., 0] - tasks[..., 0])
 
 
 class SpeedEnv(gym.Env):

@@ -10,9 +10,9 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium import spaces
+from worlds import Walk1D
 
-from poem_envs import ProcessFamilyVector, TaskFamily
+from poem_envs import ProcessFamilyVector
 from sb3_poem import POEMSAC, AdaptationEvalCallback, TaskVecEnv
 from sb3_poem.adaptation import evaluate_adaptation, evaluate_latents, known_task_return
 from sb3_poem.cli import main
@@ -21,25 +21,9 @@ sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 SMALL = {"net_arch": {"pi": [16], "qf": [16], "encoder": [16], "decoder": [16], "embedding": [8]}}
 
 
-class Walk(TaskFamily):
-    observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float64)
-    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
-    task_space = spaces.Box(-1.0, 1.0, (1,), np.float64)
-    reward_feature_dim = 1
-
-    def _begin_episode(self, rng):
-        self.x = rng.normal(0.0, 0.1, size=1)
-        return self.x.copy()
-
-    def _simulate(self, action):
-        self.x = self.x + 0.1 * action
-        return self.x.copy(), self.x.copy(), False
-
+class Walk(Walk1D):
     def _step_info(self):
         return {"success": bool(abs(self.x[0] - self._task[0]) < 0.1)}
-
-    def _reward(self, tasks, features):
-        return -np.abs(features[..., 0] - tasks[..., 0])
 
 
 @pytest.fixture(scope="module")

@@ -8,33 +8,13 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
+from worlds import Walk1D
 
 from poem_envs import TaskFamily
-
-
-class Walk1D(TaskFamily):
-    """The example of TaskFamily's docstring."""
-
-    observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float64)
-    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
-    task_space = spaces.Box(-1.0, 1.0, (1,), np.float64)
-    reward_feature_dim = 1
-
-    def _begin_episode(self, rng):
-        self.x = rng.normal(0.0, 0.1, size=1)
-        return self.x.copy()
-
-    def _simulate(self, action):
-        self.x = self.x + 0.1 * action
-        return self.x.copy(), self.x.copy(), bool(abs(self.x[0]) > 2)
-
-    def _reward(self, tasks, features):
-        return -np.abs(features[..., 0] - tasks[..., 0])
 
 
 @pytest.mark.filterwarnings("ignore:.*A Box observation space m.*imum value is")
