@@ -353,7 +353,7 @@ BROKEN = [
     (StartAfterTheLastEpisode, "the same episode again, but did not: .*reset the whole state"),
     (TaskAtOnce, "set_task must take effect at the next reset only"),
     (TaskThatIsForgotten, "after set_task and reset, task must be"),
-    (TaskThatIsIgnored, r"reset\(options=.*\) must set the task"),
+    (TaskThatIsIgnored, r"after reset\(options=.*\), task must be"),
     (TaskInTheStart, "first observation must not depend on the task"),
     (TaskInTheObservation, "observations must not depend on the task"),
     (TaskInTheFeatures, "reward features must not depend on the task"),

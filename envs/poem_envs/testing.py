@@ -207,12 +207,16 @@ def check_seeds(case: Case) -> None:
 def check_set_task(case: Case) -> None:
     """A task takes effect at the next reset, and stays."""
     env = case.make()
+
+    def in_effect(task: np.ndarray, after: str) -> None:
+        assert np.array_equal(env.task, task), (
+            f"after {after}, task must be {task}, but is {env.task}"
+        )
+
     first, second = case.tasks
     env.set_task(first)
     env.reset(seed=case.seed)
-    assert np.array_equal(env.task, first), (
-        f"after set_task and reset, task must be {first}, but is {env.task}"
-    )
+    in_effect(first, "set_task and reset")
     actions = case.draw_actions(2, case.seed)
     env.step(actions[0])
     env.set_task(second)
@@ -224,43 +228,33 @@ def check_set_task(case: Case) -> None:
         "set_task must take effect at the next reset only, but it changed the episode under way"
     )
     env.reset()
-    assert np.array_equal(env.task, second), (
-        "a reset after set_task must bring the new task into effect, but it did not"
-    )
+    in_effect(second, "set_task in an episode and reset")
     env.reset(seed=case.seed)
-    assert np.array_equal(env.task, second), (
-        "a chosen task must stay chosen over resets with a seed, but another was drawn"
-    )
+    in_effect(second, "a reset with a seed, over which a chosen task stays")
     env.reset(options={"task": first})
-    assert np.array_equal(env.task, first), (
-        'reset(options={"task": task}) must set the task, but did not'
-    )
+    in_effect(first, 'reset(options={"task": task})')
 
 
 def check_hidden_task(case: Case) -> None:
     """Where tasks differ in the reward alone, nothing that the agent sees depends on them."""
     if not case.player.shared_dynamics:
         return
+
+    def hidden(same: bool, what: str, advice: str) -> None:
+        assert same, (
+            f"{what} must not depend on the task, but differs between two with the same seed and "
+            f"actions: {advice}, or set shared_dynamics = False"
+        )
+
     first, second = case.episodes
     n = min(len(first.rewards), len(second.rewards))
-    two = "depend on the task, but two tasks with the same seed and actions"
-    or_not = "or set shared_dynamics = False"
-    assert np.array_equal(first.observations[0], second.observations[0]), (
-        f"the first observation must not {two} begin differently: leave the task out of the "
-        f"observation and out of the start, {or_not}"
-    )
-    assert np.array_equal(first.observations[: n + 1], second.observations[: n + 1]), (
-        f"observations must not {two} give different ones: leave the task out of the observation "
-        f"and the dynamics, {or_not}"
-    )
-    assert np.array_equal(first.features[:n], second.features[:n]), (
-        f"reward features must not {two} give different ones: return what the reward is computed "
-        f"from, and let _reward combine it with the task ({or_not})"
-    )
-    assert len(first.rewards) == len(second.rewards), (
-        f"an episode's end must not {two} end differently: leave the task out of `terminated`, "
-        f"{or_not}"
-    )
+    equal, out = np.array_equal, "leave the task out of"
+    seen, its_seen = first.observations[: n + 1], second.observations[: n + 1]
+    hidden(equal(seen[0], its_seen[0]), "the first observation", f"{out} it and of the start")
+    hidden(equal(seen, its_seen), "observations", f"{out} them and of the dynamics")
+    advice = "return what the reward is computed from, and let _reward combine it with the task"
+    hidden(equal(first.features[:n], second.features[:n]), "reward features", advice)
+    hidden(len(first.rewards) == len(second.rewards), "an episode's end", f"{out} `terminated`")
 
 
 def check_relabelling(case: Case) -> None:

@@ -39,6 +39,17 @@ def test_the_same_scene_from_the_same_camera(env_id: str) -> None:
     )
 
 
+@pytest.mark.skipif(not can_draw(), reason="no off-screen OpenGL")
+def test_a_scene_that_is_too_small_for_the_task(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warning to a file there
+    options = {"render_mode": "rgb_array", "render_quality": "fast", "render_task": True}
+    env = gym.make("poem/AntGoal-v0", max_geom=3, width=64, height=64, **options)
+    env.reset(seed=1)
+    with pytest.raises(RuntimeError, match="more than max_geom=3 shapes"):
+        env.render()
+    env.close()
+
+
 @pytest.mark.parametrize("env_id", ["poem/AntVel-v0", "poem/MetaWorldML1-v0"])
 def test_it_renders_images_alone(env_id: str) -> None:
     with pytest.raises(ValueError, match="render_quality"):
