@@ -1,4 +1,4 @@
-"""Every registered family keeps the contract, and ``check_task_family`` finds each way to break it."""
+"""Every registered family keeps the contract, and ``check_task_family`` finds what breaks it."""
 
 import functools
 

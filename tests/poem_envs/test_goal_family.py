@@ -157,7 +157,7 @@ class RewardOfTheInfo(Reach):
         (NoReward, r"has no compute_reward\(achieved_goal, desired_goal, info\)"),
         (
             NoGoals,
-            r"observation space must be a Dict of .*'desired_goal', but is a Dict of \['observation'\]",
+            r"space must be a Dict of .*'desired_goal', but is a Dict of \['observation'\]",
         ),
         (lambda: gym.make("CartPole-v1"), "observation space must be a Dict"),
         (Pixels, "the space of 'observation' must be a flat Box"),

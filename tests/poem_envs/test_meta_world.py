@@ -128,7 +128,10 @@ def test_tasks_of_a_manipulation_are_those_that_metaworld_accepts(rng):
 
 
 # The table of ML10 in Yu et al. 2019, in the names of Meta-World's version 3.
-ML10_TRAIN = "reach push pick-place door-open drawer-close button-press-topdown peg-insert-side window-open sweep basketball"
+ML10_TRAIN = (
+    "reach push pick-place door-open drawer-close button-press-topdown peg-insert-side window-open "
+    "sweep basketball"
+)
 ML10_TEST = "drawer-open door-close shelf-place sweep-into lever-pull"
 
 

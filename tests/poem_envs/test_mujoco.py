@@ -243,7 +243,7 @@ def test_humanoid_observations_are_gymnasiums_at_the_same_state(rng):
 
 @pytest.mark.parametrize("env_id", GYMNASIUM)
 def test_the_warm_start_matters_little(env_id, rng):
-    """Gymnasium as it is, its warm start running on, ends each single step nearly where ours does."""
+    """Gymnasium as it is, its warm start running on, ends each step nearly where ours does."""
     env = make(env_id)
     other_id, arguments = GYMNASIUM[env_id]
     other = make_gymnasium(other_id, **arguments)

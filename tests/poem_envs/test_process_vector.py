@@ -166,7 +166,8 @@ def test_an_error_names_the_copy_and_leaves_nothing_behind(wrong):
     actions = np.zeros((4, 1))
     envs.step(actions)
     actions[wrong] = 0.125
-    message = rf"environment copy {wrong}: ArithmeticError: no such step at step 2 of episode 1 since reset\(seed=1{wrong}\)"
+    episode = rf"step 2 of episode 1 since reset\(seed=1{wrong}\)"
+    message = f"environment copy {wrong}: ArithmeticError: no such step at {episode}"
     with pytest.raises(RuntimeError, match=message):
         envs.step(actions)
     expected = run(ProcessFamilyVector(Walk, num_envs=4, nthread=1), np.zeros((3, 4, 1)))

@@ -32,7 +32,7 @@ def random_actions(envs, steps, rng):
 
 
 def test_equals_single_environments_to_the_bit(env_id, rng):
-    """Over several episodes with early ends, time limits, same-step resets and a change of tasks."""
+    """Over several episodes with early ends, time limits, resets in a step, and new tasks."""
     num_envs, steps, horizon = 5, 75, 30
     arguments = {"max_episode_steps": horizon, **EARLY_ENDS.get(env_id, {})}
     envs = make_vec(env_id, num_envs, **arguments)
