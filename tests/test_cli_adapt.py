@@ -19,7 +19,6 @@ from sb3_poem import (
     Preference,
     PreferenceAdapter,
     ReturnOracle,
-    TaskVecEnv,
     cli,
 )
 from sb3_poem.adaptation import (
@@ -29,6 +28,7 @@ from sb3_poem.adaptation import (
     known_task_return,
 )
 from sb3_poem.cli.subject import parse_env_kwargs
+from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.label import Store
 
 SMALL = {
@@ -83,7 +83,7 @@ def test_json_holds_what_the_library_measures(
 
     tasks = np.array(result["tasks"])
     assert tasks.shape == (4, 1)
-    vec_env = TaskVecEnv.from_id(ENV_ID, 8)
+    vec_env = make_task_vec_env(ENV_ID, 8)
     expected = evaluate_adaptation(
         POEMSAC.load(model[1]),
         vec_env,
@@ -159,7 +159,7 @@ def test_table_plot_and_video(
 
 
 def test_the_environment_is_made_as_in_training(tmp_path: Path) -> None:
-    env = TaskVecEnv.from_id(ENV_ID, 12, step_length=0.09)
+    env = make_task_vec_env(ENV_ID, 12, step_length=0.09)
     trained = POEMSAC("MlpPolicy", env, policy_kwargs={"net_arch": [16, 16]}, **SMALL).learn(300)
     trained.save(tmp_path / "model.zip")
     trained.save_pretrained(tmp_path / "folder")
@@ -184,7 +184,7 @@ def test_the_environment_is_made_as_in_training(tmp_path: Path) -> None:
             assert adapt(str(tmp_path / name), *flags) == 0
             result = json.loads(file.read_text())
             assert result["env_kwargs"] == {"step_length": expected}
-            vec_env = TaskVecEnv.from_id(ENV_ID, 4, step_length=expected)
+            vec_env = make_task_vec_env(ENV_ID, 4, step_length=expected)
             evaluation = evaluate_adaptation(
                 trained, vec_env, np.array(result["tasks"]), record_at=[0], n_episodes=2, seed=5
             )
@@ -429,7 +429,7 @@ def test_the_policy_of_one_task_is_saved(model: tuple[POEMSAC, str], tmp_path: P
     flags = ["--queries", 2, "--task", 1.0, "--episodes", 1, "--save", tmp_path / "a.safetensors"]
     assert adapt(model[1], *flags) == 0
     expected = evaluate_adaptation(
-        model[0], TaskVecEnv.from_id(ENV_ID, 2), np.array([[1.0]]), record_at=[2], n_episodes=1
+        model[0], make_task_vec_env(ENV_ID, 2), np.array([[1.0]]), record_at=[2], n_episodes=1
     )
     saved = AdaptedPolicy.load(tmp_path / "a.safetensors")
     np.testing.assert_allclose(saved.latent, expected.latents[0, -1], rtol=1e-4)

@@ -25,7 +25,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem import PEARLSAC, POEMSAC, cli, resources
 from sb3_poem.cli import experiment
-from sb3_poem.cli.hyperparams import check_keys
+from sb3_poem.cli.hyperparams import check_entry
 from sb3_poem.cli.hyperparams_opt import SAMPLERS
 from sb3_poem.cli.zoo import register_algorithms
 from sb3_poem.common.vec_env import make_task_vec_env
@@ -92,7 +92,7 @@ def test_sampled_hyperparameters_are_arguments_of_the_algorithm_around_the_entry
     for _ in range(40):
         trial = study.ask()
         draws.append(HYPERPARAMS_SAMPLER[algorithm](trial, 2, 1, {"entry": ENTRY}))
-        check_keys(list(draws[-1]), algorithm, "the sampler")
+        check_entry(draws[-1], algorithm, "the sampler")
         assert HYPERPARAMS_CONVERTER[algorithm](trial.params) == draws[-1]
     for name, low, high in (
         ("kl_coef", 0.1, 1.6),
@@ -126,7 +126,7 @@ def test_shipped_hyperparameters_are_known_and_cover_the_environments(file: Path
         name for name in gym.registry if name.startswith("poem/")
     } <= set(entries)
     for env_id, entry in entries.items():
-        check_keys(list(entry), algorithm, f"{file}, {env_id}")
+        check_entry(entry, algorithm, f"{file}, {env_id}")
         assert entry["policy"] == "MlpPolicy"
         assert float(entry["n_timesteps"]) > 0
 

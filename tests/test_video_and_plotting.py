@@ -40,7 +40,7 @@ def test_bad_frames_are_refused(tmp_path: Path, frames: list, name: str, words: 
 
 
 def test_side_by_side_places_both_and_holds_the_last_frame() -> None:
-    frames = side_by_side(clip(3), clip(5, width=20, value=100), gap=4)
+    frames = side_by_side(clip(3), clip(5, width=20, value=100))
     assert len(frames) == 5
     assert frames[0].shape == (33, 47 + 4 + 20, 3)
     assert [int(frame[0, 0, 0]) for frame in frames] == [0, 10, 20, 20, 20]

@@ -41,6 +41,7 @@ from sb3_poem import (
     TrainingCheckpointCallback,
 )
 from sb3_poem.adaptation import AdaptedPolicy, evaluate_adaptation
+from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.label import LabelWidget
 
 NAN = float("nan")
@@ -88,7 +89,7 @@ def evaluated(tasks: Any = ((1.0,),), **options: Any) -> Any:
 
 
 def vec() -> TaskVecEnv:
-    return TaskVecEnv.from_id(POINT_GOAL, 2)
+    return make_task_vec_env(POINT_GOAL, 2)
 
 
 def anole(**arguments: Any) -> ANOLEAdapter:

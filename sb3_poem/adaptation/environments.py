@@ -9,7 +9,6 @@ import gymnasium as gym
 
 from poem_envs.registration import plain_id
 from sb3_poem.common.family_view import FamilyView, vectorised
-from sb3_poem.common.wrappers import unknown_wrappers
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
@@ -67,9 +66,7 @@ def check_model_fits(model: Any, vec_env: VecEnv) -> None:
     names = ["observation_space", "action_space"]
     family = FamilyView.of(vec_env)
     if family is not None:
-        unknown_wrappers(
-            vec_env
-        )  # refuses those that are known to change what is seen, done or paid
+        family.unknown_wrappers()  # refuses those that change what is seen, done or paid
     if hasattr(model, "task_space") and family is not None:
         names.append("task_space")
     for name in names:

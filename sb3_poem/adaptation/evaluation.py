@@ -18,7 +18,7 @@ from sb3_poem.adaptation.oracles import ReturnOracle
 from sb3_poem.adaptation.preference import Preference
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.family_view import FamilyView
-from sb3_poem.common.rollouts import rollout_features, rollout_outcomes
+from sb3_poem.common.rollouts import rollout_outcomes
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
@@ -403,13 +403,13 @@ def return_matrix(
         return returns.mean(axis=1).reshape(len(tasks), len(latents))
     # The task in effect does not matter, and it must be one that every copy accepts.
     some_task = np.repeat(tasks[:1], n_episodes * len(latents), axis=0)
-    features = rollout_features(
+    outcomes = rollout_outcomes(
         model, vec_env, np.tile(latents, (n_episodes, 1)), some_task, seed, deterministic
     )
     totals = np.stack(
         [
-            family.compute_rewards(tasks[:, None, :], episode[None, :, :]).sum(axis=1)
-            for episode in features
+            family.compute_rewards(tasks[:, None, :], episode.reward_features[None]).sum(axis=1)
+            for episode in outcomes
         ],
         axis=1,
     )

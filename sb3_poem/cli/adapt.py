@@ -1,4 +1,4 @@
-"""``sb3-poem adapt``: adapt a model to unseen tasks by preference queries, and say what it earns."""
+"""``sb3-poem adapt``: adapt a model to unseen tasks by preferences, and say what it earns."""
 
 import argparse
 import shlex
@@ -26,7 +26,7 @@ from sb3_poem.adaptation import (
     evaluate_episodes,
 )
 from sb3_poem.adaptation.evaluation import evaluation_seed
-from sb3_poem.cli import DEFAULT_STORE
+from sb3_poem.cli.arguments import DEFAULT_STORE
 from sb3_poem.cli.outputs import check_output
 from sb3_poem.cli.report import Report, row_text
 from sb3_poem.cli.subject import (
@@ -44,10 +44,8 @@ DEFAULT_TASKS = 30
 
 
 def run_adapt(arguments: argparse.Namespace) -> int:
-    """Run the command.
+    """Run the command, and return the exit status.
 
-    :param arguments: As ``sb3_poem.cli`` parsed them
-    :return: The exit status
     :raises ValueError: if they do not fit the model or the environment
     :raises OSError: if the model cannot be read, or a file not be written
     :raises EOFError: if a person should answer and standard input is closed
@@ -57,40 +55,37 @@ def run_adapt(arguments: argparse.Namespace) -> int:
     check_output("--video", arguments.video, (".mp4", ".gif"))
     check_output("--save", arguments.save, (POLICY_SUFFIX,))
     n_tasks = _check_tasks(arguments)
-    if arguments.record and max(arguments.record) > arguments.queries:
-        raise ValueError(
-            f"--record {max(arguments.record)} is more than --queries {arguments.queries}"
-        )
-    copies = COPIES_FOR_ONE_TASK if arguments.oracle == "human" else COPIES
-    subject = Subject(arguments, Console(), n_tasks, copies)
+    if arguments.record and (most := max(arguments.record)) > arguments.queries:
+        raise ValueError(f"--record {most} is more than --queries {arguments.queries}")
+    human = arguments.oracle == "human"
+    subject = Subject(arguments, Console(), n_tasks, COPIES_FOR_ONE_TASK if human else COPIES)
     if subject.latent is not None:
         raise ValueError(
             f"--model {arguments.model} is a policy that is adapted already; name the model instead"
         )
     adaptation = Adaptation(arguments, subject)
     try:
-        return adaptation.ask_person() if arguments.oracle == "human" else adaptation.ask_oracle()
+        return adaptation.ask_person() if human else adaptation.ask_oracle()
     finally:
         subject.env.close()
 
 
 def _check_tasks(arguments: argparse.Namespace) -> int:
     """How many tasks there are; refuses what does not go with so many, or with who answers."""
-    human = arguments.oracle == "human"
-    if arguments.task is not None and arguments.tasks not in (None, 1):
-        raise ValueError(f"--task is one task, but --tasks asks for {arguments.tasks}")
-    if human and arguments.tasks not in (None, 1):
-        raise ValueError(
-            f"--oracle human answers for one task, but --tasks asks for {arguments.tasks}"
-        )
-    n_tasks: int = 1 if human or arguments.task is not None else arguments.tasks or DEFAULT_TASKS
+    human, named = arguments.oracle == "human", arguments.task is not None
+    if (named or human) and arguments.tasks not in (None, 1):
+        one = "--task is" if named else "--oracle human answers for"
+        raise ValueError(f"{one} one task, but --tasks asks for {arguments.tasks}")
+    n_tasks: int = 1 if human or named else arguments.tasks or DEFAULT_TASKS
     if arguments.save is not None and n_tasks > 1:
         raise ValueError(
-            f"--save keeps the policy of one task, but {n_tasks} are adapted: add --tasks 1, or --task X"
+            f"--save keeps the policy of one task, but {n_tasks} are adapted: add --tasks 1, or "
+            "--task X"
         )
-    if human and arguments.task is None and arguments.plot is not None:
+    if human and not named and arguments.plot is not None:
         raise ValueError(
-            "--plot needs returns, and with --oracle human only --task says by which goal to measure them"
+            "--plot needs returns, and with --oracle human only --task says by which goal to "
+            "measure them"
         )
     for flag in ("store", "resume"):
         if getattr(arguments, flag) and not human:
@@ -101,11 +96,7 @@ def _check_tasks(arguments: argparse.Namespace) -> int:
 
 
 class Adaptation:
-    """How the arguments say to adapt a model to its tasks.
-
-    :param arguments: The command line's
-    :param subject: The model, its environment and the tasks
-    """
+    """How the arguments say to adapt the subject's model to its tasks."""
 
     def __init__(self, arguments: argparse.Namespace, subject: Subject) -> None:
         self.arguments = arguments
@@ -178,9 +169,8 @@ class Adaptation:
         )
         recorder = StoreRecorder(Store(folder), *about, resume=arguments.resume)
         if arguments.resume:
-            found = (
-                "Going on with" if recorder.resumed else "There is nothing to go on with; beginning"
-            )
+            nothing = "There is nothing to go on with; beginning"
+            found = "Going on with" if recorder.resumed else nothing
             say(f"{found} session {recorder.session.id} of {folder}")
         oracle = HumanOracle(record=recorder)
         env = subject.make_env("rgb_array", show_task=False)
@@ -207,9 +197,8 @@ class Adaptation:
         except (EOFError, KeyboardInterrupt) as error:
             if not adapter.n_answers:
                 raise
-            stopped = (
-                "Interrupted" if isinstance(error, KeyboardInterrupt) else "Standard input ended"
-            )
+            interrupted = isinstance(error, KeyboardInterrupt)
+            stopped = "Interrupted" if interrupted else "Standard input ended"
         finally:
             env.close()
         return self._conclude(adapter, recorder, np.array(latents), stopped)
@@ -219,13 +208,12 @@ class Adaptation:
     ) -> None:
         query = adapter.ask()
         for side in ("left", "right"):
-            if not np.allclose(
-                getattr(query, side).latent, Trajectory.from_dict(kept[side]).latent
-            ):
+            was = Trajectory.from_dict(kept[side]).latent
+            if not np.allclose(getattr(query, side).latent, was):
                 raise ValueError(
-                    f"--resume: question {adapter.n_answers + 1} of session {recorder.session.id} was another "
-                    f"one; was it asked with another model of the name {recorder.session.model}? "
-                    "Leave out --resume to begin anew"
+                    f"--resume: question {adapter.n_answers + 1} of session {recorder.session.id} "
+                    "was another one; was it asked with another model of the name "
+                    f"{recorder.session.model}? Leave out --resume to begin anew"
                 )
         adapter.tell(kept["preference"])
 
@@ -249,30 +237,20 @@ class Adaptation:
             self._report(self._measure(latents, adapter), self._known_task_return())
         if arguments.video is not None and not interrupted:
             self._film(latents, (0, adapter.n_answers))
-        say("")
         believed = belief(adapter, subject.env_id)
         if believed["picture"] == "projection":  # whose sentence is about the picture
             believed["sentence"] = f"It takes the policy of the latent ({describe_task(latent)})."
-        say(believed["sentence"])
+        say(f"\n{believed['sentence']}")
         say(f"The answers are in {recorder.store.folder}, session {recorder.session.id}. Next:")
-        again = shlex.join(
-            ["sb3-poem", *(word for word in arguments.given if word != "--resume"), "--resume"]
-        )
-        commands = [] if adapter.done else [("answer the rest", again)]
+        words = [word for word in arguments.given if word != "--resume"]
+        again = shlex.join(["sb3-poem", *words, "--resume"])
+        if not adapter.done:
+            say(f"  answer the rest:  {again}")
         if arguments.save is None:
-            commands.append(("keep the policy", f"{again} --save policy{POLICY_SUFFIX}"))
+            say(f"  keep the policy:  {again} --save policy{POLICY_SUFFIX}")
         else:
-            watch = [
-                "sb3-poem",
-                "record-video",
-                "--model",
-                str(arguments.save),
-                "--out",
-                "policy.mp4",
-            ]
-            commands.append(("watch the policy", shlex.join(watch)))
-        for what, command in commands:
-            say(f"  {what + ':':<18}{command}")
+            file = shlex.quote(str(arguments.save))
+            say(f"  watch the policy: sb3-poem record-video --model {file} --out policy.mp4")
         return 130 if interrupted else 0
 
     def _measure(self, latents: np.ndarray, adapter: PreferenceAdapter) -> AdaptationEvaluation:
@@ -296,11 +274,9 @@ class Adaptation:
         )
 
     def _known_task_return(self) -> KnownTaskReturn:
-        subject = self.subject
-        with subject.console.status(
-            "Looking for the best policy of every task, as if it were known"
-        ):
-            return subject.known_task_return(self.arguments.episodes)
+        what = "Looking for the best policy of every task, as if it were known"
+        with self.subject.console.status(what):
+            return self.subject.known_task_return(self.arguments.episodes)
 
     def _report(self, evaluation: AdaptationEvaluation, known: KnownTaskReturn | None) -> None:
         """Print and write what was measured; without ``known`` it was interrupted."""
@@ -320,9 +296,8 @@ class Adaptation:
         n_tasks = len(subject.tasks)
         title = f"{subject.env_id}, {n_tasks} task{'s' * (n_tasks > 1)}, {arguments.oracle} oracle"
         title += ", incomplete" * (known is None)
-        Report(title, settings, evaluation, known).write(
-            subject.console, arguments.json, arguments.plot
-        )
+        report = Report(title, settings, evaluation, known)
+        report.write(subject.console, arguments.json, arguments.plot)
 
     def _film(self, latents: np.ndarray, answers: Sequence[int]) -> None:
         """Film the policies after the fewest and the most answers; ``latents`` is (n_records,

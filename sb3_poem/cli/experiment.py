@@ -12,6 +12,7 @@ from typing import Any
 import gymnasium as gym
 import optuna
 import yaml
+from gymnasium.envs.registration import load_env_creator
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import get_callback_list
@@ -20,7 +21,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from poem_envs import TaskFamily
 from sb3_poem.adaptation.callback import AdaptationEvalCallback
-from sb3_poem.cli.hyperparams import check_config, check_keys, check_numbers
+from sb3_poem.cli.hyperparams import check_config, check_entry
 from sb3_poem.cli.hyperparams_opt import entry_params
 from sb3_poem.cli.outputs import check_writable
 from sb3_poem.common.family_view import FamilyView
@@ -35,10 +36,8 @@ CHECKPOINT = "checkpoint.zip"
 
 
 class TrainingInterrupted(KeyboardInterrupt):
-    """Training was interrupted, and what it had learned is saved.
-
-    :param message: how far it came
-    :param resumable: whether ``--resume`` finds a checkpoint of this run
+    """Training was interrupted, and what it had learned is saved. The message says how far it came,
+    and ``resumable`` whether ``--resume`` finds a checkpoint of this run.
     """
 
     def __init__(self, message: str, resumable: bool) -> None:
@@ -51,12 +50,7 @@ def stopping_between_epochs(checkpoint: TrainingCheckpointCallback) -> Iterator[
     """Let the first Ctrl-C (or ``SIGTERM``) end training after the epoch at hand, and the second at
     once.
     """
-    signals = (signal.SIGINT, signal.SIGTERM)
-    before = {
-        number: handler
-        for number in signals
-        if (handler := signal.getsignal(number)) is not signal.SIG_IGN
-    }
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def restore() -> None:
         for number, handler in before.items():
@@ -68,8 +62,9 @@ def stopping_between_epochs(checkpoint: TrainingCheckpointCallback) -> Iterator[
         with contextlib.suppress(OSError):  # and not print, which this signal may have interrupted
             os.write(2, b"\nStopping after this epoch, to save it. Ctrl-C again stops at once.\n")
 
-    for number in before:
-        signal.signal(number, stop)
+    for number, handler in before.items():
+        if handler is not signal.SIG_IGN:
+            signal.signal(number, stop)
     try:
         yield
     finally:
@@ -86,9 +81,8 @@ def make_experiment(
         for a number of steps or a file of hyperparameters that cannot be
     :raises OSError: if a folder that a flag names cannot be written
     """
-    if (
-        args.n_timesteps < 1 and args.n_timesteps != -1
-    ):  # which is rl_zoo3's default, and takes the entry's
+    # -1 is rl_zoo3's default, and takes the entry's
+    if args.n_timesteps < 1 and args.n_timesteps != -1:
         raise ValueError(f"-n/--n-timesteps must be at least 1, got {args.n_timesteps}")
     if args.conf_file is not None:
         check_config(args.conf_file)
@@ -103,12 +97,9 @@ def is_task_family(env_id: str) -> bool | None:
     """Whether an environment is a task family; None if its entry point is a function, which does
     not tell.
     """
-    entry_point = gym.spec(env_id).entry_point
-    creator = (
-        gym.envs.registration.load_env_creator(entry_point)
-        if isinstance(entry_point, str)
-        else entry_point
-    )
+    creator: Any = gym.spec(env_id).entry_point
+    if isinstance(creator, str):
+        creator = load_env_creator(creator)
     return issubclass(creator, TaskFamily) if inspect.isclass(creator) else None
 
 
@@ -119,11 +110,8 @@ class FamilyExperiment(ExperimentManager):
 
     def __init__(self, args: Any, algo: str, env_id: str, *rest: Any, **kwargs: Any) -> None:
         super().__init__(args, algo, env_id, *rest, **kwargs)
-        if (
-            args.vec_env == "dummy"
-            and is_task_family(env_id)
-            and gym.spec(env_id).vector_entry_point is not None
-        ):
+        vectorises = is_task_family(env_id) and gym.spec(env_id).vector_entry_point is not None
+        if args.vec_env == "dummy" and vectorises:
             self.vec_env_class = TaskVecEnv
 
 
@@ -162,20 +150,16 @@ class PoemExperiment(FamilyExperiment):
             ) from error
         source = f"{self.config}, entry {self.env_name.gym_id!r}"
         custom = self.custom_hyperparams or {}
-        for given, place in (
-            (custom, "-params"),
-            ({k: v for k, v in hyperparams.items() if k not in custom}, source),
-        ):
-            check_keys(sorted(given), self.algo, place)
-            check_numbers(given, self.algo, place)
+        check_entry(custom, self.algo, "-params")
+        of_entry = {key: value for key, value in hyperparams.items() if key not in custom}
+        check_entry(of_entry, self.algo, source)
         for key in ("n_timesteps", "policy"):
             if key not in hyperparams:
                 raise ValueError(f"{source} has no {key!r}")
         return hyperparams, saved
 
     def create_envs(self, *args: Any, **kwargs: Any) -> VecEnv:
-        # Ctrl-C reaches the processes of --vec-env subproc too, which must last until the epoch
-        # ends
+        # Ctrl-C reaches the processes of --vec-env subproc too, which must last an epoch
         before = signal.signal(signal.SIGINT, signal.SIG_IGN)
         try:
             return super().create_envs(*args, **kwargs)
@@ -192,40 +176,26 @@ class PoemExperiment(FamilyExperiment):
     def _add_callbacks(self, model: PEARLSAC) -> None:
         """Those which count in epochs, whose length the model knows."""
         if self.steps_per_evaluation > 0:
-            self.callbacks.append(
-                AdaptationEvalCallback(
-                    every=self._epochs(model, self.steps_per_evaluation),
-                    n_episodes=self.n_eval_episodes,
-                    best_model_save_path=self.save_path,
-                    env_kwargs=self._eval_env_kwargs_args,
-                    verbose=self.verbose,
-                )
+            evaluation = AdaptationEvalCallback(
+                every=_epochs(model, self.steps_per_evaluation),
+                n_episodes=self.n_eval_episodes,
+                best_model_save_path=self.save_path,
+                env_kwargs=self._eval_env_kwargs_args,
+                verbose=self.verbose,
             )
-        every = (
-            self._epochs(model, self.steps_per_checkpoint)
-            if self.steps_per_checkpoint > 0
-            else None
-        )
+            self.callbacks.append(evaluation)
+        steps = self.steps_per_checkpoint
+        every = _epochs(model, steps) if steps > 0 else None
         self.checkpoint = TrainingCheckpointCallback(Path(self.save_path) / CHECKPOINT, every)
         self.callbacks.append(self.checkpoint)
-
-    @staticmethod
-    def _epochs(model: PEARLSAC, steps: int) -> int:
-        """How many epochs take about so many environment steps, at least 1."""
-        assert model.horizon is not None
-        return max(
-            1, round(steps / (len(model.train_tasks) * model.trajectories_per_task * model.horizon))
-        )
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> Any:
         if not is_checkpoint(self.trained_agent):
             return super()._load_pretrained_agent(hyperparams, env)
         model = ALGORITHMS[self.algo].load_checkpoint(self.trained_agent, env, device=self.device)
         model.tensorboard_log, model.verbose = self.tensorboard_log, self.verbose
-        self.resumes = True
-        print(
-            f"Resuming {self.trained_agent} after {model.num_timesteps} steps, with its own hyperparameters"
-        )
+        self.resumes, steps = True, model.num_timesteps
+        print(f"Resuming {self.trained_agent} after {steps} steps, with its own hyperparameters")
         return model
 
     def learn(self, model: Any) -> None:
@@ -252,16 +222,9 @@ class PoemExperiment(FamilyExperiment):
             self.checkpoint.saved_steps,
         )
         if done < total and self.is_interrupted:
-            kept = (
-                ""
-                if saved == done
-                else ", before the first checkpoint"
-                if saved is None
-                else f", saved at {saved:,}"
-            )
-            raise TrainingInterrupted(
-                f"Interrupted at {done:,} of {total:,} steps{kept}", saved is not None
-            )
+            kept = ", before the first checkpoint" if saved is None else f", saved at {saved:,}"
+            message = f"Interrupted at {done:,} of {total:,} steps{kept * (saved != done)}"
+            raise TrainingInterrupted(message, resumable=saved is not None)
         if done >= total and self.steps_per_checkpoint <= 0:
             self.checkpoint.path.unlink(missing_ok=True)
 
@@ -287,55 +250,44 @@ class PoemExperiment(FamilyExperiment):
         :raises optuna.TrialPruned: if the trial is not worth finishing, or its hyperparameters made
             it fail
         """
-        arguments = {"entry": self._hyperparams}
-        sampled = self._preprocess_schedules(
-            HYPERPARAMS_SAMPLER[self.algo](trial, self.n_actions, self.n_envs, arguments)
-        )
+        sample, entry = HYPERPARAMS_SAMPLER[self.algo], {"entry": self._hyperparams}
+        sampled = self._preprocess_schedules(sample(trial, self.n_actions, self.n_envs, entry))
         env = self.create_envs(self.n_envs, no_log=True)
-        if not FamilyView(env).shared_dynamics:
-            sampled["relabel_fraction"] = (
-                0.0  # a reward of another task needs a transition that could be of it
+        with contextlib.closing(env):
+            if not FamilyView(env).shared_dynamics:
+                # a reward of another task needs a transition that could be of it
+                sampled["relabel_fraction"] = 0.0
+            hyperparams = {**self._hyperparams, **sampled}
+            model = ALGORITHMS[self.algo](env=env, device=self.device, **hyperparams)
+            log = self.optimization_log_path
+            evaluation = TrialAdaptationCallback(
+                trial,
+                every=_epochs(model, self.n_timesteps // self.n_evaluations),
+                n_episodes=self.n_eval_episodes,
+                best_model_save_path=log and Path(log) / f"trial_{trial.number}",
+                env_kwargs=self._eval_env_kwargs_args,
             )
-        try:
-            model = ALGORITHMS[self.algo](
-                env=env, device=self.device, **{**self._hyperparams, **sampled}
-            )
-        except Exception:
-            env.close()
-            raise
-        folder = (
-            self.optimization_log_path
-            and Path(self.optimization_log_path) / f"trial_{trial.number}"
-        )
-        evaluation = TrialAdaptationCallback(
-            trial,
-            every=self._epochs(model, self.n_timesteps // self.n_evaluations),
-            n_episodes=self.n_eval_episodes,
-            best_model_save_path=folder,
-            env_kwargs=self._eval_env_kwargs_args,
-        )
-        try:
-            model.learn(
-                self.n_timesteps,
-                [*get_callback_list({"callback": self.specified_callbacks}), evaluation],
-            )
-        except ValueError as error:
-            # Some random hyperparameters diverge, which the model reports.
-            print(f"Trial {trial.number} failed: {error}")
-            raise optuna.TrialPruned from error
-        finally:
-            assert model.env is not None
-            model.env.close()
+            own = get_callback_list({"callback": self.specified_callbacks})
+            try:
+                model.learn(self.n_timesteps, [*own, evaluation])
+            except ValueError as error:
+                # Some random hyperparameters diverge, which the model reports.
+                print(f"Trial {trial.number} failed: {error}")
+                raise optuna.TrialPruned from error
         if evaluation.is_pruned:
             raise optuna.TrialPruned
         return evaluation.last_return
 
 
+def _epochs(model: PEARLSAC, steps: int) -> int:
+    """How many epochs take about so many environment steps, at least 1."""
+    rollouts = len(model.train_tasks) * model.trajectories_per_task
+    return max(1, round(steps / (rollouts * model.family.horizon)))
+
+
 class TrialAdaptationCallback(AdaptationEvalCallback):
     """Reports each evaluation to Optuna, and ends the training of a trial that is not worth
     finishing.
-
-    :param kwargs: see :class:`AdaptationEvalCallback`
     """
 
     def __init__(self, trial: optuna.Trial, **kwargs: Any) -> None:

@@ -5,6 +5,7 @@ each value of an entry.
 import inspect
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import optuna
@@ -13,15 +14,8 @@ from rl_zoo3.utils import SimpleLinearSchedule
 from sb3_poem.loading import ALGORITHMS
 
 #: Searched from a fourth to four times the entry's value
-SCALES = (
-    "one_minus_gamma",
-    "learning_rate",
-    "tau",
-    "kl_coef",
-    "reward_coef",
-    "policy_coef",
-    "preference_coef",
-)
+COEFFICIENTS = ("kl_coef", "reward_coef", "policy_coef", "preference_coef")
+SCALES = ("one_minus_gamma", "learning_rate", "tau", *COEFFICIENTS)
 #: Searched from a half to twice the entry's value
 COUNTS = ("gradient_steps", "batch_size", "context_size", "meta_batch_size", "latent_dim")
 #: Searched up to so far from the entry's value
@@ -30,22 +24,15 @@ FRACTIONS = {"relabel_fraction": 0.3}
 #: name, and stays one
 LINEAR = "lin_learning_rate"
 
-Sampler = Callable[[optuna.Trial, int, int, dict[str, Any]], dict[str, Any]]
-
 
 def entry_params(algorithm: str, entry: dict[str, Any]) -> dict[str, Any]:
-    """The trial that is an entry itself, without what cannot be searched around it: 0, and as many
-    gradient steps as are taken in the environment (-1).
+    """The trial that is an entry itself, by the names of Optuna's parameters, without what cannot
+    be searched around it: 0, and as many gradient steps as are taken in the environment (-1).
 
-    :param algorithm: name of the algorithm
     :param entry: hyperparameters, learning rates as schedules
-    :return: values by the names of Optuna's parameters
     """
-    values = {
-        name: parameter.default
-        for name, parameter in inspect.signature(ALGORITHMS[algorithm]).parameters.items()
-    }
-    values |= entry
+    parameters = inspect.signature(ALGORITHMS[algorithm]).parameters
+    values = {name: parameter.default for name, parameter in parameters.items()} | entry
     values["one_minus_gamma"] = 1.0 - values["gamma"]
     rate = values["learning_rate"]
     if callable(rate):
@@ -57,12 +44,9 @@ def entry_params(algorithm: str, entry: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in params.items() if value > 0 or name in FRACTIONS}
 
 
-def convert_params(params: dict[str, Any]) -> dict[str, Any]:
-    """Turn a trial's parameters into hyperparameters as an entry has them.
-
-    :param params: under Optuna's names
-    """
-    hyperparams = dict(params)
+def convert_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
+    """A trial's parameters, under Optuna's names, as hyperparameters of an entry."""
+    hyperparams = dict(sampled_params)
     if "one_minus_gamma" in hyperparams:
         hyperparams["gamma"] = 1.0 - hyperparams.pop("one_minus_gamma")
     if LINEAR in hyperparams:
@@ -70,30 +54,24 @@ def convert_params(params: dict[str, Any]) -> dict[str, Any]:
     return hyperparams
 
 
-def _sampler(algorithm: str) -> Sampler:
-    def sample(
-        trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
-    ) -> dict[str, Any]:
-        params: dict[str, Any] = {}
-        for name, value in entry_params(algorithm, additional_args.get("entry", {})).items():
-            if name in COUNTS:
-                params[name] = trial.suggest_int(
-                    name, max(1, math.ceil(value / 2)), 2 * value, log=True
-                )
-            elif name in FRACTIONS:
-                reach = FRACTIONS[name]
-                params[name] = trial.suggest_float(
-                    name, max(0.0, value - reach), min(1.0, value + reach)
-                )
-            else:
-                high = 4 * value if name.endswith("_coef") else min(1.0, 4 * value)
-                params[name] = trial.suggest_float(name, value / 4, high, log=True)
-        return convert_params(params)
-
-    return sample
+def _sample(
+    algorithm: str, trial: optuna.Trial, n_actions: int, n_envs: int, more: dict[str, Any]
+) -> dict[str, Any]:
+    params: dict[str, Any] = {}
+    for name, value in entry_params(algorithm, more.get("entry", {})).items():
+        if name in COUNTS:
+            low = max(1, math.ceil(value / 2))
+            params[name] = trial.suggest_int(name, low, 2 * value, log=True)
+        elif name in FRACTIONS:
+            low, high = max(0.0, value - FRACTIONS[name]), min(1.0, value + FRACTIONS[name])
+            params[name] = trial.suggest_float(name, low, high)
+        else:
+            high = 4 * value if name in COEFFICIENTS else min(1.0, 4 * value)
+            params[name] = trial.suggest_float(name, value / 4, high, log=True)
+    return convert_params(params)
 
 
-SAMPLERS: dict[str, Sampler] = {name: _sampler(name) for name in ALGORITHMS}
-CONVERTERS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = dict.fromkeys(
-    ALGORITHMS, convert_params
-)
+#: By the algorithm's name, called with (trial, n_actions, n_envs, additional arguments)
+SAMPLERS: dict[str, Callable[..., dict[str, Any]]] = {
+    name: partial(_sample, name) for name in ALGORITHMS
+}

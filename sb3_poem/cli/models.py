@@ -1,36 +1,29 @@
 """``sb3-poem models``: what ships, a line each."""
 
 import json
-from pathlib import Path
 from typing import Any
 
 from sb3_poem.resources import pretrained_folder, pretrained_names
 
 HEADER = ("name", "environment", "algorithm", "steps", "return after 0 and 10 answers")
+FOOTER = (
+    "Returns are means over 30 unseen tasks, by the rule `bayes`; each model's card has all "
+    "figures."
+)
 
 
 def run_models(_: Any) -> None:
     """Print the models that ship. Nothing heavy is imported: their configurations are JSON."""
-    rows = [HEADER, *(_row(name, pretrained_folder(name)) for name in pretrained_names())]
+    rows = [HEADER]
+    for name in pretrained_names():
+        config = json.loads((pretrained_folder(name) / "config.json").read_text(encoding="utf-8"))
+        steps, returns = f"{config['num_timesteps']:,}", _returns(config["card"])
+        rows.append((name, config["env_id"], config["algorithm"], steps, returns))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
-        print(
-            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        )
-    print(
-        "\nReturns are means over 30 unseen tasks, by the rule `bayes`; each model's card has all figures."
-    )
-
-
-def _row(name: str, folder: Path) -> tuple[str, ...]:
-    config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
-    return (
-        name,
-        config["env_id"],
-        config["algorithm"],
-        f"{config['num_timesteps']:,}",
-        _returns(config["card"]),
-    )
+        cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
+        print("  ".join(cells).rstrip())
+    print(f"\n{FOOTER}")
 
 
 def _returns(card: dict[str, Any]) -> str:
@@ -38,5 +31,6 @@ def _returns(card: dict[str, Any]) -> str:
     for result in card.get("results", {}).get("adaptation to 30 unseen tasks", ()):
         earned = dict(zip(result["queries"], result["mean_return"], strict=True))
         if result["inference"] == "bayes" and {0, 10} <= set(earned):
-            return f"{earned[0]:.1f} -> {earned[10]:.1f} (task known: {result['known_task_return']:.1f})"
+            known = result["known_task_return"]
+            return f"{earned[0]:.1f} -> {earned[10]:.1f} (task known: {known:.1f})"
     return ""

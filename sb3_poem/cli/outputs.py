@@ -1,4 +1,4 @@
-"""Files that a command will write, checked before it spends its time."""
+"""What a command will need later, checked before it spends its time: files to write, a device."""
 
 import os
 import tempfile
@@ -10,7 +10,6 @@ def check_writable(folder: str | Path) -> None:
     """Make a folder and a file in it, so that a run does not find out at its end that it cannot
     save.
 
-    :param folder: where something will be written
     :raises OSError: if that fails; the message names the folder
     """
     try:
@@ -26,10 +25,7 @@ def check_writable(folder: str | Path) -> None:
 def check_output(flag: str, path: Path | None, suffixes: Sequence[str]) -> None:
     """Check a file that a flag named, if it did.
 
-    :param flag: the flag, for the message
-    :param path: the file
-    :param suffixes: what its name may end in
-    :raises ValueError: if its suffix is none of these
+    :raises ValueError: if its name has none of these suffixes
     :raises OSError: if its folder cannot be written
     """
     if path is None:
@@ -40,11 +36,7 @@ def check_output(flag: str, path: Path | None, suffixes: Sequence[str]) -> None:
 
 
 def check_device(name: str) -> None:
-    """Refuse a device that PyTorch does not know.
-
-    :param name: What ``--device`` names
-    :raises ValueError: if it is none
-    """
+    """Refuse a ``--device`` that PyTorch does not know."""
     import torch as th
 
     try:

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 def import_packages(names: Sequence[str]) -> None:
     """Import modules, which may lie in the working folder.
 
-    :param names: of modules
     :raises ValueError: if there is no such module
     """
     folder = os.getcwd()
@@ -23,6 +22,6 @@ def import_packages(names: Sequence[str]) -> None:
             if not f"{name}.".startswith(f"{error.name}."):
                 raise  # the module is there, and imports what is not
             raise ValueError(
-                f"--gym-packages {name}: there is no such module, neither installed nor in {folder}; "
-                "name a module as in Python's import, without .py"
+                f"--gym-packages {name}: there is no such module, neither installed nor in "
+                f"{folder}; name a module as in Python's import, without .py"
             ) from error

@@ -6,7 +6,6 @@ import shlex
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import yaml
 
@@ -27,11 +26,12 @@ def resumed(arguments: Sequence[str]) -> list[str] | None:
     parser.add_argument("--env", default="CartPole-v1")  # rl_zoo3's default
     parser.add_argument("-f", "--log-folder", default="logs")
     parser.add_argument("--seed", type=int, default=-1)
-    parser.add_argument("-i", "--trained-agent", default="")
+    parser.add_argument("-i", "--trained-agent")
     given, _ = parser.parse_known_args(arguments)
     if given.trained_agent:
         raise ValueError(
-            "--resume finds the checkpoint by itself: leave out either --resume or -i/--trained-agent"
+            "--resume finds the checkpoint by itself: leave out either --resume or "
+            "-i/--trained-agent"
         )
     rest = [argument for argument in arguments if argument != "--resume"]
     folder, env_name = Path(given.log_folder) / given.algo, given.env.replace("/", "-")
@@ -42,17 +42,15 @@ def resumed(arguments: Sequence[str]) -> list[str] | None:
         return rest
     if is_complete(run / f"{env_name}.zip"):
         print(
-            f"{run} has finished already; start another run without --resume, or train it further with -i"
+            f"{run} has finished already; start another run without --resume, or train it further "
+            "with -i"
         )
         return None
     return [*rest, "-i", str(run / CHECKPOINT)]
 
 
 def resume_command(arguments: Sequence[str]) -> str:
-    """The command that goes on with a run of which a checkpoint is left.
-
-    :param arguments: those that the run was given
-    """
+    """The command that goes on with a run that was given these arguments and left a checkpoint."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("-i", "--trained-agent")
     parser.add_argument("--resume", action="store_true")
@@ -85,18 +83,19 @@ def last_run(folder: Path, env_name: str, seed: int) -> Path | None:
     :param env_name: environment id with - in place of /
     :param seed: as given to the run; negative: any
     """
-    runs = sorted(
-        folder.glob(f"{env_name}_*"),
-        key=lambda run: int(run.name.removeprefix(env_name).split("_")[1]),
-    )
-    for run in reversed(runs):
-        if seed >= 0 and _arguments(run / env_name / "args.yml").get("seed") != seed:
+
+    def number(run: Path) -> int:
+        return int(run.name.removeprefix(env_name).split("_")[1])
+
+    for run in sorted(folder.glob(f"{env_name}_*"), key=number, reverse=True):
+        if seed >= 0 and _seed(run / env_name / "args.yml") != seed:
             continue
         if (run / CHECKPOINT).exists() or is_complete(run / f"{env_name}.zip"):
             return run
     return None
 
 
-def _arguments(file: Path) -> dict[str, Any]:
+def _seed(file: Path) -> int | None:
     # rl_zoo3 writes an OrderedDict, which only this loader reads; the file is the user's own
-    return dict(yaml.load(file.read_text(), Loader=yaml.UnsafeLoader)) if file.exists() else {}
+    arguments = yaml.load(file.read_text(), Loader=yaml.UnsafeLoader) if file.exists() else {}
+    return dict(arguments).get("seed")

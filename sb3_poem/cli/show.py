@@ -5,7 +5,6 @@ import shlex
 from math import ceil
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 
 from poem_envs.headless import has_display
@@ -19,7 +18,6 @@ from sb3_poem.cli.subject import COPIES_FOR_ONE_TASK, Subject, describe_task, sa
 def run_enjoy(arguments: argparse.Namespace) -> None:
     """Show a policy in a window.
 
-    :param arguments: As ``sb3_poem.cli`` parsed them
     :raises OSError: if there is no display, or no model
     :raises ValueError: if the arguments do not fit
     """
@@ -27,28 +25,25 @@ def run_enjoy(arguments: argparse.Namespace) -> None:
         film = shlex.join(["sb3-poem", "record-video", *arguments.given[1:], "--out", "policy.mp4"])
         raise OSError(f"there is no display to draw on: film it by `{film}`, or add --no-render")
     shown = Shown(arguments)
-    with_window = not arguments.no_render
-    env = shown.subject.make_env(
-        "human" if with_window else None, show_task=with_window and shown.has_task
-    )
-    steps = arguments.n_timesteps
-    episodes = arguments.episodes if steps is None else ceil(steps / shown.subject.model.horizon)
+    subject, steps = shown.subject, arguments.n_timesteps
+    if arguments.no_render:
+        env = subject.make_env(None, show_task=False)
+    else:
+        env = subject.make_env("human", show_task=shown.has_task)
+    episodes = arguments.episodes if steps is None else ceil(steps / subject.model.horizon)
     try:
         for number in range(episodes):
-            episode = shown.subject.roll_out(env, shown.latents[-1], number)
-            earned = (
-                f"return {shown.subject.true_return(episode):.1f} in " if shown.has_task else ""
-            )
+            episode = subject.roll_out(env, shown.latents[-1], number)
+            earned = f"return {subject.true_return(episode):.1f} in " if shown.has_task else ""
             say(f"Episode {number + 1}: {earned}{len(episode)} steps")
     finally:
         env.close()
-        shown.subject.env.close()
+        subject.env.close()
 
 
 def run_record_video(arguments: argparse.Namespace) -> None:
     """Film a policy, or one before and after adaptation side by side.
 
-    :param arguments: As ``sb3_poem.cli`` parsed them
     :raises OSError: if there is no model, or the file cannot be written
     :raises ValueError: if the arguments do not fit
     """
@@ -63,8 +58,6 @@ class Shown:
 
     ``latents`` holds one of (latent_dim,), or two, before and after adaptation, with their
     ``captions``. ``has_task`` is whether the task says anything of the policy.
-
-    :param arguments: As ``sb3_poem.cli`` parsed them
     """
 
     def __init__(self, arguments: argparse.Namespace) -> None:
@@ -74,9 +67,9 @@ class Shown:
         self.has_task = subject.latent is None or arguments.task is not None
         if subject.latent is not None and arguments.known_task:
             raise ValueError(
-                f"--known-task chooses a policy of a model, but --model {arguments.model} is a policy"
+                "--known-task chooses a policy of a model, but --model "
+                f"{arguments.model} is a policy"
             )
-        self.latents: list[np.ndarray] = []
         self.captions: list[str] = []
         if self.has_task:
             say(f"Task of {subject.env_id}: {describe_task(subject.tasks[0])}")
@@ -84,19 +77,13 @@ class Shown:
             self.latents = [subject.latent]
             say(f"Policy: that in {arguments.model}, which is adapted already")
         elif arguments.known_task:
-            self._choose_by_task(arguments)
+            with subject.console.status("Looking for the best policy for the task"):
+                known = subject.known_task_return(arguments.episodes)
+            self.latents, n = [known.latents[0]], len(known.candidate_latents)
+            what = f"the best of {n} for this task; return {known.mean_return:.1f}"
+            say(f"Policy of {arguments.model}: {what}")
         else:
             self._adapt(arguments)
-
-    def _choose_by_task(self, arguments: argparse.Namespace) -> None:
-        subject = self.subject
-        with subject.console.status("Looking for the best policy for the task"):
-            known = subject.known_task_return(arguments.episodes)
-        self.latents = [known.latents[0]]
-        n = len(known.candidate_latents)
-        say(
-            f"Policy of {arguments.model}: the best of {n} for this task; return {known.mean_return:.1f}"
-        )
 
     def _adapt(self, arguments: argparse.Namespace) -> None:
         subject = self.subject
@@ -111,33 +98,26 @@ class Shown:
             )
         self.latents = list(measured.latents[0])
         self.captions = [f"after {n} answer{'s' * (n != 1)}" for n in measured.record_at]
-        returns = [
-            f"return {earned:.1f} {when}"
-            for earned, when in zip(measured.mean_returns, self.captions, strict=True)
-        ]
-        say(
-            f"Policy of {arguments.model}, adapted by the oracle that knows the return: {', '.join(returns)}"
-        )
+        earned = zip(measured.mean_returns, self.captions, strict=True)
+        returns = ", ".join(f"return {mean:.1f} {when}" for mean, when in earned)
+        say(f"Policy of {arguments.model}, adapted by the oracle that knows the return: {returns}")
 
 
 def _last_run(arguments: argparse.Namespace) -> str:
     """The file with the model of the last run, or its checkpoint if it has not finished."""
     if arguments.env is None:
         raise ValueError(
-            "name a model by --model, or by --env the environment whose last run in --folder is shown"
+            "name a model by --model, or by --env the environment whose last run in --folder is "
+            "shown"
         )
-    name = arguments.env.replace("/", "-")
+    name, number = arguments.env.replace("/", "-"), arguments.exp_id
     folder = Path(arguments.folder) / arguments.algo
-    run = (
-        folder / f"{name}_{arguments.exp_id}"
-        if arguments.exp_id
-        else last_run(folder, name, seed=-1)
-    )
+    run = folder / f"{name}_{number}" if number else last_run(folder, name, seed=-1)
     if run is None or not run.is_dir():
-        number = f" {arguments.exp_id}" if arguments.exp_id else ""
         raise FileNotFoundError(
-            f"there is no run{number} of {arguments.algo} on {arguments.env} in --folder {arguments.folder}: "
-            "train one, or take a model that ships by --model (`sb3-poem models` lists them)"
+            f"there is no run{f' {number}' * bool(number)} of {arguments.algo} on {arguments.env} "
+            f"in --folder {arguments.folder}: train one, or take a model that ships by --model "
+            "(`sb3-poem models` lists them)"
         )
     model = run / f"{name}.zip"
     return str(model if model.exists() else run / CHECKPOINT)

@@ -1,4 +1,4 @@
-"""What ``adapt``, ``enjoy`` and ``record-video`` work on: a model, its environment and test tasks."""
+"""What ``adapt``, ``enjoy`` and ``record-video`` work on: a model, its environment, test tasks."""
 
 import argparse
 import ast
@@ -35,10 +35,7 @@ POLICY_SUFFIX = ".safetensors"
 
 
 def parse_env_kwargs(pairs: list[str]) -> dict[str, Any]:
-    """Read ``KEY:VALUE`` arguments; a value is a Python literal, or else a string.
-
-    :raises ValueError: if there is no colon
-    """
+    """Read ``KEY:VALUE`` arguments; a value is a Python literal, or else a string."""
     kwargs = {}
     for pair in pairs:
         key, colon, text = pair.partition(":")
@@ -64,7 +61,6 @@ def say(text: str) -> None:
 class Subject:
     """A model, an environment with many copies (``env``), and test tasks.
 
-    :param arguments: The command line's
     :param console: Where to say what takes its time
     :param n_tasks: How many tasks are drawn, unless ``--task`` names the only one
     :param copies: How many of the environment step at once
@@ -97,41 +93,33 @@ class Subject:
         try:
             self.family.check_same_family(self.model.task_space, self.model.reward_feature_dim)
         except ValueError as error:
-            raise ValueError(
-                f"--env {self.env_id}, but {arguments.model} was trained on {self.model.env_id}: {error}"
-            ) from error
+            trained = f"{arguments.model} was trained on {self.model.env_id}"
+            raise ValueError(f"--env {self.env_id}, but {trained}: {error}") from error
+        task, width = arguments.task, self.family.task_dim
+        if task is not None and len(task) != width:
+            raise ValueError(f"--task needs {width} numbers for {self.env_id}, got {len(task)}")
         #: (n_tasks, task_dim)
-        self.tasks = self._choose_tasks(arguments.task, n_tasks)
-
-    def _choose_tasks(self, task: list[float] | None, n_tasks: int) -> np.ndarray:
-        if task is None:
-            return self.family.test_tasks(n_tasks, self.seed)
-        if len(task) != self.family.task_dim:
-            raise ValueError(
-                f"--task needs {self.family.task_dim} numbers for {self.env_id}, got {len(task)}"
-            )
-        return np.array([task], dtype=np.float64)
+        self.tasks = (
+            self.family.test_tasks(n_tasks, self.seed)
+            if task is None
+            else np.array([task], dtype=np.float64)
+        )
 
     def known_task_return(self, n_episodes: int) -> KnownTaskReturn:
-        """The best of the model's policies for each task.
-
-        :param n_episodes: How many are measured for each
-        """
-        selection = min(n_episodes, SELECTION_EPISODES)
+        """The best of the model's policies for each task, measured on so many episodes."""
         return known_task_return(
             self.model,
             self.env,
             self.tasks,
             n_episodes=n_episodes,
             seed=self.seed,
-            selection_episodes=selection,
+            selection_episodes=min(n_episodes, SELECTION_EPISODES),
         )
 
     def make_env(self, render_mode: str | None, show_task: bool) -> DummyVecEnv:
-        """A single environment with the first task.
+        """A single environment with the first task, which is drawn too if it is shown.
 
         :param render_mode: ``"rgb_array"``, ``"human"`` or None
-        :param show_task: Whether the hidden task is drawn
         :raises ValueError: if the environment cannot render so
         """
         options = {**self.env_kwargs, "render_task": True} if show_task else self.env_kwargs
@@ -142,17 +130,11 @@ class Subject:
     def roll_out(
         self, env: DummyVecEnv, latent: np.ndarray, episode: int = 0, frames: bool = False
     ) -> Trajectory:
-        """An episode of a policy on the first task.
-
-        :param env: What :meth:`make_env` made
-        :param latent: (latent_dim,)
-        :param episode: Its number; equal numbers start alike
-        :param frames: Whether to keep its frames
+        """An episode of a policy (latent_dim,) on the first task, in what :meth:`make_env` made;
+        equal numbers start alike.
         """
-        seed = evaluation_seed(self.seed) + episode
-        return rollout_latents(
-            self.model, env, latent[None], self.tasks[:1], [seed], frames=frames
-        )[0]
+        seed, latents, tasks = evaluation_seed(self.seed) + episode, latent[None], self.tasks[:1]
+        return rollout_latents(self.model, env, latents, tasks, [seed], frames=frames)[0]
 
     def true_return(self, episode: Trajectory) -> float:
         """What an episode earns on the first task."""
@@ -166,19 +148,16 @@ class Subject:
 
         :param latents: One or two, (latent_dim,) each
         :param captions: What is written above each of two
-        :param path: MP4 or GIF
         :param show_task: Whether the task is drawn, and what was earned on it is written
         """
         env = self.make_env("rgb_array", show_task)
         with self.console.status("Filming"):
             clips = [self.roll_out(env, latent, frames=True) for latent in latents]
-            frames = clips[0].frames or []
-            if len(clips) > 1:
+            film, *other = [clip.frames or [] for clip in clips]
+            if other:
                 earned = [f": {self.true_return(clip):.1f}" if show_task else "" for clip in clips]
-                left, right = (
-                    caption + words for caption, words in zip(captions, earned, strict=True)
-                )
-                frames = side_by_side(frames, clips[1].frames or [], (left, right))
-            write_video(frames, path, float(FamilyView(env).render_fps))
+                left, right = (words + more for words, more in zip(captions, earned, strict=True))
+                film = side_by_side(film, other[0], (left, right))
+            write_video(film, path, FamilyView(env).render_fps)
         env.close()
         say(f"Wrote {path}" + (f" (task {describe_task(self.tasks[0])})" if show_task else ""))

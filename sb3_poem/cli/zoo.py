@@ -18,6 +18,7 @@ from rl_zoo3.utils import StoreDict
 from poem_envs.headless import has_display
 from sb3_poem.benchmark.suites import family_label
 from sb3_poem.cli.experiment import TrainingInterrupted, make_experiment
+from sb3_poem.cli.hyperparams_opt import SAMPLERS, convert_params
 from sb3_poem.cli.outputs import check_device
 from sb3_poem.cli.packages import import_packages
 from sb3_poem.cli.resume import resume_command, resumed
@@ -29,15 +30,17 @@ DEFAULTS = {
     "train": ["--algo", "poem_sac", "--eval-freq", "100000", "--eval-episodes", "2"],
     "enjoy": ["--folder", "logs"],
 }
+RESUME_HELP = (
+    "--resume: go on with the last run of the same algorithm, environment and seed, if it did not "
+    "finish"
+)
 
 
 def register_algorithms() -> None:
     """Make our algorithms known to rl_zoo3, in this process."""
-    from sb3_poem.cli.hyperparams_opt import CONVERTERS, SAMPLERS
-
     ALGOS.update(ALGORITHMS)
     HYPERPARAMS_SAMPLER.update(SAMPLERS)
-    HYPERPARAMS_CONVERTER.update(CONVERTERS)
+    HYPERPARAMS_CONVERTER.update(dict.fromkeys(ALGORITHMS, convert_params))
 
 
 class CheckedPairs(StoreDict):
@@ -54,8 +57,8 @@ class CheckedPairs(StoreDict):
                 super().__call__(parser, namespace, [pair], option_string)
             except Exception as error:  # whatever the text raises
                 raise ValueError(
-                    f"{option_string} {pair}: must have the form KEY:VALUE with a Python value, and {text!r} is none "
-                    f"({error}); text needs quotes, as in \"{key}:'{text}'\""
+                    f"{option_string} {pair}: must have the form KEY:VALUE with a Python value, "
+                    f"and {text!r} is none ({error}); text needs quotes, as in \"{key}:'{text}'\""
                 ) from error
 
 
@@ -86,12 +89,9 @@ def check_arguments(command: str, arguments: Sequence[str]) -> None:
             ALGORITHMS[given.algo].load(given.trained_agent, device="cpu")
     if given.env not in gym.registry:
         names = {name: env_id for env_id in gym.registry for name in (env_id, family_label(env_id))}
-        close = difflib.get_close_matches(given.env, names, n=1)
-        hint = (
-            f"did you mean {names[close[0]]}?"
-            if close
-            else "name the module that registers it by --gym-packages"
-        )
+        hint = "name the module that registers it by --gym-packages"
+        for close in difflib.get_close_matches(given.env, names, n=1):
+            hint = f"did you mean {names[close]}?"
         raise ValueError(f"--env {given.env}: there is no such environment; {hint}")
 
 
@@ -104,39 +104,28 @@ def run_zoo(command: str, arguments: Sequence[str]) -> None:
     :param arguments: its own arguments, as its ``--help`` lists them
     """
     register_algorithms()
-    defaults = DEFAULTS[command]
-    if (
-        command == "enjoy"
-        and not has_display()
-        and not {"--no-render", "-h", "--help"} & set(arguments)
-    ):
+    trains, asks_help = command == "train", bool({"-h", "--help"} & set(arguments))
+    if not trains and not has_display() and not asks_help and "--no-render" not in arguments:
         raise OSError("there is no display to draw on: add --no-render")
-
-    if {"-h", "--help"} & set(arguments):
-        print(f"Defaults here: {' '.join(defaults)}")
-        if command == "train":
-            print(
-                "--resume: go on with the last run of the same algorithm, environment and seed, if it did not finish"
-            )
-        print()
-
-    resumes = command == "train" and "--resume" in arguments
-    given = resumed([*defaults, *arguments]) if resumes else [*defaults, *arguments]
-    if given is None:
-        return
+    if asks_help:
+        print(f"Defaults here: {' '.join(DEFAULTS[command])}")
+        print(f"{RESUME_HELP}\n" if trains else "")
+    given = [*DEFAULTS[command], *arguments]
+    if trains and "--resume" in arguments:
+        if (continued := resumed(given)) is None:
+            return
+        given = continued
     check_arguments(command, given)
     # rl_zoo3's programs read the process's own arguments.
     own_arguments = sys.argv
     sys.argv = [f"sb3-poem {command}", *given]
     zoo_train.ExperimentManager = make_experiment  # type: ignore[assignment,misc]
     try:
-        zoo_train.train() if command == "train" else zoo_enjoy.enjoy()
+        zoo_train.train() if trains else zoo_enjoy.enjoy()
     except TrainingInterrupted as stop:
-        again = (
-            f"go on with: {resume_command(arguments)}"
-            if stop.resumable
-            else "the same command begins again"
-        )
+        again = "the same command begins again"
+        if stop.resumable:
+            again = f"go on with: {resume_command(arguments)}"
         raise KeyboardInterrupt(f"{stop}; {again}") from None
     except AssertionError as error:
         # rl_zoo3 asserts on what the user gave; an assertion without words is a defect.

@@ -16,45 +16,29 @@ ACTION_UNITS = 2**15 - 1
 
 @dataclass
 class Segment:
-    """Experience of several environment copies over the same number of steps.
+    """Experience of several environment copies over the same number of steps."""
 
-    :param task_ids: (copies,) index of each copy's training task
-    :param observations: (copies, steps, obs_dim)
-    :param actions: (copies, steps, action_dim), scaled to [-1, 1]
-    :param next_observations: (copies, steps, obs_dim), the last one of an episode included
-    :param rewards: (copies, steps)
-    :param terminated: (copies, steps), 1 where the episode ended other than by the time limit
-    :param features: (copies, steps, feat_dim), reward features
-    :param first_episode: (copies, steps), True up to the end of each copy's first episode
-    :param latents: (copies, latent_dim), which policy acted
-    """
-
-    task_ids: np.ndarray
-    observations: np.ndarray
-    actions: np.ndarray
-    next_observations: np.ndarray
-    rewards: np.ndarray
-    terminated: np.ndarray
-    features: np.ndarray
-    first_episode: np.ndarray
-    latents: np.ndarray
+    task_ids: np.ndarray  # (copies,) index of each copy's training task
+    observations: np.ndarray  # (copies, steps, obs_dim)
+    actions: np.ndarray  # (copies, steps, action_dim), scaled to [-1, 1]
+    next_observations: np.ndarray  # (copies, steps, obs_dim), the last of an episode included
+    rewards: np.ndarray  # (copies, steps)
+    terminated: np.ndarray  # (copies, steps), 1 where an episode ended other than by the time limit
+    features: np.ndarray  # (copies, steps, feat_dim), reward features
+    first_episode: np.ndarray  # (copies, steps), True up to the end of each copy's first episode
+    latents: np.ndarray  # (copies, latent_dim), which policy acted
 
 
 class TaskBatch(NamedTuple):
-    """Transitions of several tasks.
+    """Transitions of several tasks."""
 
-    observations (tasks, batch, obs_dim), actions (tasks, batch, action_dim), next_observations
-    (tasks, batch, obs_dim), rewards (tasks, batch), terminated (tasks, batch), features (tasks,
-    batch, feat_dim), ended (tasks, batch): whether the episode or its recording ends there.
-    """
-
-    observations: th.Tensor
-    actions: th.Tensor
-    next_observations: th.Tensor
-    rewards: th.Tensor
-    terminated: th.Tensor
-    features: th.Tensor
-    ended: th.Tensor
+    observations: th.Tensor  # (tasks, batch, obs_dim)
+    actions: th.Tensor  # (tasks, batch, action_dim)
+    next_observations: th.Tensor  # (tasks, batch, obs_dim)
+    rewards: th.Tensor  # (tasks, batch)
+    terminated: th.Tensor  # (tasks, batch)
+    features: th.Tensor  # (tasks, batch, feat_dim)
+    ended: th.Tensor  # (tasks, batch), whether the episode or its recording ends there
 
 
 class TaskReplayBuffer(ReplayBuffer):
@@ -67,10 +51,7 @@ class TaskReplayBuffer(ReplayBuffer):
     float32. Memory is taken as it fills.
 
     :param buffer_size: Transitions kept per task
-    :param observation_space: Flat Box
-    :param action_space: Flat Box
-    :param device: Where the transitions live
-    :param n_tasks: Number of training tasks
+    :param observation_space: Flat Box, as the action space
     :param feature_dim: Width of the reward features
     """
 
@@ -143,15 +124,11 @@ class TaskReplayBuffer(ReplayBuffer):
             self.rows[task, -1] = self.rows[task, 0]
             self.positions[task] = (start + steps) % self.buffer_size
             self.counts[task] = min(count + steps, self.buffer_size)
-        self._counts_on_device = th.as_tensor(self.counts, dtype=th.float32, device=self.device)
-        self.full = bool((self.counts == self.buffer_size).all())
+        self._note_counts()
 
     def draw_slots(self, source_tasks: th.Tensor, generator: th.Generator) -> th.Tensor:
-        """Draw one stored transition for each entry, uniformly from its task's own: its slot, for
-        :meth:`at`.
-
-        :param source_tasks: (tasks, batch) indices of the tasks to draw from
-        :param generator: torch generator on this buffer's device
+        """Draw one stored transition for each entry of (tasks, batch) indices of tasks, uniformly
+        from its task's own: its slot, for :meth:`at`.
         """
         uniform = th.rand(source_tasks.shape, generator=generator, device=self.device)
         return (uniform * self._counts_on_device[source_tasks]).long()
@@ -161,23 +138,15 @@ class TaskReplayBuffer(ReplayBuffer):
         return self.at(source_tasks, self.draw_slots(source_tasks, generator))
 
     def at(self, tasks: th.Tensor, slots: th.Tensor) -> TaskBatch:
-        """The transitions in some slots. The next slot, round the ring, holds the next step, but
-        where an episode or its recording ended.
-
-        :param tasks: (...) indices of tasks
-        :param slots: (...), below the tasks' ``counts``
+        """The transitions in slots (...), below their tasks' ``counts``, of tasks (...). The next
+        slot, round the ring, holds the next step, but where an episode or its recording ended.
         """
         return self._gather(tasks * self.rows.shape[1] + slots)
 
     def transitions(self, task: int) -> TaskBatch:
-        """All transitions of a task, in the order of their slots: those of :class:`TaskBatch`, each
-        (1, count, ...).
-
-        :param task: Index of the task
-        """
-        return self._gather(
-            task * self.rows.shape[1] + th.arange(int(self.counts[task]), device=self.device)[None]
-        )
+        """All transitions of a task, in the order of their slots, each (1, count, ...)."""
+        slots = th.arange(int(self.counts[task]), device=self.device)[None]
+        return self._gather(task * self.rows.shape[1] + slots)
 
     def state(self) -> dict[str, Any]:
         """Everything needed to continue, without unused room."""
@@ -202,11 +171,12 @@ class TaskReplayBuffer(ReplayBuffer):
             self.rows[:, :used] = state["rows"].to(self.device)
             self.rows[:, -1] = self.rows[:, 0]
         # a file gives tensors back where there were arrays
-        self.counts, self.positions, self._free_ends = (
-            th.as_tensor(state[name]).numpy().copy()
-            for name in ("counts", "positions", "free_ends")
-        )
+        arrays = (state[name] for name in ("counts", "positions", "free_ends"))
+        self.counts, self.positions, self._free_ends = (np.array(array) for array in arrays)
         self.ends = state["ends"].to(self.device, copy=True)
+        self._note_counts()
+
+    def _note_counts(self) -> None:
         self._counts_on_device = th.as_tensor(self.counts, dtype=th.float32, device=self.device)
         self.full = bool((self.counts == self.buffer_size).all())
 
@@ -229,35 +199,27 @@ class TaskReplayBuffer(ReplayBuffer):
         floats[..., : self.obs_dim] = obs
         floats[..., self.obs_dim : mark - 1] = segment.features[:, -steps:]
         floats[..., mark - 1] = segment.rewards[:, -steps:]
+        units = np.clip(segment.actions[:, -steps:], -1.0, 1.0) * ACTION_UNITS
         actions = packed.view(np.int16)[..., 2 * (mark + 1) :][..., : self.action_dim]
-        np.rint(
-            np.clip(segment.actions[:, -steps:], -1.0, 1.0) * ACTION_UNITS,
-            out=actions,
-            casting="unsafe",
-        )
+        np.rint(units, out=actions, casting="unsafe")
         return th.from_numpy(packed).to(self.device), is_end, terminated
 
     def _gather(self, flat: th.Tensor) -> TaskBatch:
         """Transitions (...) at row numbers (...) over all tasks."""
-        words, (all_rows, obs_dim) = (
-            sum(self.widths),
-            (self.rows.shape[0] * self.rows.shape[1], self.obs_dim),
-        )
+        words, obs_dim, mark = sum(self.widths), self.obs_dim, self._mark
         # the very last row repeats another and is never drawn, so that every row has a successor
-        with_successor = self.rows.as_strided((all_rows - 1, words + obs_dim), (words, 1))
+        drawable = self.rows.shape[0] * self.rows.shape[1] - 1
+        with_successor = self.rows.as_strided((drawable, words + obs_dim), (words, 1))
         rows = with_successor.index_select(0, flat.reshape(-1))
-        floats, mark = rows.view(th.float32), self._mark
-        marks = rows[
-            :, mark
-        ].contiguous()  # what is dense is converted and searched several times as fast
+        floats = rows.view(th.float32)
+        # what is dense is converted and searched several times as fast
+        marks = rows[:, mark].contiguous()
         ends = marks.nonzero().view(-1)
-        floats[:, words:].index_copy_(
-            0, ends, self.ends.index_select(0, marks.index_select(0, ends).abs())
-        )
+        after_ends = self.ends.index_select(0, marks.index_select(0, ends).abs())
+        floats[:, words:].index_copy_(0, ends, after_ends)
         ended, terminated = marks != 0, (marks < 0).float()
-        actions = (rows[:, mark + 1 : words].contiguous().view(th.int16) * (1.0 / ACTION_UNITS))[
-            :, : self.action_dim
-        ]
+        units = rows[:, mark + 1 : words].contiguous().view(th.int16)
+        actions = (units * (1.0 / ACTION_UNITS))[:, : self.action_dim]
         floats, shape = floats.unflatten(0, flat.shape), flat.shape
         return TaskBatch(
             floats[..., :obs_dim],
@@ -271,20 +233,14 @@ class TaskReplayBuffer(ReplayBuffer):
 
     def _reserve(self, rows_per_task: int) -> None:
         capacity = self.capacity
-        if rows_per_task > capacity:
-            new_capacity = min(
-                self.buffer_size, max(INITIAL_ROWS_PER_TASK, 2 * capacity, rows_per_task)
-            )
-            # not zeros: the system gives pages that nobody writes to no memory
-            grown = th.empty(
-                self.n_tasks,
-                new_capacity + 1,
-                self.rows.shape[2],
-                dtype=th.int32,
-                device=self.device,
-            )
-            grown[:, :capacity] = self.rows[:, :capacity]
-            self.rows = grown
+        if rows_per_task <= capacity:
+            return
+        wanted = max(INITIAL_ROWS_PER_TASK, 2 * capacity, rows_per_task)
+        # not zeros: the system gives pages that nobody writes to no memory
+        shape = (self.n_tasks, min(self.buffer_size, wanted) + 1, self.rows.shape[2])
+        grown = self.rows.new_empty(shape)
+        grown[:, :capacity] = self.rows[:, :capacity]
+        self.rows = grown
 
     def _release_ends(self, overwritten: th.Tensor) -> None:
         marks = overwritten[:, self._mark].cpu().numpy()
@@ -297,13 +253,11 @@ class TaskReplayBuffer(ReplayBuffer):
             used = len(self.ends)
             added = max(missing, used // 4, INITIAL_ROWS_PER_TASK)
             self.ends = th.cat([self.ends, self.ends.new_zeros(added, self.obs_dim)])
-            self._free_ends = np.concatenate(
-                [self._free_ends, np.arange(used, used + added, dtype=np.int32)]
-            )
+            new = np.arange(used, used + added, dtype=np.int32)
+            self._free_ends = np.concatenate([self._free_ends, new])
         numbers, self._free_ends = np.split(self._free_ends, [len(observations)])
-        self.ends[th.from_numpy(numbers).to(self.device)] = th.as_tensor(
-            observations, dtype=th.float32, device=self.device
-        )
+        kept = th.as_tensor(observations, dtype=th.float32, device=self.device)
+        self.ends[th.from_numpy(numbers).to(self.device)] = kept
         return numbers
 
 
@@ -311,15 +265,13 @@ class TaskReplayBuffer(ReplayBuffer):
 class ContextStore:
     """What the last epoch collected: the encoder's contexts and the preference labels. Replaced
     every epoch.
-
-    :param transitions: (tasks, steps, context_dim) standardised (s, a, s', r[, Q])
-    :param rewards: (tasks, steps) in the environment's units
-    :param returns: (tasks, tasks), J[i, j] of task j's policy on task i; NaN where it was not
-        measured
-    :param features: (tasks, steps, feat_dim) reward features, where contexts are relabelled
     """
 
+    #: (tasks, steps, context_dim) standardised (s, a, s', r[, Q])
     transitions: th.Tensor
+    #: (tasks, steps) in the environment's units
     rewards: th.Tensor
+    #: (tasks, tasks), J[i, j] of task j's policy on task i; NaN where it was not measured
     returns: th.Tensor
+    #: (tasks, steps, feat_dim) reward features, where contexts are relabelled
     features: th.Tensor | None = None

@@ -6,12 +6,7 @@ import numpy as np
 
 
 def check_whole(name: str, value: Any, least: int, most: int | None = None) -> None:
-    """Refuse what is no whole number, or too small, or too large.
-
-    :param name: Of the argument
-    :param value: NumPy's whole numbers are taken too; True and False are none
-    :raises ValueError: names the argument and its value
-    """
+    """Refuse what is no whole number (NumPy's are, True and False are not), too small or too large."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise ValueError(f"`{name}` must be a whole number, but is {value!r}")
     if value < least:
@@ -21,12 +16,7 @@ def check_whole(name: str, value: Any, least: int, most: int | None = None) -> N
 
 
 def check_number(name: str, value: Any, low: float = -np.inf, high: float = np.inf) -> None:
-    """Refuse what is no finite number from ``low`` to ``high``.
-
-    :param name: Of the argument
-    :param value: True and False are none
-    :raises ValueError: names the argument and its value
-    """
+    """Refuse what is no finite number from ``low`` to ``high``; True and False are none."""
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
     if not (number and np.isfinite(value)):
         raise ValueError(f"`{name}` must be a finite number, but is {value!r}")
@@ -37,18 +27,13 @@ def check_number(name: str, value: Any, low: float = -np.inf, high: float = np.i
 
 
 def check_number_or_auto(name: str, value: Any, low: float = -np.inf) -> None:
-    """Refuse what is neither a number from ``low`` on nor "auto" (or "auto_" and such a number).
-
-    :param name: Of the argument
-    :raises ValueError: names the argument and its value
-    """
-    if isinstance(value, str):
-        word, _, start = value.partition("_")
-        try:
-            known = word == "auto" and (not start or float(start) > 0)
-        except ValueError:
-            known = False
-        if not known:
-            raise ValueError(f'`{name}` must be a number or "auto", but is {value!r}')
-    else:
-        check_number(name, value, low)
+    """Refuse what is neither a number from ``low`` on nor "auto" (or "auto_" and such a number)."""
+    if not isinstance(value, str):
+        return check_number(name, value, low)
+    word, _, start = value.partition("_")
+    try:
+        known = word == "auto" and (not start or float(start) > 0)
+    except ValueError:
+        known = False
+    if not known:
+        raise ValueError(f'`{name}` must be a number or "auto", but is {value!r}')

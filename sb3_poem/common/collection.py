@@ -14,19 +14,17 @@ OnStep = Callable[[dict[str, Any]], bool]
 def check_finite(
     name: str, values: np.ndarray, task_ids: np.ndarray, episodes: np.ndarray, step: int
 ) -> None:
-    """:raises ValueError: if any copy's values are NaN or infinite; names the copy, its task and its
-    episode
-    """
-    if np.isfinite(
-        values.sum()
-    ):  # then all are; the sum of large finite values may overflow, which the lines below sort out
+    """Refuse NaN and infinity in any copy's values; names the copy, its task and its episode."""
+    # then all are; the sum of large finite values may overflow, which the lines below sort out
+    if np.isfinite(values.sum()):
         return
     finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
     if not finite.all():
         copy = int(np.argmin(finite))
         raise ValueError(
-            f"the environment returned {name} that are NaN or infinite: copy {copy}, training task {int(task_ids[copy])}, "
-            f"episode {int(episodes[copy])}, step {step}: {values[copy]}. Training stops here, before the networks see them."
+            f"the environment returned {name} that are NaN or infinite: copy {copy}, training task "
+            f"{int(task_ids[copy])}, episode {int(episodes[copy])}, step {step}: {values[copy]}. "
+            "Training stops here, before the networks see them."
         )
 
 
@@ -43,29 +41,26 @@ def collect_segment(
     """Run every copy for one horizon on its task; an episode that ends early is followed by another
     of the same task.
 
-    :param family: The environment
     :param act: Maps observations (copies, obs_dim) to actions in the environment's units and in
         [-1, 1]
     :param task_ids: (copies,) index of each copy's task
     :param tasks: (copies, task_dim)
     :param latents: (copies, latent_dim), noted in the segment
-    :param seed: Seed of the copies' resets
+    :param seed: Of the copies' resets
     :param episode_counts: (copies,) episodes begun so far, counted on here; for messages
-    :param on_step: Given the local variables of a step; False ends the collection
-    :return: The experience, or None if ``on_step`` ended the collection
+    :param on_step: Given the local variables of a step; False ends the collection, without result
     :raises ValueError: if the environment returns NaN or infinity, or what
         :meth:`FamilyView.check_experience` refuses
     """
     obs = family.reset(tasks, seed)
     check_finite("observations", obs, task_ids, episode_counts, 0)
     n, horizon = family.num_envs, family.horizon
-    assert family.env.action_space.shape is not None
-    action_dim = family.env.action_space.shape[0]
+    action_dim, obs_dim = family.action_dim, obs.shape[1]
     segment = Segment(
         task_ids=task_ids,
-        observations=np.empty((n, horizon, obs.shape[1]), dtype=np.float32),
+        observations=np.empty((n, horizon, obs_dim), dtype=np.float32),
         actions=np.empty((n, horizon, action_dim), dtype=np.float32),
-        next_observations=np.empty((n, horizon, obs.shape[1]), dtype=np.float32),
+        next_observations=np.empty((n, horizon, obs_dim), dtype=np.float32),
         rewards=np.empty((n, horizon)),
         terminated=np.zeros((n, horizon), dtype=np.float32),
         features=np.empty((n, horizon, family.reward_feature_dim)),
@@ -87,18 +82,14 @@ def collect_segment(
                 next_obs[copy] = infos[copy]["terminal_observation"]
                 segment.terminated[copy, step] = not infos[copy].get("TimeLimit.truncated", False)
         features = family.features_of(infos)
-        for name, values in (
-            ("observations", next_obs),
-            ("rewards", rewards),
-            ("reward features", features),
-        ):
+        returned = {"observations": next_obs, "rewards": rewards, "reward features": features}
+        for name, values in returned.items():
             check_finite(name, values, task_ids, episode_counts, step)
         segment.observations[:, step] = obs
         segment.actions[:, step] = scaled_actions
         segment.next_observations[:, step] = next_obs
-        segment.rewards[:, step] = rewards.astype(
-            np.float32
-        )  # as most VecEnvs give them; SubprocVecEnv does not round
+        # as most VecEnvs give them; SubprocVecEnv does not round
+        segment.rewards[:, step] = rewards.astype(np.float32)
         segment.features[:, step] = features
         segment.first_episode[:, step] = in_first_episode
         in_first_episode &= ~dones
@@ -114,17 +105,15 @@ def relabelled_returns(
     features: np.ndarray,
     mask: np.ndarray,
 ) -> np.ndarray:
-    """Returns of trajectories under every task, without another environment step.
+    """Returns of trajectories under every task, (tasks, trajectories), without another environment
+    step.
 
-    :param compute_rewards: The family's reward function
     :param tasks: (tasks, task_dim)
     :param features: (trajectories, steps, feat_dim)
     :param mask: (trajectories, steps), which steps count
-    :return: (tasks, trajectories)
     """
     returns = np.empty((len(tasks), len(features)))
-    for index, task in enumerate(
-        tasks
-    ):  # one row at a time bounds the memory at trajectories x steps
-        returns[index] = (compute_rewards(task, features) * mask).sum(axis=1)
+    # one row at a time bounds the memory at trajectories x steps
+    for row, task in zip(returns, tasks, strict=True):
+        row[:] = (compute_rewards(task, features) * mask).sum(axis=1)
     return returns

@@ -15,7 +15,7 @@ BLOCK_ROWS = 2000
 def decoded_sums(
     mlp: MLP, transitions: th.Tensor, lengths: Sequence[int], embeddings: th.Tensor, dtype: th.dtype
 ) -> th.Tensor:
-    """The decoder's outputs, summed over each trajectory, under each embedding.
+    """The decoder's outputs, summed over each trajectory, under each embedding: (m, trajectories).
 
     The first layer sees the transitions once, not once for each embedding. No gradients.
 
@@ -24,15 +24,13 @@ def decoded_sums(
     :param lengths: Steps of each trajectory
     :param embeddings: (m, latent_dim)
     :param dtype: Arithmetic of the hidden layers
-    :return: (m, number of trajectories)
     """
     sums = transitions.new_empty(len(embeddings), len(lengths))
     first, start, rows = 0, 0, 0
     for index, length in enumerate(lengths):
         if rows and rows + length > BLOCK_ROWS:
-            sums[:, first:index] = _group_sums(
-                mlp, transitions[start : start + rows], lengths[first:index], embeddings, dtype
-            )
+            group = transitions[start : start + rows], lengths[first:index]
+            sums[:, first:index] = _group_sums(mlp, *group, embeddings, dtype)
             first, start, rows = index, start + rows, 0
         rows += length
     sums[:, first:] = _group_sums(mlp, transitions[start:], lengths[first:], embeddings, dtype)
@@ -44,19 +42,18 @@ def _group_sums(
 ) -> th.Tensor:
     first, *others = [*mlp.hidden, mlp.output]
     assert isinstance(first, th.nn.Linear)
-    of_transitions, of_embeddings = first.weight.split(
-        [transitions.shape[-1], embeddings.shape[-1]], dim=1
-    )
+    widths = [transitions.shape[-1], embeddings.shape[-1]]
+    of_transitions, of_embeddings = first.weight.split(widths, dim=1)
     base = (transitions @ of_transitions.T + first.bias).to(dtype)  # (rows, width)
     shifts = (embeddings @ of_embeddings.T).to(dtype)  # (m, width)
     middle = [(layer.weight.T.to(dtype), layer.bias.to(dtype)) for layer in others[:-1]]  # type: ignore[union-attr, operator]
     last = mlp.output.weight[0].to(dtype)
     block = max(1, BLOCK_ROWS // len(base))
-    # the same memory for every block: to get new pages from the system takes longer than to fill
-    # them
+    # the same memory for every block: new pages from the system take longer than to fill them
     rows = min(block, len(shifts)) * len(base)
     buffers = [
-        base.new_empty(rows, len(bias)) for bias in [first.bias, *(bias for _, bias in middle)]
+        base.new_empty(rows, width)
+        for width in (len(first.bias), *(len(bias) for _, bias in middle))
     ]
     sums = []
     for some in shifts.split(block):
@@ -67,9 +64,7 @@ def _group_sums(
             x = th.addmm(bias, mlp.activation(x), weight, out=buffer[:rows])
         if others:
             x = mlp.activation(x) @ last
-        values = x.view(len(some), -1).float()
-        sums.append(
-            th.stack([part.sum(dim=1) for part in values.split(list(lengths), dim=1)], dim=1)
-        )
+        parts = x.view(len(some), -1).float().split(list(lengths), dim=1)
+        sums.append(th.stack([part.sum(dim=1) for part in parts], dim=1))
     result = th.cat(sums)
     return result + mlp.output.bias * result.new_tensor(lengths) if others else result

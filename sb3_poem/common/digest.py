@@ -7,10 +7,8 @@ import torch as th
 
 
 def digest_of(tensors: Mapping[str, th.Tensor]) -> str:
-    """The same for equal numbers under equal names, on whatever device and of whatever type.
-
-    :param tensors: By name
-    :return: Hexadecimal
+    """Hexadecimal; the same for equal numbers under equal names, on whatever device and of whatever
+    type.
     """
     digest = hashlib.sha256()
     for name in sorted(tensors):

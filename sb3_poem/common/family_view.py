@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -11,12 +12,12 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
 from poem_envs.family import Symmetry, definition_problem
+from sb3_poem.common.wrappers import CHANGING, CHANGING_KINDS, HARMLESS, WrapperError
 
 if TYPE_CHECKING:
-    from stable_baselines3.common.vec_env import VecEnv
-
     from sb3_poem.common.buffers import Segment
 
 # Arguments that change how an environment is drawn, not what it is.
@@ -26,13 +27,14 @@ DRAWING_ARGUMENTS = {"render_mode", "render_task"}
 TEST_TASK_STREAM = 0x7E57
 #: Steps by which it is seen whether a wrapper changes a family
 COMPARED_STEPS = 10
+NO_FEATURES = (
+    'the environment gives no info["reward_features"], from which returns are computed; '
+    "it must be a task family (poem_envs.TaskFamily)"
+)
 
 
 def no_family(env: str) -> str:
-    """What to say of an environment that is no task family.
-
-    :param env: How it describes itself
-    """
+    """What to say of an environment that is no task family, but describes itself so."""
     return (
         f"env {env} is no task family: an environment whose reward depends on a hidden task. "
         "Subclass poem_envs.TaskFamily, or make one of a goal-conditioned environment by "
@@ -42,9 +44,9 @@ def no_family(env: str) -> str:
 
 
 class FamilyView:
-    """What a vectorised environment is as a task family: the one way to ask it.
+    """What a vectorised environment, whose copies are :class:`poem_envs.TaskFamily` environments,
+    is as a task family: the one way to ask it.
 
-    :param env: Vectorised environment whose copies are :class:`poem_envs.TaskFamily` environments
     :raises ValueError: if it is of no task family
     """
 
@@ -53,9 +55,10 @@ class FamilyView:
 
     def __init__(self, env: VecEnv) -> None:
         if not env.has_attr("shared_dynamics"):  # which a subclass of TaskFamily has without a word
-            raise ValueError(no_family(str(env.env_method("__str__", indices=[0])[0])))
+            raise ValueError(no_family(env.env_method("__str__", indices=[0])[0]))
         self.env = env
         self.observation_space, self.action_space = env.observation_space, env.action_space
+        self.action_dim = spaces.flatdim(env.action_space)
         self.task_space: spaces.Box = self._get("task_space")
         self.reward_feature_dim: int = self._get("reward_feature_dim")
         self.all_tasks: np.ndarray | None = self._get("all_tasks")
@@ -78,15 +81,12 @@ class FamilyView:
         Wrappers that change what is seen, done or paid are refused: those of Gymnasium and SB3 by
         name, others by the first experience, see :meth:`check_experience`.
 
-        :param env: As for the class
         :param horizon: Steps of an episode; None reads the time limit of the environment's
             registration
         :raises ValueError: if not
         """
-        from sb3_poem.common.wrappers import unknown_wrappers
-
         family = cls(env)
-        family._unknown_wrappers = ", ".join(unknown_wrappers(env))
+        family._unknown_wrappers = ", ".join(family.unknown_wrappers())
         problem = definition_problem(family)
         if problem is not None:
             raise ValueError(f"env {env.env_method('__str__', indices=[0])[0]}: {problem}")
@@ -100,11 +100,13 @@ class FamilyView:
         steps = horizon if limit is None else limit
         if steps is None:
             raise ValueError(
-                "horizon is unknown: register the environment with max_episode_steps, or pass horizon=<steps>"
+                "horizon is unknown: register the environment with max_episode_steps, or pass "
+                "horizon=<steps>"
             )
         if horizon is not None and horizon != steps:
             raise ValueError(
-                f"horizon is {horizon}, but the environment ends episodes after {limit} steps; they must agree"
+                f"horizon is {horizon}, but the environment ends episodes after {limit} steps; "
+                "they must agree"
             )
         if steps < 1:
             raise ValueError(f"horizon must be at least 1 step, got {steps}")
@@ -128,19 +130,49 @@ class FamilyView:
             and not (name in registered and _equal(registered[name], value))
         }
 
+    def unknown_wrappers(self) -> list[str]:
+        """The names of those wrappers of which it is not known whether they change the family.
+
+        :raises WrapperError: if there are such as do
+        """
+        env, names = self.env, self._wrapper_names()
+        changing = [name for name in names if name in CHANGING]
+        changing += [kind.__name__ for kind in CHANGING_KINDS if any(env.env_is_wrapped(kind))]
+        if changing:
+            raise WrapperError(
+                f"env must not be wrapped in {changing[0]} (its wrappers: {', '.join(names)})"
+            )
+        unknown = [name for name in names if name not in HARMLESS]
+        for space in ("observation_space", "action_space") if unknown else ():
+            own, given = getattr(self._get("unwrapped"), space), getattr(env, space)
+            if own != given:
+                raise WrapperError(
+                    f"env's wrappers ({', '.join(names)}) must leave {space} {own}, but make it "
+                    f"{given}"
+                )
+        return unknown
+
+    def _wrapper_names(self) -> list[str]:
+        """Of the wrappers around the environment and around its copies, outermost first."""
+        env, names = self.env, []
+        while isinstance(env, VecEnvWrapper):
+            names.append(type(env).__name__)
+            env = env.venv
+        for chain in dict.fromkeys(env.env_method("__str__")):  # which SubprocVecEnv gives too
+            words = re.findall(r"<([^<>]+)", chain)
+            names += words[: -1 if words and words[-1].endswith(" instance") else -2]
+        return list(dict.fromkeys(names))
+
     def check_experience(self, tasks: np.ndarray, seed: int, segment: Segment) -> None:
         """Whether rewards are :meth:`compute_rewards`'s, and unknown wrappers leave the family as
         it is. The first call looks, and the others take its word.
 
         :param tasks: (copies, task_dim), those of the segment
         :param seed: Of the reset that it began with
-        :param segment: Experience of all copies
         :raises ValueError: if not
         """
         if self._experience_is_right:
             return
-        from sb3_poem.common.wrappers import WrapperError
-
         wrappers = self._unknown_wrappers
         expected = self.compute_rewards(tasks[:, None, :], segment.features)
         if expected.shape != segment.rewards.shape:
@@ -165,15 +197,14 @@ class FamilyView:
 
     def _lives_through(self, task: np.ndarray, seed: int, segment: Segment) -> bool:
         """Whether the family without its wrappers repeats the first copy's experience."""
-        from sb3_poem.common.wrappers import WrapperError
-
         if self.env_id is None:
             try:
                 twin = cloudpickle.loads(cloudpickle.dumps(self._get("unwrapped")))
             except Exception as error:
                 raise WrapperError(
-                    f"whether env's wrappers {self._unknown_wrappers} change it cannot be told without "
-                    f"a copy of env, which {type(error).__name__} prevents ({error}): register it"
+                    f"whether env's wrappers {self._unknown_wrappers} change it cannot be told "
+                    f"without a copy of env, which {type(error).__name__} prevents ({error}): "
+                    "register it"
                 ) from error
         else:
             twin = gym.make(self.env_id, disable_env_checker=True, **self.env_kwargs).unwrapped
@@ -202,7 +233,8 @@ class FamilyView:
         task = self._get("task")
         if task is None:
             raise RuntimeError(
-                "the environment has no task before its first reset(): reset it, or give the oracle its `task`"
+                "the environment has no task before its first reset(): reset it, or give the "
+                "oracle its `task`"
             )
         return np.asarray(task, dtype=np.float64)
 
@@ -214,11 +246,12 @@ class FamilyView:
     def _get(self, name: str, default: Any = None) -> Any:
         return self.env.get_attr(name, indices=[0])[0] if self.env.has_attr(name) else default
 
+    def _call(self, method: str, *arguments: Any, dtype: Any = np.float64) -> np.ndarray:
+        return np.asarray(self.env.env_method(method, *arguments, indices=[0])[0], dtype=dtype)
+
     def sample_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draw (n, task_dim) tasks from the family's distribution."""
-        return np.asarray(
-            self.env.env_method("sample_tasks", n, rng, indices=[0])[0], dtype=np.float64
-        )
+        return self._call("sample_tasks", n, rng)
 
     def test_tasks(self, n: int, seed: int) -> np.ndarray:
         """(n, task_dim) tasks that no seed gives a model to train on. Those of a finite family are
@@ -231,10 +264,7 @@ class FamilyView:
 
     def compute_rewards(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
         """Rewards (...) of reward features (..., feat_dim) under tasks (..., task_dim)."""
-        return np.asarray(
-            self.env.env_method("compute_rewards", tasks, features, indices=[0])[0],
-            dtype=np.float64,
-        )
+        return self._call("compute_rewards", tasks, features)
 
     @property
     def has_potential(self) -> bool:
@@ -243,9 +273,7 @@ class FamilyView:
 
     def compute_potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
         """Potentials (...) of observations (..., obs_dim) under tasks (..., task_dim)."""
-        return np.asarray(
-            self.env.env_method("compute_potential", tasks, observations, indices=[0])[0]
-        )
+        return self._call("compute_potential", tasks, observations, dtype=None)
 
     def set_tasks(self, tasks: np.ndarray) -> None:
         """Give copy i the task ``tasks[i]``, from its next reset on."""
@@ -262,15 +290,15 @@ class FamilyView:
         A task family that was never given a task draws one whenever it is reset with a seed; a
         reset without a seed keeps the task. So a family's generators are replaced, and its next
         reset needs no seed: the episode is the same as after a seeded reset, and the task stays.
-        Nobody looks at the task for that, except where copies have no generators to replace
-        (``TaskVecEnv``): it is told to keep them. A task that was chosen for the next reset is the
-        one that stays, and seeds that are pending are used up first.
+        Copies that have no generators to replace (``TaskVecEnv``) are told to keep their tasks. A
+        task that was chosen for the next reset is the one that stays, and seeds that are pending
+        are used up first.
 
         :param seeds: One a copy
         """
         env: Any = self.env
         if any(seed is not None for seed in env.unwrapped._seeds):
-            env.reset()  # who seeded it, as make_vec_env always does, chose its tasks, not these episodes
+            env.reset()  # as make_vec_env seeds, to choose tasks, not these episodes
         if not hasattr(env, "keep_tasks"):
             for copy, seed in enumerate(seeds):
                 env.set_attr("np_random", np.random.default_rng(seed), indices=[copy])
@@ -293,39 +321,45 @@ class FamilyView:
 
     def features_of(self, infos: list[dict[str, Any]]) -> np.ndarray:
         """Reward features (num_envs, feat_dim) of the last step."""
-        fast: np.ndarray | None = getattr(self.env, "last_reward_features", None)
-        if fast is not None:
-            return fast
-        return np.stack([info["reward_features"] for info in infos])
+        features = reward_features(self.env, infos)
+        if features is None:
+            raise ValueError(NO_FEATURES)
+        return features
 
     def check_same_family(self, task_space: spaces.Box, reward_feature_dim: int) -> None:
         """:raises ValueError: if a model that was made for another family is given this environment"""
         if self.task_space != task_space or self.reward_feature_dim != reward_feature_dim:
             raise ValueError(
-                f"the model was trained for tasks in {task_space} with {reward_feature_dim} reward features, but "
-                f"env ({self.env_id}) has tasks in {self.task_space} with {self.reward_feature_dim}. "
-                "Pass an environment of the model's own family."
+                f"the model was trained for tasks in {task_space} with {reward_feature_dim} reward "
+                f"features, but env ({self.env_id}) has tasks in {self.task_space} with "
+                f"{self.reward_feature_dim}. Pass an environment of the model's own family."
             )
+
+
+def reward_features(env: VecEnv, infos: Sequence[dict[str, Any]]) -> np.ndarray | None:
+    """(num_envs, feat_dim) of the last step, as one array where the environment has it so; None
+    where it gives none.
+    """
+    fast: np.ndarray | None = getattr(env, "last_reward_features", None)
+    if fast is not None:
+        return fast
+    if any("reward_features" not in info for info in infos):
+        return None
+    return np.stack([info["reward_features"] for info in infos])
 
 
 def seed_copies(vec_env: VecEnv, seeds: Sequence[int]) -> None:
     """Seed every copy's next reset by itself. ``VecEnv.seed(s)`` can only give copy i the seed s +
     i, and two rollouts that are compared should start alike.
-
-    :param vec_env: Any SB3 vector environment.
-    :param seeds: One a copy.
     """
     base = vec_env.unwrapped
     base.seed(seeds[0])
-    base._seeds = list(
-        seeds
-    )  # SB3's own list of "seeds to be used in the next call to env.reset()"
+    # SB3's own list of "seeds to be used in the next call to env.reset()"
+    base._seeds = list(seeds)
 
 
 def vectorised(env: gym.Env | VecEnv) -> VecEnv:
     """The same environment as a vectorised one, of one copy if it is not one."""
-    from stable_baselines3.common.vec_env import DummyVecEnv
-
     return DummyVecEnv([lambda: env]) if isinstance(env, gym.Env) else env
 
 

@@ -14,7 +14,7 @@ def write_atomically(
     """Write a file completely or not at all: a crash, a kill or a full disk leaves the previous
     file whole.
 
-    :param path: Where; missing folders are made
+    :param path: Missing folders are made
     :param content: What, or a function that writes it to an open file
     :raises OSError: if the folder cannot be written or the disk is full; names the path
     """
@@ -30,10 +30,9 @@ def write_atomically(
         os.replace(temporary, path)
         temporary = None
     except OSError as error:
-        raise OSError(
-            error.errno,
-            f"could not write {path} ({error.strerror}); what was there before, if anything, is untouched",
-        ) from error
+        before = "what was there before, if anything, is untouched"
+        message = f"could not write {path} ({error.strerror}); {before}"
+        raise OSError(error.errno, message) from error
     finally:  # an interrupt from the keyboard leaves nothing behind either
         if temporary is not None:
             with contextlib.suppress(OSError):

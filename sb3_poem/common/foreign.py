@@ -20,28 +20,24 @@ WORD = re.compile(r"[\w-]{0,100}", re.ASCII)
 #: Which an image depends on; of a family of one's own they may mean something else, which only its
 #: user knows
 IMAGE_ARGUMENTS = DRAWING_ARGUMENTS | {
-    "width",
-    "height",
-    "render_quality",
-    "max_geom",
-    "visual_options",
+    *("width", "height", "render_quality", "max_geom", "visual_options"),
+    *("camera_id", "camera_name", "default_camera_config"),
 }
-IMAGE_ARGUMENTS |= {"camera_id", "camera_name", "default_camera_config"}
 # How far an argument may be from its default, and how many numbers it may hold.
 TIMES_DEFAULT, LONGEST = 100, 64
 
 
 def check_env_id(env_id: Any, source: str) -> None:
-    """Refuse an id that would import a module, or is none.
+    """Refuse what is not a registered environment's plain id, which imports no module.
 
     :param env_id: From a file; None where a model has none
     :param source: Of the file, for the message
-    :raises ValueError: if it is another thing than a registered environment's plain id
     """
     if env_id is not None and not (isinstance(env_id, str) and PLAIN_ID.fullmatch(env_id)):
         raise ValueError(
-            f"{source}: env_id is {_short(env_id)}, but an id that comes from a file must be a plain one, as "
-            "'poem/PointGoal-v0', without a module to import; name modules by --gym-packages, or import them in Python"
+            f"{source}: env_id is {_short(env_id)}, but an id that comes from a file must be a "
+            "plain one, as 'poem/PointGoal-v0', without a module to import; name modules by "
+            "--gym-packages, or import them in Python"
         )
 
 
@@ -52,14 +48,13 @@ def environment_of(
     given_id: str | None = None,
     given_kwargs: Mapping[str, Any] | None = None,
 ) -> tuple[str, dict[str, Any]]:
-    """The environment for a model: the one that its file names, unless the user names another.
+    """The environment for a model, id and arguments for ``gym.make``: the one that its file names,
+    unless the user names another.
 
     :param source: The model's name, for the message
-    :param env_id: From its file
-    :param env_kwargs: From its file
+    :param env_id: From its file, as ``env_kwargs``
     :param given_id: From the user; taken as it is
     :param given_kwargs: From the user, in place of the file's; taken as they are
-    :return: Id and arguments, for ``gym.make``
     :raises ValueError: if nobody names an environment, or the file's id or arguments are refused
     :raises gymnasium.error.Error: if the file's environment is not registered
     """
@@ -78,8 +73,9 @@ def environment_of(
         objection = _objection(name, value, defaults)
         if objection is not None:
             raise ValueError(
-                f"{source} asks for {chosen} with {name}={_short(value)}, but {objection}. If you want it so, say so "
-                f"yourself: --env-kwargs {name}:VALUE, or in Python make the environment with it"
+                f"{source} asks for {chosen} with {name}={_short(value)}, but {objection}. If you "
+                f"want it so, say so yourself: --env-kwargs {name}:VALUE, or in Python make the "
+                "environment with it"
             )
     own = {name: tuple(value) if isinstance(value, list) else value for name, value in own.items()}
     return chosen, {**own, **given_kwargs}
@@ -110,36 +106,35 @@ def _objection(name: str, value: Any, defaults: dict[str, Any]) -> str | None:
     if name in IMAGE_ARGUMENTS:
         return "a model's file does not say how it is drawn"
     if name not in defaults:
-        return f"its class has no such argument, it has {', '.join(sorted(set(defaults) - IMAGE_ARGUMENTS)) or 'none'}"
+        known = ", ".join(sorted(set(defaults) - IMAGE_ARGUMENTS)) or "none"
+        return f"its class has no such argument, it has {known}"
     default = defaults[name]
     if isinstance(default, str) and not WORD.fullmatch(default):
         return "it names another file"
     if value is None or _fits(value, default):
         return None
+    wanted = "numbers or words" if default is None else f"the like of {default!r}"
     return (
-        f"it must be {'numbers or words' if default is None else f'the like of {default!r}'}: at most {LONGEST}, no number "
-        f"more than {TIMES_DEFAULT} times the default (or 1), no word with a dot or a slash"
+        f"it must be {wanted}: at most {LONGEST}, no number more than {TIMES_DEFAULT} times the "
+        "default (or 1), no word with a dot or a slash"
     )
 
 
 def _fits(value: Any, default: Any) -> bool:
     """Whether a value is of its default's kind (None: of any), and in proportion to it."""
-    if isinstance(default, list | tuple | np.ndarray) or (
-        default is None and isinstance(value, list)
-    ):
+    takes_list = default is None and isinstance(value, list)
+    if takes_list or isinstance(default, list | tuple | np.ndarray):
         kinds = [None] if default is None else np.ravel(default).tolist()
-        items = value if isinstance(value, list) and len(value) <= LONGEST else [[]]
-        return all(
-            not isinstance(item, list) and any(_fits(item, kind) for kind in kinds)
-            for item in items
+        return (
+            isinstance(value, list)
+            and len(value) <= LONGEST
+            and not any(isinstance(item, list) for item in value)
+            and all(any(_fits(item, kind) for kind in kinds) for item in value)
         )
     for kind in (bool, str):
         if isinstance(value, kind) or isinstance(default, kind):
-            return (
-                isinstance(value, kind)
-                and isinstance(default, kind | None)
-                and WORD.fullmatch(str(value)) is not None
-            )
+            alike = isinstance(value, kind) and isinstance(default, kind | None)
+            return alike and WORD.fullmatch(str(value)) is not None
     if not isinstance(value, int | float) or not isinstance(default, int | float | None):
         return False
     if type(default) is int and not isinstance(value, int):

@@ -22,23 +22,15 @@ class LowPrecisionMLP:
     perceptron's own, in float32.
 
     :param hidden: Hidden layers, each followed by a ReLU
-    :param output: Output layer
-    :param dtype: Arithmetic of the copies
-    :param layer_norm: Whether hidden layers are normalised before the ReLU
+    :param layer_norm: Whether they are normalised before the ReLU
     """
 
     def __init__(
-        self,
-        hidden: Sequence[nn.Linear],
-        output: nn.Linear,
-        dtype: th.dtype,
-        layer_norm: bool = False,
+        self, hidden: Sequence[nn.Linear], output: nn.Linear, dtype: th.dtype, layer_norm: bool
     ) -> None:
-        self.output = output
-        self.layer_norm = layer_norm
+        self.output, self.layer_norm, self.dtype = output, layer_norm, dtype
         alignment = 1 if layer_norm else ALIGNMENT
-        self.width = output.in_features
-        widths = [layer.in_features for layer in hidden] + [self.width]
+        widths = [*(layer.in_features for layer in hidden), output.in_features]
         padded = [-(-width // alignment) * alignment for width in widths]
         #: Column of each layer's input that is constantly 1, None without padding
         self.ones = [
@@ -47,12 +39,11 @@ class LowPrecisionMLP:
         self.parameters: list[th.Tensor] = []
         #: The float32 parameters and where their copies are
         self.pairs: list[tuple[th.Tensor, th.Tensor, tuple[slice, ...]]] = []
-        for index, layer in enumerate(hidden):
-            weight = th.zeros(
-                padded[index + 1], padded[index], dtype=dtype, device=layer.weight.device
-            )
-            bias = th.zeros(padded[index + 1], dtype=dtype, device=layer.weight.device)
-            spare = self.ones[index + 1]
+        for layer, columns, rows, spare in zip(
+            hidden, padded, padded[1:], self.ones[1:], strict=False
+        ):
+            weight = layer.weight.new_zeros(rows, columns, dtype=dtype)
+            bias = layer.weight.new_zeros(rows, dtype=dtype)
             if spare is not None:
                 bias[spare] = 1.0
             for original, copy in ((layer.weight, weight), (layer.bias, bias)):
@@ -62,7 +53,6 @@ class LowPrecisionMLP:
                 self.pairs.append((original, copy, place))
         self._constant = th.zeros(padded[0] - widths[0], device=output.weight.device)
         self._constant[:1] = 1.0
-        self.dtype = dtype
 
     def inputs(self, parts: Sequence[th.Tensor]) -> th.Tensor:
         """Concatenate (..., width) tensors into what :meth:`evaluate` takes, (..., padded width)."""
@@ -76,11 +66,10 @@ class LowPrecisionMLP:
         if frozen:
             parameters = [parameter.detach() for parameter in parameters]
         rows = x.reshape(-1, x.shape[-1])
-        out = (
-            _normalised_perceptron(rows, *parameters)
-            if self.layer_norm
-            else _Perceptron.apply(rows, self.ones, *parameters)
-        )
+        if self.layer_norm:
+            out = _normalised_perceptron(rows, *parameters)
+        else:
+            out = _Perceptron.apply(rows, self.ones, *parameters)
         return out.view(*x.shape[:-1], -1)
 
 
@@ -121,10 +110,8 @@ class _Perceptron(th.autograd.Function):
         of_parameters: list[th.Tensor | None] = [None] * (2 + 2 * n_layers)
         trained = ctx.needs_input_grad[2]
         if trained:
-            of_parameters[0], of_parameters[1] = (
-                (values[-1].t() @ low)[:width].t().float(),
-                grad.sum(dim=0),
-            )
+            of_parameters[0] = (values[-1].t() @ low)[:width].t().float()
+            of_parameters[1] = grad.sum(dim=0)
         g = low @ nn.functional.pad(out_weight.to(low.dtype), (0, room - width))
         for index in reversed(range(n_layers)):
             g = th.ops.aten.threshold_backward(g, values[index + 1], 0)

@@ -83,10 +83,7 @@ class RunningNorm(nn.Module):
 class MLP(nn.Module):
     """Multi-layer perceptron.
 
-    :param in_dim: Width of the input
-    :param out_dim: Width of the output
     :param net_arch: Widths of the hidden layers
-    :param activation_fn: Activation between layers
     :param layer_norm: Whether hidden layers are normalised before the activation
     """
 
@@ -102,9 +99,7 @@ class MLP(nn.Module):
         widths = [in_dim, *net_arch]
         activation = nn.ReLU(inplace=True) if activation_fn is nn.ReLU else activation_fn()
         self.activation = Normalised(activation) if layer_norm else activation
-        self.hidden = nn.ModuleList(
-            nn.Linear(width, next_width) for width, next_width in itertools.pairwise(widths)
-        )
+        self.hidden = nn.ModuleList(nn.Linear(*pair) for pair in itertools.pairwise(widths))
         self.output = nn.Linear(widths[-1], out_dim)
         #: The hidden layers in another arithmetic, while :class:`MixedPrecision` holds
         self.low_precision: LowPrecisionMLP | None = None
@@ -127,9 +122,8 @@ class MLP(nn.Module):
         """:meth:`forward` of an input that :meth:`inputs` has put together."""
         if self.low_precision is not None:
             return self.low_precision.evaluate(x, frozen)
-        h = x.reshape(
-            -1, x.shape[-1]
-        )  # a product of two dimensions is no view, so that activations may work in place
+        # a product of two dimensions is no view, so that activations may work in place
+        h = x.reshape(-1, x.shape[-1])
         for layer in self.hidden:
             h = self.activation(_linear(h, layer, frozen))
         return _linear(h, self.output, frozen).view(*x.shape[:-1], -1)
@@ -160,11 +154,8 @@ class _GaussianProduct(th.autograd.Function):
     def backward(ctx: Any, of_mean: th.Tensor, of_variance: th.Tensor) -> th.Tensor:  # type: ignore[override]
         means, variances, precisions, mean, variance = ctx.saved_tensors
         by_sum = (of_mean * variance).unsqueeze(-2)
-        of_precisions = (
-            (means - mean.unsqueeze(-2))
-            .mul_(by_sum)
-            .sub_((of_variance * variance.square()).unsqueeze(-2))
-        )
+        of_precisions = (means - mean.unsqueeze(-2)).mul_(by_sum)
+        of_precisions.sub_((of_variance * variance.square()).unsqueeze(-2))
         # the slope of softplus(x) = y is 1 - exp(-y); a factor at the least variance has none
         slope = th.expm1(-variances).mul_(variances >= MIN_FACTOR_VARIANCE)
         of_variances = of_precisions.mul_(precisions.square()).mul_(slope)
@@ -178,22 +169,15 @@ class ContextEncoder(nn.Module):
     posterior, as in Rakelly et al. (2019), which section 5.3 of Xu & Zhu (2025) takes over.
 
     :param in_dim: Width of one context transition
-    :param latent_dim: Dimension d of the latent
-    :param net_arch: Widths of the hidden layers
     """
 
-    def __init__(
-        self, in_dim: int, latent_dim: int, net_arch: Sequence[int] = (200, 200, 200)
-    ) -> None:
+    def __init__(self, in_dim: int, latent_dim: int, net_arch: Sequence[int]) -> None:
         super().__init__()
-        self.latent_dim = latent_dim
         self.mlp = MLP(in_dim, 2 * latent_dim, net_arch)
 
     def forward(self, context: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Posterior of every task.
-
-        :param context: (tasks, transitions, in_dim)
-        :return: mean and variance, each (tasks, latent_dim)
+        """Mean and variance of every task's posterior, each (tasks, latent_dim), from (tasks,
+        transitions, in_dim).
         """
         return _GaussianProduct.apply(self.mlp(context))
 
@@ -210,13 +194,8 @@ class _SquashedGaussian(th.autograd.Function):
         shift = log_std.exp().mul_(noise)
         pre_tanh = mean + shift
         # log(1 - tanh(x)^2) = 2 (log 2 - x - softplus(-2 x)) does not saturate
-        terms = (
-            softplus(pre_tanh * -2.0)
-            .add_(pre_tanh)
-            .mul_(2.0)
-            .sub_(log_std)
-            .addcmul_(noise, noise, value=-0.5)
-        )
+        terms = softplus(pre_tanh * -2.0).add_(pre_tanh).mul_(2.0)
+        terms.sub_(log_std).addcmul_(noise, noise, value=-0.5)
         actions = pre_tanh.tanh_()
         ctx.save_for_backward(actions, shift, raw_log_std)
         return actions, terms.sum(dim=-1).sub_(noise.shape[-1] * LOG_DENSITY_CONSTANT)
@@ -226,11 +205,9 @@ class _SquashedGaussian(th.autograd.Function):
     def backward(ctx: Any, of_actions: th.Tensor, of_log_prob: th.Tensor) -> tuple[th.Tensor, None]:  # type: ignore[override]
         actions, shift, raw_log_std = ctx.saved_tensors
         of_log_prob = of_log_prob.unsqueeze(-1)
-        # tanh' = 1 - tanh^2, and the log-probability's derivative by the value before squashing is
-        # 2 tanh
-        of_mean = of_actions.addcmul(of_actions * actions, actions, value=-1.0).addcmul_(
-            actions, of_log_prob, value=2.0
-        )
+        # tanh' = 1 - tanh^2; the log-probability's derivative by the value before squashing: 2 tanh
+        of_mean = of_actions.addcmul(of_actions * actions, actions, value=-1.0)
+        of_mean.addcmul_(actions, of_log_prob, value=2.0)
         of_log_std = (of_mean * shift).sub_(of_log_prob)
         inside = raw_log_std.clamp(LOG_STD_MIN, LOG_STD_MAX) == raw_log_std
         return th.cat([of_mean, of_log_std.mul_(inside)], dim=-1), None
@@ -239,25 +216,14 @@ class _SquashedGaussian(th.autograd.Function):
 class LatentActor(nn.Module):
     """Squashed Gaussian policy pi_theta(a | s, z_pi).
 
-    :param obs_dim: Width of a (standardised) observation
-    :param latent_dim: Width of the policy embedding
-    :param action_dim: Width of an action
-    :param net_arch: Widths of the hidden layers
-    :param activation_fn: Activation between layers
-    :param layer_norm: Whether hidden layers are normalised before the activation
+    :param architecture: Further arguments of :class:`MLP`
     """
 
     def __init__(
-        self,
-        obs_dim: int,
-        latent_dim: int,
-        action_dim: int,
-        net_arch: Sequence[int],
-        activation_fn: type[nn.Module] = nn.ReLU,
-        layer_norm: bool = False,
+        self, obs_dim: int, latent_dim: int, action_dim: int, *architecture: Any, **more: Any
     ) -> None:
         super().__init__()
-        self.mlp = MLP(obs_dim + latent_dim, 2 * action_dim, net_arch, activation_fn, layer_norm)
+        self.mlp = MLP(obs_dim + latent_dim, 2 * action_dim, *architecture, **more)
 
     def distribution(self, obs: th.Tensor, embedding: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Mean and log standard deviation before squashing, each (..., action_dim)."""
@@ -281,15 +247,8 @@ class LatentActor(nn.Module):
 
 
 class LatentCritic(nn.Module):
-    """Action values Q(s, a, z) of several critics at once.
-
-    :param obs_dim: Width of a (standardised) observation
-    :param action_dim: Width of an action
-    :param latent_dim: Width of the latent
-    :param net_arch: Widths of the hidden layers
-    :param activation_fn: Activation between layers
-    :param layer_norm: Whether hidden layers are normalised before the activation
-    :param n_critics: Number of critics
+    """Action values Q(s, a, z) of several critics at once; the arguments after the widths are those
+    of :class:`MLP`.
     """
 
     def __init__(
@@ -303,10 +262,8 @@ class LatentCritic(nn.Module):
         n_critics: int = 2,
     ) -> None:
         super().__init__()
-        in_dim = obs_dim + action_dim + latent_dim
-        self.members = nn.ModuleList(
-            MLP(in_dim, 1, net_arch, activation_fn, layer_norm) for _ in range(n_critics)
-        )
+        shape = (obs_dim + action_dim + latent_dim, 1, net_arch, activation_fn, layer_norm)
+        self.members = nn.ModuleList(MLP(*shape) for _ in range(n_critics))
 
     def forward(
         self, obs: th.Tensor, actions: th.Tensor, latents: th.Tensor, frozen: bool = False
@@ -323,27 +280,14 @@ class LatentCritic(nn.Module):
 class RewardDecoder(nn.Module):
     """Reward model r_theta_r(s, a, s', z_r), in standardised units of reward.
 
-    :param obs_dim: Width of a (standardised) observation
-    :param action_dim: Width of an action
-    :param latent_dim: Width of the reward embedding
-    :param net_arch: Widths of the hidden layers
-    :param activation_fn: Activation between layers
-    :param layer_norm: Whether hidden layers are normalised before the activation
+    :param architecture: Further arguments of :class:`MLP`
     """
 
     def __init__(
-        self,
-        obs_dim: int,
-        action_dim: int,
-        latent_dim: int,
-        net_arch: Sequence[int],
-        activation_fn: type[nn.Module] = nn.ReLU,
-        layer_norm: bool = False,
+        self, obs_dim: int, action_dim: int, latent_dim: int, *architecture: Any, **more: Any
     ) -> None:
         super().__init__()
-        self.mlp = MLP(
-            2 * obs_dim + action_dim + latent_dim, 1, net_arch, activation_fn, layer_norm
-        )
+        self.mlp = MLP(2 * obs_dim + action_dim + latent_dim, 1, *architecture, **more)
 
     def forward(
         self, obs: th.Tensor, actions: th.Tensor, next_obs: th.Tensor, embedding: th.Tensor

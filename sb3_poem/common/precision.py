@@ -19,24 +19,16 @@ def cpu_has_bfloat16() -> bool:
 def hidden_dtype(precision: str, device_type: str) -> th.dtype:
     """Type of the hidden layers' arithmetic.
 
-    :param precision: "auto", "bf16" or "fp32"
+    :param precision: One of :data:`PRECISIONS`
     :param device_type: "cpu" or "cuda"
-    :raises ValueError: for another name
     """
     if precision not in PRECISIONS:
-        raise ValueError(
-            f"precision must be one of {', '.join(map(repr, PRECISIONS))}, got {precision!r}"
-        )
+        known = ", ".join(map(repr, PRECISIONS))
+        raise ValueError(f"precision must be one of {known}, got {precision!r}")
     if precision == "auto":
         supported = th.cuda.is_bf16_supported() if device_type == "cuda" else cpu_has_bfloat16()
         return th.bfloat16 if supported else th.float32
     return th.bfloat16 if precision == "bf16" else th.float32
-
-
-def _is_rectified(activation: nn.Module) -> bool:
-    return isinstance(
-        activation.activation if isinstance(activation, Normalised) else activation, nn.ReLU
-    )
 
 
 class MixedPrecision:
@@ -54,20 +46,15 @@ class MixedPrecision:
 
     def __init__(self, module: nn.Module, dtype: th.dtype) -> None:
         self._networks: list[tuple[MLP, LowPrecisionMLP]] = []
-        if dtype != th.float32:
-            self._networks = [
-                (
-                    part,
-                    LowPrecisionMLP(
-                        list(part.hidden),  # type: ignore[arg-type]
-                        part.output,
-                        dtype,
-                        isinstance(part.activation, Normalised),
-                    ),
-                )
-                for part in module.modules()
-                if isinstance(part, MLP) and _is_rectified(part.activation) and len(part.hidden)
-            ]
+        for part in module.modules() if dtype != th.float32 else ():
+            if not isinstance(part, MLP) or not len(part.hidden):
+                continue
+            norm = isinstance(part.activation, Normalised)
+            activation = part.activation.activation if norm else part.activation
+            if isinstance(activation, nn.ReLU):
+                hidden: list[nn.Linear] = list(part.hidden)  # type: ignore[arg-type]
+                low = LowPrecisionMLP(hidden, part.output, dtype, norm)
+                self._networks.append((part, low))
         self._pairs = [pair for _, network in self._networks for pair in network.pairs]
         self._originals: list[th.Tensor] = [original for original, _, _ in self._pairs]
         self._copies: list[th.Tensor] = [copy.detach()[place] for _, copy, place in self._pairs]

@@ -37,16 +37,14 @@ class Generators:
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.numpy = np.random.default_rng()
         self.numpy.bit_generator.state = state["numpy"]
-        device = (
-            state["device"]
-            if th.device(state["device"]).type != "cuda" or th.cuda.is_available()
-            else "cpu"
-        )
-        self.torch = th.Generator(device)
-        if device == state["device"]:
+        if th.device(state["device"]).type != "cuda" or th.cuda.is_available():
+            self.torch = th.Generator(state["device"])
             self.torch.set_state(th.from_numpy(np.array(state["torch"], dtype=np.uint8)))
         else:  # a state of a CUDA generator means nothing to a CPU one
-            self.torch.manual_seed(int(self.numpy.integers(2**63 - 1)))
+            self.torch = self._seeded("cpu")
+
+    def _seeded(self, device: th.device | str) -> th.Generator:
+        return th.Generator(device).manual_seed(int(self.numpy.integers(2**63 - 1)))
 
     def to(self, device: th.device | str) -> "Generators":
         """Move the torch generator to another kind of device; its stream is then a new one, seeded
@@ -54,7 +52,5 @@ class Generators:
         """
         device = th.device(device)
         if device.type != self.torch.device.type:
-            torch_generator = th.Generator(device)
-            torch_generator.manual_seed(int(self.numpy.integers(2**63 - 1)))
-            self.torch = torch_generator
+            self.torch = self._seeded(device)
         return self

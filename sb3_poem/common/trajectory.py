@@ -10,16 +10,15 @@ from typing import Any
 
 import numpy as np
 
+STORED = ("observations", "actions", "latent", "reward_features")
+
 
 def encode_array(array: np.ndarray) -> dict[str, Any]:
-    """Write an array as JSON-ready data, bit for bit.
+    """Write an array as JSON-ready data, bit for bit, for :func:`decode_array`.
 
     Decimal text would be larger and slower, and people do not read trajectories; so the array's own
     ``.npy`` bytes are compressed and written in base 64. The shape stands beside them for the
     reader's benefit.
-
-    :param array: Any numeric or boolean array.
-    :return: A dictionary that :func:`decode_array` reads.
     """
     buffer = io.BytesIO()
     np.save(buffer, np.ascontiguousarray(array), allow_pickle=False)
@@ -32,15 +31,11 @@ def encode_array(array: np.ndarray) -> dict[str, Any]:
 def decode_array(data: dict[str, Any]) -> np.ndarray:
     """Read what :func:`encode_array` wrote.
 
-    :param data: The dictionary.
-    :return: The array, with its dtype and shape.
     :raises ValueError: If the data is not such a dictionary.
     """
     try:
-        return np.load(
-            io.BytesIO(zlib.decompress(base64.b64decode(data["npy"], validate=True))),
-            allow_pickle=False,
-        )
+        content = zlib.decompress(base64.b64decode(data["npy"], validate=True))
+        return np.load(io.BytesIO(content), allow_pickle=False)
     except (KeyError, TypeError, ValueError, EOFError, zlib.error) as error:
         raise ValueError(f"not an encoded array: {error}") from error
 
@@ -72,7 +67,8 @@ class Trajectory:
             raise ValueError("a trajectory needs at least one step, but `actions` is empty")
         if len(self.observations) != steps + 1:
             raise ValueError(
-                f"`observations` must hold one more row than `actions` ({steps + 1}), but holds {len(self.observations)}"
+                f"`observations` must hold one more row than `actions` ({steps + 1}), but holds "
+                f"{len(self.observations)}"
             )
         if self.latent.ndim != 1:
             raise ValueError(
@@ -80,7 +76,8 @@ class Trajectory:
             )
         if self.reward_features is not None and len(self.reward_features) != steps:
             raise ValueError(
-                f"`reward_features` must hold one row a step ({steps}), but holds {len(self.reward_features)}"
+                f"`reward_features` must hold one row a step ({steps}), but holds "
+                f"{len(self.reward_features)}"
             )
 
     def __repr__(self) -> str:
@@ -93,35 +90,21 @@ class Trajectory:
         return len(self.actions)
 
     def to_dict(self) -> dict[str, Any]:
-        """Write the trajectory as JSON-ready data. Frames stay out: they are large, and the
-        rollout's seed gives them again.
-
-        :return: A dictionary that :meth:`from_dict` reads.
+        """The trajectory as JSON-ready data, for :meth:`from_dict`. Frames stay out: they are large,
+        and the rollout's seed gives them again.
         """
-        return {
-            "observations": encode_array(self.observations),
-            "actions": encode_array(self.actions),
-            "latent": encode_array(self.latent),
-            "reward_features": None
-            if self.reward_features is None
-            else encode_array(self.reward_features),
-        }
+        arrays = {name: getattr(self, name) for name in STORED}
+        return {name: None if a is None else encode_array(a) for name, a in arrays.items()}
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Trajectory:
         """Read what :meth:`to_dict` wrote.
 
-        :param data: The dictionary.
-        :return: The trajectory, without frames.
         :raises ValueError: If the data is incomplete or broken.
         """
         try:
-            features = data["reward_features"]
-            return cls(
-                observations=decode_array(data["observations"]),
-                actions=decode_array(data["actions"]),
-                latent=decode_array(data["latent"]),
-                reward_features=None if features is None else decode_array(features),
-            )
+            names = STORED if data["reward_features"] is not None else STORED[:-1]
+            arrays: dict[str, Any] = {name: decode_array(data[name]) for name in names}
+            return cls(**arrays)
         except (KeyError, TypeError) as error:
             raise ValueError(f"not a stored trajectory: {error!r} is missing") from error

@@ -31,13 +31,10 @@ from poem_envs.vector import TaskFamilyVector
 from sb3_poem.common.family_view import no_family
 
 # What these do, the vectorised environment or TaskVecEnv does itself.
-ABSORBED_WRAPPERS: tuple[type[gym.Wrapper], ...] = (
-    TimeLimit,
-    OrderEnforcing,
-    PassiveEnvChecker,
-    Monitor,
-)
+ABSORBED_WRAPPERS = (TimeLimit, OrderEnforcing, PassiveEnvChecker, Monitor)
 MAKE_VEC_ARGUMENTS = frozenset({"max_episode_steps", "nthread", "num_envs", "vectorization_mode"})
+#: What TaskVecEnv reads of a vectorised environment's infos by itself
+READ_INFOS = {"reward_features", "final_obs", "_final_obs"}
 
 
 class TaskVecEnv(VecEnv):
@@ -55,8 +52,8 @@ class TaskVecEnv(VecEnv):
     :param env_fns: One function a copy that returns an environment. Only the first is called: all
         copies are made alike, from its registration and arguments. If its ``Monitor`` has a file,
         the episodes of all copies are written to that file.
-    :param nthread: Number of threads (or processes, as the family has it) to step with; None for
-        the family's default (all cores).
+    :param nthread: Threads (or processes, as the family has it) to step with; None for the family's
+        default (all cores).
     :raises ValueError: If the environment is no task family, has no vectorised version, was not
         made by ``gym.make``, was given a task already, or is inside a wrapper other than
         ``TimeLimit``, ``OrderEnforcing``, ``PassiveEnvChecker`` and ``Monitor``.
@@ -93,28 +90,11 @@ class TaskVecEnv(VecEnv):
         self._start_time = time.time() if self._monitor is None else self._monitor.t_start
 
     @classmethod
-    def from_id(
-        cls, env_id: str, n_envs: int, nthread: int | None = None, **env_kwargs: Any
-    ) -> TaskVecEnv:
-        """Make the copies of a registered family.
-
-        :param env_id: As for ``gym.make``
-        :param n_envs: Number of copies
-        :param nthread: See the class
-        :param env_kwargs: Arguments of the environment
-        """
-        return cls([functools.partial(gym.make, env_id, **env_kwargs)] * n_envs, nthread=nthread)
-
-    @classmethod
     def from_vector_env(cls, vector_env: TaskFamilyVector) -> TaskVecEnv:
-        """The face of a vectorised family that there is.
-
-        :param vector_env: As ``gym.make_vec`` makes it
-        """
+        """The face of a vectorised family that there is, as ``gym.make_vec`` makes it."""
         env, spec = cls.__new__(cls), vector_env.spec
-        if (
-            spec is not None
-        ):  # a single environment's: make_vec's own adds what gym.make does not take
+        if spec is not None:
+            # a single environment's: make_vec's own adds what gym.make does not take
             kwargs = {key: spec.kwargs[key] for key in spec.kwargs.keys() - MAKE_VEC_ARGUMENTS}
             limit = vector_env.max_episode_steps
             vector_env.spec = dataclasses.replace(spec, kwargs=kwargs, max_episode_steps=limit)
@@ -132,11 +112,7 @@ class TaskVecEnv(VecEnv):
         return self._last_reward_features
 
     def set_tasks(self, tasks: npt.ArrayLike) -> None:
-        """Choose each copy's task, from its next reset on.
-
-        :param tasks: ``(num_envs, task_dim)``
-        :raises ValueError: As :meth:`poem_envs.TaskFamilyVector.set_tasks`
-        """
+        """See :meth:`poem_envs.TaskFamilyVector.set_tasks`."""
         self.vector_env.set_tasks(tasks)
 
     def keep_tasks(self) -> None:
@@ -146,10 +122,10 @@ class TaskVecEnv(VecEnv):
     def reset(self) -> VecEnvObs:
         for index, options in enumerate(self._options):
             if options:
-                unknown = set(options) - {"task"}
-                if unknown:
+                if unknown := set(options) - {"task"}:
                     raise ValueError(
-                        f"options={options!r} of reset holds unknown keys {sorted(unknown)}, known is 'task'"
+                        f"options={options!r} of reset holds unknown keys {sorted(unknown)}, known "
+                        "is 'task'"
                     )
                 self.vector_env.set_tasks([options["task"]], copies=[index])
         observations, _ = self.vector_env.reset(seed=self._seeds)
@@ -167,11 +143,8 @@ class TaskVecEnv(VecEnv):
         if self._actions is None:
             raise RuntimeError("step_wait() was called without step_async(actions)")
         actions, self._actions = self._actions, None
-        observations, rewards, terminations, truncations, vector_infos = self.vector_env.step(
-            actions
-        )
-        features = vector_infos["reward_features"]
-        self._last_reward_features = features
+        observations, rewards, terminations, truncations, given = self.vector_env.step(actions)
+        self._last_reward_features = features = given["reward_features"]
         self._returns += rewards
         self._lengths += 1
         cut_short = truncations & ~terminations
@@ -179,16 +152,12 @@ class TaskVecEnv(VecEnv):
             {"reward_features": row, "TimeLimit.truncated": cut}
             for row, cut in zip(features, cut_short.tolist(), strict=True)
         ]
-        for key in vector_infos.keys() - {
-            "reward_features",
-            "final_obs",
-            "_final_obs",
-        }:  # "success" and the like
-            for info, value in zip(infos, vector_infos[key], strict=True):
+        for key in given.keys() - READ_INFOS:  # "success" and the like
+            for info, value in zip(infos, given[key], strict=True):
                 info[key] = value
         dones = terminations | truncations
         for index in np.flatnonzero(dones).tolist():
-            infos[index]["terminal_observation"] = vector_infos["final_obs"][index]
+            infos[index]["terminal_observation"] = given["final_obs"][index]
             infos[index]["episode"] = self._episode_info(index, infos[index])
         self._returns[dones] = 0.0
         self._lengths[dones] = 0
@@ -201,10 +170,8 @@ class TaskVecEnv(VecEnv):
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         if self.render_mode != "rgb_array":
-            warnings.warn(
-                f"The render mode is {self.render_mode}, but this method assumes it is `rgb_array` to obtain images.",
-                stacklevel=2,
-            )
+            what = "but this method assumes it is `rgb_array` to obtain images."
+            warnings.warn(f"The render mode is {self.render_mode}, {what}", stacklevel=2)
             return [None] * self.num_envs
         images = self.vector_env.render()
         assert images is not None
@@ -212,7 +179,8 @@ class TaskVecEnv(VecEnv):
 
     def __repr__(self) -> str:
         spec = self.vector_env.spec
-        return f"TaskVecEnv({'an unregistered family' if spec is None else spec.id}, {self.num_envs} copies)"
+        family = "an unregistered family" if spec is None else spec.id
+        return f"TaskVecEnv({family}, {self.num_envs} copies)"
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         return [getattr(self._views[index], attr_name) for index in self._get_indices(indices)]
@@ -220,25 +188,21 @@ class TaskVecEnv(VecEnv):
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         if sorted(self._get_indices(indices)) != list(range(self.num_envs)):
             raise ValueError(
-                f"indices={indices!r}: copies share their attributes, so {attr_name!r} can only be set for all of them"
+                f"indices={indices!r}: copies share their attributes, so {attr_name!r} can only be "
+                "set for all of them"
             )
         if attr_name in ("task", "tasks"):
             raise AttributeError(
-                f"{attr_name!r} cannot be set; use set_tasks(tasks), which takes effect at the next reset"
+                f"{attr_name!r} cannot be set; use set_tasks(tasks), which takes effect at the "
+                "next reset"
             )
         self.vector_env.set_attribute(attr_name, value)
 
     def env_method(
-        self,
-        method_name: str,
-        *method_args: Any,
-        indices: VecEnvIndices = None,
-        **method_kwargs: Any,
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **kwargs: Any
     ) -> list[Any]:
-        return [
-            getattr(self._views[index], method_name)(*method_args, **method_kwargs)
-            for index in self._get_indices(indices)
-        ]
+        methods = self.get_attr(method_name, indices)
+        return [method(*method_args, **kwargs) for method in methods]
 
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None
@@ -246,9 +210,8 @@ class TaskVecEnv(VecEnv):
         """Whether the copies do what a wrapper does: those that the first environment was inside,
         and ``Monitor`` always.
         """
-        wrapped = issubclass(Monitor, wrapper_class) or any(
-            issubclass(kind, wrapper_class) for kind in self._wrapper_types
-        )
+        kinds: tuple[type, ...] = (Monitor, *self._wrapper_types)
+        wrapped = any(issubclass(kind, wrapper_class) for kind in kinds)
         return [wrapped for _ in self._get_indices(indices)]
 
     def _episode_info(self, index: int, info: dict[str, Any]) -> dict[str, Any]:
@@ -265,9 +228,9 @@ class TaskVecEnv(VecEnv):
 
 
 def as_task_vec_env(vector_env: gym.vector.VectorEnv) -> VecEnv:
-    """Gymnasium's vectorised environment of a task family as one of SB3.
+    """Gymnasium's vectorised environment of a task family, as ``gym.make_vec`` makes it, as one of
+    SB3.
 
-    :param vector_env: As ``gym.make_vec`` makes it
     :raises ValueError: If it is of no task family, or in a wrapper, or in Gymnasium's processes
     """
     if isinstance(vector_env, TaskFamilyVector):
@@ -276,36 +239,36 @@ def as_task_vec_env(vector_env: gym.vector.VectorEnv) -> VecEnv:
         return DummyVecEnv([functools.partial(Monitor, env) for env in vector_env.envs])
     raise ValueError(
         f"env is a {type(vector_env).__name__}, but must be gym.make_vec(id, n) of a task family "
-        "(poem_envs.TaskFamily) without wrappers, or SB3's make_vec_env(id, n, vec_env_cls=...) with "
-        "TaskVecEnv, DummyVecEnv or SubprocVecEnv"
+        "(poem_envs.TaskFamily) without wrappers, or SB3's make_vec_env(id, n, vec_env_cls=...) "
+        "with TaskVecEnv, DummyVecEnv or SubprocVecEnv"
     )
 
 
 def make_task_vec_env(
-    env_id: str, n_envs: int, max_sequential: int = 8, **env_kwargs: Any
+    env_id: str,
+    n_envs: int,
+    max_sequential: int = 8,
+    nthread: int | None = None,
+    **env_kwargs: Any,
 ) -> VecEnv:
     """Copies of a registered family: a :class:`TaskVecEnv`, or a ``DummyVecEnv`` of a family
     without a vectorised version.
 
-    :param env_id: As for ``gym.make``
-    :param n_envs: Number of copies
     :param max_sequential: The most copies that a ``DummyVecEnv`` steps one after another
+    :param nthread: As of :class:`TaskVecEnv`
     :param env_kwargs: Arguments of the environment
     """
     env_id = plain_id(env_id)
+    make = functools.partial(gym.make, env_id, **env_kwargs)
     if gym.spec(env_id).vector_entry_point is not None:
-        return TaskVecEnv.from_id(env_id, n_envs, **env_kwargs)
-    return DummyVecEnv(
-        [lambda: Monitor(gym.make(env_id, **env_kwargs))] * min(n_envs, max_sequential)
-    )
+        return TaskVecEnv([make] * n_envs, nthread)
+    return DummyVecEnv([lambda: Monitor(make())] * min(n_envs, max_sequential))
 
 
 def make_shown_env(env_id: str, render_mode: str | None, **env_kwargs: Any) -> gym.Env:
     """A single environment, to be looked at.
 
-    :param env_id: As for ``gym.make``
     :param render_mode: None draws nothing
-    :param env_kwargs: Arguments of the environment
     :raises ValueError: If it cannot be drawn so
     """
     env = gym.make(env_id, render_mode=render_mode, **env_kwargs)
@@ -317,21 +280,11 @@ def make_shown_env(env_id: str, render_mode: str | None, **env_kwargs: Any) -> g
 class _CopyView:
     """One copy of a vectorised task family, with the attributes and methods of a single one."""
 
-    # What a vectorised environment has for all copies together must not pass for an attribute of
-    # one copy.
+    # What a vectorised environment has for all copies together is no attribute of one copy.
     _HIDDEN = frozenset(
         {
-            "tasks",
-            "set_tasks",
-            "keep_tasks",
-            "set_attribute",
-            "num_envs",
-            "reset",
-            "step",
-            "close",
-            "closed",
-            "render_copy",
-            "close_extras",
+            *("tasks", "set_tasks", "keep_tasks", "set_attribute", "num_envs", "reset", "step"),
+            *("close", "closed", "close_extras", "render_copy", "_vector_env"),
         }
     )
 
@@ -383,7 +336,7 @@ class _CopyView:
         return f"<{type(self._vector_env).__name__} instance>"
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__") or name in ("_vector_env", *self._HIDDEN):
+        if name.startswith("__") or name in self._HIDDEN:
             raise AttributeError(f"a copy of a vectorised task family has no attribute {name!r}")
         return getattr(self._vector_env, name)
 
@@ -398,7 +351,6 @@ def _wrappers(env: gym.Env) -> list[gym.Wrapper]:
 
 
 def _is_absorbed(wrapper: gym.Wrapper) -> bool:
-    """Whether the vectorised version does itself what the wrapper does."""
     # An import of rl_zoo3 replaces Gymnasium's TimeLimit, for environments that are made later, by
     # a subclass of its own.
     patched = isinstance(wrapper, TimeLimit) and type(wrapper).__module__ == "rl_zoo3.gym_patches"
@@ -416,24 +368,25 @@ def _vectorised(
     if foreign:
         allowed = ", ".join(kind.__name__ for kind in ABSORBED_WRAPPERS)
         raise ValueError(
-            f"the environment is wrapped in {', '.join(foreign)}, but only {allowed} can be vectorised; {instead}"
+            f"the environment is wrapped in {', '.join(foreign)}, but only {allowed} can be "
+            f"vectorised; {instead}"
         )
-    for monitor in wrappers:
-        if isinstance(monitor, Monitor) and (
-            monitor.reset_keywords or not monitor.allow_early_resets
-        ):
-            raise ValueError(
-                f"Monitor's reset_keywords and allow_early_resets=False are not supported; {instead}"
-            )
+    monitors = [wrapper for wrapper in wrappers if isinstance(wrapper, Monitor)]
+    if any(monitor.reset_keywords or not monitor.allow_early_resets for monitor in monitors):
+        raise ValueError(
+            "Monitor's reset_keywords and allow_early_resets=False are not supported; " + instead
+        )
     if bare.spec is None:
         raise ValueError(
-            f"{bare} was not made by gym.make, so that its arguments are unknown; register it, or {instead}"
+            f"{bare} was not made by gym.make, so that its arguments are unknown; register it, or "
+            f"{instead}"
         )
     if bare.spec.vector_entry_point is None:
         raise ValueError(f"{bare.spec.id} is registered without a vector_entry_point; {instead}")
     if bare._next_task is not None:
         raise ValueError(
-            "the environment was given a task, which its copies would not get; call set_tasks on the TaskVecEnv"
+            "the environment was given a task, which its copies would not get; call set_tasks on "
+            "the TaskVecEnv"
         )
     limits = [wrapper._max_episode_steps for wrapper in wrappers if isinstance(wrapper, TimeLimit)]
     spec = copy.deepcopy(bare.spec)
@@ -444,7 +397,6 @@ def _vectorised(
         raise ValueError(
             f"the vector_entry_point of {spec.id} is no poem_envs.TaskFamilyVector; {instead}"
         )
-    vector_env.spec = (
-        spec  # a single environment's: make_vec's own adds what gym.make does not take
-    )
+    # a single environment's: make_vec's own adds what gym.make does not take
+    vector_env.spec = spec
     return vector_env

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 
 Frame = np.ndarray  # (height, width, 3) uint8
+#: White pixels between two clips
+GAP = 4
 
 
 def _even(frame: Frame) -> Frame:
@@ -16,12 +18,11 @@ def _even(frame: Frame) -> Frame:
 
 
 def write_video(frames: Sequence[Frame], path: str | Path, fps: float = 20.0) -> Path:
-    """Write frames as MP4 (H.264) or GIF, by the file's suffix. Missing folders are made.
+    """Write frames as MP4 (H.264) or GIF, by the file's suffix, and return the path. Missing folders
+    are made.
 
     :param frames: (height, width, 3) uint8 each, all of one size
-    :param path: a file that ends in ``.mp4`` or ``.gif``
     :param fps: frames per second
-    :return: the path
     :raises ValueError: no frames, frames of other shapes, or another suffix
     """
     import imageio.v2 as imageio
@@ -44,9 +45,8 @@ def write_video(frames: Sequence[Frame], path: str | Path, fps: float = 20.0) ->
         ends = np.round(100.0 * step * np.arange(len(kept) + 1) / fps)
         imageio.mimwrite(path, kept, duration=(10.0 * np.diff(ends)).tolist(), loop=0)
     else:
-        imageio.mimwrite(
-            path, [_even(frame) for frame in frames], fps=fps, codec="libx264", macro_block_size=2
-        )
+        even: list[Any] = [_even(frame) for frame in frames]
+        imageio.mimwrite(path, even, fps=fps, codec="libx264", macro_block_size=2)
     return path
 
 
@@ -56,52 +56,41 @@ def _with_captions(clips: Sequence[Sequence[Frame]], captions: Sequence[str]) ->
 
     width = min(clip[0].shape[1] for clip in clips)
     size = max(10, width // 20)
-    while (
-        size > 8
-        and max(ImageFont.load_default(size).getlength(caption) for caption in captions) > width
-    ):
+
+    def longest(size: int) -> float:
+        return max(map(ImageFont.load_default(size).getlength, captions))
+
+    while size > 8 and longest(size) > width:
         size -= 1
     font = ImageFont.load_default(size)
 
     def captioned(frame: Frame, caption: str) -> Frame:
         image = Image.new("RGB", (frame.shape[1], frame.shape[0] + 2 * size), "white")
         image.paste(Image.fromarray(frame), (0, 2 * size))
-        ImageDraw.Draw(image).text(
-            (frame.shape[1] / 2, size), caption, fill="black", anchor="mm", font=font
-        )
+        middle = (frame.shape[1] / 2, size)
+        ImageDraw.Draw(image).text(middle, caption, fill="black", anchor="mm", font=font)
         return np.asarray(image)
 
-    return [
-        [captioned(frame, caption) for frame in clip]
-        for clip, caption in zip(clips, captions, strict=True)
-    ]
+    pairs = zip(clips, captions, strict=True)
+    return [[captioned(frame, caption) for frame in clip] for clip, caption in pairs]
 
 
 def side_by_side(
-    left: Sequence[Frame],
-    right: Sequence[Frame],
-    captions: tuple[str, str] | None = None,
-    gap: int = 4,
+    left: Sequence[Frame], right: Sequence[Frame], captions: tuple[str, str] | None = None
 ) -> list[Frame]:
-    """Two clips beside each other; the shorter one holds its last frame.
+    """Two clips beside each other, under a line of text each if there are captions; the shorter one
+    holds its last frame.
 
-    :param left: (height, width, 3) uint8 each
-    :param right: frames of the same height
-    :param captions: a line of text over each clip
-    :param gap: white pixels between them
-    :return: as many frames as the longer clip has
     :raises ValueError: a clip is empty, or their heights differ
     """
     if len(left) == 0 or len(right) == 0:
         raise ValueError(f"both clips need frames, got {len(left)} and {len(right)}")
-    if left[0].shape[0] != right[0].shape[0]:
-        raise ValueError(
-            f"both clips need the same height, got {left[0].shape[0]} and {right[0].shape[0]}"
-        )
+    heights = left[0].shape[0], right[0].shape[0]
+    if heights[0] != heights[1]:
+        raise ValueError(f"both clips need the same height, got {heights[0]} and {heights[1]}")
     if captions is not None:
         left, right = _with_captions((left, right), captions)
-    bar = np.full((left[0].shape[0], gap, 3), 255, dtype=np.uint8)
-    return [
-        np.concatenate([left[min(i, len(left) - 1)], bar, right[min(i, len(right) - 1)]], axis=1)
-        for i in range(max(len(left), len(right)))
-    ]
+    bar = np.full((left[0].shape[0], GAP, 3), 255, dtype=np.uint8)
+    n = max(len(left), len(right))
+    lefts, rights = ([*clip, *[clip[-1]] * (n - len(clip))] for clip in (left, right))
+    return [np.concatenate([a, bar, b], axis=1) for a, b in zip(lefts, rights, strict=True)]

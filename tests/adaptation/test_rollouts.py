@@ -3,12 +3,14 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 from worlds import HORIZON, Blinded, SpeedEnv, SpeedModel, SpeedVecEnv
 
 from sb3_poem import TaskVecEnv
-from sb3_poem.common.rollouts import rollout_features, rollout_latents
+from sb3_poem.common.rollouts import rollout_latents, rollout_outcomes
+from sb3_poem.common.vec_env import make_task_vec_env
 
 MODEL = SpeedModel()
 
@@ -20,6 +22,10 @@ class Still:
 
     def predict(self, observation, state=None, episode_start=None, deterministic=True):
         return np.zeros((len(observation), 2), dtype=np.float32), state
+
+
+def rollout_features(*arguments, **options):
+    return [outcome.reward_features for outcome in rollout_outcomes(*arguments, **options)]
 
 
 LATENTS = np.random.default_rng(0).standard_normal((7, 5))
@@ -186,10 +192,7 @@ def test_the_environments_own_task_stays():
 
 
 def test_the_task_of_a_vectorised_family_stays():
-    poem_envs = pytest.importorskip("poem_envs")
-    assert poem_envs
-    vec_env_module = pytest.importorskip("sb3_poem.common.vec_env")
-    env = vec_env_module.TaskVecEnv.from_id("poem/PointGoal-v0", 2)
+    env = make_task_vec_env("poem/PointGoal-v0", 2)
     env.seed(3)
     env.reset()
     tasks = env.tasks.copy()
@@ -228,8 +231,6 @@ def test_frames():
 
 
 def test_stochastic_actions_are_reproducible_and_leave_torch_alone():
-    torch = pytest.importorskip("torch")
-
     class Noisy(SpeedModel):
         def predict(self, observation, state=None, episode_start=None, deterministic=True):
             actions, state = super().predict(observation, state)

@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from sb3_poem.common.buffers import Segment
 from sb3_poem.common.collection import collect_segment, relabelled_returns
 from sb3_poem.common.family_view import FamilyView
-from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.common.vec_env import make_task_vec_env
 
 
 def random_policy(env: VecEnv, seed: int = 0):  # type: ignore[no-untyped-def]
@@ -81,7 +81,7 @@ def test_a_segment_is_what_single_environments_give(edge: float) -> None:
 
 def test_the_vectorised_and_the_single_environment_give_the_same_segment() -> None:
     tasks = np.array([[0.1], [2.0], [3.0]])
-    ours, _ = collect(TaskVecEnv.from_id(POINT_GOAL, 3), tasks)
+    ours, _ = collect(make_task_vec_env(POINT_GOAL, 3), tasks)
     theirs, _ = collect(make_vec_env(POINT_GOAL, 3), tasks)
     for name in Segment.__dataclass_fields__:
         assert np.array_equal(getattr(ours, name), getattr(theirs, name)), name
@@ -167,7 +167,7 @@ def test_relabelled_returns_are_what_the_other_tasks_environments_return(
     env_id: str, steps: int
 ) -> None:
     kwargs = {"max_episode_steps": steps}
-    env = TaskVecEnv.from_id(env_id, 3, **kwargs)
+    env = make_task_vec_env(env_id, 3, **kwargs)
     tasks = FamilyView(env).sample_tasks(3, np.random.default_rng(0))
     segment, _ = collect(env, tasks, seed=11)
     relabelled = relabelled_returns(

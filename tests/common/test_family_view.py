@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMoni
 
 from poem_envs import GoalFamily
 from sb3_poem.common.family_view import FamilyView
-from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.common.vec_env import make_task_vec_env
 
 
 def test_reads_a_family() -> None:
@@ -30,7 +30,7 @@ def test_reads_a_family() -> None:
     "wrap", [lambda env: env, VecMonitor, lambda env: VecMonitor(VecMonitor(env))]
 )
 @pytest.mark.parametrize(
-    "make", [lambda: make_vec_env(POINT_GOAL, 3), lambda: TaskVecEnv.from_id(POINT_GOAL, 3)]
+    "make", [lambda: make_vec_env(POINT_GOAL, 3), lambda: make_task_vec_env(POINT_GOAL, 3)]
 )
 def test_tasks_reach_the_copies_and_features_come_back(make, wrap) -> None:  # type: ignore[no-untyped-def]
     env = wrap(make())

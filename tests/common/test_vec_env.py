@@ -86,7 +86,7 @@ def test_gives_what_dummy_vec_env_gives(env_id):
 
 @pytest.mark.parametrize("env_id", FAMILIES)
 def test_a_copy_looks_like_a_single_environment(env_id):
-    ours, theirs = TaskVecEnv.from_id(env_id, 3), make_vec_env(env_id, 3)
+    ours, theirs = make_task_vec_env(env_id, 3), make_vec_env(env_id, 3)
     for name in ("task_space", "all_tasks", "shared_dynamics", "reward_feature_dim", "task"):
         for one, two in zip(ours.get_attr(name), theirs.get_attr(name), strict=True):
             assert np.array_equal(one, two)
@@ -127,14 +127,14 @@ def test_a_copy_looks_like_a_single_environment(env_id):
 
 
 def test_env_is_wrapped():
-    env = TaskVecEnv.from_id("poem/PointGoal-v0", 2)
+    env = make_task_vec_env("poem/PointGoal-v0", 2)
     assert env.env_is_wrapped(Monitor) == [True, True]
     assert env.env_is_wrapped(TimeLimit, indices=[0]) == [True]
     assert env.env_is_wrapped(gym.wrappers.RescaleAction) == [False, False]
 
 
 def test_seeding():
-    env = TaskVecEnv.from_id("poem/HalfCheetahVel-v0", 3)
+    env = make_task_vec_env("poem/HalfCheetahVel-v0", 3)
     env.seed(4)
     first = env.reset()
     assert not np.array_equal(env.reset(), first)
@@ -171,12 +171,12 @@ def test_ids_that_name_their_module():
 
 
 def test_attributes_of_a_family_in_processes():
-    env = TaskVecEnv.from_id("poem/MetaWorldML1-v0", 2, nthread=1)
+    env = make_task_vec_env("poem/MetaWorldML1-v0", 2, nthread=1)
     assert env.get_attr("env_name") == ["reach", "reach"]
 
 
 def test_set_attr():
-    env = TaskVecEnv.from_id("poem/PointGoal-v0", 2)
+    env = make_task_vec_env("poem/PointGoal-v0", 2)
     env.set_attr("render_task", True)
     assert env.get_attr("render_task") == [True, True]
     with pytest.raises(ValueError, match="only be set for all"):
@@ -218,7 +218,7 @@ def test_refused_environments():
 
 
 def test_bad_actions_and_options():
-    env = TaskVecEnv.from_id("poem/PointGoal-v0", 3)
+    env = make_task_vec_env("poem/PointGoal-v0", 3)
     env.reset()
     actions = np.zeros((3, 2))
     actions[1, 0] = np.nan
@@ -247,18 +247,18 @@ def test_monitor_files_hold_the_episodes_of_all_copies(tmp_path):
 
 
 def test_images():
-    env = TaskVecEnv.from_id("poem/PointGoal-v0", 4, render_mode="rgb_array", width=32, height=24)
+    env = make_task_vec_env("poem/PointGoal-v0", 4, render_mode="rgb_array", width=32, height=24)
     env.reset()
     assert [image.shape for image in env.get_images()] == [(24, 32, 3)] * 4
     assert env.render().shape == (48, 64, 3)
     assert env.env_method("render", indices=[2])[0].shape == (24, 32, 3)
-    silent = TaskVecEnv.from_id("poem/PointGoal-v0", 2)
+    silent = make_task_vec_env("poem/PointGoal-v0", 2)
     with pytest.warns(UserWarning, match="render mode is None"):
         assert silent.get_images() == [None, None]
 
 
 def test_sb3_algorithms_and_wrappers_take_it():
-    env = TaskVecEnv.from_id("poem/PointGoal-v0", 4)
+    env = make_task_vec_env("poem/PointGoal-v0", 4)
     model = SAC(
         "MlpPolicy", VecNormalize(VecFrameStack(env, 2)), learning_starts=100, seed=0, **SMALL
     )
@@ -306,7 +306,7 @@ POINT = "poem/PointGoal-v0"
         (lambda: gym.wrappers.vector.RecordEpisodeStatistics(gym.make_vec(POINT, 3)), 3),
         (lambda: gym.make_vec(POINT, 2, vectorization_mode="sync"), 2),
         (lambda: make_vec_env(POINT, 2), 2),
-        (lambda: VecMonitor(TaskVecEnv.from_id(POINT, 3)), 3),
+        (lambda: VecMonitor(make_task_vec_env(POINT, 3)), 3),
     ],
 )
 def test_a_task_is_chosen_through_whatever_is_around_the_family(make, num_envs):

@@ -1,0 +1,286 @@
+"""The arguments of ``sb3-poem``. Nothing heavy is imported, so that ``--help`` is immediate."""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+
+from sb3_poem import __version__
+from sb3_poem.cli.benchmark_arguments import add_benchmark
+
+OUR_ALGORITHMS = ("poem_sac", "pearl_sac")
+COMMANDS = ("train", "enjoy", "record-video", "adapt", "models", "label", "benchmark")
+DEFAULT_STORE = Path("label_data")
+INFERENCES = ("paper", "bayes")
+EXAMPLES = """\
+examples:
+  sb3-poem models
+  sb3-poem adapt --model HalfCheetahVel --oracle return
+  sb3-poem adapt --model HalfCheetahVel --oracle human
+  sb3-poem record-video --model HalfCheetahVel --out vel.mp4
+  sb3-poem train --env poem/HalfCheetahVel-v0 --eval-freq 50000 -P
+  sb3-poem label
+"""
+
+Group = argparse._ActionsContainer
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of ``sb3-poem``; the zoo commands hand their own arguments on to rl_zoo3."""
+    parser = argparse.ArgumentParser(
+        prog="sb3-poem",
+        description="Meta-train agents on families of tasks, and adapt them to hidden tasks from "
+        "preferences alone.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    commands = parser.add_subparsers(
+        dest="command", required=True, metavar="{" + ",".join(COMMANDS) + "}"
+    )
+    train = "meta-train an agent (rl_zoo3's train, with poem_sac and pearl_sac)"
+    commands.add_parser("train", help=train, add_help=False)
+    enjoy = _add_command(
+        commands,
+        "enjoy --model HalfCheetahVel",
+        "watch a trained agent after adaptation",
+        "Adapt a trained agent to a task, and show it in a window. With another --algo this is "
+        "rl_zoo3's enjoy.",
+    )
+    _add_show_arguments(enjoy)
+    _option(enjoy, "-n --n-timesteps", "show so many steps, in whole episodes", _count(1))
+    _switch(enjoy, "--no-render", "without a window: only say what the episodes earn")
+    record = _add_command(
+        commands,
+        "record-video --model HalfCheetahVel --out vel.mp4",
+        "film a trained agent before and after adaptation",
+        "Adapt a trained agent to a task, and film it before and after side by side from the same "
+        "start. Where there is only one policy (--known-task, --queries 0, or a policy as "
+        "--model), film that.",
+    )
+    _add_show_arguments(record)
+    _file(record, "--out", "the video (.mp4 or .gif)", required=True)
+    adapt = _add_command(
+        commands,
+        "adapt --model HalfCheetahVel --oracle human",
+        "adapt a trained agent to unseen tasks by preference queries",
+        "Adapt a trained agent to unseen tasks by preference queries, and print what it earns "
+        "after each.",
+    )
+    _add_adapt_arguments(adapt)
+    told = "List the trained models that ship."
+    _add_command(commands, "models", "list the trained models that ship", told)
+    label = _add_command(
+        commands,
+        "label --model HalfCheetahVel --port 8000",
+        "open the page on which a person answers; export and replay their answers",
+        "Open a web page on which people teach a trained agent their task by comparing videos.",
+    )
+    _add_label_arguments(label)
+    add_benchmark(commands, _count)
+    return parser
+
+
+def _add_command(
+    commands: Any, example: str, summary: str, description: str, prefix: str = "sb3-poem"
+) -> argparse.ArgumentParser:
+    """Add the command that the example begins with."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        example.split()[0],
+        help=summary,
+        description=description,
+        epilog=f"example: {prefix} {example}",
+    )
+    return parser
+
+
+def _option(
+    group: Group, flags: str, told: str, kind: Any = None, default: Any = None, **how: Any
+) -> Any:
+    """Add an option that takes values; its default, if it has one, is told with the rest."""
+    if default not in (None, [], argparse.SUPPRESS):
+        told = f"{told} (default: %(default)s)" if told else "default: %(default)s"
+    return group.add_argument(*flags.split(), help=told, type=kind, default=default, **how)
+
+
+def _switch(group: Group, flag: str, told: str) -> None:
+    group.add_argument(flag, help=told, action="store_true")
+
+
+def _file(group: Group, flag: str, told: str, **how: Any) -> None:
+    group.add_argument(flag, help=told, type=Path, **{"metavar": "FILE", **how})
+
+
+def _count(minimum: int) -> Callable[[str], int]:
+    def count(text: str) -> int:
+        value = int(text)
+        if value < minimum:
+            raise argparse.ArgumentTypeError(f"must be at least {minimum}, got {value}")
+        return value
+
+    count.__name__ = "whole number"
+    return count
+
+
+def _add_environment(group: Group, default: str, kwargs: str = "") -> Any:
+    env = _option(group, "--env", f"environment id (default: {default}")
+    told = f"arguments of the environment{kwargs}"
+    _option(group, "--env-kwargs", told, default=[], nargs="+", metavar="KEY:VALUE")
+    told = "modules that register environments"
+    _option(group, "--gym-packages", told, default=[], nargs="+", metavar="MODULE")
+    return env
+
+
+def _add_subject_arguments(
+    group: Group, model_help: str, env_default: str, required: bool = False
+) -> None:
+    model = _option(group, "--model", model_help, required=required)
+    model.completer = _complete_model
+    env = _add_environment(group, env_default, ", over those that the model was trained with")
+    env.completer = _complete_env
+    _option(group, "--device", "PyTorch device", default="cpu")
+    # Small batches: more threads would mostly wait for one another, and for those that simulate.
+    _option(group, "--num-threads", "of PyTorch", _count(1), 1)
+
+
+def _complete_model(prefix: str, **_: Any) -> list[str]:
+    """Shipped models, and what is on the disk."""
+    from argcomplete.completers import FilesCompleter
+
+    from sb3_poem.resources import pretrained_names
+
+    return [*pretrained_names(), *FilesCompleter()(prefix)]
+
+
+def _complete_env(**_: Any) -> list[str]:
+    return [name for name in gymnasium.registry if name.startswith("poem/")]
+
+
+def _add_show_arguments(parser: argparse.ArgumentParser) -> None:
+    """Those of ``enjoy`` and ``record-video``: a policy, and the task on which it is shown."""
+    model = parser.add_argument_group("what to show")
+    _add_subject_arguments(
+        model,
+        "a model's .zip, a pretrained folder, a shipped model's name, or a policy that adapt "
+        "--save wrote",
+        "the model's); without --model: the last run of it in --folder",
+    )
+    _option(model, "--algo", "of that run", default=OUR_ALGORITHMS[0])
+    _option(model, "-f --folder", "of the runs", default="logs")
+    exp_id = "number of that run (default: the last one)"
+    model.add_argument("--exp-id", type=_count(0), default=0, help=exp_id)
+
+    policy = parser.add_argument_group("the policy, which is adapted to a hidden task first")
+    _option(policy, "--queries", "questions, answered by the true return", _count(0), 10)
+    _switch(policy, "--known-task", "instead the best of many policies for the task")
+    task = "the task, its numbers one by one (default: drawn)"
+    _option(policy, "--task", task, float, nargs="+", metavar="X")
+    _option(policy, "--seed", "of the task and of everything else", _count(0), 0)
+    _option(policy, "--episodes", "to show, and to measure returns by", _count(1), 10)
+
+
+def _add_adapt_arguments(parser: argparse.ArgumentParser) -> None:
+    model = parser.add_argument_group("what to adapt")
+    _add_subject_arguments(
+        model,
+        "a model's .zip, a pretrained folder, or the name of a shipped model",
+        "the one that the model was trained on)",
+        required=True,
+    )
+
+    questions = parser.add_argument_group("the questions and who answers them")
+    oracles = ("return", "boltzmann", "mistake", "human")
+    questions.add_argument("--oracle", choices=oracles, default="return")
+    beta = "inverse temperature of --oracle boltzmann (default: the paper's)"
+    _option(questions, "--beta", beta, float)
+    _option(questions, "--mistake-rate", "of --oracle mistake", float, 0.2)
+    _option(questions, "--queries", "questions per task", _count(1), 10)
+    _option(questions, "--inference", "", default="bayes", choices=INFERENCES)
+    told = "how questions are chosen (default: the inference rule's own)"
+    rules = ("worst-case", "information-gain", "random")
+    _option(questions, "--query-rule", told, choices=rules)
+    told = "default: prior; for bayes aggregate where the training tasks are far from it"
+    _option(questions, "--candidates", told, choices=("prior", "aggregate"))
+    told = "candidate latents (default: 400 for bayes, 100 for paper)"
+    _option(questions, "--n-candidates", told, _count(2), metavar="N")
+
+    tasks = parser.add_argument_group("test tasks")
+    told = "how many, drawn anew (default: 30; 1 with --oracle human)"
+    _option(tasks, "--tasks", told, _count(1))
+    told = "this one task instead, its numbers one by one"
+    _option(tasks, "--task", told, float, nargs="+", metavar="X")
+    _option(tasks, "--episodes", "per task and evaluation", _count(1), 10)
+    _option(tasks, "--seed", "of the test tasks and of everything else", _count(0), 0)
+    told = "measure after so many answers (default: each)"
+    _option(tasks, "--record", told, _count(0), nargs="+", metavar="K")
+
+    output = parser.add_argument_group("output")
+    told = "where the answers of --oracle human are kept, as those of the page"
+    _file(output, "--store", f"{told} (default: {DEFAULT_STORE})", metavar="FOLDER")
+    told = "go on with the answers that the same command has in --store, if any"
+    _switch(output, "--resume", told)
+    _file(output, "--save", "write the policy of the one task that was adapted (.safetensors)")
+    _file(output, "--json", "write every task's returns, with versions and command")
+    _file(output, "--plot", "write the return against the queries (PNG, PDF, SVG)")
+    _file(output, "--video", "write one task before and after side by side (MP4, GIF)")
+
+
+def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
+    model = parser.add_argument_group("what is taught")
+    told = "a pretrained folder, a folder of such, or the name of a shipped model"
+    _option(model, "--model", f"{told} (default: all that are shipped)")
+    _add_environment(model, "the one that the model was trained on)")
+    _option(model, "--queries", "questions before the result", _count(1), 10)
+    _option(model, "--inference", "", default="bayes", choices=INFERENCES)
+    _option(model, "--mistake-rate", "how often people are taken to err", float, 0.05)
+    _option(model, "--seed", "of every session (default: each has its own)", _count(0))
+
+    server = parser.add_argument_group("the server")
+    host = "default: %(default)s, which only this machine reaches"
+    server.add_argument("--host", default="127.0.0.1", help=host)
+    port = "default: %(default)s; 0 takes a free one"
+    server.add_argument("--port", type=_count(0), default=7860, help=port)
+    password = server.add_mutually_exclusive_group()
+    told = "ask for a name and a password of at least 12 characters; others on this machine see it"
+    _option(password, "--auth", f"{told} in the list of processes", metavar="USER:PASSWORD")
+    told = "read them from a file (default: from SB3_POEM_AUTH, if that is set)"
+    _file(password, "--auth-file", told)
+    _switch(server, "--token", "let in only who has the link with the token, which is printed")
+    told = "further names of this server"
+    _option(server, "--allow-host", told, default=[], nargs="+", metavar="NAME")
+    _option(server, "--max-sessions", "people who may be at work at once", _count(1), 16)
+    _option(server, "--workers", "processes that render", _count(1), 2)
+    store = f"where answers and videos are (default: {DEFAULT_STORE})"
+    _file(server, "--store", store, default=DEFAULT_STORE, metavar="FOLDER")
+
+    commands = parser.add_subparsers(dest="label_command", metavar="{export,replay}")
+    # Of what the page has too, no defaults: they would overwrite what was given before the part.
+    own: dict[str, Any] = {"default": argparse.SUPPRESS}
+    export = _add_command(
+        commands,
+        "export --out answers.jsonl answers.parquet",
+        "write all answers as a data set",
+        "Write all answers.",
+        "sb3-poem label",
+    )
+    _file(export, "--store", store, metavar="FOLDER", **own)
+    _file(export, "--out", "ends in .jsonl or .parquet", nargs="+", required=True)
+    _switch(export, "--trajectories", "with observations, actions and reward features")
+    _switch(export, "--undone", "with answers that were taken back")
+    replay = _add_command(
+        commands,
+        "replay --inference paper --json replay.json",
+        "feed recorded answers to another model or rule",
+        "Feed the recorded answers to a model and a rule, and say how well these would have "
+        "foretold them.",
+        "sb3-poem label",
+    )
+    _file(replay, "--store", store, metavar="FOLDER", **own)
+    told = "a model's .zip, a pretrained folder, or a shipped model (default: each session's own)"
+    _option(replay, "--model", told, **own)
+    _option(replay, "--inference", "default: bayes", choices=INFERENCES, **own)
+    _option(replay, "--mistake-rate", "default: 0.05", float, **own)
+    _option(replay, "--seed", "of the inference (default: 0)", _count(0), **own)
+    _file(replay, "--json", "write what was foretold, and the latents after each answer")
