@@ -114,11 +114,11 @@ def order_on_test_tasks(env_id: str, model_file: Path, test_seed: int) -> dict[s
     """Property 1 on test tasks: preference accuracy and Kendall's tau."""
     from sb3_poem.adaptation.evaluation import known_task_return, preference_order
     from sb3_poem.common.family_view import FamilyView
-    from sb3_poem.common.vec_env import TaskVecEnv
+    from sb3_poem.common.vec_env import make_task_vec_env
     from sb3_poem.loading import load_model
 
     model = load_model(str(model_file))
-    env = TaskVecEnv.from_id(env_id, 60)
+    env = make_task_vec_env(env_id, 60)
     family = FamilyView(env)
     tasks = family.all_tasks
     if tasks is None:

@@ -28,6 +28,7 @@ from mujoco.rollout import Rollout
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_poem import POEMSAC, TaskVecEnv
+from sb3_poem.common.vec_env import make_task_vec_env
 
 N_TASKS, STEPS = 120, 25
 # 24 GB of memory did not hold 120 Meta-World environments of each kind.
@@ -143,7 +144,7 @@ def measure(env_id: str, nthread: int, repeats: int) -> dict[str, Any]:
     # forked while there are no threads yet: to start so many interpreters anew takes minutes
     others = others_of(env_id)
     processes = SubprocVecEnv([make] * others, start_method="fork")
-    env = TaskVecEnv.from_id(env_id, N_TASKS, nthread=nthread)
+    env = make_task_vec_env(env_id, N_TASKS, nthread=nthread)
     model = POEMSAC(
         "MlpPolicy",
         env,
@@ -156,7 +157,7 @@ def measure(env_id: str, nthread: int, repeats: int) -> dict[str, Any]:
     contenders: dict[str, Callable[[], Any]] = {"TaskVecEnv": sb3_loop(env, model)}
     own = POEMSAC(
         "MlpPolicy",
-        TaskVecEnv.from_id(env_id, N_TASKS, nthread=nthread),
+        make_task_vec_env(env_id, N_TASKS, nthread=nthread),
         n_train_tasks=N_TASKS,
         seed=0,
         buffer_size=1000,

@@ -18,6 +18,7 @@ import torch as th
 from sb3_poem import POEMSAC, TaskVecEnv
 from sb3_poem.common.collection import relabelled_returns
 from sb3_poem.common.family_view import FamilyView
+from sb3_poem.common.vec_env import make_task_vec_env
 
 COPIES = (1, 4, 16, 64, 256, 1024)
 BATCH_TASKS, TASKS = (2, 4, 8, 16, 32, 64), (120, 300, 1000)
@@ -30,7 +31,7 @@ def copies_and_threads(env_id: str, thread_counts: list[int], repeats: int) -> l
     for copies in COPIES:
         rng, contenders = np.random.default_rng(0), {}
         for threads in thread_counts:
-            env = TaskVecEnv.from_id(env_id, copies, nthread=threads)
+            env = make_task_vec_env(env_id, copies, nthread=threads)
             env.seed(0)
             env.reset()
             actions = rng.uniform(
@@ -89,7 +90,7 @@ def returns_matrix(repeats: int) -> list[dict[str, Any]]:
     """Milliseconds of J[i, j] for N tasks with a trajectory of 200 steps each."""
     rng, rows = np.random.default_rng(0), []
     for env_id in IDS:
-        family = FamilyView(TaskVecEnv.from_id(env_id, 1))
+        family = FamilyView(make_task_vec_env(env_id, 1))
         for n_tasks in TASKS:
             tasks = family.sample_tasks(n_tasks, rng)
             features = rng.standard_normal((n_tasks, 200, family.reward_feature_dim))

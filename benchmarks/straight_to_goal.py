@@ -13,7 +13,7 @@ from common import RESULTS
 import sb3_poem  # noqa: F401  registers the families
 from sb3_poem.benchmark.provenance import commit, machine
 from sb3_poem.common.family_view import FamilyView
-from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.common.vec_env import make_task_vec_env
 
 ENV_ID = "poem/MetaWorldML1-v0"
 GAINS = (3.0, 10.0, 30.0)
@@ -32,7 +32,7 @@ def episode(env: gym.Env, goal: np.ndarray, gain: float) -> tuple[float, bool]:
 
 def main() -> None:
     """Measure and write."""
-    tasks = FamilyView(TaskVecEnv.from_id(ENV_ID, 1)).test_tasks(30, 100)
+    tasks = FamilyView(make_task_vec_env(ENV_ID, 1)).test_tasks(30, 100)
     env = gym.make(ENV_ID)
     lines = [
         "# MetaWorldML1 (reach): straight to the goal",

@@ -20,7 +20,7 @@ from rl_zoo3.utils import linear_schedule
 from sb3_poem import POEMSAC
 from sb3_poem.adaptation.evaluation import evaluate_adaptation
 from sb3_poem.common.family_view import FamilyView
-from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.pearl_sac.callbacks import EpochCallback
 from sb3_poem.resources import zoo_entry
 
@@ -54,7 +54,7 @@ class Clock(EpochCallback):
             test_seed,
             from_step,
         )
-        self.env = TaskVecEnv.from_id(env_id, 2 * N_TASKS)
+        self.env = make_task_vec_env(env_id, 2 * N_TASKS)
         self.tasks = FamilyView(self.env).sample_tasks(
             N_TASKS, np.random.default_rng([test_seed, 77])
         )
@@ -102,7 +102,7 @@ def train(env_id: str, entry: dict[str, Any], seed: int, clock: Clock, device: s
     rate = entry.get("learning_rate")
     if isinstance(rate, str):
         entry["learning_rate"] = linear_schedule(rate.removeprefix("lin_"))
-    model = POEMSAC(policy, TaskVecEnv.from_id(env_id, n_envs), seed=seed, device=device, **entry)
+    model = POEMSAC(policy, make_task_vec_env(env_id, n_envs), seed=seed, device=device, **entry)
     clock.started = time.perf_counter()
     return model.learn(n_timesteps, callback=clock)
 

@@ -21,7 +21,7 @@ from common import available_device
 from stable_baselines3.common.utils import ConstantSchedule
 
 from sb3_poem import POEMSAC
-from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.common.vec_env import TaskVecEnv, make_task_vec_env
 from sb3_poem.pearl_sac.callbacks import EpochCallback
 from sb3_poem.resources import zoo_entry
 
@@ -150,7 +150,7 @@ def main() -> None:
     entry = zoo_entry(given.conf, given.env_id, **pairs(given.set))
     del entry["n_timesteps"]
     rate = float(str(entry.pop("learning_rate")).removeprefix("lin_"))
-    env = TaskVecEnv.from_id(
+    env = make_task_vec_env(
         given.env_id, entry.pop("n_envs"), nthread=given.threads, **pairs(given.env_set)
     )
     model = make_model(entry, env, given.start, given.seed, given.device)

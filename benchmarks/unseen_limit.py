@@ -21,7 +21,7 @@ from sb3_poem.benchmark.cells import SEED_STRIDE, SELECTION_EPISODES
 from sb3_poem.benchmark.provenance import commit, machine
 from sb3_poem.benchmark.suites import Budget
 from sb3_poem.common.family_view import FamilyView
-from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.loading import load_model
 
 COLUMNS = (0, 1, 2, 3, 5)
@@ -31,7 +31,7 @@ def limits(
     env_id: str, model_file: Path, seed: int, n_others: int
 ) -> tuple[list[float], list[float]]:
     """The limits with the test tasks in sight, and without, after :data:`COLUMNS` answers."""
-    model, env, budget = load_model(str(model_file)), TaskVecEnv.from_id(env_id, 120), Budget()
+    model, env, budget = load_model(str(model_file)), make_task_vec_env(env_id, 120), Budget()
     family = FamilyView(env)
     tasks = family.test_tasks(budget.tasks, budget.task_seed)
     others = family.sample_tasks(n_others, np.random.default_rng([budget.task_seed, seed, 1]))

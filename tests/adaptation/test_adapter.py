@@ -17,7 +17,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 from worlds import Blinded, SpeedEnv, SpeedModel
 
-from sb3_poem import POEMSAC, TaskVecEnv, set_task
+from sb3_poem import POEMSAC, set_task
 from sb3_poem.adaptation import (
     BoltzmannNoise,
     BoltzmannOracle,
@@ -511,7 +511,7 @@ def test_the_policy_is_for_the_task_of_the_adapters_environment():
         lambda: gym.make_vec(POINT, 2),
         lambda: gym.make_vec(POINT, 2, vectorization_mode="sync"),
         lambda: DummyVecEnv([lambda: gym.make(POINT)] * 2),
-        lambda: TaskVecEnv.from_id(POINT, 2),
+        lambda: make_task_vec_env(POINT, 2),
     ],
 )
 def test_models_and_environments_by_name_and_of_every_kind(env, point_goal):
@@ -524,7 +524,7 @@ def test_models_and_environments_by_name_and_of_every_kind(env, point_goal):
 
 
 def test_the_id_of_the_models_own_environment_makes_that():
-    env = TaskVecEnv.from_id(POINT, 2, step_length=0.1)
+    env = make_task_vec_env(POINT, 2, step_length=0.1)
     a = PreferenceAdapter(small(POEMSAC, env), POINT)
     assert a.env.get_attr("step_length") == [0.1]
 

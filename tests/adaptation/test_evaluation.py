@@ -24,7 +24,7 @@ from sb3_poem.adaptation import (
 )
 from sb3_poem.adaptation.evaluation import evaluation_seed, preference_order, return_matrix
 from sb3_poem.common.family_view import FamilyView
-from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.loading import load_model
 
 MODEL = SpeedModel()
@@ -98,7 +98,7 @@ def test_names_and_numbers_of_tasks_will_do():
     result = evaluate_adaptation(
         "PointGoal", "poem/PointGoal-v0", 3, record_at=(0, 2), n_episodes=1, seed=4
     )
-    env = TaskVecEnv.from_id("poem/PointGoal-v0", 4)
+    env = make_task_vec_env("poem/PointGoal-v0", 4)
     np.testing.assert_array_equal(result.tasks, FamilyView(env).test_tasks(3, 4))
     model = load_model("PointGoal", "cpu")
     again = evaluate_adaptation(model, env, result.tasks, record_at=(0, 2), n_episodes=1, seed=4)

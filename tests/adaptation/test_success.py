@@ -13,9 +13,10 @@ import pytest
 from worlds import Walk1D
 
 from poem_envs import ProcessFamilyVector
-from sb3_poem import POEMSAC, AdaptationEvalCallback, TaskVecEnv
+from sb3_poem import POEMSAC, AdaptationEvalCallback
 from sb3_poem.adaptation import evaluate_adaptation, evaluate_latents, known_task_return
 from sb3_poem.cli import main
+from sb3_poem.common.vec_env import make_task_vec_env
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 SMALL = {"net_arch": {"pi": [16], "qf": [16], "encoder": [16], "decoder": [16], "embedding": [8]}}
@@ -49,7 +50,7 @@ def make_model(env_id, env=None):
         "policy_kwargs": SMALL,
     }
     return POEMSAC(
-        "MlpPolicy", env or TaskVecEnv.from_id(env_id, 4), n_train_tasks=4, seed=0, **options
+        "MlpPolicy", env or make_task_vec_env(env_id, 4), n_train_tasks=4, seed=0, **options
     )
 
 
@@ -97,7 +98,7 @@ def test_successes_are_those_of_the_evaluated_episodes(env_id):
 def test_a_family_without_successes_has_no_rates():
     model = POEMSAC(
         "MlpPolicy",
-        TaskVecEnv.from_id("poem/PointGoal-v0", 4),
+        make_task_vec_env("poem/PointGoal-v0", 4),
         n_train_tasks=4,
         seed=0,
         policy_kwargs=SMALL,

@@ -20,7 +20,7 @@ import pytest
 from sb3_poem.adaptation import PreferenceAdapter, ReturnOracle, evaluate_latents
 from sb3_poem.adaptation.noise import MistakeNoise
 from sb3_poem.common.trajectory import Trajectory
-from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.label.catalogue import Choice, read_catalogue
 from sb3_poem.label.store import Store
 from sb3_poem.label.turns import load_choice
@@ -194,7 +194,7 @@ def begin(
 
 def returns(choice: Choice, latents: np.ndarray, task: float) -> np.ndarray:
     """True returns of latents, the mean of the same ten episodes each."""
-    env, model = TaskVecEnv.from_id(choice.env_id, 10), load_choice(choice)
+    env, model = make_task_vec_env(choice.env_id, 10), load_choice(choice)
     values = [
         evaluate_latents(model, env, latent[None, :], np.array([[task]]), 10, seed=77).mean()
         for latent in latents

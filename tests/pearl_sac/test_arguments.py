@@ -24,7 +24,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_poem import PEARLSAC, POEMSAC
-from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.pearl_sac.policies import LatentPolicy
 from sb3_poem.poem_sac.policies import POEMPolicy
 
@@ -55,7 +55,7 @@ def test_training_leaves_the_global_generators_alone(algorithm: type[PEARLSAC]) 
 
 
 def test_the_kind_of_environment_does_not_matter(algorithm: type[PEARLSAC]) -> None:
-    ours = small(algorithm, TaskVecEnv.from_id(POINT_GOAL, 5)).learn(EPOCH)
+    ours = small(algorithm, make_task_vec_env(POINT_GOAL, 5)).learn(EPOCH)
     theirs = small(algorithm, make_vec_env(POINT_GOAL, 5)).learn(EPOCH)
     assert_same_model(ours, theirs)
 

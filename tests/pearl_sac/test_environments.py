@@ -28,7 +28,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMoni
 
 from poem_envs import ProcessFamilyVector
 from sb3_poem import PEARLSAC, POEMSAC, AdaptationEvalCallback
-from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.common.vec_env import TaskVecEnv, make_task_vec_env
 
 #: For what is one code in both
 one_is_enough = pytest.mark.parametrize("algorithm", [POEMSAC])
@@ -50,7 +50,7 @@ OBS = np.random.default_rng(0).normal(size=(6, 2))
         pytest.param(
             lambda: make_vec_env(POINT_GOAL, 5, vec_env_cls=TaskVecEnv), id="task-vec-env"
         ),
-        pytest.param(lambda: TaskVecEnv.from_id(POINT_GOAL, 30), id="more-copies-than-tasks"),
+        pytest.param(lambda: make_task_vec_env(POINT_GOAL, 30), id="more-copies-than-tasks"),
     ],
 )
 def test_any_number_of_environments(algorithm: type[PEARLSAC], make_env: Any) -> None:

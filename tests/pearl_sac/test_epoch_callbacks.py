@@ -211,11 +211,11 @@ def test_evaluation_of_a_finite_family_is_on_all_its_tasks() -> None:
 
 
 def test_evaluation_takes_the_training_environments_arguments() -> None:
-    from sb3_poem.common.vec_env import TaskVecEnv
+    from sb3_poem.common.vec_env import make_task_vec_env
 
     callback = AdaptationEvalCallback(**QUICK)
     callback.init_callback(
-        small(POEMSAC, TaskVecEnv.from_id(POINT_GOAL, 3, step_length=0.2, max_episode_steps=7))
+        small(POEMSAC, make_task_vec_env(POINT_GOAL, 3, step_length=0.2, max_episode_steps=7))
     )
     env, tasks = callback._make_env()
     assert env.num_envs == 20

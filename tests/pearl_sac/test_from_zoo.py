@@ -13,7 +13,7 @@ import yaml
 from meta_toys import EPOCH, POINT_GOAL, Walk, differing, parameters, small
 
 from sb3_poem import PEARLSAC, POEMSAC
-from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.loading import ALGORITHMS
 from sb3_poem.pearl_sac.saving import kept_arguments
 from sb3_poem.resources import config_file
@@ -97,7 +97,7 @@ def test_it_is_what_the_constructor_makes() -> None:
         "seed": 0,
         "gradient_steps": 2,
         "learning_rate": 5e-3,
-        "env": TaskVecEnv.from_id(POINT_GOAL, 60),
+        "env": make_task_vec_env(POINT_GOAL, 60),
     }
     policy_kwargs = eval(entry["policy_kwargs"])
     by_hand = POEMSAC(**{**arguments, **changed, "policy_kwargs": policy_kwargs}).learn(1500)

@@ -6,7 +6,7 @@ from meta_toys import LEARN, LEARN_STEPS, POINT_GOAL, point_goal_bounds
 
 from sb3_poem import PEARLSAC
 from sb3_poem.adaptation.evaluation import evaluate_latents
-from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.common.vec_env import make_task_vec_env
 
 
 def test_pearl_learns_point_goal() -> None:
@@ -15,7 +15,7 @@ def test_pearl_learns_point_goal() -> None:
     """
     model = PEARLSAC("MlpPolicy", POINT_GOAL, **LEARN).learn(5 * LEARN_STEPS // 3)
     tasks, latents = model.train_tasks.tasks, model.task_latents
-    env = TaskVecEnv.from_id(POINT_GOAL, len(tasks))
+    env = make_task_vec_env(POINT_GOAL, len(tasks))
     own = evaluate_latents(model, env, latents, tasks, n_episodes=2, seed=5).mean()
     blind, known = point_goal_bounds(tasks)
     assert own > blind + 0.2 * (known - blind)

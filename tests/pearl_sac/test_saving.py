@@ -28,7 +28,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_poem import PEARLSAC, POEMSAC
-from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.common.vec_env import make_task_vec_env
 
 #: For what is one code in both
 one_is_enough = pytest.mark.parametrize("algorithm", [POEMSAC])
@@ -94,7 +94,7 @@ def test_set_env_takes_another_number_of_copies(algorithm: type[PEARLSAC]) -> No
     model = small(algorithm).learn(EPOCH)
     for env in (
         make_vec_env(POINT_GOAL, 2),
-        TaskVecEnv.from_id(POINT_GOAL, 30),
+        make_task_vec_env(POINT_GOAL, 30),
         gym.make(POINT_GOAL),
     ):
         model.set_env(env)
@@ -297,7 +297,7 @@ def test_an_id_becomes_as_many_copies_as_in_training(
         assert loaded.n_envs == whole.n_envs == 12
     resumed.learn(2 * 12 * 25, reset_num_timesteps=False)
     assert not differing(parameters(resumed), parameters(whole))
-    other = small(algorithm, TaskVecEnv.from_id(POINT_GOAL, 5), **arguments)
+    other = small(algorithm, make_task_vec_env(POINT_GOAL, 5), **arguments)
     other.save(tmp_path / "o.zip")
     assert algorithm.load(tmp_path / "o.zip", POINT_GOAL).n_envs == 5
 

@@ -12,7 +12,7 @@ from meta_toys import Walk, small, walks
 
 from poem_envs import ProcessFamilyVector
 from sb3_poem import PEARLSAC
-from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.common.vec_env import make_task_vec_env
 
 GAMMA = 0.9
 
@@ -75,7 +75,7 @@ def test_the_vectorised_and_the_process_family_have_the_potential_of_the_single_
     np.testing.assert_allclose(single.compute_potential(tasks, observations), [-3.0, -1.5])
     standing = np.column_stack([observations[:, :2], np.zeros(2)])
     np.testing.assert_allclose(single.compute_rewards(tasks, standing), [-3.0, -1.5])
-    vec_env = TaskVecEnv.from_id("poem/AntGoal-v0", 2)
+    vec_env = make_task_vec_env("poem/AntGoal-v0", 2)
     assert vec_env.get_attr("has_potential") == [True, True]
     np.testing.assert_allclose(
         vec_env.env_method("compute_potential", tasks, observations, indices=[0])[0], [-3.0, -1.5]

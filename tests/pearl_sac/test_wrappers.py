@@ -25,7 +25,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_poem import PEARLSAC, POEMSAC
-from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.common.vec_env import make_task_vec_env
 
 Wrap = Callable[[gym.Env], gym.Env]
 
@@ -100,7 +100,7 @@ def test_known_wrappers_are_refused_by_name(wrap: Wrap, name: str, monitor: bool
 
 
 @pytest.mark.parametrize("wrap", [VecNormalize, functools.partial(VecFrameStack, n_stack=2)])
-@pytest.mark.parametrize("make", [make_vec_env, TaskVecEnv.from_id])
+@pytest.mark.parametrize("make", [make_vec_env, make_task_vec_env])
 def test_sb3s_wrappers_are_refused_by_name(
     wrap: Callable[[VecEnv], VecEnv], make: Callable[[str, int], VecEnv]
 ) -> None:
@@ -171,7 +171,7 @@ def test_unknown_wrappers_are_refused_by_the_first_experience(
 
 
 def test_unknown_wrappers_around_the_vectorised_environment() -> None:
-    for env in (TaskVecEnv.from_id(POINT_GOAL, 2), make_vec_env(POINT_GOAL, 2)):
+    for env in (make_task_vec_env(POINT_GOAL, 2), make_vec_env(POINT_GOAL, 2)):
         with pytest.raises(ValueError, match="env's wrappers OwnVec change what is seen or done"):
             small(POEMSAC, OwnVec(env)).learn(EPOCH)
 

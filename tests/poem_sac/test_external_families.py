@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from sb3_poem import POEMSAC, TaskVecEnv
+from sb3_poem import POEMSAC
 from sb3_poem.adaptation import evaluate_episodes
+from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.pearl_sac.collector import EpochCollector
 
 HORIZON = 8
@@ -12,7 +13,7 @@ SMALL = {"net_arch": {"pi": [16], "qf": [16], "encoder": [16], "decoder": [16], 
 
 
 def make_model(env_id, n_tasks=4, n_envs=4, **env_kwargs):
-    env = TaskVecEnv.from_id(env_id, n_envs, nthread=1, max_episode_steps=HORIZON, **env_kwargs)
+    env = make_task_vec_env(env_id, n_envs, nthread=1, max_episode_steps=HORIZON, **env_kwargs)
     options = {
         "batch_size": 8,
         "context_size": 8,

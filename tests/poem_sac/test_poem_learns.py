@@ -15,7 +15,7 @@ from sb3_poem.adaptation.evaluation import (
     preference_order,
     return_matrix,
 )
-from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.common.vec_env import TaskVecEnv, make_task_vec_env
 
 
 def preference_accuracy(model: POEMSAC, env: TaskVecEnv) -> float:
@@ -36,7 +36,7 @@ def test_poem_learns_point_goal() -> None:
     78 % of the way.
     """
     model = POEMSAC("MlpPolicy", POINT_GOAL, **LEARN).learn(LEARN_STEPS)
-    env = TaskVecEnv.from_id(POINT_GOAL, 20)
+    env = make_task_vec_env(POINT_GOAL, 20)
     own = evaluate_latents(
         model, env, model.task_latents, model.train_tasks.tasks, n_episodes=2, seed=5
     ).mean()
@@ -58,4 +58,4 @@ def test_preferences_are_ordered_by_the_preference_loss_alone() -> None:
     them.
     """
     model = POEMSAC("MlpPolicy", POINT_GOAL, **LEARN, preference_coef=0.0).learn(LEARN_STEPS)
-    assert preference_accuracy(model, TaskVecEnv.from_id(POINT_GOAL, 20)) < 0.7
+    assert preference_accuracy(model, make_task_vec_env(POINT_GOAL, 20)) < 0.7

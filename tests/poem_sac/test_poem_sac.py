@@ -25,7 +25,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_poem import PEARLSAC, POEMSAC
 from sb3_poem.adaptation.bayes import BayesInference
 from sb3_poem.common.buffers import Segment, TaskBatch
-from sb3_poem.common.vec_env import TaskVecEnv
+from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.pearl_sac.collector import EpochCollector
 from sb3_poem.pearl_sac.objective import TaskEmbeddings, kl_to_prior
 from sb3_poem.poem_sac.objective import POEMObjective
@@ -93,7 +93,7 @@ def sources() -> dict[str, tuple[POEMSAC, Spy]]:
     """
     result = {}
     for source in ("relabel", "rollout"):
-        env = TaskVecEnv.from_id(POINT_GOAL, 4, reset_noise_scale=0.0)
+        env = make_task_vec_env(POINT_GOAL, 4, reset_noise_scale=0.0)
         model = small(
             POEMSAC,
             env,
@@ -215,7 +215,7 @@ class StillWindyWalk(WindyWalk):
 
 
 def test_trajectories_of_a_task_are_averaged() -> None:
-    env = TaskVecEnv.from_id(POINT_GOAL, 3, reset_noise_scale=0.0)
+    env = make_task_vec_env(POINT_GOAL, 3, reset_noise_scale=0.0)
     model = nearly_deterministic(
         small(POEMSAC, env, gradient_steps=0, n_train_tasks=4, trajectories_per_task=2)
     )
@@ -579,7 +579,7 @@ def test_one_task_is_a_family_too() -> None:
 @pytest.mark.parametrize("algorithm", [PEARLSAC, POEMSAC])
 def test_half_cheetah_forwards_and_backwards(algorithm: type[PEARLSAC]) -> None:
     """Two tasks on the real simulator, from the id alone."""
-    env = TaskVecEnv.from_id("poem/HalfCheetahFwdBack-v0", 2, max_episode_steps=20)
+    env = make_task_vec_env("poem/HalfCheetahFwdBack-v0", 2, max_episode_steps=20)
     model = small(algorithm, env, n_train_tasks=None).learn(80)
     assert sorted(model.train_tasks.tasks.ravel()) == [-1.0, 1.0]
     assert all(value.isfinite().all() for value in parameters(model).values())
