@@ -55,12 +55,16 @@ def foreign() -> SAC:
     return SAC("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [4]}, buffer_size=10)
 
 
-def config_file(folder: Path, env_id: str = POINT_GOAL, **changes: Any) -> str:
+def write_entry(path: Path, env_id: str = POINT_GOAL, **changes: Any) -> Path:
     """A file of hyperparameters: :data:`ENTRY` with changes."""
-    folder.mkdir(exist_ok=True)
-    path = folder / "my.yml"
     path.write_text(yaml.safe_dump({env_id: {**ENTRY, **changes}}))
-    return str(path)
+    return path
+
+
+def config_file(folder: Path, env_id: str = POINT_GOAL, **changes: Any) -> str:
+    """The same in a folder of its own."""
+    folder.mkdir(exist_ok=True)
+    return str(write_entry(folder / "my.yml", env_id, **changes))
 
 
 class Outcome(NamedTuple):

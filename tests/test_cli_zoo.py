@@ -16,6 +16,8 @@ import pandas as pd
 import pytest
 import torch as th
 import yaml
+from first_hour import ENTRY as SMALL
+from first_hour import write_entry
 from meta_toys import WindyWalk, differing, parameters
 from rl_zoo3 import ALGOS
 from rl_zoo3.exp_manager import ExperimentManager
@@ -31,39 +33,15 @@ from sb3_poem.cli.zoo import register_algorithms
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.pearl_sac.arguments import UNSUPPORTED
 
-SMALL = {
-    "policy": "MlpPolicy",
-    "n_timesteps": 300,
-    "n_envs": 6,
-    "n_train_tasks": 6,
-    "gradient_steps": 3,
-    "meta_batch_size": 4,
-    "batch_size": 16,
-    "context_size": 16,
-    "policy_kwargs": "dict(net_arch=[16, 16])",
-}
-
 
 @pytest.fixture
 def config(tmp_path: Path) -> Path:
-    path = tmp_path / "small.yml"
-    path.write_text(yaml.safe_dump({"poem/PointGoal-v0": SMALL}))
-    return path
+    return write_entry(tmp_path / "small.yml")
 
 
 def train(*arguments: object) -> int:
-    return cli.main(
-        [
-            "train",
-            "--env",
-            "poem/PointGoal-v0",
-            "--seed",
-            "0",
-            "--verbose",
-            "0",
-            *map(str, arguments),
-        ]
-    )
+    small = ["train", "--env", "poem/PointGoal-v0", "--seed", "0", "--verbose", "0"]
+    return cli.main([*small, *map(str, arguments)])
 
 
 def test_algorithms_are_registered() -> None:
@@ -135,7 +113,7 @@ def test_shipped_hyperparameters_are_known_and_cover_the_environments(file: Path
 def test_what_only_sac_takes_is_refused_by_the_same_words(
     key: str, config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    config.write_text(yaml.safe_dump({"poem/PointGoal-v0": {**SMALL, key: "normal"}}))
+    write_entry(config, **{key: "normal"})
     assert train("-c", config, "-f", tmp_path / "logs") != 0
     assert f"'{key}' in {config}" in (error := capsys.readouterr().err)
     assert UNSUPPORTED[key] in error
@@ -406,11 +384,6 @@ def test_rl_zoo3_is_left_as_it_was(config: Path, tmp_path: Path) -> None:
     assert sys.argv is arguments
 
 
-def write_entry(path: Path, **changes: object) -> Path:
-    path.write_text(yaml.safe_dump({"poem/PointGoal-v0": {**SMALL, **changes}}))
-    return path
-
-
 def test_unknown_key_is_named_with_file_algorithm_and_near_matches(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -468,10 +441,9 @@ def test_broken_yaml_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 def test_a_number_that_yaml_reads_as_text_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "text.yml").write_text(
-        yaml.safe_dump({"poem/PointGoal-v0": SMALL}) + "  learning_rate: 1e-3\n"
-    )
-    assert train("-c", tmp_path / "text.yml", "-f", tmp_path / "logs") == 1
+    config = write_entry(tmp_path / "text.yml")
+    config.write_text(config.read_text() + "  learning_rate: 1e-3\n")
+    assert train("-c", config, "-f", tmp_path / "logs") == 1
     error = capsys.readouterr().err
     assert "learning_rate in " in error
     assert "write 0.001" in error

@@ -60,9 +60,8 @@ def run_adapt(arguments: argparse.Namespace) -> int:
     human = arguments.oracle == "human"
     subject = Subject(arguments, Console(), n_tasks, COPIES_FOR_ONE_TASK if human else COPIES)
     if subject.latent is not None:
-        raise ValueError(
-            f"--model {arguments.model} is a policy that is adapted already; name the model instead"
-        )
+        what = "a policy that is adapted already; name the model instead"
+        raise ValueError(f"--model {arguments.model} is {what}")
     adaptation = Adaptation(arguments, subject)
     try:
         return adaptation.ask_person() if human else adaptation.ask_oracle()
@@ -89,9 +88,8 @@ def _check_tasks(arguments: argparse.Namespace) -> int:
         )
     for flag in ("store", "resume"):
         if getattr(arguments, flag) and not human:
-            raise ValueError(
-                f"--{flag} is about a person's answers, but --oracle is {arguments.oracle}"
-            )
+            what = f"about a person's answers, but --oracle is {arguments.oracle}"
+            raise ValueError(f"--{flag} is {what}")
     return n_tasks
 
 

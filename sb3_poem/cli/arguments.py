@@ -37,9 +37,8 @@ def build_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
-    commands = parser.add_subparsers(
-        dest="command", required=True, metavar="{" + ",".join(COMMANDS) + "}"
-    )
+    known = "{" + ",".join(COMMANDS) + "}"
+    commands = parser.add_subparsers(dest="command", required=True, metavar=known)
     train = "meta-train an agent (rl_zoo3's train, with poem_sac and pearl_sac)"
     commands.add_parser("train", help=train, add_help=False)
     enjoy = _add_command(

@@ -126,9 +126,7 @@ class PoemExperiment(FamilyExperiment):
 
     def __init__(self, args: Any, algo: str, env_id: str, *rest: Any, **kwargs: Any) -> None:
         if is_task_family(env_id) is False:
-            raise ValueError(
-                f"--env {env_id} is no task family (a poem_envs.TaskFamily), and {algo} needs one"
-            )
+            raise ValueError(f"--env {env_id} is no task family, and {algo} needs one")
         kwargs["config"] = kwargs.get("config") or str(config_file(algo))
         super().__init__(args, algo, env_id, *rest, **kwargs)
         self.steps_per_evaluation = self.eval_freq
@@ -141,9 +139,8 @@ class PoemExperiment(FamilyExperiment):
         try:
             hyperparams, saved = super().read_hyperparameters()
         except yaml.YAMLError as error:
-            raise ValueError(
-                f"{self.config} is not valid YAML: {' '.join(str(error).split())}"
-            ) from error
+            why = " ".join(str(error).split())
+            raise ValueError(f"{self.config} is not valid YAML: {why}") from error
         except (AttributeError, TypeError) as error:
             raise ValueError(
                 f"{self.config} must hold a mapping of hyperparameters for each environment id"

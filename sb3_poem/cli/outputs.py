@@ -17,9 +17,8 @@ def check_writable(folder: str | Path) -> None:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise OSError(
-            f"cannot write to the folder {str(folder)!r}: {error.strerror or error}"
-        ) from error
+        why = error.strerror or error
+        raise OSError(f"cannot write to the folder {str(folder)!r}: {why}") from error
 
 
 def check_output(flag: str, path: Path | None, suffixes: Sequence[str]) -> None:
@@ -42,6 +41,5 @@ def check_device(name: str) -> None:
     try:
         th.device("cpu" if name == "auto" else name)
     except RuntimeError as error:
-        raise ValueError(
-            f"--device {name}: there is no such device; there are auto, cpu and cuda"
-        ) from error
+        known = "there are auto, cpu and cuda"
+        raise ValueError(f"--device {name}: there is no such device; {known}") from error

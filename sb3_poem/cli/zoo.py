@@ -82,9 +82,8 @@ def check_arguments(command: str, arguments: Sequence[str]) -> None:
     check_device(given.device)
     if given.trained_agent:
         if not given.trained_agent.endswith(".zip") or not Path(given.trained_agent).is_file():
-            raise ValueError(
-                f"-i {given.trained_agent}: there is no such file of a model, which ends in .zip"
-            )
+            what = "there is no such file of a model, which ends in .zip"
+            raise ValueError(f"-i {given.trained_agent}: {what}")
         if given.algo in ALGORITHMS and not is_checkpoint(given.trained_agent):
             ALGORITHMS[given.algo].load(given.trained_agent, device="cpu")
     if given.env not in gym.registry:

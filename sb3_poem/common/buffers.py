@@ -96,11 +96,6 @@ class TaskReplayBuffer(ReplayBuffer):
         """Transitions of a task that there is memory for."""
         return self.rows.shape[1] - 1
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes that are allocated."""
-        return sum(tensor.numel() * tensor.element_size() for tensor in (self.rows, self.ends))
-
     def size(self) -> int:
         """Transitions stored, over all tasks."""
         return int(self.counts.sum())

@@ -61,9 +61,7 @@ def environment_of(
     given_kwargs = given_kwargs or {}
     chosen = given_id or env_id
     if chosen is None:
-        raise ValueError(
-            f"--env is needed: {source} does not say on which environment it was trained"
-        )
+        raise ValueError(f"--env is needed: {source} does not say where it was trained")
     if chosen != env_id:
         return chosen, dict(given_kwargs)
     check_env_id(env_id, source)

@@ -33,15 +33,12 @@ class LowPrecisionMLP:
         widths = [*(layer.in_features for layer in hidden), output.in_features]
         padded = [-(-width // alignment) * alignment for width in widths]
         #: Column of each layer's input that is constantly 1, None without padding
-        self.ones = [
-            width if width < room else None for width, room in zip(widths, padded, strict=True)
-        ]
+        self.ones = [w if w < room else None for w, room in zip(widths, padded, strict=True)]
         self.parameters: list[th.Tensor] = []
         #: The float32 parameters and where their copies are
         self.pairs: list[tuple[th.Tensor, th.Tensor, tuple[slice, ...]]] = []
-        for layer, columns, rows, spare in zip(
-            hidden, padded, padded[1:], self.ones[1:], strict=False
-        ):
+        sizes = zip(hidden, padded, padded[1:], self.ones[1:], strict=False)
+        for layer, columns, rows, spare in sizes:
             weight = layer.weight.new_zeros(rows, columns, dtype=dtype)
             bias = layer.weight.new_zeros(rows, dtype=dtype)
             if spare is not None:

@@ -125,9 +125,7 @@ def _episodes(
     latents = np.asarray(latents, dtype=np.float64)
     n, copies = len(latents), vec_env.num_envs
     if latents.ndim != 2:
-        raise ValueError(
-            f"`latents` must have shape (n, latent_dim), but has shape {latents.shape}"
-        )
+        raise ValueError(f"`latents` must have shape (n, latent_dim), but has {latents.shape}")
     if not (finite := np.isfinite(latents).all(axis=1)).all():
         raise ValueError(f"`latents` must be finite, but row {int(np.argmin(finite))} is not")
     if tasks is not None:
@@ -139,9 +137,7 @@ def _episodes(
             )
     seeds = [seed + i for i in range(n)] if isinstance(seed, (int, np.integer)) else list(seed)
     if len(seeds) != n:
-        raise ValueError(
-            f"`seed` must be one integer or hold one a latent ({n}), but holds {len(seeds)}"
-        )
+        raise ValueError(f"`seed` must be one integer or hold one a latent ({n}), not {len(seeds)}")
     steps = model.horizon if max_steps is None else max_steps
     if steps < 1:
         raise ValueError(f"`max_steps` must be at least 1, but is {steps}")
@@ -198,7 +194,7 @@ def _wave(
     """An episode of each copy that is running, of which the first has this number."""
     n, copies = int(running.sum()), len(running)
     observations = _flat(vec_env.reset())
-    _check_finite(observations, running, first, 0, "an observation")
+    _finite(observations, running, first, 0, "an observation")
     lengths = np.zeros(copies, dtype=np.int64)
     seen, taken = [observations.copy()], []
     features: list[np.ndarray | None] = []
@@ -208,7 +204,7 @@ def _wave(
         _add_images(images, vec_env, running)
     for step in range(1, max_steps + 1):
         actions = policy_actions(model, observations, latents, deterministic)
-        _check_finite(actions, running, first, step, "an action")
+        _finite(actions, running, first, step, "an action")
         stepped, _, dones, infos = vec_env.step(actions)
         observations = _flat(stepped)
         given = reward_features(vec_env, infos)
@@ -219,7 +215,7 @@ def _wave(
         after = observations.copy()
         for copy in np.flatnonzero(dones & running):
             after[copy] = infos[copy]["terminal_observation"]
-        _check_finite(after, running, first, step, "an observation")
+        _finite(after, running, first, step, "an observation")
         lengths[running] = step
         if keep:
             taken.append(np.array(actions))
@@ -251,15 +247,11 @@ def _flat(observations: Any) -> np.ndarray:
     return observations.reshape(len(observations), -1)
 
 
-def _check_finite(
-    values: np.ndarray, running: np.ndarray, first: int, step: int, what: str
-) -> None:
+def _finite(values: np.ndarray, running: np.ndarray, first: int, step: int, what: str) -> None:
     bad = running & ~np.isfinite(values).all(axis=1)
     if bad.any():
         episode = first + int(np.argmax(bad))
-        raise ValueError(
-            f"{what} of episode {episode} at step {step} is not finite; the rollout stops"
-        )
+        raise ValueError(f"{what} of episode {episode} at step {step} is not finite")
 
 
 def _add_images(images: list[list[np.ndarray]], vec_env: VecEnv, running: np.ndarray) -> None:

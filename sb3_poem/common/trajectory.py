@@ -71,9 +71,7 @@ class Trajectory:
                 f"{len(self.observations)}"
             )
         if self.latent.ndim != 1:
-            raise ValueError(
-                f"`latent` must have shape (latent_dim,), but has shape {self.latent.shape}"
-            )
+            raise ValueError(f"`latent` must have shape (latent_dim,), but has {self.latent.shape}")
         if self.reward_features is not None and len(self.reward_features) != steps:
             raise ValueError(
                 f"`reward_features` must hold one row a step ({steps}), but holds "

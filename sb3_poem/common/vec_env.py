@@ -65,9 +65,7 @@ class TaskVecEnv(VecEnv):
         if len(env_fns) < 1:
             raise ValueError("env_fns is empty; pass one function for each copy")
         if not callable(env_fns[0]):
-            raise TypeError(
-                f"env_fns must hold functions that make an environment, but holds {env_fns[0]!r}"
-            )
+            raise TypeError(f"env_fns must hold functions that make one, but holds {env_fns[0]!r}")
         env = env_fns[0]()
         wrappers = _wrappers(env)
         vector_env = _vectorised(env, wrappers, len(env_fns), nthread)
@@ -84,7 +82,8 @@ class TaskVecEnv(VecEnv):
         super().__init__(vector_env.num_envs, observation_space, vector_env.single_action_space)
         self.metadata = vector_env.metadata
         self._actions: np.ndarray | None = None
-        self._last_reward_features: np.ndarray | None = None
+        #: (num_envs, reward_feature_dim), those of the last step; None before the first
+        self.last_reward_features: np.ndarray | None = None
         self._returns = np.zeros(self.num_envs)
         self._lengths = np.zeros(self.num_envs, dtype=np.int64)
         self._start_time = time.time() if self._monitor is None else self._monitor.t_start
@@ -106,11 +105,6 @@ class TaskVecEnv(VecEnv):
         """The tasks in effect, ``(num_envs, task_dim)``; None before the first reset."""
         return self.vector_env.tasks
 
-    @property
-    def last_reward_features(self) -> np.ndarray | None:
-        """``(num_envs, reward_feature_dim)``, those of the last step; None before the first."""
-        return self._last_reward_features
-
     def set_tasks(self, tasks: npt.ArrayLike) -> None:
         """See :meth:`poem_envs.TaskFamilyVector.set_tasks`."""
         self.vector_env.set_tasks(tasks)
@@ -131,7 +125,6 @@ class TaskVecEnv(VecEnv):
         observations, _ = self.vector_env.reset(seed=self._seeds)
         self._reset_seeds()
         self._reset_options()
-        self.reset_infos = [{} for _ in range(self.num_envs)]
         self._returns[:] = 0.0
         self._lengths[:] = 0
         return observations
@@ -144,7 +137,7 @@ class TaskVecEnv(VecEnv):
             raise RuntimeError("step_wait() was called without step_async(actions)")
         actions, self._actions = self._actions, None
         observations, rewards, terminations, truncations, given = self.vector_env.step(actions)
-        self._last_reward_features = features = given["reward_features"]
+        self.last_reward_features = features = given["reward_features"]
         self._returns += rewards
         self._lengths += 1
         cut_short = truncations & ~terminations
@@ -301,22 +294,6 @@ class _CopyView:
         tasks = self._vector_env.tasks
         return None if tasks is None else tasks[self._index]
 
-    @property
-    def observation_space(self) -> gym.Space:
-        return self._vector_env.single_observation_space
-
-    @property
-    def action_space(self) -> gym.Space:
-        return self._vector_env.single_action_space
-
-    @property
-    def np_random(self) -> np.random.Generator:
-        return self._vector_env.np_random[self._index]
-
-    @property
-    def np_random_seed(self) -> int:
-        return self._vector_env.np_random_seed[self._index]
-
     def set_task(self, task: npt.ArrayLike) -> None:
         self._vector_env.set_tasks([np.asarray(task)], copies=[self._index])
 
@@ -338,7 +315,10 @@ class _CopyView:
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") or name in self._HIDDEN:
             raise AttributeError(f"a copy of a vectorised task family has no attribute {name!r}")
-        return getattr(self._vector_env, name)
+        if name in ("observation_space", "action_space"):
+            return getattr(self._vector_env, f"single_{name}")
+        value = getattr(self._vector_env, name)
+        return value[self._index] if name in ("np_random", "np_random_seed") else value
 
 
 def _wrappers(env: gym.Env) -> list[gym.Wrapper]:
@@ -373,9 +353,8 @@ def _vectorised(
         )
     monitors = [wrapper for wrapper in wrappers if isinstance(wrapper, Monitor)]
     if any(monitor.reset_keywords or not monitor.allow_early_resets for monitor in monitors):
-        raise ValueError(
-            "Monitor's reset_keywords and allow_early_resets=False are not supported; " + instead
-        )
+        what = "Monitor's reset_keywords and allow_early_resets=False are not supported"
+        raise ValueError(f"{what}; {instead}")
     if bare.spec is None:
         raise ValueError(
             f"{bare} was not made by gym.make, so that its arguments are unknown; register it, or "
@@ -394,9 +373,7 @@ def _vectorised(
     kwargs: dict[str, Any] = {} if nthread is None else {"nthread": nthread}
     vector_env = gym.make_vec(spec, num_envs, "vector_entry_point", **kwargs)
     if not isinstance(vector_env, TaskFamilyVector):
-        raise ValueError(
-            f"the vector_entry_point of {spec.id} is no poem_envs.TaskFamilyVector; {instead}"
-        )
+        raise ValueError(f"{spec.id}'s vector_entry_point is no TaskFamilyVector; {instead}")
     # a single environment's: make_vec's own adds what gym.make does not take
     vector_env.spec = spec
     return vector_env
