@@ -144,8 +144,8 @@ def test_table_plot_and_video(
         "task known: the best of 300 policies for each task, measured anew on 1 episodes" in prose
     )
     assert (
-        "limit: the best 2^answers of those 300 for these very tasks, chosen with the tasks in sight"
-        in prose
+        "limit: the best 2^answers of those 300 for these very tasks, chosen with the tasks in "
+        "sight" in prose
     )
     assert (
         shown.index("after 0 answers: return")
@@ -321,7 +321,8 @@ def test_a_person_who_stops_goes_on_later_as_if_they_had_not(
     shown = capsys.readouterr().out
     assert "Standard input ended after 1 of 3 answers" in shown
     assert "It believes that you mean a place near" in shown
-    again = f"sb3-poem adapt --model {model[1]} --oracle human --queries 3 --seed 2 {shlex.join(TINY)} --resume"
+    words = f"--oracle human --queries 3 --seed 2 {shlex.join(TINY)} --resume"
+    again = f"sb3-poem adapt --model {model[1]} {words}"
     assert f"answer the rest:  {again}\n" in shown
     monkeypatch.setattr(sys, "stdin", ThenInterrupt("r\n"))
     assert adapt(model[1], *flags, "--resume") == 130

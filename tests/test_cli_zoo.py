@@ -522,8 +522,8 @@ def test_what_changes_a_family_is_refused_before_training(
     assert train("--algo", algorithm, "-c", config, "-f", tmp_path / "logs") == 1
     error = capsys.readouterr().err
     assert (
-        f"'{key}' in {config}, entry 'poem/PointGoal-v0' is not for {algorithm}: it changes what is seen or paid"
-        in error
+        f"'{key}' in {config}, entry 'poem/PointGoal-v0' is not for {algorithm}: it changes what "
+        "is seen or paid" in error
     )
     assert not list((tmp_path / "logs").rglob("*.csv")), "nothing may have started"
 
@@ -675,8 +675,8 @@ def test_an_interrupt_of_the_program(tmp_path: Path, whole: dict[str, th.Tensor]
     )
     assert done.returncode == 130, done.stderr
     assert (
-        "Interrupted at 600 of 900 steps; go on with: sb3-poem train --env poem/PointGoal-v0 --seed 0 -P"
-        in done.stderr
+        "Interrupted at 600 of 900 steps; go on with: sb3-poem train --env poem/PointGoal-v0 "
+        "--seed 0 -P" in done.stderr
     )
     assert train("-c", config, "-f", tmp_path, *LONG, "--resume") == 0
     assert not differing(parameters(trained(tmp_path, 2)), whole)
@@ -690,9 +690,9 @@ def test_a_second_interrupt_stops_at_once_and_loses_no_older_checkpoint(
     assert train(*flags) == 130
     assert train(*flags, "--resume") == 130  # within the first epoch of this run
     error = capfd.readouterr().err.splitlines()[-1]
-    assert (
-        error
-        == "Interrupted at 630 of 900 steps, before the first checkpoint; the same command begins again"
+    assert error == (
+        "Interrupted at 630 of 900 steps, before the first checkpoint; the same command begins "
+        "again"
     )
     assert train(*flags, "--resume", "-params", "n_timesteps:900", "callback:None") == 0
     assert "after 600 steps" in capfd.readouterr().out

@@ -1,4 +1,4 @@
-"""What README and guides show is what runs: their Python blocks and commands, with small budgets."""
+"""What README and guides show is what runs: their Python blocks and commands, on little."""
 
 import io
 import re

@@ -6,7 +6,7 @@ import numpy as np
 
 
 def check_whole(name: str, value: Any, least: int, most: int | None = None) -> None:
-    """Refuse what is no whole number (NumPy's are, True and False are not), too small or too large."""
+    """Refuse what is no whole number in the range; NumPy's are, True and False are not."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise ValueError(f"`{name}` must be a whole number, but is {value!r}")
     if value < least:

@@ -326,7 +326,7 @@ class FamilyView:
         return features
 
     def check_same_family(self, task_space: spaces.Box, reward_feature_dim: int) -> None:
-        """:raises ValueError: if a model that was made for another family is given this environment"""
+        """Refuse a model that was made for another family."""
         if self.task_space != task_space or self.reward_feature_dim != reward_feature_dim:
             raise ValueError(
                 f"the model was trained for tasks in {task_space} with {reward_feature_dim} reward "

@@ -52,7 +52,7 @@ class LowPrecisionMLP:
         self._constant[:1] = 1.0
 
     def inputs(self, parts: Sequence[th.Tensor]) -> th.Tensor:
-        """Concatenate (..., width) tensors into what :meth:`evaluate` takes, (..., padded width)."""
+        """Concatenate (..., width) tensors into what :meth:`evaluate` takes, (..., padded)."""
         if self.ones[0] is not None:
             parts = [*parts, self._constant.expand(*parts[0].shape[:-1], -1)]
         return th.cat(list(parts), dim=-1).to(self.dtype)

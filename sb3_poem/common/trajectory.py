@@ -88,8 +88,8 @@ class Trajectory:
         return len(self.actions)
 
     def to_dict(self) -> dict[str, Any]:
-        """The trajectory as JSON-ready data, for :meth:`from_dict`. Frames stay out: they are large,
-        and the rollout's seed gives them again.
+        """JSON-ready data for :meth:`from_dict`. Frames stay out: they are large, and the rollout's
+        seed gives them again.
         """
         arrays = {name: getattr(self, name) for name in STORED}
         return {name: None if a is None else encode_array(a) for name, a in arrays.items()}

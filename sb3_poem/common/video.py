@@ -18,11 +18,10 @@ def _even(frame: Frame) -> Frame:
 
 
 def write_video(frames: Sequence[Frame], path: str | Path, fps: float = 20.0) -> Path:
-    """Write frames as MP4 (H.264) or GIF, by the file's suffix, and return the path. Missing folders
-    are made.
+    """Write frames as MP4 (H.264) or GIF, by the file's suffix; missing folders are made.
 
     :param frames: (height, width, 3) uint8 each, all of one size
-    :param fps: frames per second
+    :return: the path
     :raises ValueError: no frames, frames of other shapes, or another suffix
     """
     import imageio.v2 as imageio

@@ -110,7 +110,8 @@ def test_poison_is_named(what: str) -> None:
     )
     with pytest.raises(
         ValueError,
-        match=rf"returned {what} that are NaN or infinite: copy 1, training task 1, episode 1, step 10: .*Training stops",
+        match=rf"returned {what} that are NaN or infinite: copy 1, training task 1, episode 1, "
+        r"step 10: .*Training stops",
     ):
         collect(env, np.zeros((2, 1)), horizon=20)
 

@@ -218,7 +218,8 @@ def test_arguments_that_a_file_may_not_give(
 ) -> None:
     spoil(folder, {"env_id": env_id, "env_kwargs": env_kwargs})
     with refused(
-        f"model asks for {env_id} with {next(iter(env_kwargs))}=.*{message}.*say so yourself: --env-kwargs"
+        f"model asks for {env_id} with {next(iter(env_kwargs))}=.*{message}.*say so yourself: "
+        "--env-kwargs"
     ):
         read_catalogue(str(folder))
     assert not trap.exists()
@@ -395,7 +396,8 @@ def test_a_broken_adapted_policy(folder: Path, latent: np.ndarray, n_answers: st
         {**facts, "n_answers": n_answers},
     )
     with refused(
-        "policy.safetensors is broken: (`latent` has shape|`latent` must be finite|n_answers must be a whole number)"
+        "policy.safetensors is broken: "
+        "(`latent` has shape|`latent` must be finite|n_answers must be a whole number)"
     ):
         AdaptedPolicy.load(policy)
 
@@ -416,7 +418,8 @@ def test_files_of_the_wrong_kind(folder: Path, monkeypatch: pytest.MonkeyPatch) 
     with refused("use POEMSAC.from_pretrained\\('model'\\)"):
         POEMSAC.load("model")
     with refused(
-        "HalfCheetahVel is the name of a model that ships: use PEARLSAC.from_pretrained\\('HalfCheetahVel'\\)"
+        "HalfCheetahVel is the name of a model that ships: "
+        r"use PEARLSAC.from_pretrained\('HalfCheetahVel'\)"
     ):
         PEARLSAC.load("HalfCheetahVel")
     with refused("model.zip: there is no such file or folder", FileNotFoundError):

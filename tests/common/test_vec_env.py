@@ -282,7 +282,7 @@ def test_learning_is_the_same_as_with_dummy_vec_env():
 
 
 def test_takes_environments_that_were_made_after_an_import_of_rl_zoo3():
-    """rl_zoo3 patches Gymnasium's TimeLimit when it is imported, whoever imported TimeLimit before."""
+    """rl_zoo3 patches Gymnasium's TimeLimit when it is imported, whoever imported that before."""
     code = """
 import gymnasium as gym
 from sb3_poem.common.vec_env import TaskVecEnv
