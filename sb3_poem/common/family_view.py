@@ -56,15 +56,20 @@ class FamilyView:
     def __init__(self, env: VecEnv) -> None:
         if not env.has_attr("shared_dynamics"):  # which a subclass of TaskFamily has without a word
             raise ValueError(no_family(env.env_method("__str__", indices=[0])[0]))
-        self.env = env
+        self.env, self.num_envs = env, env.num_envs
         self.observation_space, self.action_space = env.observation_space, env.action_space
         self.action_dim = spaces.flatdim(env.action_space)
         self.task_space: spaces.Box = self._get("task_space")
+        self.task_dim = int(self.task_space.shape[0])
         self.reward_feature_dim: int = self._get("reward_feature_dim")
         self.all_tasks: np.ndarray | None = self._get("all_tasks")
         self.shared_dynamics = bool(self._get("shared_dynamics"))
         self.symmetries: tuple[Symmetry, ...] = self._get("symmetries", ())
+        #: Whether the family has :meth:`compute_potential`
+        self.has_potential = bool(self._get("has_potential", False))
         self.spec: EnvSpec | None = self._get("spec")
+        #: Of its registration
+        self.env_id = None if self.spec is None else self.spec.id
         self._unknown_wrappers = ""
         self._experience_is_right = False
 
@@ -112,23 +117,15 @@ class FamilyView:
             raise ValueError(f"horizon must be at least 1 step, got {steps}")
         return int(steps)
 
-    @property
-    def env_id(self) -> str | None:
-        """Of its registration."""
-        return None if self.spec is None else self.spec.id
-
     @cached_property
     def env_kwargs(self) -> dict[str, Any]:
         """What it was made with beyond its registration, and beyond how it is drawn."""
-        if self.spec is None:
-            return {}
-        registered = gym.registry[self.spec.id].kwargs if self.spec.id in gym.registry else {}
-        return {
-            name: value
-            for name, value in self.spec.kwargs.items()
-            if name not in DRAWING_ARGUMENTS
-            and not (name in registered and _equal(registered[name], value))
-        }
+        own = {} if self.spec is None else dict(self.spec.kwargs)
+        registered = gym.registry[self.env_id].kwargs if self.env_id in gym.registry else {}
+        for name, value in registered.items():
+            if name in own and _equal(value, own[name]):
+                del own[name]
+        return {name: value for name, value in own.items() if name not in DRAWING_ARGUMENTS}
 
     def unknown_wrappers(self) -> list[str]:
         """The names of those wrappers of which it is not known whether they change the family.
@@ -219,14 +216,6 @@ class FamilyView:
         return np.allclose(np.array(seen, dtype=np.float32), shown, rtol=1e-4, atol=1e-4)
 
     @property
-    def num_envs(self) -> int:
-        return self.env.num_envs
-
-    @property
-    def task_dim(self) -> int:
-        return int(self.task_space.shape[0])
-
-    @property
     def task(self) -> np.ndarray:
         """(task_dim,), the one in effect in the first copy."""
         task = self._get("task")
@@ -264,11 +253,6 @@ class FamilyView:
     def compute_rewards(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
         """Rewards (...) of reward features (..., feat_dim) under tasks (..., task_dim)."""
         return self._call("compute_rewards", tasks, features)
-
-    @property
-    def has_potential(self) -> bool:
-        """Whether the family has :meth:`compute_potential`."""
-        return bool(self._get("has_potential", False))
 
     def compute_potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
         """Potentials (...) of observations (..., obs_dim) under tasks (..., task_dim)."""
