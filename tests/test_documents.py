@@ -5,6 +5,7 @@ import re
 import shlex
 import shutil
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +16,20 @@ from sybil.evaluators.python import PythonEvaluator
 from sybil.parsers.markdown import CodeBlockParser
 
 from sb3_poem import PEARLSAC, POEMSAC, PreferenceAdapter, cli
+from sb3_poem.cli import experiment
 from sb3_poem.resources import config_file, shipped_folder
 
 TOP = Path(__file__).parents[1]
 PAGES = ("README.md", *(f"docs/{page.name}" for page in sorted((TOP / "docs").glob("*.md"))))
 LEARN = PEARLSAC.learn
 
+TINY = "--env-kwargs width:48 height:48"
 #: Further words by subcommand, of which the last counts: as little as can be done
 SMALL = {
     "train": "-n 1500 --n-trials 1 --verbose 0",
     "enjoy": "--no-render --queries 1",
-    "record-video": "--queries 1",
-    "adapt": "--tasks 1 --episodes 1 --queries 2",
+    "record-video": f"--queries 1 {TINY}",
+    "adapt": f"--tasks 1 --episodes 1 --queries 2 {TINY}",
     "benchmark": "--list",
 }
 #: Pages to be served, and tables of records that a run has to make first: only read
@@ -100,6 +103,8 @@ def test_readme_s_commands_run(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(PEARLSAC, "learn", learn_quickly)
+    for name in ("AdaptationEvalCallback", "TrialAdaptationCallback"):
+        monkeypatch.setattr(experiment, name, partial(getattr(experiment, name), n_tasks=2))
     for command in commands("README.md"):
         if any(set(some.split()) <= set(command.split()) for some in ONLY_READ):
             continue
@@ -109,7 +114,7 @@ def test_readme_s_commands_run(
         monkeypatch.setattr("sys.stdin", io.StringIO("l\n" * 20))
         more = SMALL.get(words[0], "").split()
         if "human" in words:
-            more = ["--queries", "2"]
+            more = ["--queries", "2", *TINY.split()]
         if words[0] == "train" and "-P" not in words:  # whose best model is adapted further down
             more += ["--eval-freq", "-1"]
         assert cli.main([*words, *more]) == 0, (command, capsys.readouterr().err[-2000:])

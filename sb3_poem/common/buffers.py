@@ -166,8 +166,8 @@ class TaskReplayBuffer(ReplayBuffer):
             self.rows[:, :used] = state["rows"].to(self.device)
             self.rows[:, -1] = self.rows[:, 0]
         # a file gives tensors back where there were arrays
-        arrays = (state[name] for name in ("counts", "positions", "free_ends"))
-        self.counts, self.positions, self._free_ends = (np.array(array) for array in arrays)
+        arrays = (th.as_tensor(state[name]) for name in ("counts", "positions", "free_ends"))
+        self.counts, self.positions, self._free_ends = (each.numpy().copy() for each in arrays)
         self.ends = state["ends"].to(self.device, copy=True)
         self._note_counts()
 
