@@ -2,7 +2,7 @@
 
     python benchmarks/straight_to_goal.py
 
-On the 30 test tasks of ``benchmarks/adaptation.py``, an episode each; writes
+On the benchmark's 30 test tasks, an episode each; writes
 ``benchmarks/results/MetaWorldML1/straight-to-goal.md``.
 """
 

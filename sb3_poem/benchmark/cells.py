@@ -69,6 +69,7 @@ def run_cell(cell: Cell, library: ModelLibrary, say: Say = print) -> Record:
     result["training_samples"] = int(getattr(model, "num_timesteps", training.get("env_steps", 0)))
     result["updates"] = int(getattr(model, "_n_updates", training.get("updates", 0)))
     result["training_seconds"] = training.get("seconds")
+    result["training_cpu_seconds"] = training.get("cpu_seconds")
     about = {
         **provenance(),
         "device": library.workplace.device,

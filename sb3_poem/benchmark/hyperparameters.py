@@ -13,7 +13,7 @@ from sb3_poem.benchmark.suites import ModelKey
 from sb3_poem.resources import config_file
 
 #: Models are saved, for curves and against interruptions, this many times in a training.
-SAVES = 10
+SAVES = 20
 
 
 @dataclass(frozen=True)

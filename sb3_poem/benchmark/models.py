@@ -27,17 +27,25 @@ from sb3_poem.benchmark.hyperparameters import MissingEntryError, TrainingPlan, 
 from sb3_poem.benchmark.locks import locked, try_lock
 from sb3_poem.benchmark.methods import META_ITERATIONS, META_ITERATIONS_OF, VARIANTS
 from sb3_poem.benchmark.provenance import provenance
-from sb3_poem.benchmark.suites import ModelKey, family_id, family_label
+from sb3_poem.benchmark.suites import (
+    FILE,
+    REVISION,
+    ModelKey,
+    digest,
+    family_id,
+    family_label,
+)
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.loading import ALGORITHMS
 from sb3_poem.pearl_sac import PEARLSAC
 from sb3_poem.pearl_sac.saving import CONFIG, WEIGHTS, is_checkpoint, read_config
 
-CHECKPOINT, MODEL, FINISHED, SESSIONS, LOG, REWARD = (
+CHECKPOINT, MODEL, BEGUN, FINISHED, SESSIONS, LOG, REWARD = (
     "checkpoint.zip",
     "model.zip",
+    "begun.json",
     "trained.json",
-    "sessions.json",
+    "sessions",
     "train.log",
     "reward",
 )
@@ -95,7 +103,7 @@ class ModelLibrary:
         if not key.training.is_default:
             text = json.dumps(key.training.to_dict(), sort_keys=True)
             variant += "-" + hashlib.sha256(text.encode()).hexdigest()[:8]
-        return self.runs / _place(key) / variant / f"seed{key.seed}"
+        return self.runs / model_folder(key.env_id) / variant / f"seed{key.seed}"
 
     def given(self, key: ModelKey) -> Path | None:
         """The file or folder of a model that was handed over: one that was named;
@@ -119,11 +127,11 @@ class ModelLibrary:
                     _find_content(named)
                 return named
         for folder in map(Path, self.workplace.models):
-            place = folder / _place(key) / key.variant / f"seed{key.seed}"
+            place = folder / model_folder(key.env_id) / key.variant / f"seed{key.seed}"
             for candidate in (place, place.with_suffix(".zip")):
                 if candidate.is_file() or (candidate.is_dir() and _content(candidate) is not None):
                     return candidate
-            pretrained = folder / _place(key)
+            pretrained = folder / model_folder(key.env_id)
             if (pretrained / CONFIG).is_file() and _is_variant(read_config(pretrained), key):
                 return pretrained
         return None
@@ -139,6 +147,35 @@ class ModelLibrary:
         if (folder / FINISHED).exists():
             return "trained"
         return "interrupted" if any(folder.glob(f"*/*/{CHECKPOINT}")) else "missing"
+
+    def origin(self, key: ModelKey) -> str:
+        """What a model is, or will be, made of, as part of a cell's identity: the file that was
+        handed over; or the hyperparameters, and the revision of the code that trained with them.
+
+        :param key: The model.
+        :raises ValueError: If there are no hyperparameters for it, or what there is of it was
+            trained with others.
+        """
+        path = self.given(key)
+        if path is not None:
+            return FILE + _describe_given(path)["sha256"][:24]
+        base = VARIANTS[key.variant].base
+        if base is not None:
+            return self.origin(_other(key, base))
+        made = {"hyperparameters": _as_json(training_plan(key).hyperparameters)}
+        begun = self.folder(key) / BEGUN
+        if begun.exists():
+            found = read_json(begun)
+        elif self.state(key) == "missing":
+            found = {**made, "revision": REVISION}
+        else:
+            found = {"hyperparameters": None}
+        if found["hyperparameters"] != made["hyperparameters"]:
+            raise ValueError(
+                f"{begun.parent} was trained with other hyperparameters than zoo_configs/ has for {key} now: take "
+                "another folder for --runs, or remove it"
+            )
+        return f"hyperparameters {digest(found)}"
 
     def has_snapshots(self, key: ModelKey) -> bool:
         """Whether the model is, or will be, saved along its training."""
@@ -244,9 +281,12 @@ class ModelLibrary:
 
     def _train(self, key: ModelKey, lock: int, say: Say) -> None:
         plan, folder = training_plan(key), self.folder(key)
-        sessions = _begin_session(folder)
+        if not (folder / BEGUN).exists():
+            made = {"hyperparameters": _as_json(plan.hyperparameters), "revision": REVISION}
+            write_json_atomically(folder / BEGUN, made)
+        before = len(list(folder.glob(f"{SESSIONS}/*.json")))
         arguments = _train_arguments(key, plan)
-        state = "resuming" if len(sessions) > 1 else "training"
+        state = "resuming" if before else "training"
         say(
             f"{state} {key}: {plan.timesteps:,} steps, {plan.updates:,} updates; log in {folder / LOG}"
         )
@@ -261,6 +301,7 @@ class ModelLibrary:
         ]
         others += ["--num-threads", str(self.workplace.num_threads)]
         module = [sys.executable, "-m", "sb3_poem.benchmark.training_process", str(os.getpid())]
+        module += [str(folder / SESSIONS / f"{before + 1}.json")]
         threads = {
             name: str(self.workplace.num_threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")
         }
@@ -296,17 +337,18 @@ class ModelLibrary:
             raise TrainingError(
                 f"{finished[-1]} stopped after {model.num_timesteps:,} of {plan.timesteps:,} steps; remove it"
             )
-        sessions[-1]["seconds"] = time.time() - sessions[-1]["started"]
-        write_json_atomically(folder / SESSIONS, {"sessions": sessions})
+        sessions = [read_json(file) for file in folder.glob(f"{SESSIONS}/*.json")]
         info = {
             "source": "trained",
             "run": str(finished[-1].parent.relative_to(folder)),
             "command": "sb3-poem " + " ".join(arguments),
+            "revision": read_json(folder / BEGUN)["revision"],
             "hyperparameters": plan.hyperparameters,
             "overrides": plan.overrides,
             "env_steps": int(model.num_timesteps),
             "updates": int(model._n_updates),
             "seconds": round(sum(session["seconds"] for session in sessions), 1),
+            "cpu_seconds": round(sum(session["cpu_seconds"] for session in sessions), 1),
             "sessions": len(sessions),
             **provenance(),
         }
@@ -349,11 +391,11 @@ def _other(key: ModelKey, variant: str) -> ModelKey:
     return ModelKey(key.env_id, variant, key.seed, key.training)
 
 
-def _place(key: ModelKey) -> str:
+def model_folder(env_id: str) -> str:
     """The folder of an environment's models: two families of one name, from other packages or of
     other versions, have two.
     """
-    return _file_name(family_label(key.env_id))
+    return _file_name(family_label(env_id))
 
 
 def _file_name(env_id: str) -> str:
@@ -380,20 +422,8 @@ def _train_arguments(key: ModelKey, plan: TrainingPlan) -> list[str]:
     return arguments
 
 
-def _begin_session(folder: Path) -> list[dict[str, float]]:
-    """Note that a training (again) begins. An earlier one that was interrupted counts up to its
-    last checkpoint.
-    """
-    file = folder / SESSIONS
-    sessions: list[dict[str, float]] = read_json(file)["sessions"] if file.exists() else []
-    if sessions and "seconds" not in sessions[-1]:
-        saved = max(
-            (path.stat().st_mtime for path in folder.glob(f"*/*/{CHECKPOINT}")), default=0.0
-        )
-        sessions[-1]["seconds"] = max(0.0, saved - sessions[-1]["started"])
-    sessions.append({"started": time.time()})
-    write_json_atomically(file, {"sessions": sessions})
-    return sessions
+def _as_json(data: Any) -> Any:
+    return json.loads(json.dumps(data))
 
 
 def _content(folder: Path) -> Path | None:
@@ -488,7 +518,8 @@ def _describe_given(path: Path) -> dict[str, Any]:
             "updates": config["n_updates"],
             "arguments": config["arguments"],
         }
-        info |= {"seconds": card.get("wall_seconds"), "card": card}
+        info |= {"seconds": card.get("wall_seconds"), "cpu_seconds": card.get("cpu_seconds")}
+        info["card"] = card
         file = path / WEIGHTS
     info["sha256"] = hashlib.sha256(file.read_bytes()).hexdigest()
     return info

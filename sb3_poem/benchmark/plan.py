@@ -5,7 +5,7 @@ trained for them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from sb3_poem.benchmark.estimate import Pace, cell_seconds, measure_pace, training_seconds
 from sb3_poem.benchmark.families import family_facts
@@ -68,29 +68,31 @@ def make_plan(
     :param training: What differs from the hyperparameter files.
     :param snapshots: See :meth:`Suite.cells`.
     :return: The plan.
-    :raises ValueError: If a family or method does not exist, or a method that was named cannot run
-        on a family.
+    :raises ValueError: If a family or method does not exist, a method that was named cannot run on
+        a family, or there are no hyperparameters for a model that is missing.
     """
     plan = Plan()
     facts = {fact.env_id: fact for fact in map(family_facts, families or suite.families)}
     finished = set() if store is None else store.keys()
+    origins: dict[ModelKey, str] = {}
     for cell in suite.cells(list(facts), seeds, methods, budget, training, snapshots):
         objection = cell.definition.objection(facts[cell.env_id].shared_dynamics)
         if objection is not None and methods:
             raise ValueError(f"--methods {cell.method} cannot run on {cell.family}: {objection}")
+        if objection is not None:
+            plan.skipped.append((cell, f"{cell.method} cannot run on {cell.family}: {objection}"))
+            continue
+        if cell.model_key not in origins:
+            origins[cell.model_key] = library.origin(cell.model_key)
+        cell = replace(cell, model=origins[cell.model_key])
         if cell.key in finished:
             plan.done.append(cell)
-        elif objection is not None:
-            plan.skipped.append((cell, f"{cell.method} cannot run on {cell.family}: {objection}"))
         elif cell.snapshot is not None and not library.has_snapshots(cell.model_key):
             plan.skipped.append(
                 (cell, "the model was handed over, without those along its training")
             )
         else:
             plan.todo.append(cell)
-    for key in plan.models:  # refuses now what would fail after hours
-        if library.state(key) in ("missing", "interrupted"):
-            training_plan(key)
     plan.todo = _in_order(plan.todo)
     return plan
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -14,11 +14,14 @@ from sb3_poem.benchmark.cells import make_oracle_factory
 from sb3_poem.benchmark.methods import METHODS
 from sb3_poem.benchmark.store import Record
 from sb3_poem.benchmark.suites import (
+    FILE,
+    REVISION,
     Budget,
     Entry,
     OracleSpec,
     Suite,
     Training,
+    digest,
     family_label,
     family_name,
     hashable,
@@ -34,6 +37,7 @@ class Condition:
     :param episodes: Per task and measurement.
     :param task_seed: Of the test tasks.
     :param training: What differs from the hyperparameter files.
+    :param revision: See :data:`REVISION`.
     """
 
     env_id: str
@@ -41,6 +45,7 @@ class Condition:
     episodes: int
     task_seed: int
     training: Training
+    revision: int
 
     @property
     def family(self) -> str:
@@ -59,6 +64,8 @@ class Condition:
         if self.training.timesteps is not None:
             words.append(f"trained for {self.training.timesteps:,} steps")
         words += [f"{name} = {value}" for name, value in self.training.hyperparameters]
+        if self.revision != REVISION:
+            words.append(f"revision {self.revision} of the code")
         return ", ".join(words)
 
 
@@ -93,6 +100,12 @@ class Series:
         """Environment steps of the training, mean over seeds."""
         return float(np.mean([record.result["training_samples"] for record in self.records]))
 
+    @property
+    def success_rates(self) -> list[float] | None:
+        """(n_queries,) means over seeds and tasks; None for a family without successes."""
+        rates = [record.result.get("task_success_rates") for record in self.records]
+        return None if None in rates else np.mean(rates, axis=(0, 1)).tolist()
+
     def at(self, queries: int) -> np.ndarray | None:
         """(n_seeds, n_tasks) after so many answers; None if that was not measured."""
         return self.returns[:, :, self.queries.index(queries)] if queries in self.queries else None
@@ -119,6 +132,12 @@ class Reference:
         """(n_seeds,) mean returns if the task were known."""
         return np.array([np.mean(record.result["task_returns"]) for record in self.records])
 
+    @property
+    def success_rate(self) -> float | None:
+        """Mean over seeds and tasks if the task were known; None for a family without successes."""
+        rates = [record.result.get("task_success_rates") for record in self.records]
+        return None if None in rates else float(np.mean(rates))
+
     def limits(self, queries: int, oracle: OracleSpec) -> np.ndarray:
         """The information limit, (n_seeds,).
 
@@ -130,7 +149,8 @@ class Reference:
 
 
 class Selection:
-    """What there is of a suite.
+    """What there is of a suite. Models that were trained with other hyperparameters than the newest
+    of their kind are left out.
 
     :param records: Of a store.
     :param families: Only these; None: all.
@@ -140,10 +160,14 @@ class Selection:
         self, suite: Suite, records: Iterable[Record], families: Sequence[str] | None = None
     ) -> None:
         self.suite = suite
+        of_families = [one for one in records if families is None or one.family in families]
+        in_order = sorted(of_families, key=lambda record: record.created)
+        newest = {_kind(one): one.identity["model"] for one in in_order if not _handed_over(one)}
+        #: By the key of a cell whose model is not told
         self.records = {
-            record.key: record
-            for record in records
-            if families is None or record.family in families
+            digest({**record.identity, "model": None}): record
+            for record in in_order
+            if _handed_over(record) or record.identity["model"] == newest[_kind(record)]
         }
         self.conditions = sorted(
             {_condition(record.identity) for record in self.records.values()},
@@ -168,9 +192,10 @@ class Selection:
         for seed in self.seeds:
             arguments = (condition.env_id, seed, condition.budget, condition.training)
             for cell in self.suite.entry_cells(entry, *arguments, sorted(self._shares[condition])):
-                if cell.key in self.records:
+                key = replace(cell, revision=condition.revision).key
+                if key in self.records:
                     found.setdefault((cell.method, cell.oracle, cell.snapshot), []).append(
-                        self.records[cell.key]
+                        self.records[key]
                     )
         order = {name: position for position, name in enumerate(entry.methods)}
         result = []
@@ -199,8 +224,9 @@ class Selection:
             for cell in self.suite.entry_cells(
                 entry, condition.env_id, seed, condition.budget, condition.training
             ):
-                if cell.key in self.records:
-                    found.setdefault(cell.method, []).append(self.records[cell.key])
+                key = replace(cell, revision=condition.revision).key
+                if key in self.records:
+                    found.setdefault(cell.method, []).append(self.records[key])
         return [
             Reference(method, tuple(found[method]))
             for method in self.suite.references
@@ -234,7 +260,16 @@ def _condition(identity: dict[str, Any]) -> Condition:
         identity["episodes"],
         identity["task_seed"],
         Training(training["timesteps"], hyperparameters),
+        identity["revision"],
     )
+
+
+def _kind(record: Record) -> tuple[Condition, str]:
+    return _condition(record.identity), record.identity["variant"]
+
+
+def _handed_over(record: Record) -> bool:
+    return str(record.identity["model"]).startswith(FILE)
 
 
 def _family_order(suite: Suite, family: str) -> int:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from rliable import library, metrics
-from scipy.stats import trim_mean
+from scipy.stats import sem, trim_mean
 
 BOOTSTRAP_SAMPLES = 2000
 
@@ -23,6 +23,8 @@ class Summary:
     :param iqm: The interquartile mean over seeds and tasks.
     :param low: The lower end of its 95 % interval; None for one seed, and where none is wanted.
     :param high: The upper end.
+    :param task_error: Standard error over tasks of their returns, means over seeds; None for one
+        task.
     """
 
     n_seeds: int
@@ -31,6 +33,7 @@ class Summary:
     iqm: float
     low: float | None
     high: float | None
+    task_error: float | None
 
 
 def summarise(returns: np.ndarray, intervals: bool = True) -> list[Summary]:
@@ -59,7 +62,9 @@ def summarise(returns: np.ndarray, intervals: bool = True) -> list[Summary]:
                 {"method": returns}, _iqms, reps=BOOTSTRAP_SAMPLES
             )
         low, high = bounds["method"].tolist()
-    figures = zip(seeds.mean(axis=0).tolist(), deviations, iqms, low, high, strict=True)
+    tasks = returns.mean(axis=0)
+    errors = sem(tasks).tolist() if len(tasks) > 1 else [None] * len(iqms)
+    figures = zip(seeds.mean(axis=0).tolist(), deviations, iqms, low, high, errors, strict=True)
     return [Summary(len(returns), *figure) for figure in figures]
 
 

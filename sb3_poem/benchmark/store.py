@@ -18,7 +18,7 @@ from sqlalchemy.schema import CreateTable
 
 from sb3_poem import __version__
 
-SCHEMA = "2"
+SCHEMA = "3"
 BUSY_SECONDS = 120
 
 

@@ -23,6 +23,13 @@ PAPER_FAMILIES = (
 )
 CHEETAHS = PAPER_FAMILIES[:2]
 RECORD_AT = (0, 1, 2, 3, 5, 7, 10)
+REVISION = 1
+"""Of the code that trains, adapts and measures: part of every cell's identity. Raise it with each
+change after which the same cell may come to another figure (a loss, a default of an algorithm or a
+rule, how tasks and seeds are drawn), not for what only takes less time, nor for ``zoo_configs/``,
+whose hyperparameters are in the identity by themselves. 0 stands for all that was recorded before
+revisions were counted.
+"""
 TABLE_METHODS = (
     "poem-bayes",
     "poem-paper",
@@ -36,6 +43,8 @@ TABLE_REFERENCES = ("known-task", "known-task-pearl")
 # MAML-reward trains a reward only, so its return does not depend on how long a policy was trained;
 # greedy search takes as long as all the others together, and lies beside ANOLE.
 WITHOUT_CURVE = ("maml-reward", "anole-greedy")
+#: How the origin of a model begins that was handed over
+FILE = "file "
 
 
 @dataclass(frozen=True)
@@ -137,6 +146,8 @@ class Cell:
     :param training: See :class:`Training`.
     :param snapshot: The share of the training after which the model is taken; None: all of it.
     :param overrides: Options of the adapter that differ from the method's own, sorted by name.
+    :param model: What the model is made of, see :meth:`ModelLibrary.origin`; None: not told.
+    :param revision: See :data:`REVISION`.
     """
 
     env_id: str
@@ -147,6 +158,8 @@ class Cell:
     training: Training = Training()
     snapshot: float | None = None
     overrides: tuple[tuple[str, Any], ...] = ()
+    model: str | None = None
+    revision: int = REVISION
 
     @property
     def family(self) -> str:
@@ -169,9 +182,7 @@ class Cell:
         return {**self.definition.options, **dict(self.overrides)}
 
     def identity(self) -> dict[str, Any]:
-        """What makes two cells the same, JSON-ready. It names neither a suite nor where the model
-        comes from.
-        """
+        """All that can change the cell's figure, JSON-ready; so it names no suite."""
         method = self.definition
         known = method.kind == "known"
         return {
@@ -188,12 +199,14 @@ class Cell:
             "task_seed": self.budget.task_seed,
             "training": self.training.to_dict(),
             "snapshot": self.snapshot,
+            "model": self.model,
+            "revision": self.revision,
         }
 
     @property
     def key(self) -> str:
         """A digest of :meth:`identity`."""
-        return hashlib.sha256(json.dumps(self.identity(), sort_keys=True).encode()).hexdigest()[:24]
+        return digest(self.identity())
 
     def __str__(self) -> str:
         words = [family_label(self.env_id), self.method, f"seed {self.seed}"]
@@ -217,6 +230,9 @@ class Entry:
     :param record_at: See :class:`Budget`.
     :param curves: With whose answers the methods are measured along the training too.
     :param by_inference: Whether figures have a row for each of POEM's inference rules.
+    :param shown: Numbers of answers that tables show, of those that were recorded.
+    :param by_task: Whether tables show the standard error over tasks, and success rates, rather
+        than interquartile means.
     """
 
     name: str
@@ -226,6 +242,8 @@ class Entry:
     record_at: tuple[int, ...] = RECORD_AT
     curves: tuple[OracleSpec, ...] = ()
     by_inference: bool = False
+    shown: tuple[int, ...] = (1, 5, 10, 20)
+    by_task: bool = False
 
 
 @dataclass(frozen=True)
@@ -334,6 +352,11 @@ class Suite:
         return cells
 
 
+def digest(data: Any) -> str:
+    """A short name of JSON-ready data."""
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:24]
+
+
 def hashable(value: Any) -> Any:
     """A hyperparameter's value, with tuples for lists: a model is looked up by its hyperparameters,
     and JSON has no tuples.
@@ -393,6 +416,14 @@ SUITES = {
             PAPER_FAMILIES,
             (Entry("methods", "Methods", TABLE_METHODS, curves=(EXACT,)),),
             TABLE_REFERENCES,
+        ),
+        Suite(
+            "shipped",
+            "The models that ship",
+            (*PAPER_FAMILIES, "FetchReach", "PointGoal"),
+            (Entry("rules", "Inference rules", _BOTH, shown=(0, 1, 2, 5, 10), by_task=True),),
+            ("known-task",),
+            snapshots=1,
         ),
         Suite(
             "noise",

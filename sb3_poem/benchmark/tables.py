@@ -14,9 +14,7 @@ from sb3_poem.benchmark.methods import METHODS
 from sb3_poem.benchmark.paper import paper_figure
 from sb3_poem.benchmark.selection import Condition, Reference, Selection, Series
 from sb3_poem.benchmark.statistics import Summary, summarise
-from sb3_poem.benchmark.suites import EXACT, Entry, OracleSpec
-
-SHOWN_QUERIES = (1, 5, 10, 20)
+from sb3_poem.benchmark.suites import EXACT, REVISION, Entry, OracleSpec
 
 
 @dataclass(frozen=True)
@@ -40,6 +38,8 @@ class Row:
     :param iqm_high: Of its 95 % interval.
     :param paper_mean: What the paper reports.
     :param paper_deviation: What the paper reports.
+    :param task_error: Standard error over tasks of their returns, means over seeds.
+    :param success_rate: Mean over seeds and tasks, where the family has successes.
     """
 
     suite: str
@@ -61,6 +61,8 @@ class Row:
     iqm_high: float | None = None
     paper_mean: float | None = None
     paper_deviation: float | None = None
+    task_error: float | None = None
+    success_rate: float | None = None
 
 
 @dataclass(frozen=True)
@@ -119,6 +121,8 @@ def suite_tables(selection: Selection) -> list[Table]:
                 some = [row for row in rows if (row.condition, row.entry, row.oracle) == place]
                 if some:
                     tables.append(_comparison(condition, entry, oracle, some))
+                if entry.by_task and any(row.success_rate is not None for row in some):
+                    tables.append(_successes(condition, entry, some))
         models = _models(selection, condition)
         if models is not None:
             tables.append(models)
@@ -164,8 +168,10 @@ def format_rows(rows: Iterable[Row], kind: str) -> str:
 def _method_rows(suite: str, condition: Condition, entry: Entry, series: Series) -> list[Row]:
     definition = METHODS[series.method]
     rows = []
-    summaries = summarise(series.returns, intervals=series.snapshot is None)
-    for queries, summary in zip(series.queries, summaries, strict=True):
+    intervals = series.snapshot is None and not entry.by_task
+    summaries = summarise(series.returns, intervals)
+    successes = series.success_rates or [None] * len(summaries)
+    for queries, summary, success in zip(series.queries, summaries, successes, strict=True):
         # The paper's figures are of the whole training and of its own answers.
         final = series.snapshot is None and series.oracle == EXACT and entry.name == "methods"
         paper = paper_figure(condition.family, definition.paper_row, queries) if final else None
@@ -185,6 +191,8 @@ def _method_rows(suite: str, condition: Condition, entry: Entry, series: Series)
                 summary.n_seeds,
                 *_figures(summary),
                 *(paper or (None, None)),
+                summary.task_error,
+                success,
             )
         )
     return rows
@@ -229,9 +237,8 @@ def _reference_rows(
             )
         known = reference.known
         mean, deviation = float(known.mean()), _deviation(known)
-        rows.append(
-            Row(*place, reference.label, "known", None, None, None, len(known), mean, deviation)
-        )
+        facts = (*place, reference.label, "known", None, None, None, len(known), mean, deviation)
+        rows.append(Row(*facts, success_rate=reference.success_rate))
     return rows
 
 
@@ -245,12 +252,13 @@ def _comparison(
     """Methods against numbers of answers: mean and deviation, interquartile mean and interval, the
     paper's figure.
     """
-    queries = [k for k in SHOWN_QUERIES if k in entry.record_at]
+    queries = [k for k in entry.shown if k in entry.record_at]
+    beside = "std. error over tasks" if entry.by_task else "IQM [95 %]"
     has_paper = any(row.paper_mean is not None for row in rows)
     header = ["method", "seeds"]
     for k in queries:
         after = f"{k} answer{'s' * (k != 1)}"
-        header += [after, "IQM [95 %]", *(["paper"] if has_paper else [])]
+        header += [after, beside, *(["paper"] if has_paper else [])]
     body = []
     final = [row for row in rows if row.snapshot is None]
     for kind in ("method", "limit"):
@@ -259,9 +267,11 @@ def _comparison(
             cells = [label, str(next(iter(mine.values())).n_seeds)]
             for k in queries:
                 row = mine.get(k)
-                cells += (
-                    ["", ""] if row is None else [_mean(row.mean, row.deviation), _interval(row)]
-                )
+                if row is None:
+                    cells += ["", ""]
+                else:
+                    spread = _number(row.task_error) if entry.by_task else _interval(row)
+                    cells += [_mean(row.mean, row.deviation), spread]
                 if has_paper:
                     cells.append(
                         ""
@@ -272,9 +282,12 @@ def _comparison(
     known = [
         f"{row.label}: {_mean(row.mean, row.deviation)}" for row in final if row.kind == "known"
     ]
-    notes = [
-        "Mean and standard deviation over seeds; interquartile mean over seeds and tasks with its bootstrap interval."
-    ]
+    also = (
+        "standard error over tasks of their means over seeds"
+        if entry.by_task
+        else "interquartile mean over seeds and tasks with its bootstrap interval"
+    )
+    notes = [f"Mean and standard deviation over seeds; {also}."]
     notes += known
     if any(row.kind == "limit" for row in rows):
         notes.append(
@@ -289,52 +302,62 @@ def _comparison(
     )
 
 
+def _successes(condition: Condition, entry: Entry, rows: Sequence[Row]) -> Table:
+    """Success rates against numbers of answers."""
+    body = []
+    for label in dict.fromkeys(row.label for row in rows if row.kind == "method"):
+        mine = {row.queries: row.success_rate for row in rows if row.label == label}
+        body.append((label, *(f"{mine[k]:.2f}" for k in entry.shown)))
+    notes = [f"{row.label}: {row.success_rate:.2f}" for row in rows if row.kind == "known"]
+    header = ("method", *(f"{k} answer{'s' * (k != 1)}" for k in entry.shown))
+    return Table(f"{condition}; success rates", header, tuple(body), tuple(notes))
+
+
 def _models(selection: Selection, condition: Condition) -> Table | None:
     """How the models were trained, and how well they order policies."""
-    body = []
-    for reference in selection.references(condition):
-        for record in reference.records:
-            training = record.provenance["model"]
-            seconds = record.result["training_seconds"]
-            order = [record.result.get(name) for name in ("preference_accuracy", "kendall_tau")]
-            body.append(
-                (
-                    METHODS[reference.method].variant,
-                    str(record.seed),
-                    training["source"],
-                    f"{record.result['training_samples']:,}",
-                    f"{record.result['updates']:,}",
-                    "" if seconds is None else f"{seconds:,.0f}",
-                    *("" if value is None else f"{value:.3f}" for value in order),
-                    str(training.get("commit") or training.get("card", {}).get("commit", "")),
-                )
-            )
-    if not body:
+    references = selection.references(condition)
+    records = [(one.method, record) for one in references for record in one.records]
+    if not records:
         return None
-    header = (
-        "model",
-        "seed",
-        "source",
-        "samples",
-        "updates",
-        "seconds",
-        "preference accuracy",
-        "Kendall's tau",
-        "commit",
-    )
-    machines = sorted(
-        {
-            record.provenance["machine"]
-            for reference in selection.references(condition)
-            for record in reference.records
-        }
-    )
+    columns: dict[str, list[str]] = {
+        "model": [METHODS[method].variant for method, _ in records],
+        "seed": [str(record.seed) for _, record in records],
+    }
+    results = [record.result for _, record in records]
+    models = [record.provenance["model"] for _, record in records]
+    columns["source"] = [model["source"] for model in models]
+    for name, key in (("samples", "training_samples"), ("updates", "updates")):
+        columns[name] = [f"{result[key]:,}" for result in results]
+    columns["seconds"] = [_seconds(result["training_seconds"]) for result in results]
+    processor = [_seconds(result.get("training_cpu_seconds")) for result in results]
+    if any(processor):
+        columns["CPU seconds"] = processor
+    for name, key in (
+        ("preference accuracy", "preference_accuracy"),
+        ("Kendall's tau", "kendall_tau"),
+    ):
+        orders = [result.get(key) for result in results]
+        columns[name] = ["" if order is None else f"{order:.3f}" for order in orders]
+    commits = [model.get("commit") or model.get("card", {}).get("commit", "") for model in models]
+    columns["commit"] = list(map(str, commits))
+    machines = sorted({record.provenance["machine"] for _, record in records})
     return Table(
-        f"{condition.family}: the models",
-        header,
-        tuple(body),
+        f"{condition.family}: the models"
+        + (
+            f", revision {condition.revision} of the code" if condition.revision != REVISION else ""
+        ),
+        tuple(columns),
+        tuple(zip(*columns.values(), strict=True)),
         (f"Measured on: {'; '.join(machines)}.",),
     )
+
+
+def _seconds(value: float | None) -> str:
+    return "" if value is None else f"{value:,.0f}"
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else _mean(value, None)
 
 
 def _mean(mean: float, deviation: float | None) -> str:

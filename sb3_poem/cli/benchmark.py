@@ -8,6 +8,7 @@ from sb3_poem.benchmark.methods import VARIANTS
 from sb3_poem.benchmark.suites import (
     SUITES,
     Budget,
+    Cell,
     Training,
     family_id,
     family_label,
@@ -36,7 +37,7 @@ def _run(arguments: argparse.Namespace) -> int:
         raise ValueError(
             f"the benchmark's packages are missing: pip install 'sb3_poem[benchmark]' ({error})"
         ) from error
-    from sb3_poem.benchmark.models import ModelLibrary, Workplace
+    from sb3_poem.benchmark.models import ModelLibrary, Workplace, model_folder
     from sb3_poem.benchmark.plan import describe, make_plan
     from sb3_poem.benchmark.runner import run_cells
 
@@ -73,11 +74,14 @@ def _run(arguments: argparse.Namespace) -> int:
         training,
         arguments.snapshots,
     )
+    if arguments.export is not None and suite.name != "shipped":
+        raise ValueError(f"--export is for --suite shipped, not {suite.name}")
     if arguments.list:
         print("\n".join(describe(plan, library)))
         return 0
     assert store is not None
-    check_writable(arguments.runs)
+    for folder in filter(None, (arguments.runs, arguments.export)):
+        check_writable(folder)
     print(f"{plan}; results in {arguments.store}", flush=True)
     if arguments.backend == "ray":
         from sb3_poem.benchmark.ray_backend import RayOptions, run_with_ray
@@ -98,6 +102,17 @@ def _run(arguments: argparse.Namespace) -> int:
         f"{len(plan.todo) - left} cells run"
         + (f", {left} failed: the same command tries them again" if left else "")
     )
+    if arguments.export is not None and not failures:
+        from sb3_poem.benchmark.report import export_model
+
+        models: dict[str, list[Cell]] = {}
+        for cell in (*plan.done, *plan.todo):
+            if cell.seed == arguments.first_seed:
+                models.setdefault(cell.env_id, []).append(cell)
+        for env_id, cells in models.items():
+            folder = arguments.export / model_folder(env_id)
+            export_model(cells, library, store, folder)
+            print(f"Wrote {folder}")
     return 1 if failures else 0
 
 

@@ -13,6 +13,7 @@ EXAMPLES = """\
 examples:
   sb3-poem benchmark run --suite smoke
   sb3-poem benchmark run --suite table3 --families HalfCheetahVel --models pretrained --list
+  sb3-poem benchmark run --suite shipped --families HalfCheetahVel --export pretrained
   sb3-poem benchmark report --suite smoke --out results
 """
 
@@ -100,6 +101,13 @@ def _add_run_arguments(parser: argparse.ArgumentParser, count: Count) -> None:
         default=[],
         metavar="FAMILY:VARIANT:SEED=PATH",
         help="take this trained model: a .zip, a checkpoint, or a folder with one or with a pretrained model",
+    )
+
+    models.add_argument(
+        "--export",
+        type=Path,
+        metavar="FOLDER",
+        help="with --suite shipped: write the first seed's models to <FOLDER>/<Family>, as in pretrained/",
     )
 
     budget = parser.add_argument_group("budget, which every record notes")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +37,7 @@ def test_the_estimate_of_the_smoke_suite_is_within_a_factor_of_two() -> None:
         records = {record.key: record for record in store.records()}
     pace = pace_of(list(records.values()))
     cells = SUITES["smoke"].cells(["poem/PointGoal-v0"], range(3))
+    cells = [replace(cell, revision=0) for cell in cells]
     assert {cell.key for cell in cells} == set(records)
     estimated: dict[str, float] = defaultdict(float)
     recorded: dict[str, float] = defaultdict(float)

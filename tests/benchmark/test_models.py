@@ -1,7 +1,9 @@
 """Which models are taken, and what is refused before any training."""
 
+import hashlib
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,7 @@ from sb3_poem.benchmark.families import FamilyFacts, family_facts
 from sb3_poem.benchmark.hyperparameters import training_plan
 from sb3_poem.benchmark.models import ModelLibrary, Workplace
 from sb3_poem.benchmark.plan import describe, make_plan
-from sb3_poem.benchmark.suites import SUITES, Budget, ModelKey, Training
+from sb3_poem.benchmark.suites import REVISION, SUITES, Budget, ModelKey, Training
 from sb3_poem.cli import main
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.resources import shipped_folder
@@ -36,7 +38,7 @@ def plan_for(
 def test_the_training_plan_follows_the_hyperparameter_file(tmp_path: Path) -> None:
     plan = training_plan(ModelKey("poem/HalfCheetahVel-v0", "poem-d2", 0))
     assert (plan.timesteps, plan.epoch_steps, plan.updates) == (720_000, 24_000, 12_000)
-    assert plan.save_steps == 72_000
+    assert plan.save_steps == 48_000
     assert plan.hyperparameters["latent_dim"] == 2
     assert plan.overrides == {"latent_dim": 2}
     two_tasks = training_plan(ModelKey("poem/HalfCheetahFwdBack-v0", "poem", 0))
@@ -66,6 +68,33 @@ def test_shipped_models_are_taken_for_their_own_seed_alone() -> None:
             assert library.given(ModelKey(f"poem/{family}-v0", variant, own)) is None
     altered = ModelKey("poem/HalfCheetahVel-v0", "poem", 0, Training(timesteps=1000))
     assert library.given(altered) is None
+
+
+def test_a_model_is_told_by_its_hyperparameters_or_its_file(tmp_path: Path) -> None:
+    library, key = ModelLibrary(Workplace(str(tmp_path))), ModelKey(POINT, "poem", 0)
+    made = library.origin(key)
+    assert made == library.origin(replace(key, seed=1))
+    assert made != library.origin(ModelKey(POINT, "poem-inner", 0))
+    pearl, reward = (library.origin(ModelKey(POINT, name, 0)) for name in ("pearl", "maml-reward"))
+    assert pearl == reward
+    shipped = ModelLibrary(Workplace(str(tmp_path), models=(str(shipped_folder("pretrained")),)))
+    folder = shipped_folder("pretrained") / "PointGoal"
+    own = replace(key, seed=json.loads((folder / "config.json").read_text())["arguments"]["seed"])
+    sha256 = hashlib.sha256((folder / "model.safetensors").read_bytes()).hexdigest()
+    assert sha256.startswith(shipped.origin(own).removeprefix("file "))
+    begun = library.folder(key) / "begun.json"
+    begun.parent.mkdir(parents=True)
+    hyperparameters = json.loads(json.dumps(training_plan(key).hyperparameters))
+    begun.write_text(json.dumps({"hyperparameters": hyperparameters, "revision": REVISION}))
+    assert library.origin(key) == made
+    begun.write_text(json.dumps({"hyperparameters": hyperparameters, "revision": REVISION + 1}))
+    assert library.origin(key) != made
+    hyperparameters["gamma"] = 0.5
+    begun.write_text(json.dumps({"hyperparameters": hyperparameters, "revision": REVISION}))
+    with pytest.raises(
+        ValueError, match="was trained with other hyperparameters than zoo_configs/"
+    ):
+        library.origin(key)
 
 
 def test_families_of_one_name_have_folders_of_their_own(tmp_path: Path) -> None:

@@ -125,6 +125,50 @@ def test_other_budgets_stand_in_other_tables(tmp_path: Path) -> None:
     ]
 
 
+def test_one_table_never_mixes_versions(tmp_path: Path) -> None:
+    """Older revisions have tables of their own; of models trained with other hyperparameters the
+    newest are shown, and such as were handed over.
+    """
+    versions = (
+        ([0, 1, 2], {"revision": 0}, -100.0),
+        ([0, 1, 2], {"model": "hyperparameters 1"}, -50.0),
+        ([0], {"model": "hyperparameters 2"}, 0.0),
+        ([1], {"model": "file 1"}, 10.0),
+    )
+    cells = SUITES["shipped"].cells([VEL], range(3), ["poem-bayes"], FOUR)
+    with Store(tmp_path / "store.sqlite") as store:
+        for year, (seeds, changes, shift) in enumerate(versions, start=2001):
+            for cell in cells:
+                if cell.seed in seeds:
+                    record = finished(
+                        replace(cell, **changes), lambda cell, k, by=shift: ladder(cell, k) + by
+                    )
+                    store.add(replace(record, created=f"{year}-01-01"))
+        tables = suite_tables(Selection(SUITES["shipped"], store.records()))
+    old, new = sorted(tables, key=lambda table: "revision" not in table.title)
+    assert old.title.split(";")[0].endswith("2 episodes each, revision 0 of the code")
+    assert (old.rows[0][1:3], new.rows[0][1:3]) == (("3", "-120.0 ± 5.0"), ("2", "-17.5 ± 10.6"))
+
+
+def test_the_table_of_what_ships(tmp_path: Path) -> None:
+    """Seeds' means and standard errors over tasks, with success rates and times."""
+    facts = {"training_cpu_seconds": 1234.0}
+    with Store(tmp_path / "store.sqlite") as store:
+        for cell in SUITES["shipped"].cells([VEL], range(2), budget=FOUR):
+            known = cell.definition.kind == "known"
+            rates = [0.5] * 4 if known else [[0.25] * 7] * 4
+            extra = {**facts, "task_success_rates": rates, **(matrix(cell) if known else {})}
+            store.add(finished(cell, ladder, **extra))
+    text, _ = make_report(store, ["shipped"])
+    # Seeds' means are -25 and -20; tasks are 10 apart, so their error is 12.9 / 2.
+    row = next(line for line in text.splitlines() if line.startswith("| POEM (Bayes) | 2 |"))
+    assert row.split(" | ")[2:6] == ["-22.5 ± 3.5", "6.5", "-21.5 ± 3.5", "6.5"]
+    assert "| POEM (Bayes) | 0.25 | 0.25 | 0.25 | 0.25 | 0.25 |" in text
+    assert "task known (POEM's policies): 0.50" in text
+    assert "CPU seconds" in text
+    assert "1,234" in text
+
+
 def test_families_of_one_name_and_curves_of_different_parts_stay_apart(tmp_path: Path) -> None:
     with Store(tmp_path / "store.sqlite") as store:
         for env_id, parts in ((VEL, 5), ("mine/HalfCheetahVel-v0", 2)):

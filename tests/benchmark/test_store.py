@@ -84,7 +84,7 @@ def test_another_version_is_refused_by_name(tmp_path: Path) -> None:
         connection.execute("update about set value = '9.9' where name = 'version'")
     with pytest.raises(
         ValueError,
-        match=r"written in schema '7' by sb3_poem '9.9', but this is .* which reads schema '2'",
+        match=r"written in schema '7' by sb3_poem '9.9', but this is .* which reads schema '3'",
     ):
         Store(path)
 

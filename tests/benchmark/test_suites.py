@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 import yaml
@@ -107,6 +108,7 @@ def test_a_cell_is_the_same_in_every_suite() -> None:
     assert (
         one["known-task"].key in keys["table3"] & keys["noise"] & keys["ablation"] & keys["epsilon"]
     )
+    assert keys["shipped"] < keys["table3"]
     for name, suite in SUITES.items():
         cells = cells_of(suite, env_ids=["poem/AntVel-v0"])
         assert len(keys[name]) == len(cells)
@@ -139,7 +141,8 @@ def test_whatever_changes_a_result_changes_the_key() -> None:
         for c in suite.cells(["poem/AntVel-v0"], [0], ["anole"], snapshots=1)
         if c.oracle == EXACT
     ]
-    assert len(set(keys)) == 7
+    keys += [replace(cell, revision=0).key, replace(cell, model="file 123").key]
+    assert len(set(keys)) == 9
 
 
 def test_unknown_methods_are_refused() -> None:
