@@ -33,14 +33,8 @@ STEPS = 200
 
 
 def make_model(latent_dim: int) -> POEMSAC:
-    model = POEMSAC(
-        "MlpPolicy",
-        "poem/HalfCheetahVel-v0",
-        n_train_tasks=2,
-        latent_dim=latent_dim,
-        seed=0,
-        device="cpu",
-    )
+    settings = {"n_train_tasks": 2, "latent_dim": latent_dim, "seed": 0, "device": "cpu"}
+    model = POEMSAC("MlpPolicy", "poem/HalfCheetahVel-v0", **settings)
     model.predicted_rewards_error = 0.05  # a trained model's; an untrained one has measured none
     means = np.random.default_rng(0).standard_normal((120, latent_dim))
     model.train_tasks.set_posteriors(means, np.full((120, latent_dim), 0.01))
@@ -48,9 +42,8 @@ def make_model(latent_dim: int) -> POEMSAC:
 
 
 def trajectory(latent: np.ndarray, rng: np.random.Generator) -> Trajectory:
-    return Trajectory(
-        rng.standard_normal((STEPS + 1, 17)), rng.uniform(-1.0, 1.0, (STEPS, 6)), latent
-    )
+    actions = rng.uniform(-1.0, 1.0, (STEPS, 6))
+    return Trajectory(rng.standard_normal((STEPS + 1, 17)), actions, latent)
 
 
 def milliseconds(
@@ -76,78 +69,43 @@ def milliseconds(
 
 def main() -> None:
     """Measure and write."""
-    options = common.arguments(
-        __doc__, lambda parser: parser.add_argument("--repeats", type=int, default=3)
-    )
+    repeats = (given := common.arguments(__doc__, repeats=3)).repeats
     th.set_num_threads(1)
     results: list[dict[str, Any]] = []
     for dim in DIMENSIONS:
         model = make_model(dim)
-        for n_candidates in CANDIDATES:
+        for n in CANDIDATES:
             runs: dict[str, list[np.ndarray]] = {rule: [] for rule in RULES}
-            for repeat in range(options.repeats if n_candidates == CANDIDATES[0] else 1):
-                for rule, arguments in RULES.items():  # in turns
-                    runs[rule].append(
-                        milliseconds(
-                            model,
-                            max(ANSWERS[n_candidates]),
-                            1,
-                            repeat,
-                            n_candidates=n_candidates,
-                            **arguments,
-                        )
+            for repeat in range(repeats if n == CANDIDATES[0] else 1):
+                for rule, options in RULES.items():  # in turns
+                    taken = milliseconds(
+                        model, max(ANSWERS[n]), 1, repeat, n_candidates=n, **options
                     )
-            for rule, taken in runs.items():
-                of_run = np.median(taken, axis=0)
-                result = {
-                    "rule": rule,
-                    "d": dim,
-                    "candidates": n_candidates,
-                    "worst": float(of_run.sum(axis=1).max()),
-                }
-                for k in ANSWERS[n_candidates]:
-                    result[f"k = {k}"] = float(of_run[:k].sum(axis=1).mean())
-                results.append(result)
+                    runs[rule].append(taken.sum(axis=1))
+            for rule, of_rule in runs.items():
+                taken = np.median(of_rule, axis=0)
+                means = {f"k = {k}": float(taken[:k].mean()) for k in ANSWERS[n]}
+                worst = {"worst": float(taken.max())}
+                results.append({"rule": rule, "d": dim, "candidates": n, **worst, **means})
     model = make_model(5)
     many = {
-        rule: milliseconds(model, 10, 30, 0, n_candidates=100, **arguments).sum(axis=1).mean()
-        for rule, arguments in RULES.items()
+        rule: float(milliseconds(model, 10, 30, 0, n_candidates=100, **options).sum(axis=1).mean())
+        for rule, options in RULES.items()
     }
-    header = ["rule", "d", "candidates", *(f"k = {k}" for k in ANSWERS[100]), "worst question"]
-    rows = [
-        [
-            r["rule"],
-            r["d"],
-            r["candidates"],
-            *(r.get(f"k = {k}", "not run") for k in ANSWERS[100]),
-            r["worst"],
-        ]
-        for r in results
-    ]
+    shown = ["rule", "d", "candidates", *(f"k = {k}" for k in ANSWERS[100]), "worst"]
     sections = [
         "Milliseconds of `ask` + `tell`, mean over the first k questions.",
-        common.table(header, rows),
+        common.table(shown, [[row.get(name, "not run") for name in shown] for row in results]),
         "30 tasks at once, d = 5, 100 candidates, k = 10: milliseconds a question for all of them.",
         common.table(
-            ["rule", "30 tasks", "each"],
-            [[rule, float(ms), float(ms) / 30] for rule, ms in many.items()],
+            ["rule", "30 tasks", "each"], [[rule, ms, ms / 30] for rule, ms in many.items()]
         ),
     ]
-    settings = {
-        "threads of torch": 1,
-        "steps of a trajectory": STEPS,
-        "runs": options.repeats,
-        "precision": "auto",
-    }
-    data = {"one task": results, "30 tasks": {rule: float(value) for rule, value in many.items()}}
-    common.write(
-        "adaptation-speed",
-        "Adaptation: time without rollouts",
-        sections,
-        data,
-        options.out,
-        settings,
-    )
+    settings = {"threads of torch": 1, "steps of a trajectory": STEPS, "runs": repeats}
+    settings["precision"] = "auto"
+    data = {"one task": results, "30 tasks": many}
+    title = "Adaptation: time without rollouts"
+    common.write("adaptation-speed", title, sections, data, given.out, settings)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ steps its own versions of these robots.
 
 from __future__ import annotations
 
-import argparse
 import functools
 import importlib.util
 import multiprocessing
@@ -27,27 +26,23 @@ import torch as th
 from mujoco.rollout import Rollout
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-from sb3_poem import POEMSAC, TaskVecEnv
+from poem_envs.vector import available_cores
+from sb3_poem import POEMSAC
+from sb3_poem.benchmark.suites import family_name
 from sb3_poem.common.vec_env import make_task_vec_env
 
 N_TASKS, STEPS = 120, 25
 # 24 GB of memory did not hold 120 Meta-World environments of each kind.
 OTHERS = {"MetaWorld": 16}
 ENVPOOL = {"HalfCheetah": "HalfCheetah-v4", "Ant": "Ant-v4", "Humanoid": "Humanoid-v4"}
-DEFAULT_IDS = (
-    "poem/HalfCheetahVel-v0",
-    "poem/AntVel-v0",
-    "poem/HumanoidDir2D-v0",
-    "poem/MetaWorldML1-v0",
-)
+DEFAULT_IDS = [
+    f"poem/{name}-v0" for name in ("HalfCheetahVel", "AntVel", "HumanoidDir2D", "MetaWorldML1")
+]
 
 
 class Loop:
-    """Steps of a vectorised environment under a policy, going on where the last call stopped.
-
-    :param reset: Gives the first observations
-    :param step: Maps actions to observations
-    :param model: Whose policy acts
+    """Steps of a vectorised environment under a model's policy, going on where the last call
+    stopped.
     """
 
     def __init__(
@@ -58,10 +53,9 @@ class Loop:
     ) -> None:
         self.observations, self.step, self.model = reset(), step, model
         self.copies = len(self.observations)
-        self.act = model.policy.acting_on(
-            np.zeros((self.copies, model.latent_dim))
-        )  # as collection does
-        self.noise_shape = (len(self.observations), int(model.action_space.shape[0]))
+        # as collection does
+        self.act = model.policy.acting_on(np.zeros((self.copies, model.latent_dim)))
+        self.noise_shape = (self.copies, int(model.action_space.shape[0]))
 
     def __call__(self) -> None:
         space, policy = self.model.action_space, self.model.policy
@@ -124,12 +118,11 @@ def sb3_loop(env: Any, model: POEMSAC) -> Loop:
     return Loop(env.reset, lambda actions: env.step(actions)[0], model)
 
 
-def gymnasium_loop(env: Any, model: POEMSAC, obs_dim: int) -> Loop:
-    return Loop(
-        lambda: env.reset()[0][:, :obs_dim],
-        lambda actions: env.step(actions)[0][:, :obs_dim],
-        model,
-    )
+def gymnasium_loop(env: Any, model: POEMSAC, obs_dim: int | None = None) -> Loop:
+    def step(actions: np.ndarray) -> np.ndarray:
+        return env.step(actions)[0][:, :obs_dim]
+
+    return Loop(lambda: env.reset()[0][:, :obs_dim], step, model)
 
 
 def others_of(env_id: str) -> int:
@@ -144,33 +137,18 @@ def measure(env_id: str, nthread: int, repeats: int) -> dict[str, Any]:
     # forked while there are no threads yet: to start so many interpreters anew takes minutes
     others = others_of(env_id)
     processes = SubprocVecEnv([make] * others, start_method="fork")
-    env = make_task_vec_env(env_id, N_TASKS, nthread=nthread)
-    model = POEMSAC(
-        "MlpPolicy",
-        env,
-        n_train_tasks=N_TASKS,
-        seed=0,
-        buffer_size=1000,
-        learning_starts=0,
-        device="cpu",
-    )
+    settings: dict[str, Any] = {"n_train_tasks": N_TASKS, "seed": 0, "device": "cpu"}
+    settings |= {"buffer_size": 1000, "learning_starts": 0}
+    env, own_env = (make_task_vec_env(env_id, N_TASKS, nthread=nthread) for _ in range(2))
+    model, own = (POEMSAC("MlpPolicy", each, **settings) for each in (env, own_env))
     contenders: dict[str, Callable[[], Any]] = {"TaskVecEnv": sb3_loop(env, model)}
-    own = POEMSAC(
-        "MlpPolicy",
-        make_task_vec_env(env_id, N_TASKS, nthread=nthread),
-        n_train_tasks=N_TASKS,
-        seed=0,
-        buffer_size=1000,
-        device="cpu",
-    )
     contenders["training (with storage)"] = training(own)
     contenders["TaskVecEnv"]()
     if hasattr(env.vector_env, "_integrator"):
         contenders["limit: bare mujoco.rollout"] = Limit(env, nthread)
     contenders["SB3 DummyVecEnv"] = sb3_loop(DummyVecEnv([make] * others), model)
-    contenders["Gymnasium SyncVectorEnv"] = gymnasium_loop(
-        gym.vector.SyncVectorEnv([make] * others), model, 10**6
-    )
+    gymnasium = gym.vector.SyncVectorEnv([make] * others)
+    contenders["Gymnasium SyncVectorEnv"] = gymnasium_loop(gymnasium, model)
     robot = next((name for name in ENVPOOL if f"/{name}" in env_id), None)
     if robot is not None and importlib.util.find_spec("envpool") is not None:
         import envpool
@@ -178,69 +156,49 @@ def measure(env_id: str, nthread: int, repeats: int) -> dict[str, Any]:
         pool = envpool.make(
             ENVPOOL[robot], env_type="gymnasium", num_envs=N_TASKS, num_threads=nthread, seed=0
         )
-        contenders[f"EnvPool {ENVPOOL[robot]}"] = gymnasium_loop(
-            pool, model, env.observation_space.shape[0]
-        )
+        loop = gymnasium_loop(pool, model, env.observation_space.shape[0])
+        contenders[f"EnvPool {ENVPOOL[robot]}"] = loop
     contenders["SB3 SubprocVecEnv"] = sb3_loop(processes, model)
     seconds = common.seconds_in_turns(contenders, repeats)
     processes.close()
     copies = {name: getattr(contender, "copies", N_TASKS) for name, contender in contenders.items()}
-    rates = {
-        name: STEPS * copies[name] / float(np.median(values)) for name, values in seconds.items()
-    }
-    shares = {
-        name: common.ratio(seconds["TaskVecEnv"], values) * copies[name] / N_TASKS
-        for name, values in seconds.items()
-    }
+    ours = seconds["TaskVecEnv"]
     return {
         "env_id": env_id,
         "seconds": seconds,
-        "steps_per_second": rates,
-        "seconds_of_TaskVecEnv_over_own": shares,
+        "steps_per_second": {
+            name: STEPS * copies[name] / float(np.median(values))
+            for name, values in seconds.items()
+        },
+        "seconds_of_TaskVecEnv_over_own": {
+            name: common.ratio(ours, values) * copies[name] / N_TASKS
+            for name, values in seconds.items()
+        },
     }
 
 
 def main() -> None:
     """Measure and write."""
-
-    def add(parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("--env", nargs="+", default=DEFAULT_IDS)
-        parser.add_argument("--threads", type=int, default=common.cores())
-        parser.add_argument("--repeats", type=int, default=5)
-
-    options = common.arguments(__doc__, add)
+    given = common.arguments(__doc__, env=DEFAULT_IDS, threads=available_cores(), repeats=5)
     settings = {
         "copies": N_TASKS,
-        "threads of MuJoCo and EnvPool": options.threads,
+        "threads of MuJoCo and EnvPool": given.threads,
         "threads of torch": 1,
         "steps a turn": STEPS,
-        "turns": options.repeats,
+        "turns": given.repeats,
         "policy": "256-256, float32, one call for all copies",
     }
-    for env_id in options.env:
-        if env_id not in gym.registry:
-            print(f"{env_id} skipped: it is not registered in this version")
-            continue
+    header = ["contender", "environment steps per second", "TaskVecEnv is so many times as fast"]
+    for env_id in given.env:
         # in a process of its own, so that a family's memory is free again for the next
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as fresh:
-            result = fresh.submit(measure, env_id, options.threads, options.repeats).result()
+            result = fresh.submit(measure, env_id, given.threads, given.repeats).result()
         mine = result["seconds_of_TaskVecEnv_over_own"]
         rows = [[name, rate, 1.0 / mine[name]] for name, rate in result["steps_per_second"].items()]
-        header = [
-            "contender",
-            "environment steps per second",
-            "TaskVecEnv is so many times as fast",
-        ]
-        family = env_id.split("/")[-1].split("-")[0]
-        common.write(
-            f"collection-{family}",
-            f"Collection, {env_id}",
-            [common.table(header, rows)],
-            result,
-            options.out,
-            {**settings, "copies of SB3's and Gymnasium's": others_of(env_id)},
-            options.threads,
-        )
+        settings["copies of SB3's and Gymnasium's"] = others_of(env_id)
+        name, title = f"collection-{family_name(env_id)}", f"Collection, {env_id}"
+        sections = [common.table(header, rows)]
+        common.write(name, title, sections, result, given.out, settings, given.threads)
 
 
 if __name__ == "__main__":

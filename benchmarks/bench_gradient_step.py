@@ -13,16 +13,16 @@ processor, with the given number of threads, and the matrix products are replaye
 as our step is.
 """
 
-import argparse
 import statistics
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch as th
-from common import arguments, available_device, seconds_in_turns, table, write
+from common import DEVICE, arguments, seconds_in_turns, table, write
 from plain_poem import PlainPOEM
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import configure
@@ -44,40 +44,31 @@ STEPS_ON_GPU = {"ours": 1000, "ours, float32": 1000, "SAC": 100}
 
 def poem(size: dict[str, Any], precision: str, device: str) -> POEMSAC:
     """A model with an epoch of data, ready for gradient steps."""
-    model = POEMSAC(
-        "MlpPolicy",
-        "poem/HalfCheetahVel-v0",
-        gradient_steps=0,
-        n_train_tasks=N_TRAIN_TASKS,
-        meta_batch_size=size["tasks"],
-        batch_size=size["batch"],
-        context_size=CONTEXT_SIZE,
-        policy_kwargs={"net_arch": {"pi": size["widths"], "qf": size["widths"]}},
-        precision=precision,
-        seed=0,
-        device=device,
-    )
+    settings: dict[str, Any] = {
+        "gradient_steps": 0,
+        "n_train_tasks": N_TRAIN_TASKS,
+        "meta_batch_size": size["tasks"],
+        "batch_size": size["batch"],
+        "context_size": CONTEXT_SIZE,
+        "policy_kwargs": {"net_arch": {"pi": size["widths"], "qf": size["widths"]}},
+    }
+    settings |= {"precision": precision, "seed": 0, "device": device}
+    model = POEMSAC("MlpPolicy", "poem/HalfCheetahVel-v0", **settings)
     return model.learn(N_TRAIN_TASKS * HORIZON)
 
 
 def sac(size: dict[str, Any], device: str) -> SAC:
     """SB3's own SAC with as many transitions in its buffer."""
-    model = SAC(
-        "MlpPolicy",
-        gym.make("HalfCheetah-v5"),
-        policy_kwargs={"net_arch": size["widths"]},
-        buffer_size=N_TRAIN_TASKS * HORIZON,
-        seed=0,
-        device=device,
-    )
+    settings: dict[str, Any] = {"policy_kwargs": {"net_arch": size["widths"]}, "device": device}
+    settings |= {"buffer_size": N_TRAIN_TASKS * HORIZON, "seed": 0}
+    model = SAC("MlpPolicy", gym.make("HalfCheetah-v5"), **settings)
     model.set_logger(configure(None, []))
-    assert model.replay_buffer is not None
-    rng = np.random.default_rng(0)
+    buffer, rng = model.replay_buffer, np.random.default_rng(0)
+    assert buffer is not None
     for _ in range(N_TRAIN_TASKS * HORIZON):
         obs, next_obs = rng.normal(size=(2, 1, 17))
-        model.replay_buffer.add(
-            obs, next_obs, rng.uniform(-1, 1, (1, 6)), rng.normal(size=1), np.zeros(1), [{}]
-        )
+        action = rng.uniform(-1, 1, (1, 6))
+        buffer.add(obs, next_obs, action, rng.normal(size=1), np.zeros(1), [{}])
     return model
 
 
@@ -97,22 +88,18 @@ def compare_losses(model: POEMSAC, plain: PlainPOEM, size: dict[str, Any]) -> di
         objective = model.make_objective()
         embeddings = objective.embed(mean + variance.sqrt() * noises[0])
         data, alpha = objective.standardised(batch.transitions), model.entropy_coefficient.value
-        critic = objective.critic_loss(batch, data, embeddings, alpha)
         actor, log_prob = objective.actor_loss(batch, data, embeddings, alpha)
-        decoder = objective.decoder_loss(batch, data, embeddings)
-        preference = objective.embedding_loss(batch, embeddings)[1]["preference_loss"]
-        ours = [
-            critic,
-            actor,
-            decoder,
-            kl_to_prior(mean, variance).mean(),
-            preference,
-            log_prob,
-        ]
-    names = ("critic", "actor", "decoder", "kl", "preference", "log_prob")
+        ours = {
+            "critic": objective.critic_loss(batch, data, embeddings, alpha),
+            "actor": actor,
+            "decoder": objective.decoder_loss(batch, data, embeddings),
+            "kl": kl_to_prior(mean, variance).mean(),
+            "preference": objective.embedding_loss(batch, embeddings)[1]["preference_loss"],
+            "log_prob": log_prob,
+        }
     differences = {
         name: abs(a.item() - b.item()) / max(abs(b.item()), 1e-3)
-        for name, a, b in zip(names, ours, theirs, strict=True)
+        for (name, a), b in zip(ours.items(), theirs, strict=True)
     }
     assert max(differences.values()) < 1e-3, differences
     return differences
@@ -134,23 +121,15 @@ class Products(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
     def _note(self, left: th.Tensor, right: th.Tensor) -> None:
-        self.operands[
-            tuple((tuple(x.shape), x.stride(), x.dtype, x.device.type) for x in (left, right))
-        ] += 1
+        layouts = ((tuple(x.shape), x.stride(), x.dtype, x.device.type) for x in (left, right))
+        self.operands[tuple(layouts)] += 1
 
     def contender(self) -> Callable[[], None]:
         """All of the products by ``torch.mm``, one after another."""
         pairs = []
         for (left, right), count in self.operands.items():
-            one, two = (strided(*operand) for operand in (left, right))
-            pairs.append(
-                (
-                    one,
-                    two,
-                    th.empty(one.shape[0], two.shape[1], dtype=one.dtype, device=one.device),
-                    count,
-                )
-            )
+            one, two = strided(*left), strided(*right)
+            pairs.append((one, two, one.new_empty(one.shape[0], two.shape[1]), count))
 
         def run() -> None:
             for one, two, out, count in pairs:
@@ -179,10 +158,8 @@ def strided(
 def products_of_a_step(model: POEMSAC, size: dict[str, Any]) -> Products:
     """The matrix products of one gradient step."""
     policy, products = model.policy, Products()
-    networks = th.nn.ModuleList(
-        [policy.encoder, policy.decoder, policy.actor, policy.critic, policy.critic_target]
-    )
-    with MixedPrecision(networks, model.hidden_dtype) as precision:
+    networks = [policy.encoder, policy.decoder, policy.actor, policy.critic, policy.critic_target]
+    with MixedPrecision(th.nn.ModuleList(networks), model.hidden_dtype) as precision:
         precision.refresh()
         batch = model.make_sampler().sample(1, size["batch"])[0]
         with products:
@@ -215,112 +192,81 @@ def measure(name: str, device: str, turns: int) -> dict[str, Any]:
     differences = compare_losses(exact, plain, size) if device == "cpu" else {}
     products = products_of_a_step(fast, size)
     n_steps = {key: steps if device == "cpu" else count for key, count in STEPS_ON_GPU.items()}
-
-    def synchronised(run: Callable[[], Any]) -> Callable[[], Any]:
-        def timed() -> None:
-            run()
-            if device != "cpu":
-                th.cuda.synchronize()
-
-        return timed
-
-    contenders = {
-        "ours": (lambda: fast.train(n_steps["ours"], size["batch"]), n_steps["ours"]),
-        "ours, float32": (
-            lambda: exact.train(n_steps["ours, float32"], size["batch"]),
-            n_steps["ours, float32"],
-        ),
-        "end of an epoch": (lambda: fast.train(0, size["batch"]), 1),
-        "end of an epoch, float32": (lambda: exact.train(0, size["batch"]), 1),
+    contenders: dict[str, tuple[Callable[[], Any], int]] = {
         "SAC": (lambda: plain_sac.train(n_steps["SAC"], n), n_steps["SAC"]),
         "products": (
             products.contender() if device == "cpu" else captured(products.contender()),
             1,
         ),
     }
-    pairs = [("ours", "end of an epoch"), ("ours, float32", "end of an epoch, float32")]
+    ends = {}
+
+    def add(key: str, model: POEMSAC, steps: int) -> None:
+        """A model's steps, and what it does at the end of an epoch."""
+        ends[key] = f"end of an epoch, {key}"
+        contenders[key] = (partial(model.train, steps, size["batch"]), steps)
+        contenders[ends[key]] = (partial(model.train, 0, size["batch"]), 1)
+
+    add("ours", fast, n_steps["ours"])
+    add("ours, float32", exact, n_steps["ours, float32"])
     if device == "cpu":
-        contenders["plain"] = (lambda: plain.step(size["tasks"], size["batch"]), 1)
+        contenders["plain"] = (partial(plain.step, size["tasks"], size["batch"]), 1)
     else:
-        near = poem(size, "auto", "cpu")
-        contenders["on the processor"] = (lambda: near.train(steps, size["batch"]), steps)
-        contenders["end of an epoch, processor"] = (lambda: near.train(0, size["batch"]), 1)
-        pairs.append(("on the processor", "end of an epoch, processor"))
-    turns_taken = seconds_in_turns(
-        {key: synchronised(run) for key, (run, _) in contenders.items()}, turns
-    )
-    seconds = {key: statistics.median(values) for key, values in turns_taken.items()}
-    for key, end in pairs:
-        seconds[key] -= seconds[
-            end
-        ]  # posteriors and decoder are measured once an epoch, not in a step
+        add("on the processor", poem(size, "auto", "cpu"), steps)
+
+    def synchronised(run: Callable[[], Any]) -> None:
+        run()
+        if device != "cpu":
+            th.cuda.synchronize()
+
+    timed = {key: partial(synchronised, run) for key, (run, _) in contenders.items()}
+    taken = seconds_in_turns(timed, turns)
+    seconds = {key: statistics.median(values) for key, values in taken.items()}
+    for (
+        key,
+        end,
+    ) in ends.items():  # posteriors and decoder are measured once an epoch, not in a step
+        seconds[key] -= seconds[end]
     milliseconds = {key: 1e3 * seconds[key] / contenders[key][1] for key in contenders}
+    ours, nan = milliseconds["ours"], float("nan")
     return {
         "size": {key: value for key, value in size.items() if key != "steps"}
         | {"context": CONTEXT_SIZE},
         "arithmetic of hidden layers": str(fast.hidden_dtype),
         "milliseconds": milliseconds,
-        "faster than plain": milliseconds.get("plain", float("nan")) / milliseconds["ours"],
-        "faster than the processor": milliseconds.get("on the processor", float("nan"))
-        / milliseconds["ours"],
-        "faster than SAC": milliseconds["SAC"] / milliseconds["ours"],
-        "share of the products rate": milliseconds["products"] / milliseconds["ours"],
+        "faster than plain": milliseconds.get("plain", nan) / ours,
+        "faster than the processor": milliseconds.get("on the processor", nan) / ours,
+        "faster than SAC": milliseconds["SAC"] / ours,
+        "share of the products rate": milliseconds["products"] / ours,
         "gigaflop a step": products.operations / 1e9,
         "relative differences of the losses from plain": differences,
     }
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The script's own arguments."""
-    parser.add_argument("--sizes", nargs="+", choices=SIZES, default=list(SIZES))
-    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--turns", type=int, default=5)
-    parser.add_argument("--device", type=available_device, default="cpu")
-
-
 def main() -> None:
     """Measure, print, write."""
-    given = arguments(__doc__, add_arguments)
-    rows, results = [], []
-    reference, rival = (
-        ("plain", "plain") if given.device == "cpu" else ("on the processor", "the processor")
-    )
+    sizes = {"nargs": "+", "choices": SIZES, "default": list(SIZES)}
+    given = arguments(__doc__, sizes=sizes, threads=[1, 2], turns=5, device=DEVICE)
+    on_cpu = given.device == "cpu"
+    reference, rival = ("plain", "plain") if on_cpu else ("on the processor", "the processor")
     columns = ["ours", "ours, float32", reference, "SAC", "products"]
+    rows, results = [], []
     for threads in given.threads:
         th.set_num_threads(threads)
         for name in given.sizes:
             result = {"name": name, "threads": threads, **measure(name, given.device, given.turns)}
             results.append(result)
-            shown = result["milliseconds"]
-            cells = [f"{shown[key]:.3g}" for key in columns]
-            ratios = [f"{result[key]:.1f}x" for key in (f"faster than {rival}", "faster than SAC")]
-            rows.append(
-                [
-                    name,
-                    threads,
-                    *cells,
-                    *ratios,
-                    f"{100 * result['share of the products rate']:.0f} %",
-                ]
-            )
-    ratios_of = [f"ours to {rival}", "ours to SAC", "share of the products' rate"]
-    text = table(["size", "threads", *(f"{key}, ms" for key in columns), *ratios_of], rows)
-    suffix = "" if given.device == "cpu" else f"-{given.device}"
-    settings = {
-        "turns": given.turns,
-        "device": given.device,
-        "context": CONTEXT_SIZE,
-        "tasks": N_TRAIN_TASKS,
-    }
-    write(
-        f"gradient-step{suffix}",
-        "Gradient step",
-        [DESCRIPTION, text],
-        results,
-        given.out,
-        settings,
-        max(given.threads),
-    )
+            cells = [f"{result['milliseconds'][key]:.3g}" for key in columns]
+            cells += [f"{result[key]:.1f}x" for key in (f"faster than {rival}", "faster than SAC")]
+            share = f"{100 * result['share of the products rate']:.0f} %"
+            rows.append([name, threads, *cells, share])
+    ratios = [f"ours to {rival}", "ours to SAC", "share of the products' rate"]
+    text = table(["size", "threads", *(f"{key}, ms" for key in columns), *ratios], rows)
+    name = "gradient-step" if on_cpu else f"gradient-step-{given.device}"
+    settings = {"turns": given.turns, "device": given.device}
+    settings |= {"context": CONTEXT_SIZE, "tasks": N_TRAIN_TASKS}
+    sections, threads = [DESCRIPTION, text], max(given.threads)
+    write(name, "Gradient step", sections, results, given.out, settings, threads)
 
 
 DESCRIPTION = (__doc__ or "").split("\n\n")[-1].strip()

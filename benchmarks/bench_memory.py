@@ -9,7 +9,6 @@ gather, as the buffer does.
 
 from __future__ import annotations
 
-import argparse
 import os
 import statistics
 from pathlib import Path
@@ -32,10 +31,9 @@ def resident_bytes() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def make_segment(
-    obs_dim: int, action_dim: int, feature_dim: int, rng: np.random.Generator
-) -> Segment:
+def make_segment(shape: tuple[int, int, int], rng: np.random.Generator) -> Segment:
     """One horizon of every task."""
+    obs_dim, action_dim, feature_dim = shape
     states = rng.standard_normal((N_TASKS, STEPS + 1, obs_dim), dtype=np.float32)
     next_observations = states[:, 1:].copy()
     terminated = np.zeros((N_TASKS, STEPS), dtype=np.float32)
@@ -65,16 +63,14 @@ def make_buffer(size: int, shape: tuple[int, int, int]) -> TaskReplayBuffer:
 def filling(size: int, marks: tuple[float, ...] = (0.1, 0.25, 0.5, 1.0)) -> list[dict[str, Any]]:
     """What the buffer takes while it fills with Ant's transitions."""
     rng = np.random.default_rng(0)
-    segments = [make_segment(*SHAPES["Ant"], rng) for _ in range(4)]
+    segments = [make_segment(SHAPES["Ant"], rng) for _ in range(4)]
     before, rows = resident_bytes(), []
     buffer = make_buffer(size, SHAPES["Ant"])
     for epoch in range(size // STEPS):
         buffer.extend(segments[epoch % len(segments)])
         if buffer.counts[0] in [int(mark * size) // STEPS * STEPS for mark in marks]:
-            taken = resident_bytes() - before
-            rows.append(
-                {"stored": buffer.size(), "resident": taken, "bytes each": taken / buffer.size()}
-            )
+            taken, stored = resident_bytes() - before, buffer.size()
+            rows.append({"stored": stored, "resident": taken, "bytes each": taken / stored})
     return rows
 
 
@@ -84,7 +80,7 @@ def sampling(name: str, size: int, repeats: int) -> list[dict[str, Any]]:
     obs_dim, action_dim, _ = shape
     buffer, rng = make_buffer(size, shape), np.random.default_rng(0)
     for _ in range(size // STEPS):
-        buffer.extend(make_segment(*shape, rng))
+        buffer.extend(make_segment(shape, rng))
     widths = [obs_dim, action_dim, obs_dim, 1]
     plain = th.rand(N_TASKS, size, sum(widths))
     generator, rows = th.Generator().manual_seed(0), []
@@ -93,66 +89,46 @@ def sampling(name: str, size: int, repeats: int) -> list[dict[str, Any]]:
 
         def sample_plain(sources: th.Tensor = sources) -> None:
             slots = (th.rand(sources.shape, generator=generator) * size).long()
-            flat = (sources * size + slots).view(-1)
-            plain.view(-1, plain.shape[2]).index_select(0, flat).view(*sources.shape, -1).split(
-                widths, dim=-1
-            )
+            flat = plain.view(-1, plain.shape[2])
+            taken = flat.index_select(0, (sources * size + slots).view(-1))
+            taken.view(*sources.shape, -1).split(widths, dim=-1)
 
-        contenders = {
-            "buffer": lambda s=sources: buffer.sample_rows(s, generator),
-            "plain": sample_plain,
-        }
+        def sample_buffer(sources: th.Tensor = sources) -> None:
+            buffer.sample_rows(sources, generator)
+
+        contenders = {"buffer": sample_buffer, "plain": sample_plain}
         seconds = common.seconds_in_turns(contenders, repeats, warm_up=20)
         microseconds = {key: 1e6 * statistics.median(values) for key, values in seconds.items()}
-        rows.append({"family": name, "batch": f"{tasks} x {batch}", **microseconds,
-                     "ratio": common.ratio(seconds["buffer"], seconds["plain"])})  # fmt: skip
+        share = {"ratio": common.ratio(seconds["buffer"], seconds["plain"])}
+        rows.append({"family": name, "batch": f"{tasks} x {batch}", **microseconds, **share})
     return rows
 
 
 def main() -> None:
     """Measure and write."""
-
-    def add(parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("--size", type=int, default=100_000, help="transitions of a task")
-        parser.add_argument("--repeats", type=int, default=300)
-
-    options = common.arguments(__doc__, add)
+    size = {"type": int, "default": 100_000, "help": "transitions of a task"}
+    given = common.arguments(__doc__, size=size, repeats=300)
     th.set_num_threads(1)
-    filled = filling(options.size)
-    sampled = [
-        row for name in SHAPES for row in sampling(name, min(options.size, 20_000), options.repeats)
-    ]
+    filled = filling(given.size)
+    some = min(given.size, 20_000)
+    sampled = [row for name in SHAPES for row in sampling(name, some, given.repeats)]
     plain = 4 * (2 * 27 + 8 + 1)
-    sections = [
-        f"Ant, {N_TASKS} tasks, room for {options.size:,} transitions each; a plain store takes {plain} bytes a transition.",
-        common.table(
-            ["transitions stored", "resident, MB", "bytes a transition", "share of a plain store"],
-            [
-                [r["stored"], r["resident"] / 1e6, r["bytes each"], r["bytes each"] / plain]
-                for r in filled
-            ],
-        ),
-        "Microseconds of a batch, 20,000 transitions a task.",
-        common.table(
-            [
-                "family",
-                "tasks x batch",
-                "replay buffer",
-                "plain store, flags and features missing",
-                "ratio",
-            ],
-            [[r["family"], r["batch"], r["buffer"], r["plain"], r["ratio"]] for r in sampled],
-        ),
+    header = ["transitions stored", "resident, MB", "bytes a transition", "share of a plain store"]
+    rows = [
+        [row["stored"], row["resident"] / 1e6, row["bytes each"], row["bytes each"] / plain]
+        for row in filled
     ]
-    settings = {"threads of torch": 1, "steps of a segment": STEPS, "turns": options.repeats}
-    common.write(
-        "memory",
-        "Memory of the replay buffer",
-        sections,
-        {"filling": filled, "sampling": sampled},
-        options.out,
-        settings,
-    )
+    others = ["replay buffer", "plain store, flags and features missing", "ratio"]
+    sections = [
+        f"Ant, {N_TASKS} tasks, room for {given.size:,} transitions each; a plain store takes "
+        f"{plain} bytes a transition.",
+        common.table(header, rows),
+        "Microseconds of a batch, 20,000 transitions a task.",
+        common.table(["family", "tasks x batch", *others], [[*row.values()] for row in sampled]),
+    ]
+    settings = {"threads of torch": 1, "steps of a segment": STEPS, "turns": given.repeats}
+    data = {"filling": filled, "sampling": sampled}
+    common.write("memory", "Memory of the replay buffer", sections, data, given.out, settings)
 
 
 if __name__ == "__main__":

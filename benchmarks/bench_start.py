@@ -7,7 +7,7 @@ from __future__ import annotations
 import statistics
 import subprocess
 import sys
-from typing import Any
+from functools import partial
 
 import common
 
@@ -33,25 +33,16 @@ COMMANDS: dict[str, list[str]] = {
 
 def main() -> None:
     """Measure and write."""
-    options = common.arguments(
-        __doc__, lambda parser: parser.add_argument("--repeats", type=int, default=5)
-    )
-
-    def runner(arguments: list[str]) -> Any:
-        return lambda: subprocess.run([sys.executable, *arguments], check=True, capture_output=True)
-
-    contenders = {name: runner(arguments) for name, arguments in COMMANDS.items()}
-    seconds = common.seconds_in_turns(contenders, options.repeats)
+    given = common.arguments(__doc__, repeats=5)
+    contenders = {
+        name: partial(subprocess.run, [sys.executable, *words], check=True, capture_output=True)
+        for name, words in COMMANDS.items()
+    }
+    seconds = common.seconds_in_turns(contenders, given.repeats)
     rows = [[name, statistics.median(values), min(values)] for name, values in seconds.items()]
     sections = [common.table(["what", "seconds, median", "fastest"], rows)]
-    common.write(
-        "start",
-        "Import and start",
-        sections,
-        seconds,
-        options.out,
-        {"turns": options.repeats, "caches": "warm"},
-    )
+    settings = {"turns": given.repeats, "caches": "warm"}
+    common.write("start", "Import and start", sections, seconds, given.out, settings)
 
 
 if __name__ == "__main__":

@@ -1,39 +1,48 @@
-"""What all benchmarks share: timing in turns, a description of the machine, and the files that
-results are written to.
+"""What the measurements share: arguments, timing in turns, tables, a server of the page, and the
+files that results are written to.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
-import os
+import re
 import statistics
+import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from poem_envs.vector import available_cores
 from sb3_poem.benchmark.provenance import commit, machine
 
 RESULTS = Path(__file__).parent / "results"
-SPEED = RESULTS / "speed"
+ZOO = Path(__file__).parents[1] / "zoo_configs"
+OUT = {"type": Path, "default": RESULTS / "speed", "help": "folder of the results"}
 
 
-def arguments(
-    description: str | None, add: Callable[[argparse.ArgumentParser], None] | None = None
-) -> argparse.Namespace:
+def arguments(description: str | None, /, **options: Any) -> argparse.Namespace:
     """Parse the command line.
 
     :param description: The script's docstring
-    :param add: Adds the script's own arguments
+    :param options: By name, each by its default, a list where there may be several; or by the
+        arguments of ``add_argument``, as a dictionary
     """
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--out", type=Path, default=SPEED, help="folder of the results")
-    if add is not None:
-        add(parser)
+    for name, default in {"out": OUT, **options}.items():
+        if isinstance(default, dict):
+            how = default
+        elif isinstance(default, list):
+            how = {"type": type(default[0]), "nargs": "+", "default": default}
+        else:
+            how = {"type": type(default), "default": default}
+        parser.add_argument(f"--{name.replace('_', '-')}", **how)
     return parser.parse_args()
 
 
@@ -52,9 +61,7 @@ def available_device(name: str) -> str:
     return name
 
 
-def cores() -> int:
-    """Cores that this process may use now."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+DEVICE = {"type": available_device, "default": "cpu"}
 
 
 def seconds_in_turns(
@@ -91,6 +98,12 @@ def table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     return "\n".join([*lines, *("| " + " | ".join(map(_cell, row)) + " |" for row in rows)])
 
 
+def _cell(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+    return f"{value:,}" if isinstance(value, int) else str(value)
+
+
 def write(
     name: str,
     title: str,
@@ -102,51 +115,48 @@ def write(
 ) -> None:
     """Write ``<out>/<name>.md`` and ``.json``, and print the former.
 
-    :param name: Of the files
-    :param title: Heading
     :param sections: Paragraphs and tables in Markdown
-    :param data: What the tables were made of
-    :param out: Folder
+    :param data: What the tables were made of; None writes no JSON
     :param settings: Of this run, printed below
     :param threads: The most that any contender used
     :raises RuntimeError: if the process has fewer cores than that, as when it was pinned after it
         began
     """
-    if cores() < threads:
+    if available_cores() < threads:
         raise RuntimeError(
-            f"{name} was to be measured with {threads} threads, but this process may use {cores()} core(s) by now; nothing "
-            "was written, since contenders that share a core say nothing about threads. "
-            "Free the cores, or ask for fewer threads."
+            f"{name} was to be measured with {threads} threads, but this process may use "
+            f"{available_cores()} core(s) by now; nothing was written, since contenders that share "
+            "a core say nothing about threads. Free the cores, or ask for fewer threads."
         )
-    origin = {
-        "command": " ".join(
-            ["python", f"benchmarks/{Path(sys.argv[0]).name}", *_without_out(sys.argv[1:])]
-        ),
-        "commit": commit(),
-        "machine": machine(),
-        "settings": settings,
-    }
-    footer = (
-        f"`{origin['command']}` at {origin['commit']}, on {origin['machine']}. Settings: "
-        + ", ".join(f"{key} {value}" for key, value in settings.items())
-    )
+    words = re.sub(r" --out \S+", "", " ".join(["", *sys.argv[1:]]))
+    command = f"python benchmarks/{Path(sys.argv[0]).name}{words}"
+    origin = {"command": command, "commit": commit(), "machine": machine(), "settings": settings}
+    footer = f"`{command}` at {origin['commit']}, on {origin['machine']}."
+    if settings:
+        footer += " Settings: " + ", ".join(f"{key} {value}" for key, value in settings.items())
     text = "\n\n".join([f"# {title}", *sections, footer]) + "\n"
     out.mkdir(parents=True, exist_ok=True)
     (out / f"{name}.md").write_text(text)
-    (out / f"{name}.json").write_text(json.dumps({**origin, "results": data}, indent=1) + "\n")
+    if data is not None:
+        (out / f"{name}.json").write_text(json.dumps({**origin, "results": data}, indent=1) + "\n")
     print(text, flush=True)
 
 
-def _without_out(words: Sequence[str]) -> list[str]:
-    kept, skip = [], False
-    for word in words:
-        if not skip and word != "--out":
-            kept.append(word)
-        skip = word == "--out"
-    return kept
-
-
-def _cell(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
-    return f"{value:,}" if isinstance(value, int) else str(value)
+@contextlib.contextmanager
+def label_server(model: str, *words: str) -> Iterator[tuple[subprocess.Popen[str], str, Path]]:
+    """``sb3-poem label`` on loopback: its process, its address, and the folder of its store."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-u", "-m", "sb3_poem.cli", "label", "--model", model]
+        command += ["--port", "0", "--store", folder, *words]
+        server = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        )
+        try:
+            for line in server.stdout or ():
+                if found := re.search(r"http://\S+", line):
+                    yield server, found.group(), Path(folder)
+                    return
+            raise RuntimeError("the server did not start")
+        finally:
+            server.terminate()
+            server.wait()

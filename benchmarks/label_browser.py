@@ -5,17 +5,15 @@ python benchmarks/label_browser.py [--model HalfCheetahVel] [--answers 9] [--wat
 FILE]
 """
 
-import argparse
 import json
 import os
-import re
 import shutil
-import subprocess
-import sys
-import tempfile
 import time
 
+from common import arguments, label_server
 from playwright.sync_api import sync_playwright
+
+PATIENCE = 300_000  # milliseconds
 
 
 def waits(
@@ -32,18 +30,16 @@ def waits(
         page.goto(url)
         started = time.perf_counter()
         page.locator(".choices button").first.click()
-        page.wait_for_selector('#board[data-phase="question"]', timeout=300_000)
+        page.wait_for_selector('#board[data-phase="question"]', timeout=PATIENCE)
         first, seconds = time.perf_counter() - started, []
         for i in range(answers):
             page.wait_for_timeout(1000.0 * watch)
             started = time.perf_counter()
             page.keyboard.press("ArrowLeft" if i % 2 else "ArrowRight")
-            page.wait_for_function(
-                "i => document.getElementById('count').textContent.startsWith(String(i + 2))", arg=i
-            )
-            page.wait_for_function(
-                "() => document.getElementById('progress').hidden", timeout=300_000
-            )
+            counted = "i => document.getElementById('count').textContent.startsWith(String(i + 2))"
+            page.wait_for_function(counted, arg=i)
+            shown = "() => document.getElementById('progress').hidden"
+            page.wait_for_function(shown, timeout=PATIENCE)
             seconds.append(time.perf_counter() - started)
         if screenshot:
             page.screenshot(path=screenshot)
@@ -53,48 +49,18 @@ def waits(
 
 def main() -> None:
     """Start a server, answer, print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    given = arguments(
+        __doc__,
+        model="HalfCheetahVel",
+        answers={"type": int, "default": 9, "choices": range(1, 10), "metavar": "1..9"},
+        watch={"type": float, "default": 6.0, "help": "seconds before each answer"},
+        screenshot={"help": "a PNG of the page at the end"},
     )
-    parser.add_argument("--model", default="HalfCheetahVel")
-    parser.add_argument("--answers", type=int, default=9, choices=range(1, 10), metavar="1..9")
-    parser.add_argument("--watch", type=float, default=6.0, help="seconds before each answer")
-    parser.add_argument("--screenshot", help="a PNG of the page at the end")
-    arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        command = [
-            sys.executable,
-            "-m",
-            "sb3_poem.cli",
-            "label",
-            "--model",
-            arguments.model,
-            "--port",
-            "0",
-            "--store",
-            folder,
-        ]
-        environment = {"MUJOCO_GL": "egl", **os.environ, "PYTHONUNBUFFERED": "1"}
-        server = subprocess.Popen(
-            command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-        )
-        try:
-            assert server.stdout is not None
-            url = next(
-                found for line in server.stdout if (found := re.search(r"http://\S+", line))
-            ).group()
-            first, seconds = waits(url, arguments.answers, arguments.watch, arguments.screenshot)
-        finally:
-            server.terminate()
-            server.wait()
-    print(
-        json.dumps(
-            {
-                "first_question_s": round(first, 1),
-                "next_pair_s": [round(value, 2) for value in seconds],
-            }
-        )
-    )
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    with label_server(given.model) as (_, url, _):
+        first, seconds = waits(url, given.answers, given.watch, given.screenshot)
+    waited = [round(value, 2) for value in seconds]
+    print(json.dumps({"first_question_s": round(first, 1), "next_pair_s": waited}))
 
 
 if __name__ == "__main__":

@@ -9,20 +9,20 @@ waits for what comes next.
 
 from __future__ import annotations
 
-import argparse
 import http.client
 import json
 import random
 import re
 import statistics
-import subprocess
 import sys
-import tempfile
 import threading
 import time
 import urllib.parse
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from common import arguments, label_server
 
 from sb3_poem.label.store import Store
 
@@ -59,10 +59,8 @@ class Person(threading.Thread):
             time.sleep(self.random.uniform(0.5, 1.5) * self.watch)
             preference = self.random.choice(("left", "right", "equal"))
             asked = time.monotonic()
-            self._send(
-                f"/s/{self.token}/answer",
-                {"question": view["turn"]["id"], "preference": preference},
-            )
+            answer = {"question": view["turn"]["id"], "preference": preference}
+            self._send(f"/s/{self.token}/answer", answer)
             self.given.append(preference)
             view = self._settled()
             # The film itself is part of what a person waits for.
@@ -79,32 +77,28 @@ class Person(threading.Thread):
         raise TimeoutError(f"no question within {PATIENCE_SECONDS} s")
 
     def _start(self) -> str:
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
         body = urllib.parse.urlencode({"model": self.model})
-        connection.request(
-            "POST", "/start", body, {"Content-Type": "application/x-www-form-urlencoded"}
-        )
-        location = connection.getresponse().headers["Location"]
-        connection.close()
-        return location.rpartition("/")[2]
+        form = {"Content-Type": "application/x-www-form-urlencoded"}
+        response, _ = self._request("POST", "/start", body, form)
+        return str(response.headers["Location"]).rpartition("/")[2]
 
     def _send(self, path: str, data: dict[str, Any]) -> None:
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
-        connection.request("POST", path, json.dumps(data), {"Content-Type": "application/json"})
-        response = connection.getresponse()
-        if response.status != 200:
-            raise RuntimeError(f"{path} was answered {response.status}: {response.read().decode()}")
-        connection.close()
+        self._request("POST", path, json.dumps(data), {"Content-Type": "application/json"})
 
     def _get(self, path: str) -> bytes:
+        return self._request("GET", path)[1]
+
+    def _request(
+        self, method: str, path: str, body: str | None = None, headers: dict[str, str] | None = None
+    ) -> tuple[http.client.HTTPResponse, bytes]:
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
-        connection.request("GET", path)
+        connection.request(method, path, body, headers or {})
         response = connection.getresponse()
         content = response.read()
         connection.close()
-        if response.status != 200:
-            raise RuntimeError(f"{path} was answered {response.status}")
-        return content
+        if response.status >= 400:
+            raise RuntimeError(f"{path} was answered {response.status}: {content[:200]!r}")
+        return response, content
 
 
 def _wait_until_warm(port: int, model: str) -> None:
@@ -117,111 +111,70 @@ def _wait_until_warm(port: int, model: str) -> None:
 
 def memory_of(pid: int) -> float:
     """Resident memory of a process, MB."""
-    line = next(
-        line
-        for line in Path(f"/proc/{pid}/status").read_text().splitlines()
-        if line.startswith("VmRSS")
-    )
-    return int(line.split()[1]) / 1024
-
-
-def children_of(pid: int) -> list[int]:
-    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    [line] = re.findall(r"VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text())
+    return int(line) / 1024
 
 
 def busy_share(seconds: float = 2.0) -> float:
     """How much of all processors other programs use, before the measurement."""
 
-    def read() -> tuple[int, int]:
-        values = [
-            int(value) for value in Path("/proc/stat").read_text().splitlines()[0].split()[1:]
-        ]
-        return sum(values), values[3] + values[4]
+    def read() -> np.ndarray:
+        values = Path("/proc/stat").read_text().splitlines()[0].split()[1:]
+        times = np.array(values, dtype=float)
+        return np.array([times.sum(), times[3] + times[4]])
 
-    total, idle = read()
+    before = read()
     time.sleep(seconds)
-    total_after, idle_after = read()
-    return 1.0 - (idle_after - idle) / (total_after - total)
+    total, idle = read() - before
+    return float(1.0 - idle / total)
+
+
+def lost_answers(folder: Path, people: list[Person]) -> int:
+    """Sessions whose answers in the store are not those that were given."""
+    store = Store(folder)
+    lost = 0
+    for person in people:
+        session = store.find(person.token)
+        rows = [] if session is None else store.answers(session.id)
+        lost += [row["preference"] for row in rows] != person.given
+    store.close()
+    return lost
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    """Let people answer, and print."""
+    given = arguments(
+        __doc__,
+        model="HalfCheetahVel",
+        people={"type": int, "default": 8, "choices": range(1, 33), "metavar": "1..32"},
+        seconds={"type": float, "default": 90.0, "help": "at most 600"},
+        watch={"type": float, "default": 8.0, "help": "mean seconds before an answer"},
+        workers=2,
+        out={"type": Path, "help": "write the figures to this file, as JSON"},
     )
-    parser.add_argument("--model", default="HalfCheetahVel")
-    parser.add_argument("--people", type=int, default=8, choices=range(1, 33), metavar="1..32")
-    parser.add_argument("--seconds", type=float, default=90.0, help="at most 600")
-    parser.add_argument(
-        "--watch",
-        type=float,
-        default=8.0,
-        help="mean seconds for which a person watches a question's films",
-    )
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--out", type=Path, help="write the figures as JSON")
-    arguments = parser.parse_args()
-    if not 0.0 < arguments.seconds <= 600.0:
-        parser.error("--seconds must be at most 600")
-    if arguments.out is not None and arguments.out.is_dir():
-        parser.error(f"--out must be a file, but {arguments.out} is a folder")
-
+    if not 0.0 < given.seconds <= 600.0:
+        raise SystemExit("--seconds must be at most 600")
+    if given.out is not None and given.out.is_dir():
+        raise SystemExit(f"--out must be a file, but {given.out} is a folder")
     others = busy_share()
-    with tempfile.TemporaryDirectory() as folder:
-        command = [
-            sys.executable,
-            "-m",
-            "sb3_poem.cli",
-            "label",
-            "--model",
-            arguments.model,
-            "--port",
-            "0",
-            "--store",
-            folder,
-        ]
-        command += [
-            "--queries",
-            "1000",
-            "--max-sessions",
-            str(arguments.people + 1),
-            "--workers",
-            str(arguments.workers),
-        ]
-        server = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-        )
-        assert server.stdout is not None
-        match = re.search(r":(\d+)", server.stdout.readline().partition("127.0.0.1")[2])
-        assert match is not None, "the server did not start"
-        port = int(match[1])
-        try:
-            _wait_until_warm(port, arguments.model)
-            memory_before = memory_of(server.pid)
-            until = time.monotonic() + arguments.seconds
-            people = [
-                Person(port, arguments.model, arguments.watch, until, seed)
-                for seed in range(arguments.people)
-            ]
-            begun = time.monotonic()
-            for person in people:
-                person.start()
-            for person in people:
-                person.join()
-            took = time.monotonic() - begun
-            memory = memory_of(server.pid)
-            workers = [memory_of(child) for child in children_of(server.pid)]
-        finally:
-            server.terminate()
-            server.wait()
-        store = Store(folder)
-        lost = 0
+    words = ["--queries", "1000", "--max-sessions", str(given.people + 1)]
+    words += ["--workers", str(given.workers)]
+    with label_server(given.model, *words) as (server, url, folder):
+        port = urllib.parse.urlsplit(url).port or 80
+        _wait_until_warm(port, given.model)
+        memory_before = memory_of(server.pid)
+        begun = time.monotonic()
+        until = begun + given.seconds
+        people = [Person(port, given.model, given.watch, until, i) for i in range(given.people)]
         for person in people:
-            session = store.find(person.token)
-            kept = (
-                [] if session is None else [row["preference"] for row in store.answers(session.id)]
-            )
-            lost += kept != person.given
-        store.close()
+            person.start()
+        for person in people:
+            person.join()
+        took = time.monotonic() - begun
+        memory = memory_of(server.pid)
+        children = Path(f"/proc/{server.pid}/task/{server.pid}/children").read_text().split()
+        workers = [memory_of(int(child)) for child in children]
+        lost = lost_answers(folder, people)
     waits = sorted(wait for person in people for wait in person.waits)
     result = {
         "people": len(people),
@@ -239,10 +192,9 @@ def main() -> None:
         "busy_with_other_programs_before": round(others, 2),
     }
     print(json.dumps(result, indent=1))
-    if arguments.out is not None:
-        arguments.out.write_text(
-            json.dumps({"command": " ".join(sys.argv), **result}, indent=1) + "\n"
-        )
+    if given.out is not None:
+        data = {"command": " ".join(sys.argv), **result}
+        given.out.write_text(json.dumps(data, indent=1) + "\n")
 
 
 if __name__ == "__main__":

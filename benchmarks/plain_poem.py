@@ -58,14 +58,8 @@ class PlainPOEM:
         assert model.log_ent_coef is not None
         self.log_alpha = model.log_ent_coef.detach().clone().requires_grad_()
         rate = model.policy.optimizer.param_groups[0]["lr"]
-        trained = [
-            self.encoder,
-            self.decoder,
-            self.policy_embedding,
-            self.reward_embedding,
-            self.actor,
-            *self.critics,
-        ]
+        trained = [self.encoder, self.decoder, self.policy_embedding, self.reward_embedding]
+        trained += [self.actor, *self.critics]
         self.optimizers = [th.optim.Adam(network.parameters(), lr=rate) for network in trained]
         self.alpha_optimizer = th.optim.Adam([self.log_alpha], lr=rate)
         assert model.epoch_context is not None
@@ -73,25 +67,20 @@ class PlainPOEM:
         self.data = [TaskData(model, task) for task in range(len(self.returns))]
         self.rng = np.random.default_rng(seed)
         self.obs_mean, self.obs_std = policy.obs_norm.mean.cpu(), policy.obs_norm.std.cpu()
-        self.reward_mean, self.reward_std = (
-            policy.reward_norm.mean.cpu(),
-            policy.reward_norm.std.cpu(),
-        )
+        self.reward_mean = policy.reward_norm.mean.cpu()
+        self.reward_std = policy.reward_norm.std.cpu()
         self.reward_variance = model.epoch_context.rewards.var().cpu()
 
     def step(self, n_tasks: int, batch_size: int) -> None:
         """Sample a meta-batch, and update every network once."""
         tasks = self.rng.choice(len(self.data), size=n_tasks, replace=False)
         batches = [self.data[task].sample(self.rng, batch_size) for task in tasks]
-        contexts = [
-            self.data[task].sample_context(self.rng, self.settings.context_size) for task in tasks
-        ]
+        size = self.settings.context_size
+        contexts = [self.data[task].sample_context(self.rng, size) for task in tasks]
         batch = [th.stack(field) for field in zip(*batches, strict=True)]
         context, context_rewards = (th.stack(field) for field in zip(*contexts, strict=True))
-        noises = [
-            th.randn(n_tasks, self.settings.latent_dim),
-            *(th.randn(batch[1].shape) for _ in range(2)),
-        ]
+        noises = [th.randn(n_tasks, self.settings.latent_dim)]
+        noises += [th.randn(batch[1].shape) for _ in range(2)]
         self.update(batch, context, context_rewards, self.returns[tasks][:, tasks], noises)
 
     def losses(
@@ -122,47 +111,37 @@ class PlainPOEM:
         acts, rews, ends = actions.flatten(0, 1), rewards.flatten(), terminated.flatten()
         # critics
         with th.no_grad():
-            next_actions, next_log_prob = self.act(
-                next_obs, self.policy_embedding(z_rows), noises[1].flatten(0, 1)
-            )
-            next_values = [
-                target(th.cat([next_obs, next_actions, z_rows], dim=1)) for target in self.targets
-            ]
+            z_pi = self.policy_embedding(z_rows)
+            next_actions, next_log_prob = self.act(next_obs, z_pi, noises[1].flatten(0, 1))
+            inputs = th.cat([next_obs, next_actions, z_rows], dim=1)
+            next_values = [target(inputs) for target in self.targets]
             next_value = th.min(*next_values).squeeze(1) - alpha * next_log_prob
             wanted = rews / self.reward_std + self.settings.gamma * (1.0 - ends) * next_value
         values = [critic(th.cat([obs, acts, z_rows], dim=1)).squeeze(1) for critic in self.critics]
         critic_loss = sum((0.5 * mse_loss(value, wanted) for value in values), th.zeros(()))
         # actor
-        new_actions, log_prob = self.act(
-            obs, self.policy_embedding(z_rows), noises[2].flatten(0, 1)
-        )
-        new_values = [
-            critic(th.cat([obs, new_actions, z_rows.detach()], dim=1)) for critic in self.critics
-        ]
+        z_pi = self.policy_embedding(z_rows)
+        new_actions, log_prob = self.act(obs, z_pi, noises[2].flatten(0, 1))
+        inputs = th.cat([obs, new_actions, z_rows.detach()], dim=1)
+        new_values = [critic(inputs) for critic in self.critics]
         actor_loss = (alpha * log_prob - th.min(*new_values).squeeze(1)).mean()
         # decoder, on the context (eq. 4)
         obs_dim, action_dim = obs.shape[1], acts.shape[1]
         z_context = self.reward_embedding(z)[:, None].expand(-1, context.shape[1], -1)
-        decoded = self.decoder(
-            th.cat([context[..., : 2 * obs_dim + action_dim], z_context], dim=-1)
-        ).squeeze(-1)
+        inputs = th.cat([context[..., : 2 * obs_dim + action_dim], z_context], dim=-1)
+        decoded = self.decoder(inputs).squeeze(-1)
         decoded = decoded * self.reward_std + self.reward_mean
         decoder_loss = mse_loss(decoded, context_rewards) / self.reward_variance
         # preferences (eqs. 6 and 7), task by task
         z_r, z_pi = self.reward_embedding(z), self.policy_embedding(z)
         first, second = th.triu_indices(n_tasks, n_tasks, offset=1)
         terms = []
-        for task in range(n_tasks):
-            scores = z_pi @ z_r[task]
-            earned = returns[task]
+        for earned, scores in zip(returns, z_r @ z_pi.T, strict=True):
             label = (earned[first] > earned[second]).float()
             distinct = earned[first] != earned[second]
             margin = scores[first] - scores[second]
-            terms.append(
-                binary_cross_entropy_with_logits(
-                    margin[distinct], label[distinct], reduction="none"
-                )
-            )
+            loss = binary_cross_entropy_with_logits
+            terms.append(loss(margin[distinct], label[distinct], reduction="none"))
         return critic_loss, actor_loss, decoder_loss, kl, th.cat(terms).mean(), log_prob.mean()
 
     def update(
@@ -183,9 +162,9 @@ class PlainPOEM:
         (settings.policy_coef * actor).backward(retain_graph=True)
         for network in self.critics:  # the actor's loss must not move the critics
             network.zero_grad()
-        (settings.kl_coef * kl).backward(retain_graph=True)
-        (settings.reward_coef * decoder).backward(retain_graph=True)
-        (settings.preference_coef * preference).backward(retain_graph=True)
+        coefs = (settings.kl_coef, settings.reward_coef, settings.preference_coef)
+        for coef, loss in zip(coefs, (kl, decoder, preference), strict=True):
+            (coef * loss).backward(retain_graph=True)
         critic.backward()
         for optimizer in self.optimizers:
             optimizer.step()

@@ -8,10 +8,9 @@ On the benchmark's 30 test tasks, an episode each; writes
 
 import gymnasium as gym
 import numpy as np
-from common import RESULTS
+from common import RESULTS, table, write
 
 import sb3_poem  # noqa: F401  registers the families
-from sb3_poem.benchmark.provenance import commit, machine
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.vec_env import make_task_vec_env
 
@@ -34,23 +33,16 @@ def main() -> None:
     """Measure and write."""
     tasks = FamilyView(make_task_vec_env(ENV_ID, 1)).test_tasks(30, 100)
     env = gym.make(ENV_ID)
-    lines = [
-        "# MetaWorldML1 (reach): straight to the goal",
-        "",
-        "`action = gain (goal - hand)`, clipped; 30 test tasks.",
-        "",
-    ]
-    lines += ["| gain | mean return | least | most | success |", "|---|---|---|---|---|"]
+    rows = []
     for gain in GAINS:
         outcomes = [episode(env, goal, gain) for goal in tasks]
         returns = np.array([total for total, _ in outcomes])
-        success = np.mean([succeeded for _, succeeded in outcomes])
-        lines.append(
-            f"| {gain:g} | {returns.mean():.1f} | {returns.min():.1f} | {returns.max():.1f} | {success:.2f} |"
-        )
-    lines += ["", f"By `benchmarks/straight_to_goal.py` at {commit()}. Machine: {machine()}."]
-    (RESULTS / "MetaWorldML1" / "straight-to-goal.md").write_text("\n".join(lines) + "\n")
-    print("\n".join(lines))
+        figures = [f"{value:.1f}" for value in (returns.mean(), returns.min(), returns.max())]
+        rows.append([gain, *figures, f"{np.mean([success for _, success in outcomes]):.2f}"])
+    sections = ["`action = gain (goal - hand)`, clipped; 30 test tasks."]
+    sections.append(table(["gain", "mean return", "least", "most", "success"], rows))
+    title = "MetaWorldML1 (reach): straight to the goal"
+    write("straight-to-goal", title, sections, None, RESULTS / "MetaWorldML1", {})
 
 
 if __name__ == "__main__":

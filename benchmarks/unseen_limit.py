@@ -1,7 +1,7 @@
 """What k answers allow a method that knows the family but not the test tasks, beside the limit that
 has these in sight.
 
-    python benchmarks/unseen_limit.py HalfCheetahVel --seeds 0 1 2 --models M0.zip M1.zip M2.zip
+    python benchmarks/unseen_limit.py --family HalfCheetahVel --seeds 0 1 2 --models M0 M1 M2
 
 The tables' limit takes the 2^k policies that are best for the 30 test tasks. Here they are the 2^k
 that are best for many other tasks of the family; then each test task gets the best of them, as if k
@@ -9,16 +9,14 @@ answers could tell which that is. Policies, episodes and test tasks are those of
 cells. Writes ``benchmarks/results/<Family>/unseen-limit.md``.
 """
 
-import argparse
 from pathlib import Path
 
 import numpy as np
-from common import RESULTS
+from common import RESULTS, arguments, table, write
 
 from sb3_poem.adaptation.evaluation import evaluation_seed, known_task_return, return_matrix
 from sb3_poem.adaptation.limits import best_codebook
 from sb3_poem.benchmark.cells import SEED_STRIDE, SELECTION_EPISODES
-from sb3_poem.benchmark.provenance import commit, machine
 from sb3_poem.benchmark.suites import Budget
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.vec_env import make_task_vec_env
@@ -52,51 +50,34 @@ def limits(
     ]
 
 
-def row(name: str, values: np.ndarray) -> str:
-    """Mean and deviation over seeds."""
-    cells = [
-        f"{mean:.1f} ± {deviation:.1f}"
-        for mean, deviation in zip(values.mean(0), values.std(0, ddof=1), strict=True)
-    ]
-    return f"| {name} | " + " | ".join(cells) + " |"
-
-
 def main() -> None:
     """Measure and write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    given = arguments(
+        __doc__,
+        family={"required": True},
+        models={"nargs": "+", "type": Path, "required": True, "help": "one for each seed"},
+        seeds={"nargs": "+", "type": int, "required": True, "help": "at least two"},
+        others={"type": int, "default": 600, "help": "tasks that the policies are chosen on"},
     )
-    parser.add_argument("family")
-    parser.add_argument("--models", nargs="+", type=Path, required=True, help="one for each seed")
-    parser.add_argument("--seeds", nargs="+", type=int, required=True, help="at least two")
-    parser.add_argument(
-        "--others", type=int, default=600, help="tasks that the policies are chosen on"
-    )
-    given = parser.parse_args()
     if not 2 <= len(given.seeds) == len(given.models):
-        parser.error("--seeds and --models: name at least two seeds, and a model for each")
+        raise SystemExit("--seeds and --models: name at least two seeds, and a model for each")
+    env_id = f"poem/{given.family}-v0"
     measured = [
-        limits(f"poem/{given.family}-v0", model, seed, given.others)
+        limits(env_id, model, seed, given.others)
         for model, seed in zip(given.models, given.seeds, strict=True)
     ]
-    seen, unseen = np.swapaxes(np.array(measured), 0, 1)
-    lines = [
-        f"# What k exact answers allow, {given.family}",
-        "",
-        f"Mean and deviation over seeds {', '.join(map(str, given.seeds))}; 30 test tasks, POEM's policies.",
-        "",
-        "| policies chosen for | " + " | ".join(f"k = {k}" for k in COLUMNS) + " |",
-        "|---" * (len(COLUMNS) + 1) + "|",
-        row("the test tasks (the limit of the tables)", seen),
-        row(f"{given.others} other tasks", unseen),
-        "",
-        f"By `benchmarks/unseen_limit.py {given.family} --seeds {' '.join(map(str, given.seeds))} --others {given.others} "
-        f"--models ...` at {commit()}. Machine: {machine()}.",
+    rows = []
+    names = ("the test tasks (the limit of the tables)", f"{given.others} other tasks")
+    for name, values in zip(names, np.swapaxes(np.array(measured), 0, 1), strict=True):
+        figures = zip(values.mean(axis=0), values.std(axis=0, ddof=1), strict=True)
+        rows.append([name, *(f"{mean:.1f} ± {deviation:.1f}" for mean, deviation in figures)])
+    sections = [
+        f"Mean and deviation over seeds {', '.join(map(str, given.seeds))}; 30 test tasks, POEM's "
+        "policies.",
+        table(["policies chosen for", *(f"k = {k}" for k in COLUMNS)], rows),
     ]
-    out = RESULTS / given.family / "unseen-limit.md"
-    out.parent.mkdir(exist_ok=True)
-    out.write_text("\n".join(lines) + "\n")
-    print(out.read_text())
+    title = f"What k exact answers allow, {given.family}"
+    write("unseen-limit", title, sections, None, RESULTS / given.family, {})
 
 
 if __name__ == "__main__":

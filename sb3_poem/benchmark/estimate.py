@@ -13,10 +13,9 @@ from sb3_poem.adaptation.evaluation import LATENTS_WITH_OWN_DYNAMICS, LATENTS_WI
 from sb3_poem.baselines.fragments import default_fragment_length
 from sb3_poem.baselines.maml_adapter import MAMLRewardOptions
 from sb3_poem.benchmark.cells import SELECTION_EPISODES
-from sb3_poem.benchmark.families import family_facts
-from sb3_poem.benchmark.hyperparameters import training_plan
 from sb3_poem.benchmark.methods import META_ITERATIONS, META_ITERATIONS_OF, VARIANTS
 from sb3_poem.benchmark.suites import Cell, ModelKey
+from sb3_poem.benchmark.training import family_facts, training_plan
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.poem_sac import POEMSAC
 

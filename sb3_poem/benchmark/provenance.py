@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import subprocess
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -54,28 +55,20 @@ def machine() -> str:
     """The processor by what it can do: cores that this process may use, architecture, vector
     instructions; and the GPU.
     """
-    cpuinfo = Path("/proc/cpuinfo")
-    flags: set[str] = set()
-    if cpuinfo.exists():
-        flags = set(
-            next(
-                (line for line in cpuinfo.read_text().splitlines() if line.startswith("flags")), ""
-            ).split()
-        )
-    known = [name for name in INSTRUCTION_SETS if name in flags]
-    words = [f"{available_cores()} of {os.cpu_count()} cores", platform.machine(), *known]
     import torch as th
 
-    if th.cuda.is_available():
-        words.append(th.cuda.get_device_name())
-    return ", ".join(words)
+    cpuinfo = Path("/proc/cpuinfo")
+    flags = re.search(r"^flags.*$", cpuinfo.read_text() if cpuinfo.exists() else "", re.MULTILINE)
+    known = set(flags[0].split()) if flags else set()
+    words = [f"{available_cores()} of {os.cpu_count()} cores", platform.machine()]
+    words += [name for name in INSTRUCTION_SETS if name in known]
+    return ", ".join(words + ([th.cuda.get_device_name()] if th.cuda.is_available() else []))
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
     try:
-        done = subprocess.run(
-            ["git", *arguments], cwd=folder, capture_output=True, text=True, check=True
-        )
+        return subprocess.check_output(
+            ["git", *arguments], cwd=folder, stderr=subprocess.DEVNULL, text=True
+        ).strip()
     except (OSError, subprocess.CalledProcessError):
         return None
-    return done.stdout.strip()

@@ -10,19 +10,19 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import shutil
 import uuid
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from sb3_poem.benchmark.cells import run_cell
 from sb3_poem.benchmark.methods import VARIANTS
 from sb3_poem.benchmark.models import ModelLibrary, Say, Workplace
-from sb3_poem.benchmark.plan import Plan
+from sb3_poem.benchmark.running import Plan
 from sb3_poem.benchmark.store import Record, Store
-from sb3_poem.benchmark.suites import Budget, Cell, ModelKey, OracleSpec, Training
+from sb3_poem.benchmark.suites import Cell, ModelKey
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,6 @@ def run_with_ray(
     """Run a plan as Tune trials.
 
     :param library: The models; its folders must be the same on all machines.
-    :param store: The results.
-    :param options: See there.
     :param say: Takes lines of progress.
     :return: What failed, a line each; the other cells were run all the same.
     :raises ValueError: If Ray is not installed.
@@ -60,40 +58,28 @@ def run_with_ray(
         raise ValueError(
             f"--backend ray needs Ray: pip install 'sb3_poem[ray]' ({error})"
         ) from error
-    workplace = _absolute(library.workplace)
     own = not ray.is_initialized()
     if own:
-        ray.init(
-            address=options.address,
-            log_to_driver=False,
-            include_dashboard=False,
-            logging_level=logging.ERROR,
-        )
+        quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
+        ray.init(address=options.address, include_dashboard=False, **quiet)
+    models = [key for key in plan.models if library.state(key) in ("missing", "interrupted")]
+    derived = [key for key in models if VARIANTS[key.variant].base is not None]
+    trained = [key for key in models if key not in derived]
+    workplace = library.workplace.absolute()
+    failures: list[str] = []
     try:
-        failures: list[str] = []
-        for depth in (False, True):  # what is derived from others comes after them
-            keys = [
-                key
-                for key in plan.models
-                if (VARIANTS[key.variant].base is not None) == depth
-                and library.state(key) in ("missing", "interrupted")
-            ]
-            jobs = [{"model": _model_to_dict(key)} for key in keys]
-            failures += _run_trials(jobs, list(map(str, keys)), workplace, store, options, say)
-        cells = [cell for cell in plan.todo if cell.key not in store]
-        jobs = [{"cell": cell_to_dict(cell)} for cell in cells]
-        failures += _run_trials(jobs, list(map(str, cells)), workplace, store, options, say)
-        return failures
+        for jobs in (trained, derived, plan.todo):  # what is made from others comes after them
+            failures += _run_trials(jobs, workplace, store.path.absolute(), options, say)
     finally:
         if own:
             ray.shutdown()
+    return failures
 
 
 def _run_trials(
-    jobs: Sequence[dict[str, Any]],
-    names: Sequence[str],
+    jobs: Sequence[ModelKey | Cell],
     workplace: Workplace,
-    store: Store,
+    store: Path,
     options: RayOptions,
     say: Say,
 ) -> list[str]:
@@ -102,45 +88,11 @@ def _run_trials(
         return []
     from ray import tune
 
-    # Where all machines can see it. Of Tune's own files nothing is needed afterwards: store and
-    # runs hold everything.
-    storage = Path(workplace.runs) / ".ray" / uuid.uuid4().hex
-    storage.mkdir(parents=True)
-    try:
-        tuner = tune.Tuner(
-            tune.with_resources(_trial, {"cpu": options.cpus, "gpu": options.gpus}),
-            param_space={
-                "workplace": workplace.to_dict(),
-                "job": tune.grid_search(
-                    [{**job, "name": name} for job, name in zip(jobs, names, strict=True)]
-                ),
-            },
-            run_config=tune.RunConfig(
-                storage_path=str(storage),
-                failure_config=tune.FailureConfig(max_failures=options.max_failures),
-                callbacks=[_keep_records(store.path.absolute(), say)],
-                verbose=0,
-            ),
-        )
-        results = tuner.fit()
-    finally:
-        shutil.rmtree(storage, ignore_errors=True)
-    failures = []
-    for result in (results[i] for i in range(len(results))):
-        if result.error is not None:
-            failures.append(
-                f"{(result.config or {}).get('job', {}).get('name', 'a trial')}: {result.error}"
-            )
-    return failures
-
-
-def _keep_records(store: Path, say: Say) -> Any:
-    """A callback that keeps each record when it arrives, so that losing this process loses no
-    finished cell. Tune pickles it with everything else, hence the path.
-    """
-    from ray import tune
-
     class KeepRecords(tune.Callback):
+        """Keeps each record when it arrives, so that losing this process loses no finished cell.
+        Tune pickles it with everything else, hence the store's path.
+        """
+
         def on_trial_result(
             self, iteration: int, trials: list, trial: Any, result: dict, **info: Any
         ) -> None:
@@ -150,96 +102,38 @@ def _keep_records(store: Path, say: Say) -> Any:
             if "name" in result:
                 say(f"finished {result['name']}")
 
-    return KeepRecords()
+    # Where all machines can see it. Of Tune's own files nothing is needed afterwards: store and
+    # runs hold everything.
+    storage = Path(workplace.runs) / ".ray" / uuid.uuid4().hex
+    storage.mkdir(parents=True)
+    run = tune.with_parameters(_run_trial, jobs=list(jobs), workplace=workplace)
+    tuner = tune.Tuner(
+        tune.with_resources(run, {"cpu": options.cpus, "gpu": options.gpus}),
+        param_space={"number": tune.grid_search(list(range(len(jobs))))},
+        run_config=tune.RunConfig(
+            storage_path=str(storage),
+            failure_config=tune.FailureConfig(max_failures=options.max_failures),
+            callbacks=[KeepRecords()],
+            verbose=0,
+        ),
+    )
+    try:
+        results = tuner.fit()
+    finally:
+        shutil.rmtree(storage, ignore_errors=True)
+    failed = [result for i in range(len(results)) if (result := results[i]).error is not None]
+    return [f"{jobs[(result.config or {})['number']]}: {result.error}" for result in failed]
 
 
-def _trial(config: dict[str, Any]) -> None:
+def _run_trial(
+    config: dict[str, Any], jobs: Sequence[ModelKey | Cell], workplace: Workplace
+) -> None:
     """What a trial runs, in a worker."""
     from ray import tune
 
-    from sb3_poem.benchmark.cells import run_cell
-
-    job, library = config["job"], ModelLibrary(Workplace.from_dict(config["workplace"]))
-    record = ""
-    if "model" in job:
-        library.ensure(_model_from_dict(job["model"]), print)
+    job, library, record = jobs[config["number"]], ModelLibrary(workplace), ""
+    if isinstance(job, ModelKey):
+        library.ensure(job, print)
     else:
-        record = json.dumps(run_cell(cell_from_dict(job["cell"]), library, print).to_dict())
-    tune.report({"record": record, "name": job["name"]})
-
-
-def _absolute(workplace: Workplace) -> Workplace:
-    """Workers have other working folders."""
-    return replace(
-        workplace,
-        runs=os.path.abspath(workplace.runs),
-        models=tuple(map(os.path.abspath, workplace.models)),
-        named=tuple(
-            (family, variant, seed, str(Path(path).absolute()))
-            for family, variant, seed, path in workplace.named
-        ),
-    )
-
-
-def _training_to_dict(training: Training) -> dict[str, Any]:
-    return {
-        "timesteps": training.timesteps,
-        "hyperparameters": [list(pair) for pair in training.hyperparameters],
-    }
-
-
-def _training_from_dict(data: dict[str, Any]) -> Training:
-    return Training(
-        data["timesteps"], tuple((str(name), value) for name, value in data["hyperparameters"])
-    )
-
-
-def _model_to_dict(key: ModelKey) -> dict[str, Any]:
-    return {
-        "env_id": key.env_id,
-        "variant": key.variant,
-        "seed": key.seed,
-        "training": _training_to_dict(key.training),
-    }
-
-
-def _model_from_dict(data: dict[str, Any]) -> ModelKey:
-    return ModelKey(
-        data["env_id"], data["variant"], data["seed"], _training_from_dict(data["training"])
-    )
-
-
-def cell_to_dict(cell: Cell) -> dict[str, Any]:
-    """A cell as plain data, which :func:`cell_from_dict` reads.
-
-    :return: A dictionary.
-    """
-    return {
-        "env_id": cell.env_id,
-        "method": cell.method,
-        "seed": cell.seed,
-        "oracle": {"kind": cell.oracle.kind, "value": cell.oracle.value},
-        "budget": {**vars(cell.budget), "record_at": list(cell.budget.record_at)},
-        "training": _training_to_dict(cell.training),
-        "snapshot": cell.snapshot,
-        "overrides": [list(pair) for pair in cell.overrides],
-    }
-
-
-def cell_from_dict(data: dict[str, Any]) -> Cell:
-    """Read what :func:`cell_to_dict` wrote.
-
-    :param data: The dictionary.
-    :return: The cell.
-    """
-    budget = {**data["budget"], "record_at": tuple(data["budget"]["record_at"])}
-    return Cell(
-        data["env_id"],
-        data["method"],
-        data["seed"],
-        OracleSpec(**data["oracle"]),
-        Budget(**budget),
-        _training_from_dict(data["training"]),
-        data["snapshot"],
-        tuple((str(name), value) for name, value in data["overrides"]),
-    )
+        record = json.dumps(run_cell(job, library, print).to_dict())
+    tune.report({"record": record, "name": str(job)})

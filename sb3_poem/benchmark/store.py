@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import sqlalchemy as sa
@@ -61,7 +60,6 @@ class Record:
     """A finished cell.
 
     :param key: :attr:`Cell.key`.
-    :param family: The family's name.
     :param method: The method under whose name it was run first.
     :param identity: :meth:`Cell.identity`.
     :param result: Every task's return after every recorded number of answers, samples and times.
@@ -101,57 +99,43 @@ class Store:
                     f"--store {path}: there is no such file; `sb3-poem benchmark run` makes it"
                 )
             self.path.parent.mkdir(parents=True, exist_ok=True)
-        arguments = {"timeout": BUSY_SECONDS}
-        self._engine = sa.create_engine(
-            f"sqlite:///{self.path}", poolclass=NullPool, connect_args=arguments
-        )
+        patience = {"timeout": BUSY_SECONDS}
+        url = f"sqlite:///{self.path}"
+        self._engine = sa.create_engine(url, poolclass=NullPool, connect_args=patience)
         try:
-            self._open(create)
+            about = self._open(create)
         except sa.exc.DatabaseError as error:
             raise ValueError(
                 f"--store {path} cannot be used as a store of the benchmark: {error.orig}"
             ) from error
-
-    def _open(self, create: bool) -> None:
-        with self._engine.connect() as connection:
-            tables = set(sa.inspect(connection).get_table_names())
-        if "about" not in tables:
-            if tables or not create:
-                raise ValueError(
-                    f"--store {self.path} is a database of another program: it has no table `about`"
-                )
-            self._create()
-        about = self._about()
-        if not about and create:  # another process is creating it, or was ended while it did
-            self._create()
-            about = self._about()
         if about.get("schema") != SCHEMA:
             raise ValueError(
-                f"--store {self.path} was written in schema {about.get('schema')!r} by sb3_poem {about.get('version')!r}, "
-                f"but this is sb3_poem {__version__}, which reads schema {SCHEMA!r}; use that version, or another file"
+                f"--store {path} was written in schema {about.get('schema')!r} by sb3_poem "
+                f"{about.get('version')!r}, but this is sb3_poem {__version__}, which reads schema "
+                f"{SCHEMA!r}; use that version, or another file"
             )
 
-    def _about(self) -> dict[str, str]:
+    def _open(self, create: bool) -> dict[str, str]:
+        """What the file says about itself; it is made, or completed, first."""
         with self._engine.connect() as connection:
-            return {row.name: row.value for row in connection.execute(sa.select(_ABOUT))}
-
-    def _create(self) -> None:
-        """Another process may be doing the same: what is there already stays."""
+            tables = set(sa.inspect(connection).get_table_names())
+        if "about" not in tables and (tables or not create):
+            raise ValueError(
+                f"--store {self.path} is a database of another program: it has no table `about`"
+            )
         with self._engine.begin() as connection:
-            for table in _METADATA.sorted_tables:
-                connection.execute(CreateTable(table, if_not_exists=True))
-            facts = [{"name": "schema", "value": SCHEMA}, {"name": "version", "value": __version__}]
-            connection.execute(insert(_ABOUT).on_conflict_do_nothing(), facts)
+            if create:  # another process may be doing the same: what is there already stays
+                for table in _METADATA.sorted_tables:
+                    connection.execute(CreateTable(table, if_not_exists=True))
+                facts = {"schema": SCHEMA, "version": __version__}
+                rows = [{"name": name, "value": value} for name, value in facts.items()]
+                connection.execute(insert(_ABOUT).on_conflict_do_nothing(), rows)
+            return {row.name: row.value for row in connection.execute(sa.select(_ABOUT))}
 
     def __enter__(self) -> Store:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -159,11 +143,7 @@ class Store:
         self._engine.dispose()
 
     def __contains__(self, key: str) -> bool:
-        with self._engine.connect() as connection:
-            return (
-                connection.execute(sa.select(_CELLS.c.key).where(_CELLS.c.key == key)).first()
-                is not None
-            )
+        return key in self.keys()
 
     def keys(self) -> set[str]:
         """Of all finished cells."""
@@ -171,21 +151,14 @@ class Store:
             return set(connection.execute(sa.select(_CELLS.c.key)).scalars())
 
     def add(self, record: Record) -> bool:
-        """Keep a finished cell.
-
-        :return: Whether it is new; if not, what is there stays.
-        """
+        """Keep a finished cell, and tell whether it is new; if not, what is there stays."""
         row = record.to_dict()
         row["created"] = record.created or datetime.now(UTC).isoformat(timespec="seconds")
         with self._engine.begin() as connection:
             return connection.execute(insert(_CELLS).on_conflict_do_nothing(), row).rowcount == 1
 
     def records(self, keys: Iterable[str] | None = None) -> Iterator[Record]:
-        """Finished cells, in the order of their names.
-
-        :param keys: Only these; None: all.
-        :return: The records.
-        """
+        """Finished cells, in the order of their names; all, or those of some keys."""
         wanted = None if keys is None else set(keys)
         order = (_CELLS.c.family, _CELLS.c.method, _CELLS.c.seed, _CELLS.c.key)
         with self._engine.connect() as connection:

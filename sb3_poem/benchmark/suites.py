@@ -49,10 +49,8 @@ FILE = "file "
 
 @dataclass(frozen=True)
 class OracleSpec:
-    """Who answers.
-
-    :param kind: "return", "boltzmann" or "mistake".
-    :param value: The Boltzmann oracle's beta (None is the paper's), or the rate of mistakes.
+    """Who answers: "return", "boltzmann" with its beta (None is the paper's), or "mistake" with its
+    rate.
     """
 
     kind: str = "return"
@@ -76,8 +74,8 @@ NOISES = (BOLTZMANN, OracleSpec("mistake", 0.1), OracleSpec("mistake", 0.2))
 class Budget:
     """What a cell may spend on evaluation.
 
-    :param tasks: Test tasks, drawn alike for all methods and seeds.
-    :param episodes: Episodes per task and measurement.
+    :param tasks: Test tasks, alike for all methods and seeds.
+    :param episodes: Per task and measurement.
     :param record_at: Numbers of answers after which returns are measured; the largest is the number
         of questions.
     :param task_seed: Of the test tasks.
@@ -112,13 +110,7 @@ class Training:
 
 @dataclass(frozen=True)
 class ModelKey:
-    """Which trained model.
-
-    :param env_id: The family.
-    :param variant: A name of :data:`VARIANTS`.
-    :param seed: Of the training.
-    :param training: What differs from the hyperparameter files.
-    """
+    """Which trained model: the family, a name of :data:`VARIANTS`, and the seed of the training."""
 
     env_id: str
     variant: str
@@ -138,12 +130,8 @@ class ModelKey:
 class Cell:
     """One entry of the store: a method with its settings on a family, with one seed.
 
-    :param env_id: The family.
     :param method: A name of :data:`METHODS`.
     :param seed: Of the training, and of what is random in the adaptation.
-    :param oracle: Who answers.
-    :param budget: What may be spent.
-    :param training: See :class:`Training`.
     :param snapshot: The share of the training after which the model is taken; None: all of it.
     :param overrides: Options of the adapter that differ from the method's own, sorted by name.
     :param model: What the model is made of, see :meth:`ModelLibrary.origin`; None: not told.
@@ -168,7 +156,7 @@ class Cell:
 
     @property
     def definition(self) -> Method:
-        """The method."""
+        """What the method is."""
         return METHODS[self.method]
 
     @property
@@ -224,10 +212,6 @@ class Entry:
     """Methods that a suite compares under the same conditions: a table, and a figure.
 
     :param name: Of the comparison; part of its figures' names.
-    :param title: As in reports.
-    :param methods: Their names.
-    :param oracles: Who answers.
-    :param record_at: See :class:`Budget`.
     :param curves: With whose answers the methods are measured along the training too.
     :param by_inference: Whether figures have a row for each of POEM's inference rules.
     :param shown: Numbers of answers that tables show, of those that were recorded.
@@ -250,10 +234,7 @@ class Entry:
 class Suite:
     """A declared set of cells.
 
-    :param name: As on the command line.
-    :param title: As in reports.
     :param families: What it runs on unless told otherwise.
-    :param entries: What it compares.
     :param references: Methods that say what the models' policies could earn, for the limits in the
         tables.
     :param snapshots: In how many equal parts the training is cut for measurements along it; 1
@@ -275,11 +256,8 @@ class Suite:
     @property
     def methods(self) -> tuple[str, ...]:
         """All that it compares, each once."""
-        return tuple(
-            dict.fromkeys(
-                [name for entry in self.entries for name in entry.methods] + [*self.references]
-            )
-        )
+        compared = [name for entry in self.entries for name in entry.methods]
+        return tuple(dict.fromkeys([*compared, *self.references]))
 
     def cells(
         self,
@@ -292,28 +270,26 @@ class Suite:
     ) -> list[Cell]:
         """The suite's cells, each once, in the order in which they should be run.
 
-        :param env_ids: Families.
         :param methods: Only these; None: all.
         :param budget: Numbers of tasks and episodes, if not the suite's own; ``record_at`` is the
             entries'.
-        :param training: See :class:`Training`.
         :param snapshots: See the class; None takes the suite's own.
-        :return: The cells.
         :raises ValueError: If the suite does not hold a method.
         """
         for name in methods or ():
             if find_method(name).name not in self.methods:
                 raise ValueError(
-                    f"--methods {name} is not in the suite {self.name!r}, which has: {', '.join(self.methods)}"
+                    f"--methods {name} is not in the suite {self.name!r}, which has: "
+                    f"{', '.join(self.methods)}"
                 )
-        budget, training = budget or self.budget, training or Training()
-        parts = self.snapshots if snapshots is None else snapshots
+        parts = snapshots or self.snapshots
         shares = [round(part / parts, 4) for part in range(1, parts)]
+        spent = (budget or self.budget, training or Training(), shares)
         cells: dict[str, Cell] = {}
         for env_id in env_ids:
             for seed in seeds:
                 for entry in (*self.entries, Entry("references", "", self.references)):
-                    for cell in self.entry_cells(entry, env_id, seed, budget, training, shares):
+                    for cell in self.entry_cells(entry, env_id, seed, *spent):
                         if not methods or cell.method in methods:
                             cells.setdefault(cell.key, cell)
         return list(cells.values())
@@ -325,21 +301,16 @@ class Suite:
         seed: int,
         budget: Budget,
         training: Training,
-        shares: Sequence[float] = (),
+        shares: Sequence[float],
     ) -> list[Cell]:
         """The cells of one entry, for one family and seed.
 
-        :param env_id: The family.
-        :param budget: See :meth:`cells`.
-        :param training: See :meth:`cells`.
         :param shares: After which shares of the training the methods are measured too, where the
             entry has curves.
-        :return: The cells.
         """
         cells = []
         for name in entry.methods:
-            kind = METHODS[name].kind
-            overrides = self.overrides.get(kind, ())
+            overrides = self.overrides.get(METHODS[name].kind, ())
             for oracle in entry.oracles:
                 moments: list[tuple[float | None, tuple[int, ...]]] = [(None, entry.record_at)]
                 if oracle in entry.curves and name not in WITHOUT_CURVE:
@@ -361,7 +332,6 @@ def hashable(value: Any) -> Any:
     """A hyperparameter's value, with tuples for lists: a model is looked up by its hyperparameters,
     and JSON has no tuples.
 
-    :param value: Of YAML or JSON
     :raises ValueError: if it is, or holds, a dictionary
     """
     if isinstance(value, dict):
@@ -391,21 +361,11 @@ def family_id(name: str) -> str:
 
 _ABLATED = ("poem-inner", "poem-pearl-context", "poem-d2", "poem-d10")
 _BOTH = ("poem-bayes", "poem-paper")
-_DESIGNS = (
-    *_BOTH,
-    *(f"{variant}-{inference}" for variant in _ABLATED for inference in ("bayes", "paper")),
-)
+_DESIGNS = (*_BOTH, *(f"{variant}-{rule}" for variant in _ABLATED for rule in ("bayes", "paper")))
 # A rule's own way of asking has no name of its own.
-_RULES = (
-    *_BOTH,
-    *(
-        name
-        for i in ("bayes", "paper")
-        for rule in QUERY_RULES
-        if (name := f"poem-{i}-{rule}") in METHODS
-    ),
-)
-_EPSILON_METHODS = tuple(f"poem-paper-epsilon-{epsilon:g}" for epsilon in EPSILONS)
+_ASKING = (*_BOTH, *(name for b in _BOTH for q in QUERY_RULES if (name := f"{b}-{q}") in METHODS))
+_EPSILONS = tuple(f"poem-paper-epsilon-{epsilon:g}" for epsilon in EPSILONS)
+_TABLE = Entry("methods", "Methods", TABLE_METHODS, curves=(EXACT,))
 
 SUITES = {
     suite.name: suite
@@ -414,7 +374,7 @@ SUITES = {
             "table3",
             "Methods under exact answers (Table 3; figures 5, 9, 10)",
             PAPER_FAMILIES,
-            (Entry("methods", "Methods", TABLE_METHODS, curves=(EXACT,)),),
+            (_TABLE,),
             TABLE_REFERENCES,
         ),
         Suite(
@@ -429,7 +389,7 @@ SUITES = {
             "noise",
             "Methods under answers with errors (figures 6, 11)",
             CHEETAHS,
-            (Entry("methods", "Methods", TABLE_METHODS, NOISES, curves=(BOLTZMANN,)),),
+            (replace(_TABLE, oracles=NOISES, curves=(BOLTZMANN,)),),
             TABLE_REFERENCES,
         ),
         Suite(
@@ -444,13 +404,8 @@ SUITES = {
                     curves=(EXACT,),
                     by_inference=True,
                 ),
-                Entry("rules", "Query rules", _RULES, by_inference=True),
-                Entry(
-                    "queries",
-                    "Number of queries",
-                    ("poem-bayes", "poem-paper"),
-                    record_at=tuple(range(21)),
-                ),
+                Entry("rules", "Query rules", _ASKING, by_inference=True),
+                Entry("queries", "Number of queries", _BOTH, record_at=tuple(range(21))),
             ),
             ("known-task", *(f"known-task-{variant}" for variant in _ABLATED)),
         ),
@@ -458,14 +413,14 @@ SUITES = {
             "epsilon",
             "Tolerance of the paper's rule (figures 14, 15)",
             CHEETAHS,
-            (Entry("tolerance", "Tolerance epsilon", _EPSILON_METHODS, (EXACT, BOLTZMANN)),),
+            (Entry("tolerance", "Tolerance epsilon", _EPSILONS, (EXACT, BOLTZMANN)),),
             ("known-task",),
         ),
         Suite(
             "smoke",
             "All methods on a small family",
             ("PointGoal",),
-            (Entry("methods", "Methods", TABLE_METHODS, (EXACT, BOLTZMANN), curves=(EXACT,)),),
+            (replace(_TABLE, oracles=(EXACT, BOLTZMANN)),),
             TABLE_REFERENCES,
             snapshots=3,
             budget=Budget(tasks=10, episodes=5),

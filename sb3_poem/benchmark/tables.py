@@ -1,20 +1,92 @@
-"""Tables of a suite, as pure functions of what the store holds."""
+"""Tables of a suite, and its report: pure functions of what the store holds."""
 
 from __future__ import annotations
 
 import csv
 import io
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from sb3_poem.benchmark.figures import write_figures
 from sb3_poem.benchmark.methods import METHODS
-from sb3_poem.benchmark.paper import paper_figure
-from sb3_poem.benchmark.selection import Condition, Reference, Selection, Series
-from sb3_poem.benchmark.statistics import Summary, summarise
-from sb3_poem.benchmark.suites import EXACT, REVISION, Entry, OracleSpec
+from sb3_poem.benchmark.results import Condition, Selection, summarise
+from sb3_poem.benchmark.store import Store
+from sb3_poem.benchmark.suites import EXACT, SUITES, Entry, OracleSpec
+
+SUFFIX = {"md": ".md", "latex": ".tex", "csv": ".csv", "json": ".json"}
+#: Table 3 of Xu & Zhu (ICML 2025): family -> row -> (mean, standard deviation) after 1, 5 and 10
+#: queries
+TABLE_3: dict[str, dict[str, tuple[tuple[float, float], ...]]] = {
+    "HalfCheetahVel": {
+        "MAML-reward": ((-201, 13), (-193, 11), (-182, 11)),
+        "ANOLE": ((-173, 12), (-120, 10), (-112, 14)),
+        "ANOLE-random": ((-172, 14), (-125, 13), (-115, 13)),
+        "ANOLE-greedy": ((-169, 12), (-128, 18), (-115, 12)),
+        "POEM": ((-65, 10), (-50, 8), (-46, 6)),
+    },
+    "HalfCheetahFwdBack": {
+        "MAML-reward": ((-120, 130), (-40, 138), (-4, 142)),
+        "ANOLE": ((503, 149), (1012, 121), (1198, 89)),
+        "ANOLE-random": ((1236, 203), (1419, 108), (1483, 45)),
+        "ANOLE-greedy": ((1367, 155), (1482, 91), (1493, 89)),
+        "POEM": ((1689, 54), (1684, 32), (1709, 23)),
+    },
+    "AntGoal": {
+        "MAML-reward": ((-610, 81), (-603, 85), (-602, 89)),
+        "ANOLE": ((-550, 21), (-405, 29), (-380, 19)),
+        "ANOLE-random": ((-551, 22), (-419, 26), (-378, 16)),
+        "ANOLE-greedy": ((-560, 25), (-412, 38), (-401, 51)),
+        "POEM": ((-351, 9), (-203, 12), (-202, 7)),
+    },
+    "AntFwdBack": {
+        "MAML-reward": ((101, 11), (105, 12), (105, 11)),
+        "ANOLE": ((618, 60), (830, 20), (802, 38)),
+        "ANOLE-random": ((808, 38), (810, 22), (812, 29)),
+        "ANOLE-greedy": ((788, 39), (806, 23), (820, 32)),
+        "POEM": ((1030, 12), (1013, 56), (1015, 48)),
+    },
+    "AntDir2D": {
+        "MAML-reward": ((102, 20), (101, 23), (112, 30)),
+        "ANOLE": ((308, 45), (515, 78), (588, 67)),
+        "ANOLE-random": ((181, 30), (432, 45), (498, 35)),
+        "ANOLE-greedy": ((172, 20), (443, 30), (414, 25)),
+        "POEM": ((671, 15), (732, 45), (749, 40)),
+    },
+    "AntVel": {
+        "MAML-reward": ((-3, 9), (-1, 10), (6, 8)),
+        "ANOLE": ((36, 5), (80, 10), (83, 7)),
+        "ANOLE-random": ((20, 5), (60, 10), (100, 6)),
+        "ANOLE-greedy": ((30, 5), (70, 10), (110, 5)),
+        "POEM": ((95, 5), (108, 8), (112, 4)),
+    },
+    "HumanoidDir2D": {
+        "MAML-reward": ((504, 52), (529, 56), (523, 58)),
+        "ANOLE": ((754, 59), (703, 55), (722, 62)),
+        "ANOLE-random": ((232, 54), (780, 64), (796, 58)),
+        "ANOLE-greedy": ((231, 30), (781, 59), (798, 54)),
+        "POEM": ((812, 45), (1462, 14), (1451, 67)),
+    },
+    "MetaWorldML10": {
+        "MAML-reward": ((153, 18), (164, 19), (166, 15)),
+        "ANOLE": ((238, 31), (192, 42), (240, 21)),
+        "ANOLE-random": ((242, 31), (192, 39), (229, 29)),
+        "ANOLE-greedy": ((239, 34), (175, 26), (183, 13)),
+        "POEM": ((326, 17), (324, 13), (349, 7)),
+    },
+    "MetaWorldML1": {
+        "MAML-reward": ((680, 36), (691, 40), (692, 49)),
+        "ANOLE": ((1086, 67), (1042, 70), (1018, 82)),
+        "ANOLE-random": ((1117, 64), (1045, 80), (1145, 52)),
+        "ANOLE-greedy": ((1091, 47), (1011, 67), (1122, 76)),
+        "POEM": ((1435, 12), (1588, 32), (1601, 13)),
+    },
+}
+QUERIES = (1, 5, 10)
 
 
 @dataclass(frozen=True)
@@ -30,14 +102,10 @@ class Row:
     :param queries: After how many answers; None for "known".
     :param snapshot: The share of the training after which; None: all.
     :param samples: Environment steps of the training, mean over seeds.
-    :param n_seeds: How many seeds.
     :param mean: Mean over seeds.
     :param deviation: Standard deviation over seeds (n - 1).
-    :param iqm: Interquartile mean over seeds and tasks.
-    :param iqm_low: Of its 95 % interval.
-    :param iqm_high: Of its 95 % interval.
-    :param paper_mean: What the paper reports.
-    :param paper_deviation: What the paper reports.
+    :param iqm: Interquartile mean over seeds and tasks, with its 95 % interval.
+    :param paper_mean: What the paper reports, with its deviation.
     :param task_error: Standard error over tasks of their returns, means over seeds.
     :param success_rate: Mean over seeds and tasks, where the family has successes.
     """
@@ -67,13 +135,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """A table to be printed.
-
-    :param title: Above it.
-    :param header: Names of the columns.
-    :param rows: Cells.
-    :param notes: Below it.
-    """
+    """A table to be printed: title, names of the columns, cells, and notes below."""
 
     title: str
     header: tuple[str, ...]
@@ -81,51 +143,77 @@ class Table:
     notes: tuple[str, ...] = ()
 
 
-def suite_rows(selection: Selection) -> list[Row]:
-    """Everything of a suite in long form.
+def make_report(
+    store: Store,
+    suites: Sequence[str] | None = None,
+    families: Sequence[str] | None = None,
+    kind: str = "md",
+    out: Path | None = None,
+    seeds: Sequence[int] | None = None,
+) -> tuple[str, list[Path]]:
+    """Tables as text and, in a folder, the figures beside them.
 
-    :param selection: What there is.
-    :return: The rows.
+    :param suites: Names of suites; None: all of which there is something.
+    :param families: Names of families; None: all.
+    :param kind: "md", "latex", "csv" or "json".
+    :param out: Where to write ``<suite>.<suffix>`` and the figures; None writes nothing.
+    :param seeds: Only these, say where some methods have more of them than others; None: all.
+    :return: The text of all suites, and the files.
+    :raises ValueError: If the store holds nothing of what is asked for.
     """
-    rows: list[Row] = []
-    for condition in selection.conditions:
-        references = selection.references(condition)
-        for entry in selection.suite.entries:
-            series = selection.series(entry, condition)
-            for oracle in entry.oracles:
-                some = [one for one in series if one.oracle == oracle]
-                for one in some:
-                    rows += _method_rows(selection.suite.name, condition, entry, one)
-                variants = {METHODS[one.method].variant for one in some}
-                own = [
-                    reference
-                    for reference in references
-                    if METHODS[reference.method].variant in variants
-                ]
-                rows += _reference_rows(selection.suite.name, condition, entry, oracle, own)
-    return rows
+    records = [record for record in store.records() if seeds is None or record.seed in seeds]
+    texts, files = [], []
+    for name in suites or SUITES:
+        # A small family's cells belong to the suite that declares it, unless a suite is asked for
+        # by its name.
+        own = SUITES[name].families if suites is None and families is None else families
+        selection = Selection(SUITES[name], records, own)
+        if not any(
+            selection.series(entry, condition)
+            for entry in selection.suite.entries
+            for condition in selection.conditions
+        ):
+            if suites:
+                raise ValueError(f"--suite {name}: {store.path} holds no finished cell of it")
+            continue
+        if kind in ("md", "latex"):
+            text = format_tables(selection.suite.title, suite_tables(selection), kind)
+        else:
+            text = format_rows(suite_rows(selection), kind)
+        texts.append(text)
+        if out is not None:
+            file = out / f"{name}{SUFFIX[kind]}"
+            file.write_text(text)
+            files += [file, *write_figures(selection, out)]
+    if not texts:
+        of = ", ".join([*(families or []), *(f"seed {seed}" for seed in seeds or [])])
+        raise ValueError(f"{store.path} holds no finished cell" + (f" of {of}" if of else ""))
+    return "\n".join(texts), files
+
+
+def suite_rows(selection: Selection) -> list[Row]:
+    """Everything of a suite in long form."""
+    return [
+        row
+        for condition in selection.conditions
+        for entry in selection.suite.entries
+        for oracle in entry.oracles
+        for row in _rows(selection, condition, entry, oracle)
+    ]
 
 
 def suite_tables(selection: Selection) -> list[Table]:
-    """A table for each family, comparison and oracle; and one of the models.
-
-    :param selection: What there is.
-    :return: The tables.
-    """
-    rows = suite_rows(selection)
+    """A table for each family, comparison and oracle; and one of the models."""
     tables: list[Table] = []
     for condition in selection.conditions:
         for entry in selection.suite.entries:
             for oracle in entry.oracles:
-                place = (str(condition), entry.name, oracle.label)
-                some = [row for row in rows if (row.condition, row.entry, row.oracle) == place]
-                if some:
-                    tables.append(_comparison(condition, entry, oracle, some))
-                if entry.by_task and any(row.success_rate is not None for row in some):
-                    tables.append(_successes(condition, entry, some))
-        models = _models(selection, condition)
-        if models is not None:
-            tables.append(models)
+                rows = list(_rows(selection, condition, entry, oracle))
+                if rows:
+                    tables.append(_comparison(condition, entry, oracle, rows))
+                if entry.by_task and any(row.success_rate is not None for row in rows):
+                    tables.append(_successes(condition, entry, rows))
+        tables += _models(selection, condition)
     return tables
 
 
@@ -134,131 +222,110 @@ def format_tables(title: str, tables: Sequence[Table], kind: str) -> str:
 
     :param title: Of the whole.
     :param kind: "md" or "latex".
-    :return: The text.
-    :raises ValueError: If the format is neither.
     """
     if kind == "md":
         return "\n\n".join([f"# {title}", *map(_markdown, tables)]) + "\n"
-    if kind == "latex":
-        return (
-            "\n\n".join([f"% {title}; needs \\usepackage{{booktabs}}", *map(_latex, tables)]) + "\n"
-        )
-    raise ValueError(f"`kind` must be 'md' or 'latex', but is {kind!r}")
+    head = f"% {title}; needs \\usepackage{{booktabs}}"
+    return "\n\n".join([head, *map(_latex, tables)]) + "\n"
 
 
 def format_rows(rows: Iterable[Row], kind: str) -> str:
     """Rows as text.
 
     :param kind: "csv" or "json".
-    :return: The text.
-    :raises ValueError: If the format is neither.
     """
     data = [asdict(row) for row in rows]
     if kind == "json":
         return json.dumps(data, indent=1) + "\n"
-    if kind == "csv":
-        text = io.StringIO()
-        writer = csv.DictWriter(text, list(Row.__dataclass_fields__), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(data)
-        return text.getvalue()
-    raise ValueError(f"`kind` must be 'csv' or 'json', but is {kind!r}")
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(Row.__dataclass_fields__), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(data)
+    return text.getvalue()
 
 
-def _method_rows(suite: str, condition: Condition, entry: Entry, series: Series) -> list[Row]:
-    definition = METHODS[series.method]
-    rows = []
-    intervals = series.snapshot is None and not entry.by_task
-    summaries = summarise(series.returns, intervals)
-    successes = series.success_rates or [None] * len(summaries)
-    for queries, summary, success in zip(series.queries, summaries, successes, strict=True):
+def paper_figure(family: str, row: str | None, queries: int) -> tuple[float, float] | None:
+    """Mean and standard deviation that the paper reports; None if it reports nothing.
+
+    :param row: A row of its table.
+    """
+    figures = TABLE_3.get(family, {}).get(row or "")
+    if figures is None or queries not in QUERIES:
+        return None
+    mean, deviation = figures[QUERIES.index(queries)]
+    return float(mean), float(deviation)
+
+
+def _rows(
+    selection: Selection, condition: Condition, entry: Entry, oracle: OracleSpec
+) -> Iterator[Row]:
+    """Of a table: methods, then the limits and known tasks of their models."""
+    place: dict[str, Any] = {
+        "suite": selection.suite.name,
+        "family": condition.family,
+        "condition": str(condition),
+        "entry": entry.name,
+        "oracle": oracle.label,
+    }
+    some = [one for one in selection.series(entry, condition) if one.oracle == oracle]
+    for one in some:
+        final = one.snapshot is None
         # The paper's figures are of the whole training and of its own answers.
-        final = series.snapshot is None and series.oracle == EXACT and entry.name == "methods"
-        paper = paper_figure(condition.family, definition.paper_row, queries) if final else None
-        rows.append(
-            Row(
-                suite,
-                condition.family,
-                str(condition),
-                entry.name,
-                series.oracle.label,
-                series.method,
-                series.label,
-                "method",
-                queries,
-                series.snapshot,
-                series.samples,
-                summary.n_seeds,
-                *_figures(summary),
-                *(paper or (None, None)),
-                summary.task_error,
-                success,
+        has_paper = final and oracle == EXACT and entry.name == "methods"
+        summaries = summarise(one.returns, intervals=final and not entry.by_task)
+        successes = one.success_rates
+        for i, (queries, summary) in enumerate(zip(one.queries, summaries, strict=True)):
+            row = METHODS[one.method].paper_row if has_paper else None
+            paper = paper_figure(condition.family, row, queries) or (None, None)
+            yield Row(
+                **place,
+                method=one.method,
+                label=one.label,
+                kind="method",
+                queries=queries,
+                snapshot=one.snapshot,
+                samples=one.samples,
+                n_seeds=summary.n_seeds,
+                mean=summary.mean,
+                deviation=summary.deviation,
+                iqm=summary.iqm,
+                iqm_low=summary.low,
+                iqm_high=summary.high,
+                paper_mean=paper[0],
+                paper_deviation=paper[1],
+                task_error=summary.task_error,
+                success_rate=None if successes is None else successes[i],
             )
-        )
-    return rows
-
-
-def _figures(summary: Summary) -> tuple[float, float | None, float, float | None, float | None]:
-    return summary.mean, summary.deviation, summary.iqm, summary.low, summary.high
-
-
-def _reference_rows(
-    suite: str,
-    condition: Condition,
-    entry: Entry,
-    oracle: OracleSpec,
-    references: Sequence[Reference],
-) -> list[Row]:
-    rows = []
-    for reference in references:
-        place = (
-            suite,
-            condition.family,
-            str(condition),
-            entry.name,
-            oracle.label,
-            reference.method,
-        )
-        label = reference.label.replace("task known", "limit")
+    variants = {METHODS[one.method].variant for one in some}
+    for reference in selection.references(condition):
+        if METHODS[reference.method].variant not in variants:
+            continue
+        of = {**place, "method": reference.method, "snapshot": None, "samples": None}
+        limit = reference.label.replace("task known", "limit")
         for queries in entry.record_at:
-            limits = reference.limits(queries, oracle)
-            rows.append(
-                Row(
-                    *place,
-                    label,
-                    "limit",
-                    queries,
-                    None,
-                    None,
-                    len(limits),
-                    float(limits.mean()),
-                    _deviation(limits),
-                )
-            )
-        known = reference.known
-        mean, deviation = float(known.mean()), _deviation(known)
-        facts = (*place, reference.label, "known", None, None, None, len(known), mean, deviation)
-        rows.append(Row(*facts, success_rate=reference.success_rate))
-    return rows
+            values = _over_seeds(reference.limits(queries, oracle))
+            yield Row(**of, label=limit, kind="limit", queries=queries, **values)
+        values = {**_over_seeds(reference.known), "success_rate": reference.success_rate}
+        yield Row(**of, label=reference.label, kind="known", queries=None, **values)
 
 
-def _deviation(values: np.ndarray) -> float | None:
-    return float(values.std(ddof=1)) if len(values) > 1 else None
+def _over_seeds(values: np.ndarray) -> dict[str, Any]:
+    deviation = float(values.std(ddof=1)) if len(values) > 1 else None
+    return {"n_seeds": len(values), "mean": float(values.mean()), "deviation": deviation}
 
 
 def _comparison(
     condition: Condition, entry: Entry, oracle: OracleSpec, rows: Sequence[Row]
 ) -> Table:
-    """Methods against numbers of answers: mean and deviation, interquartile mean and interval, the
-    paper's figure.
+    """Methods against numbers of answers: mean and deviation, interquartile mean and interval (or
+    the standard error over tasks), the paper's figure.
     """
     queries = [k for k in entry.shown if k in entry.record_at]
-    beside = "std. error over tasks" if entry.by_task else "IQM [95 %]"
     has_paper = any(row.paper_mean is not None for row in rows)
+    beside = "std. error over tasks" if entry.by_task else "IQM [95 %]"
     header = ["method", "seeds"]
     for k in queries:
-        after = f"{k} answer{'s' * (k != 1)}"
-        header += [after, beside, *(["paper"] if has_paper else [])]
+        header += [_after(k), beside, *(["paper"] if has_paper else [])]
     body = []
     final = [row for row in rows if row.snapshot is None]
     for kind in ("method", "limit"):
@@ -268,38 +335,31 @@ def _comparison(
             for k in queries:
                 row = mine.get(k)
                 if row is None:
-                    cells += ["", ""]
-                else:
-                    spread = _number(row.task_error) if entry.by_task else _interval(row)
-                    cells += [_mean(row.mean, row.deviation), spread]
+                    cells += [""] * (2 + has_paper)
+                    continue
+                interval = (row.iqm_low, row.iqm_high)
+                spread = _number(row.task_error) if entry.by_task else _number(row.iqm, *interval)
+                cells += [_mean(row.mean, row.deviation), spread]
                 if has_paper:
-                    cells.append(
-                        ""
-                        if row is None or row.paper_mean is None
-                        else _mean(row.paper_mean, row.paper_deviation)
-                    )
+                    cells.append(_mean(row.paper_mean, row.paper_deviation))
             body.append(tuple(cells))
-    known = [
-        f"{row.label}: {_mean(row.mean, row.deviation)}" for row in final if row.kind == "known"
-    ]
     also = (
         "standard error over tasks of their means over seeds"
         if entry.by_task
         else "interquartile mean over seeds and tasks with its bootstrap interval"
     )
     notes = [f"Mean and standard deviation over seeds; {also}."]
-    notes += known
+    notes += [
+        f"{row.label}: {_mean(row.mean, row.deviation)}" for row in final if row.kind == "known"
+    ]
     if any(row.kind == "limit" for row in rows):
         notes.append(
-            "A limit is the most that so many of these answers allow with those policies, chosen with the test tasks in "
-            "sight; it does not bind the reward oracle, which sees more than answers."
+            "A limit is the most that so many of these answers allow with those policies, chosen "
+            "with the test tasks in sight; it does not bind the reward oracle, which sees more "
+            "than answers."
         )
-    return Table(
-        f"{condition}; {entry.title.lower()}, {oracle.label}",
-        tuple(header),
-        tuple(body),
-        tuple(notes),
-    )
+    title = f"{condition}; {entry.title.lower()}, {oracle.label}"
+    return Table(title, tuple(header), tuple(body), tuple(notes))
 
 
 def _successes(condition: Condition, entry: Entry, rows: Sequence[Row]) -> Table:
@@ -309,72 +369,65 @@ def _successes(condition: Condition, entry: Entry, rows: Sequence[Row]) -> Table
         mine = {row.queries: row.success_rate for row in rows if row.label == label}
         body.append((label, *(f"{mine[k]:.2f}" for k in entry.shown)))
     notes = [f"{row.label}: {row.success_rate:.2f}" for row in rows if row.kind == "known"]
-    header = ("method", *(f"{k} answer{'s' * (k != 1)}" for k in entry.shown))
+    header = ("method", *map(_after, entry.shown))
     return Table(f"{condition}; success rates", header, tuple(body), tuple(notes))
 
 
-def _models(selection: Selection, condition: Condition) -> Table | None:
-    """How the models were trained, and how well they order policies."""
+def _models(selection: Selection, condition: Condition) -> list[Table]:
+    """How the models were trained, and how well they order policies: a table, if there are any."""
     references = selection.references(condition)
-    records = [(one.method, record) for one in references for record in one.records]
+    records = [record for reference in references for record in reference.records]
     if not records:
-        return None
+        return []
+    results = [record.result for record in records]
+    models = [record.provenance["model"] for record in records]
     columns: dict[str, list[str]] = {
-        "model": [METHODS[method].variant for method, _ in records],
-        "seed": [str(record.seed) for _, record in records],
+        "model": [METHODS[record.method].variant for record in records],
+        "seed": [str(record.seed) for record in records],
+        "source": [model["source"] for model in models],
+        "samples": [f"{result['training_samples']:,}" for result in results],
+        "updates": [f"{result['updates']:,}" for result in results],
+        "seconds": [_shown(result["training_seconds"], ",.0f") for result in results],
+        "CPU seconds": [_shown(result.get("training_cpu_seconds"), ",.0f") for result in results],
+        "preference accuracy": [_shown(r.get("preference_accuracy"), ".3f") for r in results],
+        "Kendall's tau": [_shown(r.get("kendall_tau"), ".3f") for r in results],
+        "commit": [
+            str(model.get("commit") or model.get("card", {}).get("commit", "")) for model in models
+        ],
     }
-    results = [record.result for _, record in records]
-    models = [record.provenance["model"] for _, record in records]
-    columns["source"] = [model["source"] for model in models]
-    for name, key in (("samples", "training_samples"), ("updates", "updates")):
-        columns[name] = [f"{result[key]:,}" for result in results]
-    columns["seconds"] = [_seconds(result["training_seconds"]) for result in results]
-    processor = [_seconds(result.get("training_cpu_seconds")) for result in results]
-    if any(processor):
-        columns["CPU seconds"] = processor
-    for name, key in (
-        ("preference accuracy", "preference_accuracy"),
-        ("Kendall's tau", "kendall_tau"),
-    ):
-        orders = [result.get(key) for result in results]
-        columns[name] = ["" if order is None else f"{order:.3f}" for order in orders]
-    commits = [model.get("commit") or model.get("card", {}).get("commit", "") for model in models]
-    columns["commit"] = list(map(str, commits))
-    machines = sorted({record.provenance["machine"] for _, record in records})
-    return Table(
-        f"{condition.family}: the models"
-        + (
-            f", revision {condition.revision} of the code" if condition.revision != REVISION else ""
-        ),
-        tuple(columns),
-        tuple(zip(*columns.values(), strict=True)),
-        (f"Measured on: {'; '.join(machines)}.",),
-    )
+    if not any(columns["CPU seconds"]):
+        del columns["CPU seconds"]
+    machines = sorted({record.provenance["machine"] for record in records})
+    return [
+        Table(
+            f"{condition.family}: the models{condition.version}",
+            tuple(columns),
+            tuple(zip(*columns.values(), strict=True)),
+            (f"Measured on: {'; '.join(machines)}.",),
+        )
+    ]
 
 
-def _seconds(value: float | None) -> str:
-    return "" if value is None else f"{value:,.0f}"
+def _after(k: int) -> str:
+    return f"{k} answer{'s' * (k != 1)}"
 
 
-def _number(value: float | None) -> str:
-    return "" if value is None else _mean(value, None)
+def _shown(value: float | None, form: str) -> str:
+    return "" if value is None else format(value, form)
 
 
-def _mean(mean: float, deviation: float | None) -> str:
-    digits = 0 if abs(mean) >= 1000 else 1
-    return f"{mean:,.{digits}f}" + ("" if deviation is None else f" ± {deviation:,.{digits}f}")
-
-
-def _interval(row: Row) -> str:
-    if row.iqm is None:
+def _mean(mean: float | None, deviation: float | None) -> str:
+    if mean is None:
         return ""
-    digits = 0 if abs(row.iqm) >= 1000 else 1
-    text = f"{row.iqm:,.{digits}f}"
-    return (
-        text
-        if row.iqm_low is None
-        else f"{text} [{row.iqm_low:,.{digits}f}, {row.iqm_high:,.{digits}f}]"
-    )
+    form = ",.0f" if abs(mean) >= 1000 else ",.1f"
+    return format(mean, form) + ("" if deviation is None else f" ± {deviation:{form}}")
+
+
+def _number(value: float | None, low: float | None = None, high: float | None = None) -> str:
+    if value is None:
+        return ""
+    form = ",.0f" if abs(value) >= 1000 else ",.1f"
+    return format(value, form) + ("" if low is None else f" [{low:{form}}, {high:{form}}]")
 
 
 def _markdown(table: Table) -> str:

@@ -8,7 +8,6 @@ from sb3_poem.benchmark.methods import VARIANTS
 from sb3_poem.benchmark.suites import (
     SUITES,
     Budget,
-    Cell,
     Training,
     family_id,
     family_label,
@@ -27,93 +26,77 @@ def run_benchmark(arguments: argparse.Namespace) -> int:
     :raises ValueError: if they name what does not exist or cannot be run
     :raises ImportError: if an optional package is missing; the message says how to install it
     """
-    return _run(arguments) if arguments.part == "run" else _report(arguments)
-
-
-def _run(arguments: argparse.Namespace) -> int:
     try:
-        from sb3_poem.benchmark.store import Store
-    except ImportError as error:
+        return _run(arguments) if arguments.part == "run" else _report(arguments)
+    except ModuleNotFoundError as error:
+        if error.name not in ("rliable", "sqlalchemy"):
+            raise
         raise ValueError(
             f"the benchmark's packages are missing: pip install 'sb3_poem[benchmark]' ({error})"
         ) from error
+
+
+def _run(arguments: argparse.Namespace) -> int:
     from sb3_poem.benchmark.models import ModelLibrary, Workplace, model_folder
-    from sb3_poem.benchmark.plan import describe, make_plan
-    from sb3_poem.benchmark.runner import run_cells
+    from sb3_poem.benchmark.running import describe, export_model, make_plan, run_cells
+    from sb3_poem.benchmark.store import Store
 
     import_packages(arguments.gym_packages)
+    suite = SUITES[arguments.suite]
     training = Training(arguments.timesteps, tuple(sorted(_parse_params(arguments.params).items())))
     if not training.is_default and (arguments.models or arguments.model):
         raise ValueError(
-            "--models and --model hand over models that were trained already: leave out --timesteps and --params"
+            "--models and --model hand over models that were trained already: leave out "
+            "--timesteps and --params"
         )
+    if arguments.export is not None and (suite.name != "shipped" or arguments.methods):
+        raise ValueError("--export is for --suite shipped with all of its methods")
     _check_models(arguments)
-    library = ModelLibrary(
-        Workplace(
-            arguments.runs,
-            tuple(arguments.models),
-            tuple(_parse_named(text) for text in arguments.model),
-            arguments.device,
-            arguments.num_threads,
-        )
-    )
+    named = tuple(_parse_named(text) for text in arguments.model)
+    place = (arguments.runs, tuple(arguments.models), named)
+    library = ModelLibrary(Workplace(*place, arguments.device, arguments.num_threads))
     store = Store(arguments.store) if not arguments.list or arguments.store.exists() else None
-    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
-    suite = SUITES[arguments.suite]
-    budget = Budget(
-        arguments.tasks or suite.budget.tasks, arguments.episodes or suite.budget.episodes
-    )
     plan = make_plan(
         suite,
         library,
         store,
         arguments.families,
         arguments.methods,
-        seeds,
-        budget,
+        _seeds(arguments),
+        Budget(arguments.tasks or suite.budget.tasks, arguments.episodes or suite.budget.episodes),
         training,
         arguments.snapshots,
     )
-    if arguments.export is not None and suite.name != "shipped":
-        raise ValueError(f"--export is for --suite shipped, not {suite.name}")
-    if arguments.list:
+    if store is None or arguments.list:
         print("\n".join(describe(plan, library)))
         return 0
-    assert store is not None
     for folder in filter(None, (arguments.runs, arguments.export)):
         check_writable(folder)
     print(f"{plan}; results in {arguments.store}", flush=True)
     if arguments.backend == "ray":
         from sb3_poem.benchmark.ray_backend import RayOptions, run_with_ray
 
-        options = RayOptions(
-            arguments.address,
-            arguments.cpus_per_trial,
-            arguments.gpus_per_trial,
-            arguments.max_failures,
-        )
+        resources = (arguments.cpus_per_trial, arguments.gpus_per_trial, arguments.max_failures)
+        options = RayOptions(arguments.address, *resources)
         failures = run_with_ray(plan, library, store, options, _say)
     else:
         failures = run_cells(plan.todo, library, store, _say)
     for failure in failures:
         print(f"FAILED {failure}")
-    left = len(failures)
-    print(
-        f"{len(plan.todo) - left} cells run"
-        + (f", {left} failed: the same command tries them again" if left else "")
-    )
-    if arguments.export is not None and not failures:
-        from sb3_poem.benchmark.report import export_model
+    left = f", {len(failures)} failed: the same command tries them again" if failures else ""
+    print(f"{len(plan.todo) - len(failures)} cells run{left}")
+    if failures:
+        return 1
+    cells = [cell for cell in (*plan.done, *plan.todo) if cell.seed == arguments.first_seed]
+    for env_id in dict.fromkeys(cell.env_id for cell in cells if arguments.export is not None):
+        folder = arguments.export / model_folder(env_id)
+        export_model([cell for cell in cells if cell.env_id == env_id], library, store, folder)
+        print(f"Wrote {folder}")
+    return 0
 
-        models: dict[str, list[Cell]] = {}
-        for cell in (*plan.done, *plan.todo):
-            if cell.seed == arguments.first_seed:
-                models.setdefault(cell.env_id, []).append(cell)
-        for env_id, cells in models.items():
-            folder = arguments.export / model_folder(env_id)
-            export_model(cells, library, store, folder)
-            print(f"Wrote {folder}")
-    return 1 if failures else 0
+
+def _seeds(arguments: argparse.Namespace) -> range:
+    return range(arguments.first_seed, arguments.first_seed + arguments.seeds)
 
 
 def _check_models(arguments: argparse.Namespace) -> None:
@@ -123,7 +106,7 @@ def _check_models(arguments: argparse.Namespace) -> None:
             raise ValueError(f"--models {folder}: there is no such folder")
     names = arguments.families or SUITES[arguments.suite].families
     families = {family_id(name) for name in names}
-    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+    seeds = _seeds(arguments)
     for text in arguments.model:
         family, _, seed, _ = _parse_named(text)
         if family not in families:
@@ -138,19 +121,10 @@ def _check_models(arguments: argparse.Namespace) -> None:
 
 
 def _report(arguments: argparse.Namespace) -> int:
-    try:
-        from sb3_poem.benchmark.report import make_report
-        from sb3_poem.benchmark.store import Store
-    except ImportError as error:
-        raise ValueError(
-            f"the benchmark's packages are missing: pip install 'sb3_poem[benchmark]' ({error})"
-        ) from error
+    from sb3_poem.benchmark.store import Store
+    from sb3_poem.benchmark.tables import make_report
 
-    families = (
-        None
-        if arguments.families is None
-        else [family_name(family_id(name)) for name in arguments.families]
-    )
+    families = arguments.families and [family_name(family_id(name)) for name in arguments.families]
     if arguments.out is not None:
         check_writable(arguments.out)
     store = Store(arguments.store, create=False)

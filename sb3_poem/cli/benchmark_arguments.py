@@ -8,6 +8,7 @@ from typing import Any
 from sb3_poem.benchmark.suites import SUITES
 
 Count = Callable[[int], Any]
+DEFAULT = "default: %(default)s"
 
 EXAMPLES = """\
 examples:
@@ -46,150 +47,78 @@ def add_benchmark(commands: Any, count: Count) -> None:
     _add_report_arguments(report, count)
 
 
-def _add_store(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--store",
-        type=Path,
-        default=Path("benchmark.sqlite"),
-        metavar="FILE",
-        help="results (default: %(default)s)",
-    )
+def _add_store(add: Any) -> None:
+    default = Path("benchmark.sqlite")
+    add("--store", type=Path, default=default, metavar="FILE", help=f"results ({DEFAULT})")
 
 
 def _add_run_arguments(parser: argparse.ArgumentParser, count: Count) -> None:
-    what = parser.add_argument_group("what to run")
-    what.add_argument("--suite", choices=SUITES, required=True)
-    what.add_argument(
-        "--families",
-        nargs="+",
-        metavar="FAMILY",
-        help="such as HalfCheetahVel, or ids (default: the suite's)",
-    )
-    what.add_argument(
-        "--methods", nargs="+", metavar="METHOD", help="only these (default: all of the suite)"
-    )
-    what.add_argument("--seeds", type=count(1), default=3, help="how many (default: %(default)s)")
-    what.add_argument("--first-seed", type=count(0), default=0, help="default: %(default)s")
-    what.add_argument(
-        "--gym-packages",
-        nargs="+",
-        metavar="MODULE",
-        default=[],
-        help="modules that register environments",
-    )
-    what.add_argument(
-        "--list", action="store_true", help="only show the plan, and what must be trained for it"
-    )
+    several: dict[str, Any] = {"nargs": "+", "default": []}
+    add = parser.add_argument_group("what to run").add_argument
+    add("--suite", choices=SUITES, required=True)
+    families = "such as HalfCheetahVel, or ids (default: the suite's)"
+    add("--families", nargs="+", metavar="FAMILY", help=families)
+    add("--methods", nargs="+", metavar="METHOD", help="only these (default: all of the suite)")
+    add("--seeds", type=count(1), default=3, help=f"how many ({DEFAULT})")
+    add("--first-seed", type=count(0), default=0, help=DEFAULT)
+    modules = "modules that register environments"
+    add("--gym-packages", metavar="MODULE", help=modules, **several)
+    add("--list", action="store_true", help="only show the plan, and what must be trained for it")
 
-    models = parser.add_argument_group("models")
-    models.add_argument(
-        "--runs",
-        default="logs/benchmark",
-        metavar="FOLDER",
-        help="trainings and checkpoints (default: %(default)s)",
-    )
-    models.add_argument(
+    add = parser.add_argument_group("models").add_argument
+    runs = f"trainings and checkpoints ({DEFAULT})"
+    add("--runs", default="logs/benchmark", metavar="FOLDER", help=runs)
+    add(
         "--models",
-        nargs="+",
-        default=[],
         metavar="FOLDER",
-        help="take trained models: <FOLDER>/<Family>/<variant>/seed<seed>[.zip], or <FOLDER>/<Family> as in pretrained/",
+        help="take trained models: <FOLDER>/<Family>/<variant>/seed<seed>[.zip], or "
+        "<FOLDER>/<Family> as in pretrained/",
+        **several,
     )
-    models.add_argument(
+    add(
         "--model",
-        nargs="+",
-        default=[],
         metavar="FAMILY:VARIANT:SEED=PATH",
-        help="take this trained model: a .zip, a checkpoint, or a folder with one or with a pretrained model",
+        help="take this trained model: a .zip, a checkpoint, or a folder with one or with a "
+        "pretrained model",
+        **several,
     )
-
-    models.add_argument(
+    add(
         "--export",
         type=Path,
         metavar="FOLDER",
-        help="with --suite shipped: write the first seed's models to <FOLDER>/<Family>, as in pretrained/",
+        help="with --suite shipped: write the first seed's models to <FOLDER>/<Family>, as in "
+        "pretrained/",
     )
 
-    budget = parser.add_argument_group("budget, which every record notes")
-    budget.add_argument(
-        "--tasks", type=count(1), help="test tasks (default: the suite's, 30 but for smoke)"
-    )
-    budget.add_argument(
-        "--episodes",
-        type=count(1),
-        help="per task and measurement (default: the suite's, 10 but for smoke)",
-    )
-    budget.add_argument(
-        "--timesteps", type=count(1), help="of every training (default: zoo_configs/)"
-    )
-    budget.add_argument(
-        "--params",
-        nargs="+",
-        default=[],
-        metavar="KEY:VALUE",
-        help="hyperparameters of every training",
-    )
-    budget.add_argument(
-        "--snapshots",
-        type=count(1),
-        metavar="N",
-        help="measure after every Nth part of a training; 1: at its end only",
-    )
+    add = parser.add_argument_group("budget, which every record notes").add_argument
+    tasks = "test tasks (default: the suite's, 30 but for smoke)"
+    episodes = "per task and measurement (default: the suite's, 10 but for smoke)"
+    snapshots = "measure after every Nth part of a training; 1: at its end only"
+    add("--tasks", type=count(1), help=tasks)
+    add("--episodes", type=count(1), help=episodes)
+    add("--timesteps", type=count(1), help="of every training (default: zoo_configs/)")
+    add("--params", metavar="KEY:VALUE", help="hyperparameters of every training", **several)
+    add("--snapshots", type=count(1), metavar="N", help=snapshots)
 
-    where = parser.add_argument_group("where to run")
-    _add_store(where)  # type: ignore[arg-type]
-    where.add_argument("--device", default="cpu", help="PyTorch device (default: %(default)s)")
-    where.add_argument(
-        "--num-threads", type=count(1), default=1, help="of PyTorch (default: %(default)s)"
-    )
-    where.add_argument(
-        "--backend", choices=("local", "ray"), default="local", help="default: %(default)s"
-    )
-    where.add_argument("--address", help="of a Ray cluster (default: one on this machine)")
-    where.add_argument(
-        "--cpus-per-trial",
-        type=float,
-        default=1.0,
-        help="with --backend ray (default: %(default)s)",
-    )
-    where.add_argument(
-        "--gpus-per-trial",
-        type=float,
-        default=0.0,
-        help="with --backend ray (default: %(default)s)",
-    )
-    where.add_argument(
-        "--max-failures",
-        type=count(0),
-        default=3,
-        help="retries of a trial with --backend ray (default: %(default)s)",
-    )
+    add = parser.add_argument_group("where to run").add_argument
+    _add_store(add)
+    add("--device", default="cpu", help=f"PyTorch device ({DEFAULT})")
+    add("--num-threads", type=count(1), default=1, help=f"of PyTorch ({DEFAULT})")
+    add("--backend", choices=("local", "ray"), default="local", help=DEFAULT)
+    add("--address", help="of a Ray cluster (default: one on this machine)")
+    with_ray = f"with --backend ray ({DEFAULT})"
+    add("--cpus-per-trial", type=float, default=1.0, help=with_ray)
+    add("--gpus-per-trial", type=float, default=0.0, help=with_ray)
+    add("--max-failures", type=count(0), default=3, help=f"retries of a trial {with_ray}")
 
 
 def _add_report_arguments(parser: argparse.ArgumentParser, count: Count) -> None:
-    parser.add_argument(
-        "--suite", nargs="+", choices=SUITES, help="default: all of which the store holds cells"
-    )
-    parser.add_argument(
-        "--families", nargs="+", metavar="FAMILY", help="default: all that the store holds"
-    )
-    parser.add_argument(
-        "--seeds",
-        nargs="+",
-        type=count(0),
-        metavar="SEED",
-        help="default: all that the store holds",
-    )
-    parser.add_argument(
-        "--format",
-        choices=("md", "latex", "csv", "json"),
-        default="md",
-        help="default: %(default)s",
-    )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        metavar="FOLDER",
-        help="write tables, and figures as PNG and PDF (default: print)",
-    )
-    _add_store(parser)
+    add, everything = parser.add_argument, "default: all that the store holds"
+    suites = "default: all of which the store holds cells"
+    add("--suite", nargs="+", choices=SUITES, help=suites)
+    add("--families", nargs="+", metavar="FAMILY", help=everything)
+    add("--seeds", nargs="+", type=count(0), metavar="SEED", help=everything)
+    add("--format", choices=("md", "latex", "csv", "json"), default="md", help=DEFAULT)
+    out = "write tables, and figures as PNG and PDF (default: print)"
+    add("--out", type=Path, metavar="FOLDER", help=out)
+    _add_store(add)

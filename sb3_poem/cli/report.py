@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from scipy.stats import sem
 
 from sb3_poem.adaptation import AdaptationEvaluation, KnownTaskReturn
 from sb3_poem.adaptation.state import write_json_atomically
@@ -46,23 +47,16 @@ class Report:
         """
         known, limits = self.known, self.limits
         rates = self.evaluation.success_rates
-        table = Table(
-            title=self.title, caption=self._caption(), caption_justify="left", min_width=TABLE_WIDTH
-        )
-        for name in (
-            "answers",
-            "return",
-            "std. error",
-            "limit",
-            *(() if rates is None else ("success rate",)),
-        ):
+        look: dict[str, Any] = {"caption_justify": "left", "min_width": TABLE_WIDTH}
+        table = Table(title=self.title, caption=self._caption(), **look)
+        names = ["answers", "return", "std. error", "limit"]
+        for name in names if rates is None else [*names, "success rate"]:
             table.add_column(name, justify="right")
         for row, (n, mean, error) in enumerate(_means(self.evaluation)):
             limit = "" if limits is None else f"{limits[row]:.1f}"
             rate = [] if rates is None else [f"{rates[row]:.2f}"]
-            table.add_row(
-                str(n), f"{mean:.1f}", "" if np.isnan(error) else f"{error:.1f}", limit, *rate
-            )
+            spread = "" if np.isnan(error) else f"{error:.1f}"
+            table.add_row(str(n), f"{mean:.1f}", spread, limit, *rate)
         if known is not None:
             table.add_section()
             rate = [] if known.success_rate is None else [f"{known.success_rate:.2f}"]
@@ -104,26 +98,17 @@ class Report:
         }
 
     def write(self, console: Console, json_file: Path | None, plot_file: Path | None) -> None:
-        """Print the table and write the files that were asked for.
-
-        :param console: where to print
-        :param json_file: for :meth:`to_dict`
-        :param plot_file: for the return against the number of answers
+        """Print the table, and write what was asked for: :meth:`to_dict`, and a plot of the return
+        against the number of answers.
         """
         console.print(self.table())
         if json_file is not None:
             write_json_atomically(json_file, self.to_dict())
             console.print(f"Wrote {json_file}")
         if plot_file is not None:
-            evaluation = self.evaluation
-            plot_returns(
-                evaluation.record_at,
-                evaluation.task_returns,
-                self.limits,
-                None if self.known is None else self.known.mean_return,
-                title=self.title,
-                path=plot_file,
-            )
+            known = None if self.known is None else self.known.mean_return
+            earned = (self.evaluation.record_at, self.evaluation.task_returns)
+            plot_returns(*earned, self.limits, known, title=self.title, path=plot_file)
             console.print(f"Wrote {plot_file}")
 
 
@@ -140,9 +125,6 @@ def row_text(evaluation: AdaptationEvaluation) -> str:
 def _means(evaluation: AdaptationEvaluation) -> Iterator[tuple[int, float, float]]:
     """Number of answers, mean return over tasks, its standard error (NaN for one task): a row each."""
     returns = evaluation.task_returns
-    errors = (
-        returns.std(axis=0, ddof=1) / np.sqrt(len(returns))
-        if len(returns) > 1
-        else np.full(returns.shape[1], np.nan)
-    )
+    nothing = np.full(returns.shape[1], np.nan)
+    errors = sem(returns) if len(returns) > 1 else nothing
     return zip(evaluation.record_at, returns.mean(axis=0), errors, strict=True)

@@ -11,11 +11,11 @@ import pytest
 from meta_toys import small, walks
 
 from sb3_poem import PEARLSAC, POEMSAC
-from sb3_poem.benchmark.families import FamilyFacts, family_facts
-from sb3_poem.benchmark.hyperparameters import training_plan
+from sb3_poem.benchmark.estimate import Pace
 from sb3_poem.benchmark.models import ModelLibrary, Workplace
-from sb3_poem.benchmark.plan import describe, make_plan
+from sb3_poem.benchmark.running import describe, make_plan
 from sb3_poem.benchmark.suites import REVISION, SUITES, Budget, ModelKey, Training
+from sb3_poem.benchmark.training import FamilyFacts, family_facts, training_plan
 from sb3_poem.cli import main
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.resources import shipped_folder
@@ -86,6 +86,7 @@ def test_a_model_is_told_by_its_hyperparameters_or_its_file(tmp_path: Path) -> N
     begun.parent.mkdir(parents=True)
     hyperparameters = json.loads(json.dumps(training_plan(key).hyperparameters))
     begun.write_text(json.dumps({"hyperparameters": hyperparameters, "revision": REVISION}))
+    (begun.parent / "trained.json").touch()
     assert library.origin(key) == made
     begun.write_text(json.dumps({"hyperparameters": hyperparameters, "revision": REVISION + 1}))
     assert library.origin(key) != made
@@ -150,6 +151,19 @@ def test_models_are_found_in_a_folder_or_by_name_and_checked(tmp_path: Path) -> 
     env.close()
 
 
+def test_the_model_saved_nearest_to_a_share_of_the_training(tmp_path: Path) -> None:
+    library, key = ModelLibrary(Workplace(str(tmp_path))), ModelKey(POINT, "poem", 0)
+    plan = training_plan(key)
+    run = library.folder(key) / "poem_sac" / "poem-PointGoal-v0_1"
+    run.mkdir(parents=True)
+    for steps in (plan.epoch_steps, plan.timesteps // 2):
+        (run / f"rl_model_{steps}_steps.zip").touch()
+    half = library.snapshot_file(key, 0.5 + 0.4 * plan.save_steps / plan.timesteps)
+    assert half.name == f"rl_model_{plan.timesteps // 2}_steps.zip"
+    with pytest.raises(ValueError, match="has no model that was saved near 1,050 steps"):
+        library.snapshot_file(key, 0.01)  # nothing was learnt from the first epoch
+
+
 def test_a_method_that_cannot_run_on_a_family_says_so_before_training(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -157,11 +171,12 @@ def test_a_method_that_cannot_run_on_a_family_says_so_before_training(
     ml10 = FamilyFacts(
         "poem/MetaWorldML10-v0", 200, None, False
     )  # Meta-World takes seconds to make it
-    for module in ("plan", "hyperparameters"):
+    for module in ("running", "training", "estimate"):
         monkeypatch.setattr(
             f"sb3_poem.benchmark.{module}.family_facts",
             lambda name: ml10 if "ML10" in name else family_facts(name),
         )
+    monkeypatch.setattr("sb3_poem.benchmark.running.measure_pace", lambda *where: Pace(1e-4, 1e-2))
     assert known.shared_dynamics
     library = ModelLibrary(Workplace(str(tmp_path)))
     with pytest.raises(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import pickle
 import threading
 import time
 from pathlib import Path
@@ -10,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from sb3_poem.benchmark.models import ModelLibrary, Workplace
-from sb3_poem.benchmark.plan import make_plan
-from sb3_poem.benchmark.ray_backend import RayOptions, cell_from_dict, cell_to_dict, run_with_ray
+from sb3_poem.benchmark.ray_backend import RayOptions, run_with_ray
+from sb3_poem.benchmark.running import make_plan
 from sb3_poem.benchmark.store import Store
 from sb3_poem.benchmark.suites import SUITES, Budget, Entry, Suite, Training
 
@@ -36,7 +37,7 @@ TRAINING = Training(9000, tuple(sorted(MODEL.items())))
 def test_cells_survive_the_journey_to_a_worker() -> None:
     for suite in SUITES.values():
         for cell in suite.cells(["poem/PointGoal-v0"], [0], training=TRAINING):
-            assert cell_from_dict(cell_to_dict(cell)) == cell
+            assert pickle.loads(pickle.dumps(cell)) == cell
 
 
 @pytest.mark.slow
@@ -115,7 +116,7 @@ def training_process(folder: Path) -> int:
         if process.name.isdigit():
             with contextlib.suppress(OSError):
                 command = (process / "cmdline").read_bytes()
-                if b"training_process" in command and str(folder).encode() in command:
+                if b"sb3_poem.benchmark.training" in command and str(folder).encode() in command:
                     return int(process.name)
     raise AssertionError(f"nobody trains in {folder}")
 

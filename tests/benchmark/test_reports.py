@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 from benchmark_records import finished
 
-from sb3_poem.benchmark.report import make_report
-from sb3_poem.benchmark.selection import Selection
-from sb3_poem.benchmark.statistics import summarise
+from sb3_poem.benchmark.results import Selection, summarise
 from sb3_poem.benchmark.store import Store
 from sb3_poem.benchmark.suites import BOLTZMANN, SUITES, Budget, Cell, OracleSpec, Training
-from sb3_poem.benchmark.tables import suite_rows, suite_tables
+from sb3_poem.benchmark.tables import make_report, suite_rows, suite_tables
 
 VEL = "poem/HalfCheetahVel-v0"
 FOUR = Budget(tasks=4, episodes=2)
@@ -23,7 +21,7 @@ FOUR = Budget(tasks=4, episodes=2)
 
 @pytest.fixture(autouse=True)
 def few_bootstrap_samples(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sb3_poem.benchmark.statistics.BOOTSTRAP_SAMPLES", 20)
+    monkeypatch.setattr("sb3_poem.benchmark.results.BOOTSTRAP_SAMPLES", 20)
 
 
 def ladder(cell: Cell, k: int) -> np.ndarray:

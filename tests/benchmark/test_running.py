@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,12 +14,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from meta_toys import small
 
-from sb3_poem.benchmark.locks import locked
-from sb3_poem.benchmark.models import ModelLibrary, Workplace
-from sb3_poem.benchmark.plan import make_plan
-from sb3_poem.benchmark.runner import run_cells
-from sb3_poem.benchmark.selection import Selection
+from sb3_poem import PEARLSAC, POEMSAC
+from sb3_poem.adaptation.state import write_json_atomically
+from sb3_poem.benchmark.models import ModelLibrary, Workplace, locked
+from sb3_poem.benchmark.results import Selection
+from sb3_poem.benchmark.running import make_plan, run_cells
 from sb3_poem.benchmark.store import Store
 from sb3_poem.benchmark.suites import (
     EXACT,
@@ -26,10 +28,13 @@ from sb3_poem.benchmark.suites import (
     TABLE_REFERENCES,
     Budget,
     Entry,
+    ModelKey,
     Suite,
     Training,
 )
 from sb3_poem.benchmark.tables import suite_rows
+from sb3_poem.cli import main
+from sb3_poem.pearl_sac.callbacks import EpochCallback, TrainingCheckpointCallback
 
 TINY_MODEL = {
     "n_train_tasks": 12,
@@ -51,12 +56,96 @@ BUDGET = Budget(tasks=2, episodes=1)
 TRAINING = Training(1800, tuple(sorted(TINY_MODEL.items())))
 
 
-def test_every_method_runs_and_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+POINT = "poem/PointGoal-v0"
+
+
+@pytest.fixture(scope="module")
+def handed_over(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of models of one epoch; of PEARL's with and without its replay buffer."""
+    folder = tmp_path_factory.mktemp("models")
+    for name in ("all", "without"):
+        (folder / name / "PointGoal/pearl/seed0").mkdir(parents=True)
+        (folder / name / "PointGoal/poem").mkdir()
+    poem, pearl = small(POEMSAC).learn(300), small(PEARLSAC).learn(300)
+    poem.save(folder / "all/PointGoal/poem/seed0.zip")
+    pearl.save_checkpoint(folder / "all/PointGoal/pearl/seed0/checkpoint.zip")
+    pearl.save(folder / "without/PointGoal/pearl/seed0/model.zip")
+    return folder
+
+
+def library_of(tmp_path: Path, *models: Path) -> tuple[ModelLibrary, Store]:
+    place = Workplace(str(tmp_path / "runs"), models=tuple(map(str, models)))
+    return ModelLibrary(place), Store(tmp_path / "store.sqlite")
+
+
+def test_every_method_runs_and_is_recorded(
+    tmp_path: Path, handed_over: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("sb3_poem.benchmark.models.META_ITERATIONS_OF", {"PointGoal": 2})
-    library, store = (
-        ModelLibrary(Workplace(str(tmp_path / "runs"))),
-        Store(tmp_path / "store.sqlite"),
-    )
+    library, store = library_of(tmp_path, handed_over / "all")
+    arguments = (TINY, library, store, None, None, range(1), BUDGET, Training(), 1)
+    plan = make_plan(*arguments)
+    assert run_cells(plan.todo, library, store) == []
+    records = {record.method: record for record in store.records()}
+    assert records.keys() == {*TABLE_METHODS, *TABLE_REFERENCES}
+    for record in records.values():
+        returns = np.array(record.result["task_returns"])
+        assert np.isfinite(returns).all()
+        assert returns.shape == ((2, 3) if "queries" in record.result else (2,))
+        assert record.provenance["versions"]["torch"]
+        assert record.result["training_samples"] == 300
+        assert record.identity["model"].startswith("file ")
+        assert str(tmp_path) not in json.dumps([record.result, record.provenance, record.identity])
+    assert records["anole"].result["fragments"] == "replay buffer"
+    rows = suite_rows(Selection(TINY, records.values()))
+    assert {row.method for row in rows} == {*TABLE_METHODS, *TABLE_REFERENCES}
+    again = make_plan(*arguments)
+    assert (len(again.done), again.todo) == (len(plan.todo), [])
+
+
+def test_a_model_without_experience(tmp_path: Path, handed_over: Path) -> None:
+    library, store = library_of(tmp_path, handed_over / "without")
+    methods = ["anole-random", "maml-reward"]
+    plan = make_plan(TINY, library, store, None, methods, range(1), BUDGET, Training(), 1)
+    [failure] = run_cells(plan.todo, library, store)
+    assert "which the model that was handed over does not have; hand over its checkpoint" in failure
+    [record] = store.records()
+    assert record.result["fragments"] == "rollouts of the training tasks"
+
+
+def test_what_ships_is_exported_with_what_it_earns(
+    tmp_path: Path, handed_over: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["benchmark", "run", "--seeds", "1", "--families", "PointGoal", "--tasks", "2"]
+    words += ["--episodes", "1", "--models", str(handed_over / "all"), "--runs", str(tmp_path)]
+    words += ["--store", str(tmp_path / "s.sqlite"), "--export", str(tmp_path / "out")]
+    assert main([*words, "--suite", "shipped"]) == 0
+    model = POEMSAC.from_pretrained(tmp_path / "out" / "PointGoal")
+    assert model.num_timesteps == 300
+    results = json.loads((tmp_path / "out/PointGoal/config.json").read_text())["card"]["results"]
+    earned = results["adaptation to 2 unseen tasks"]
+    assert [one["inference"] for one in earned] == ["bayes", "paper"]
+    with Store(tmp_path / "s.sqlite") as store:
+        records = {record.method: record.result for record in store.records()}
+    known = np.mean(records["known-task"]["task_returns"])
+    for one, method in zip(earned, ("poem-bayes", "poem-paper"), strict=True):
+        assert one["queries"] == [0, 1, 2, 3, 5, 7, 10]
+        np.testing.assert_allclose(
+            one["mean_return"], np.mean(records[method]["task_returns"], axis=0)
+        )
+        assert one["known_task_return"] == pytest.approx(known)
+        assert one["limit"] == sorted(one["limit"])
+    assert results["property 1"]["env_steps"] == 300
+    assert main([*words, "--suite", "smoke"]) != 0
+    assert "--export is for --suite shipped" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_every_method_is_trained_and_measured_along_the_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sb3_poem.benchmark.models.META_ITERATIONS_OF", {"PointGoal": 2})
+    library, store = library_of(tmp_path)
     arguments = (TINY, library, store, None, None, range(1), BUDGET, TRAINING)
     plan = make_plan(*arguments)
     assert run_cells(plan.todo, library, store) == []
@@ -93,10 +182,7 @@ def test_every_method_runs_and_is_recorded(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_a_training_that_fails_is_reported_and_the_rest_is_run(tmp_path: Path) -> None:
-    library, store = (
-        ModelLibrary(Workplace(str(tmp_path / "runs"))),
-        Store(tmp_path / "store.sqlite"),
-    )
+    library, store = library_of(tmp_path)
     broken = Training(600, (("gradient_stebs", 3),))
     plan = make_plan(
         TINY, library, store, None, ["poem-bayes", "poem-paper"], range(1), BUDGET, broken, 1
@@ -112,31 +198,68 @@ def test_a_training_that_fails_is_reported_and_the_rest_is_run(tmp_path: Path) -
     assert store.keys() == set()
 
 
-def test_cells_whose_model_another_process_trains_come_last(tmp_path: Path) -> None:
-    library, store = (
-        ModelLibrary(Workplace(str(tmp_path / "runs"))),
-        Store(tmp_path / "store.sqlite"),
-    )
-    plan = make_plan(
-        TINY, library, store, None, ["poem-paper", "reward-oracle"], range(1), BUDGET, TRAINING, 1
-    )
-    assert [cell.method for cell in plan.todo] == ["poem-paper", "reward-oracle"]
+def test_cells_whose_model_another_process_trains_come_last(
+    tmp_path: Path, handed_over: Path
+) -> None:
+    (tmp_path / "pearl/PointGoal").mkdir(parents=True)
+    pearl = handed_over / "all/PointGoal/pearl"
+    shutil.copytree(pearl, tmp_path / "pearl/PointGoal/pearl")
+    library, store = library_of(tmp_path, tmp_path / "pearl")
+    methods = ["poem-paper", "reward-oracle"]
+    plan = make_plan(TINY, library, store, None, methods, range(1), BUDGET, Training(), 1)
+    assert [cell.method for cell in plan.todo] == methods
+    key = plan.todo[0].model_key
     lines: list[str] = []
     with contextlib.ExitStack() as other_process:
-        other_process.enter_context(locked(library.lock_file(plan.todo[0].model_key)))
+        other_process.enter_context(locked(library.lock_file(key)))
 
         def say(line: str) -> None:
             lines.append(line)
             assert "waiting" not in line  # this process would wait for ever
-            if "reward-oracle" in line:
+            if "reward-oracle" in line:  # the other one ends its training
+                run = library.folder(key) / "poem_sac/poem-PointGoal-v0_1"
+                run.mkdir(parents=True)
+                model = handed_over / "all/PointGoal/poem/seed0.zip"
+                shutil.copy(model, run / "poem-PointGoal-v0.zip")
+                made = {"run": str(run.relative_to(library.folder(key))), "seconds": 1.0}
+                (library.folder(key) / "trained.json").write_text(json.dumps(made))
                 other_process.close()
 
         assert run_cells(plan.todo, library, store, say) == []
-    assert [line.split(", ")[1] for line in lines if line.startswith("[")] == [
-        "reward-oracle",
-        "poem-paper",
-    ]
+    shown = [line.split(", ")[1] for line in lines if line.startswith("[")]
+    assert shown == ["reward-oracle", "poem-paper"]
     assert len(store.keys()) == 2
+
+
+def test_an_interrupted_training_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
+    """Time after the last checkpoint of the session before counts for nothing."""
+    library, _ = library_of(tmp_path)
+    key = ModelKey(POINT, "poem", 0, Training(600, tuple(sorted(TINY_MODEL.items()))))
+    folder = library.folder(key)
+    run = folder / "poem_sac" / "poem-PointGoal-v0_1"
+    callback = TrainingCheckpointCallback(run / "checkpoint.zip")
+
+    class Stop(EpochCallback):
+        def _on_epoch(self) -> None:
+            callback.stop()
+
+    with pytest.raises(KeyboardInterrupt):
+        small(POEMSAC).learn(600, [Stop(), callback])
+    (run / "poem-PointGoal-v0").mkdir()
+    (run / "poem-PointGoal-v0/args.yml").write_text("seed: 0")
+    write_json_atomically(folder / "sessions/1.json", {"seconds": 100.0, "cpu_seconds": 50.0})
+    write_json_atomically(folder / "begun.json", {"hyperparameters": {}, "revision": 7})
+    assert library.state(key) == "interrupted"
+    lines: list[str] = []
+    info = library.ensure(key, lines.append)
+    assert lines[0].startswith("resuming PointGoal poem seed 0")
+    assert "Resuming" in (folder / "train.log").read_text()
+    assert (info["env_steps"], info["sessions"], info["revision"]) == (600, 2, 7)
+    own = json.loads((folder / "sessions/2.json").read_text())
+    assert own["cpu_seconds"] > 0
+    assert info["seconds"] == pytest.approx(100.0 + own["seconds"], abs=0.1)
+    assert info["cpu_seconds"] == pytest.approx(50.0 + own["cpu_seconds"], abs=0.1)
+    assert library.state(key) == "trained"
 
 
 def start(folder: Path) -> subprocess.Popen[str]:
@@ -168,6 +291,7 @@ def wait_for(pattern: str, folder: Path, process: subprocess.Popen[str]) -> Path
     raise AssertionError(f"no {pattern} before the end: {process.communicate()[0]}")
 
 
+@pytest.mark.slow
 def test_a_killed_run_is_continued_by_two_processes_and_nothing_is_done_twice(
     tmp_path: Path,
 ) -> None:

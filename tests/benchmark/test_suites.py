@@ -11,7 +11,6 @@ from benchmark_records import cells_of
 
 from sb3_poem.benchmark.cells import _episode_seed
 from sb3_poem.benchmark.methods import METHODS, VARIANTS, find_method
-from sb3_poem.benchmark.paper import TABLE_3, paper_figure
 from sb3_poem.benchmark.suites import (
     BOLTZMANN,
     EXACT,
@@ -24,6 +23,7 @@ from sb3_poem.benchmark.suites import (
     family_name,
     hashable,
 )
+from sb3_poem.benchmark.tables import TABLE_3, paper_figure
 from sb3_poem.resources import config_file
 
 

@@ -1,0 +1,254 @@
+"""What a run will do, and doing it in this process, one cell after another."""
+
+from __future__ import annotations
+
+import contextlib
+import traceback
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_poem.benchmark.cells import run_cell
+from sb3_poem.benchmark.estimate import cell_seconds, measure_pace, training_seconds
+from sb3_poem.benchmark.methods import VARIANTS
+from sb3_poem.benchmark.models import ModelLibrary, Say, locked, try_lock
+from sb3_poem.benchmark.store import Store
+from sb3_poem.benchmark.suites import EXACT, Budget, Cell, ModelKey, Suite, Training
+from sb3_poem.benchmark.training import family_facts, training_plan
+from sb3_poem.common.vec_env import make_task_vec_env
+
+
+@dataclass
+class Plan:
+    """A run: cells to be run, in order; cells that the store has; and cells that cannot be run, with
+    the reason.
+    """
+
+    todo: list[Cell] = field(default_factory=list)
+    done: list[Cell] = field(default_factory=list)
+    skipped: list[tuple[Cell, str]] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        sizes = (len(self.done), len(self.todo), len(self.skipped))
+        return "{} cells done, {} to do, {} not possible".format(*sizes)
+
+    @property
+    def models(self) -> list[ModelKey]:
+        """What the cells to be run need, each once, a variant after its base."""
+        keys: dict[ModelKey, None] = {}
+        for key in (cell.model_key for cell in self.todo):
+            base = VARIANTS[key.variant].base
+            if base is not None:
+                keys[replace(key, variant=base)] = None
+            keys[key] = None
+        return list(keys)
+
+
+def make_plan(
+    suite: Suite,
+    library: ModelLibrary,
+    store: Store | None,
+    families: Sequence[str] | None,
+    methods: Sequence[str] | None,
+    seeds: Sequence[int],
+    budget: Budget,
+    training: Training,
+    snapshots: int | None = None,
+) -> Plan:
+    """Look at what there is.
+
+    :param store: Results; None: none yet.
+    :param families: Names or ids; None: the suite's own.
+    :param methods: Only these; None: all of the suite, without those that cannot run on a family.
+    :param budget: Numbers of tasks and episodes.
+    :param training: What differs from the hyperparameter files.
+    :param snapshots: See :meth:`Suite.cells`.
+    :raises ValueError: If a family or method does not exist, a method that was named cannot run on
+        a family, or there are no hyperparameters for a model that is missing.
+    """
+    plan = Plan()
+    facts = {fact.env_id: fact for fact in map(family_facts, families or suite.families)}
+    finished = set() if store is None else store.keys()
+    origins: dict[ModelKey, str] = {}
+    for cell in suite.cells(list(facts), seeds, methods, budget, training, snapshots):
+        key = cell.model_key
+        objection = cell.definition.objection(facts[cell.env_id].shared_dynamics)
+        if objection is not None:
+            reason = f"{cell.method} cannot run on {cell.family}: {objection}"
+            if methods:
+                raise ValueError(f"--methods {reason}")
+            plan.skipped.append((cell, reason))
+            continue
+        if key not in origins:
+            origins[key] = library.origin(key)
+        cell = replace(cell, model=origins[key])
+        if cell.key in finished:
+            plan.done.append(cell)
+        elif cell.snapshot is not None and library.given(key) is not None:
+            reason = "the model was handed over, without those along its training"
+            plan.skipped.append((cell, reason))
+        else:
+            plan.todo.append(cell)
+    # By family and seed as they come, then by model, its final cells before those along its training
+    places = list(dict.fromkeys((cell.env_id, cell.seed) for cell in plan.todo))
+    models = list(dict.fromkeys(cell.model_key for cell in plan.todo))
+    plan.todo.sort(
+        key=lambda cell: (
+            places.index((cell.env_id, cell.seed)),
+            models.index(cell.model_key),
+            cell.snapshot is not None,
+        )
+    )
+    return plan
+
+
+def describe(plan: Plan, library: ModelLibrary) -> list[str]:
+    """The plan in lines, with an estimate of its time on this machine, which takes a few seconds
+    for each family.
+    """
+    reasons = Counter(reason for _, reason in plan.skipped)
+    lines = [str(plan)]
+    lines += [f"  not possible, {count} cells: {reason}" for reason, count in reasons.items()]
+    device, threads = library.workplace.device, library.workplace.num_threads
+    seconds = 0.0
+    if plan.models:
+        lines.append("models:")
+    for key in plan.models:
+        state = library.state(key)
+        text = f"  {key}: {state}"
+        if state == "handed over":
+            text += f" ({library.given(key)})"
+        elif state != "trained":
+            estimate = training_seconds(key, measure_pace(key.env_id, device, threads))
+            seconds += estimate
+            base, training = VARIANTS[key.variant].base, training_plan(key)
+            if base is None:
+                text += f", {training.timesteps:,} steps, {training.updates:,} updates"
+            else:
+                text += f", from the experience of {base}"
+            text += f", about {_minutes(estimate)}"
+            text += " if from scratch" if state == "interrupted" else ""
+        lines.append(text)
+    if plan.todo:
+        lines += ["cells:", *(f"  {cell}" for cell in plan.todo)]
+        for cell in plan.todo:
+            seconds += cell_seconds(cell, measure_pace(cell.env_id, device, threads))
+        about = _minutes(seconds)
+        lines.append(f"about {about} in one process, if this machine stays as busy as it is")
+    return lines
+
+
+def _minutes(seconds: float) -> str:
+    return f"{seconds / 3600:.1f} h" if seconds >= 5400 else f"{max(1, round(seconds / 60))} min"
+
+
+def run_cells(
+    cells: Sequence[Cell], library: ModelLibrary, store: Store, say: Say = print
+) -> list[str]:
+    """Run cells, and keep each as soon as it is finished. It may be interrupted at any moment; what
+    another process is at, or has finished, is left to it, and cells whose model another process is
+    training come last.
+
+    :param say: Takes lines of progress.
+    :return: What failed, a line each; the other cells were run all the same.
+    """
+    failures: list[str] = []
+    postponed: list[Cell] = []
+    broken: dict[ModelKey, str] = {}
+
+    def run_one(cell: Cell, place: str) -> None:
+        if cell.key in store:
+            return
+        key = cell.model_key
+        if key in broken:  # its training has failed, and would again
+            failures.append(f"{cell}: {broken[key]}")
+            return
+        say(f"{place} {cell}")
+        is_trained = False
+        try:
+            library.ensure(key, say)
+            is_trained = True
+            record = run_cell(cell, library, say)
+        except Exception as error:
+            traceback.print_exc()
+            failures.append(f"{cell}: {error}")
+            if not is_trained:
+                broken[key] = str(error)
+            return
+        store.add(record)
+        say(f"    {summary(record.result)}, {record.result['seconds']:.0f} s")
+
+    def lock_file(cell: Cell) -> Path:
+        # another store's cell of the same key is another piece of work
+        return library.runs / ".locks" / store.path.name / cell.key
+
+    for position, cell in enumerate(cells, start=1):
+        with try_lock(lock_file(cell)) as mine:
+            if mine and (cell.key in store or not library.is_taken(cell.model_key)):
+                run_one(cell, f"[{position}/{len(cells)}]")
+            else:
+                postponed.append(cell)
+    for cell in postponed:  # whoever has them, or trains for them, may have died
+        wait = f"waiting for another process: {cell}"
+        with locked(lock_file(cell), lambda wait=wait: say(wait)):  # type: ignore[misc]
+            run_one(cell, "[postponed]")
+    return failures
+
+
+def summary(result: dict) -> str:
+    """The mean returns of a result in a line."""
+    means = np.mean(result["task_returns"], axis=0)
+    if "queries" not in result:
+        return f"return {means:.1f}"
+    return ", ".join(f"{k}: {mean:.1f}" for k, mean in zip(result["queries"], means, strict=True))
+
+
+def export_model(cells: Sequence[Cell], library: ModelLibrary, store: Store, folder: Path) -> None:
+    """Write the model of finished cells as a pretrained folder, with how it was trained and what it
+    earns on its card.
+
+    :param cells: Of one model: methods with preferences, and what is known.
+    :param folder: Where; made if missing.
+    :raises ValueError: If a cell is not finished.
+    """
+    from sb3_poem.benchmark.results import Reference  # rliable is slow to import
+
+    records = {record.key: record for record in store.records(cell.key for cell in cells)}
+    missing = [str(cell) for cell in cells if cell.key not in records]
+    if missing:
+        raise ValueError(f"{folder} cannot be written before its cells are finished: {missing}")
+    [known] = [records[cell.key] for cell in cells if cell.definition.kind == "known"]
+    reference = Reference("known-task", (known,))
+    adaptations = []
+    for cell in cells:
+        if cell.definition.kind == "known":
+            continue
+        result = records[cell.key].result
+        figures = {
+            "inference": cell.options["inference"],
+            "queries": result["queries"],
+            "mean_return": np.mean(result["task_returns"], axis=0).tolist(),
+            "limit": [float(reference.limits(k, EXACT)[0]) for k in result["queries"]],
+            "known_task_return": float(reference.known[0]),
+        }
+        if reference.success_rate is not None:
+            figures["success_rate"] = np.mean(result["task_success_rates"], axis=0).tolist()
+            figures["known_task_success_rate"] = reference.success_rate
+        adaptations.append(figures)
+    training = known.provenance["model"]
+    order = {name: known.result[name] for name in ("preference_accuracy", "kendall_tau")}
+    order |= {"env_steps": known.result["training_samples"], "updates": known.result["updates"]}
+    tasks = f"adaptation to {len(known.result['tasks'])} unseen tasks"
+    card: dict[str, Any] = {
+        **{name: training[name] for name in ("command", "commit", "machine") if name in training},
+        "seed": cells[0].seed,
+        "wall_seconds": training.get("seconds"),
+        "cpu_seconds": training.get("cpu_seconds"),
+        "results": {tasks: adaptations, "property 1": order},
+    }
+    with contextlib.closing(make_task_vec_env(cells[0].env_id, 1)) as env:
+        library.load(cells[0].model_key, env).save_pretrained(folder, card)

@@ -1,0 +1,250 @@
+"""How a family's models are trained, and the training itself: ``sb3-poem train`` as a child of the
+benchmark (``python -m sb3_poem.benchmark.training PARENT SESSION train ...``).
+
+The child ends with its parent, so that a benchmark that was killed leaves no training behind, and
+notes how long it took.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import runpy
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import yaml
+
+from sb3_poem.adaptation.state import write_json_atomically
+from sb3_poem.benchmark.methods import VARIANTS
+from sb3_poem.benchmark.suites import ModelKey, family_id
+from sb3_poem.common.family_view import FamilyView, vectorised
+from sb3_poem.resources import config_file
+
+CHECKPOINT, SESSIONS, LOG = "checkpoint.zip", "sessions", "train.log"
+#: Models are saved, for curves and against interruptions, this many times in a training.
+SAVES = 20
+LOG_LINES = 15
+LOOK_SECONDS = 2.0
+PR_SET_PDEATHSIG = 1
+
+
+class TrainingError(RuntimeError):
+    """A training that did not end well; the message has the end of its log."""
+
+
+class MissingEntryError(ValueError):
+    """There are no hyperparameters for a family."""
+
+
+@dataclass(frozen=True)
+class FamilyFacts:
+    """What the benchmark must know of a family before it starts anything.
+
+    :param horizon: Steps of an episode.
+    :param n_tasks: How many tasks there are; None: infinitely many.
+    :param shared_dynamics: Whether tasks differ in their rewards alone.
+    """
+
+    env_id: str
+    horizon: int
+    n_tasks: int | None
+    shared_dynamics: bool
+
+
+@cache
+def family_facts(name: str) -> FamilyFacts:
+    """Look at a family.
+
+    :param name: An id, or AntGoal for poem/AntGoal-v0.
+    :raises ValueError: If there is no such environment, or it is no task family, or has no time
+        limit.
+    """
+    env_id = family_id(name)
+    try:
+        with contextlib.closing(vectorised(gym.make(env_id))) as env:
+            family = FamilyView.for_training(env)
+    except gym.error.Error as error:
+        own = sorted(spec[5:].split("-")[0] for spec in gym.registry if spec.startswith("poem/"))
+        raise ValueError(
+            f"--families {name}: {error} The package's own families are: {', '.join(own)}"
+        ) from error
+    except ValueError as error:
+        raise ValueError(f"--families {name}: {error}") from error
+    n_tasks = None if family.all_tasks is None else len(family.all_tasks)
+    return FamilyFacts(env_id, family.horizon, n_tasks, family.shared_dynamics)
+
+
+@dataclass(frozen=True)
+class TrainingPlan:
+    """A training, in figures.
+
+    :param algorithm: "poem_sac" or "pearl_sac".
+    :param hyperparameters: All that differs from the algorithm's defaults.
+    :param overrides: The part of them that differs from the hyperparameter file.
+    :param timesteps: Environment steps asked for.
+    :param epoch_steps: Environment steps of an epoch.
+    :param updates: Gradient steps.
+    """
+
+    algorithm: str
+    hyperparameters: dict[str, Any]
+    overrides: dict[str, Any]
+    timesteps: int
+    epoch_steps: int
+    updates: int
+
+    @property
+    def save_steps(self) -> int:
+        """Environment steps between two saved models, a whole number of epochs."""
+        return max(1, round(self.timesteps / SAVES / self.epoch_steps)) * self.epoch_steps
+
+
+def training_plan(key: ModelKey) -> TrainingPlan:
+    """How a model is trained.
+
+    :raises MissingEntryError: If there are no hyperparameters for the family.
+    """
+    from sb3_poem.pearl_sac.train_tasks import DEFAULT_TRAIN_TASKS
+
+    variant = VARIANTS[key.variant]
+    file = config_file(variant.algorithm)
+    entries = yaml.safe_load(file.read_text())
+    entry = entries.get(key.env_id, entries.get("default"))
+    if entry is None:
+        raise MissingEntryError(
+            f"{file} has no entry for {key.env_id}, which says how to train {variant.name} on it: "
+            "add one, or hand over a model by --models or --model"
+        )
+    overrides = {**variant.hyperparameters, **dict(key.training.hyperparameters)}
+    hyperparameters = {**entry, **overrides}
+    timesteps = int(key.training.timesteps or hyperparameters["n_timesteps"])
+    hyperparameters["n_timesteps"] = timesteps
+    facts, tasks = family_facts(key.env_id), hyperparameters.get("n_train_tasks")
+    if tasks is None:
+        tasks = min(DEFAULT_TRAIN_TASKS, facts.n_tasks or DEFAULT_TRAIN_TASKS)
+    epoch_steps = tasks * hyperparameters.get("trajectories_per_task", 1) * facts.horizon
+    per_epoch = int(hyperparameters.get("gradient_steps", 1000))
+    updates = -(-timesteps // epoch_steps) * (epoch_steps if per_epoch < 0 else per_epoch)
+    return TrainingPlan(
+        variant.algorithm, hyperparameters, overrides, timesteps, int(epoch_steps), updates
+    )
+
+
+def train_arguments(key: ModelKey, plan: TrainingPlan) -> list[str]:
+    """Those of ``sb3-poem`` that decide what comes out."""
+    arguments = ["train", "--algo", plan.algorithm, "--env", key.env_id]
+    arguments += ["--seed", str(key.seed), "--eval-freq", "-1"]
+    if key.training.timesteps is not None:
+        arguments += ["-n", str(plan.timesteps)]
+    if plan.overrides:
+        arguments += ["-params", *(f"{name}:{value!r}" for name, value in plan.overrides.items())]
+    return arguments
+
+
+def run_training(
+    arguments: list[str], save_steps: int, folder: Path, lock: int, device: str, num_threads: int
+) -> None:
+    """Train, or go on with a training, in a child process.
+
+    :param arguments: See :func:`train_arguments`.
+    :param save_steps: Environment steps between two checkpoints.
+    :param folder: Of the training.
+    :param lock: A lock's file descriptor, which the child inherits: nobody else trains while it
+        still ends.
+    :param device: As PyTorch names it.
+    :param num_threads: Of PyTorch.
+    :raises TrainingError: If it fails.
+    """
+    session = folder / SESSIONS / f"{len(list(folder.glob(f'{SESSIONS}/*.json'))) + 1}.json"
+    command = [sys.executable, "-m", "sb3_poem.benchmark.training", str(os.getpid()), str(session)]
+    command += [*arguments, "-f", str(folder), "--resume", "--save-freq", str(save_steps)]
+    command += ["--device", device, "--num-threads", str(num_threads)]
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), str(num_threads))
+    with (folder / LOG).open("a") as log:
+        # In a session of its own an interrupt from the keyboard does not reach it: rl_zoo3 would
+        # save half a training as if it were whole.
+        child = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, **threads},
+            pass_fds=(lock,),
+            start_new_session=True,
+        )
+        try:
+            status = child.wait()
+        finally:
+            child.kill()
+            child.wait()
+    if status != 0:
+        tail = "\n".join((folder / LOG).read_text(errors="replace").splitlines()[-LOG_LINES:])
+        raise TrainingError(
+            f"the training in {folder} ended with status {status}; the end of its {LOG}:\n{tail}"
+        )
+
+
+def end_with_parent(parent: int) -> None:
+    """Ask the system to kill this process when its parent is gone; where it cannot, nothing
+    happens.
+
+    :param parent: The parent's process id, which may be gone already.
+    """
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError, AttributeError):
+            ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        sys.exit("the benchmark that started this training is gone")
+
+
+@contextlib.contextmanager
+def timed(session: Path) -> Iterator[None]:
+    """Write to a file how long the training took, by the clock and of the processor (all threads):
+    at its end, and whenever there is a new checkpoint, since what comes after the last one is lost
+    with a process that is killed.
+    """
+    started = time.monotonic()
+
+    def note() -> None:
+        times = {"seconds": time.monotonic() - started, "cpu_seconds": sum(os.times()[:4])}
+        write_json_atomically(session, times)
+
+    def last_checkpoint() -> float:
+        files = session.parents[1].glob(f"*/*/{CHECKPOINT}")
+        return max((file.stat().st_mtime for file in files), default=0.0)
+
+    def look() -> None:
+        seen = last_checkpoint()
+        while not over.wait(LOOK_SECONDS):
+            if last_checkpoint() > seen:
+                seen = last_checkpoint()
+                note()
+
+    over = threading.Event()
+    watcher = threading.Thread(target=look, daemon=True)
+    write_json_atomically(session, {"seconds": 0.0, "cpu_seconds": 0.0})
+    watcher.start()
+    try:
+        yield
+    finally:
+        over.set()
+        watcher.join()
+        note()
+
+
+if __name__ == "__main__":
+    end_with_parent(int(sys.argv[1]))
+    with timed(Path(sys.argv[2])):
+        del sys.argv[1:3]
+        runpy.run_module("sb3_poem.cli", run_name="__main__")
