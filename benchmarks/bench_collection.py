@@ -41,17 +41,13 @@ DEFAULT_IDS = [
 
 
 class Loop:
-    """Steps of a vectorised environment under a model's policy, going on where the last call
-    stopped.
+    """Steps of SB3's or Gymnasium's vectorised environment under a model's policy, going on where
+    the last call stopped.
     """
 
-    def __init__(
-        self,
-        reset: Callable[[], np.ndarray],
-        step: Callable[[np.ndarray], np.ndarray],
-        model: POEMSAC,
-    ) -> None:
-        self.observations, self.step, self.model = reset(), step, model
+    def __init__(self, env: Any, model: POEMSAC) -> None:
+        self.env, self.model = env, model
+        self.observations = self._only_ours(env.reset())
         self.copies = len(self.observations)
         # as collection does
         self.act = model.policy.acting_on(np.zeros((self.copies, model.latent_dim)))
@@ -62,7 +58,13 @@ class Loop:
         for _ in range(STEPS):
             noise = th.randn(self.noise_shape, generator=self.model.generators.torch)
             actions = policy.unscale_action(self.act(self.observations, noise))
-            self.observations = self.step(np.clip(actions, space.low, space.high))
+            stepped = self.env.step(np.clip(actions, space.low, space.high))
+            self.observations = self._only_ours(stepped[0])
+
+    def _only_ours(self, found: Any) -> np.ndarray:
+        """Gymnasium's reset has infos too, and EnvPool's robots observe more."""
+        observations = found[0] if isinstance(found, tuple) else found
+        return observations[:, : self.model.observation_space.shape[0]]
 
 
 class Limit:
@@ -114,17 +116,6 @@ def training(model: POEMSAC) -> Callable[[], None]:
     return collect
 
 
-def sb3_loop(env: Any, model: POEMSAC) -> Loop:
-    return Loop(env.reset, lambda actions: env.step(actions)[0], model)
-
-
-def gymnasium_loop(env: Any, model: POEMSAC, obs_dim: int | None = None) -> Loop:
-    def step(actions: np.ndarray) -> np.ndarray:
-        return env.step(actions)[0][:, :obs_dim]
-
-    return Loop(lambda: env.reset()[0][:, :obs_dim], step, model)
-
-
 def others_of(env_id: str) -> int:
     """How many copies SB3's and Gymnasium's vectorised environments step."""
     return next((copies for name, copies in OTHERS.items() if name in env_id), N_TASKS)
@@ -141,14 +132,14 @@ def measure(env_id: str, nthread: int, repeats: int) -> dict[str, Any]:
     settings |= {"buffer_size": 1000, "learning_starts": 0}
     env, own_env = (make_task_vec_env(env_id, N_TASKS, nthread=nthread) for _ in range(2))
     model, own = (POEMSAC("MlpPolicy", each, **settings) for each in (env, own_env))
-    contenders: dict[str, Callable[[], Any]] = {"TaskVecEnv": sb3_loop(env, model)}
+    contenders: dict[str, Callable[[], Any]] = {"TaskVecEnv": Loop(env, model)}
     contenders["training (with storage)"] = training(own)
     contenders["TaskVecEnv"]()
     if hasattr(env.vector_env, "_integrator"):
         contenders["limit: bare mujoco.rollout"] = Limit(env, nthread)
-    contenders["SB3 DummyVecEnv"] = sb3_loop(DummyVecEnv([make] * others), model)
+    contenders["SB3 DummyVecEnv"] = Loop(DummyVecEnv([make] * others), model)
     gymnasium = gym.vector.SyncVectorEnv([make] * others)
-    contenders["Gymnasium SyncVectorEnv"] = gymnasium_loop(gymnasium, model)
+    contenders["Gymnasium SyncVectorEnv"] = Loop(gymnasium, model)
     robot = next((name for name in ENVPOOL if f"/{name}" in env_id), None)
     if robot is not None and importlib.util.find_spec("envpool") is not None:
         import envpool
@@ -156,9 +147,8 @@ def measure(env_id: str, nthread: int, repeats: int) -> dict[str, Any]:
         pool = envpool.make(
             ENVPOOL[robot], env_type="gymnasium", num_envs=N_TASKS, num_threads=nthread, seed=0
         )
-        loop = gymnasium_loop(pool, model, env.observation_space.shape[0])
-        contenders[f"EnvPool {ENVPOOL[robot]}"] = loop
-    contenders["SB3 SubprocVecEnv"] = sb3_loop(processes, model)
+        contenders[f"EnvPool {ENVPOOL[robot]}"] = Loop(pool, model)
+    contenders["SB3 SubprocVecEnv"] = Loop(processes, model)
     seconds = common.seconds_in_turns(contenders, repeats)
     processes.close()
     copies = {name: getattr(contender, "copies", N_TASKS) for name, contender in contenders.items()}

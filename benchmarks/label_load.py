@@ -9,7 +9,6 @@ waits for what comes next.
 
 from __future__ import annotations
 
-import http.client
 import json
 import random
 import re
@@ -22,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import requests
 from common import arguments, label_server
 
 from sb3_poem.label.store import Store
@@ -34,9 +34,9 @@ PATIENCE_SECONDS = 120.0
 class Person(threading.Thread):
     """Answers at random until the time is up, and notes how long each next question took."""
 
-    def __init__(self, port: int, model: str, watch: float, until: float, seed: int) -> None:
+    def __init__(self, server: str, model: str, watch: float, until: float, seed: int) -> None:
         super().__init__(daemon=True)
-        self.port, self.model, self.watch, self.until = port, model, watch, until
+        self.server, self.model, self.watch, self.until = server, model, watch, until
         self.random = random.Random(seed)
         self.waits: list[float] = []
         self.given: list[str] = []
@@ -52,7 +52,8 @@ class Person(threading.Thread):
 
     def _talk(self) -> None:
         begun = time.monotonic()
-        self.token = self._start()
+        start = self._call("/start", data={"model": self.model})
+        self.token = start.headers["Location"].rpartition("/")[2]
         view = self._settled()
         self.first = time.monotonic() - begun
         while time.monotonic() < self.until and view["phase"] == "question":
@@ -60,53 +61,27 @@ class Person(threading.Thread):
             preference = self.random.choice(("left", "right", "equal"))
             asked = time.monotonic()
             answer = {"question": view["turn"]["id"], "preference": preference}
-            self._send(f"/s/{self.token}/answer", answer)
+            self._call(f"/s/{self.token}/answer", json=answer)
             self.given.append(preference)
             view = self._settled()
             # The film itself is part of what a person waits for.
-            self._get(f"/s/{self.token}/video/{view['turn']['id']}")
+            self._call(f"/s/{self.token}/video/{view['turn']['id']}")
             self.waits.append(time.monotonic() - asked)
 
     def _settled(self) -> dict[str, Any]:
         deadline = time.monotonic() + PATIENCE_SECONDS
         while time.monotonic() < deadline:
-            view = json.loads(self._get(f"/s/{self.token}/state"))
+            view: dict[str, Any] = self._call(f"/s/{self.token}/state").json()
             if view["phase"] != "preparing":
                 return view
             time.sleep(POLL_SECONDS)
         raise TimeoutError(f"no question within {PATIENCE_SECONDS} s")
 
-    def _start(self) -> str:
-        body = urllib.parse.urlencode({"model": self.model})
-        form = {"Content-Type": "application/x-www-form-urlencoded"}
-        response, _ = self._request("POST", "/start", body, form)
-        return str(response.headers["Location"]).rpartition("/")[2]
-
-    def _send(self, path: str, data: dict[str, Any]) -> None:
-        self._request("POST", path, json.dumps(data), {"Content-Type": "application/json"})
-
-    def _get(self, path: str) -> bytes:
-        return self._request("GET", path)[1]
-
-    def _request(
-        self, method: str, path: str, body: str | None = None, headers: dict[str, str] | None = None
-    ) -> tuple[http.client.HTTPResponse, bytes]:
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
-        connection.request(method, path, body, headers or {})
-        response = connection.getresponse()
-        content = response.read()
-        connection.close()
-        if response.status >= 400:
-            raise RuntimeError(f"{path} was answered {response.status}: {content[:200]!r}")
-        return response, content
-
-
-def _wait_until_warm(port: int, model: str) -> None:
-    """One question, so that the workers have loaded everything."""
-    first = Person(port, model, 0.0, 0.0, 0)
-    first.run()
-    if first.error is not None:
-        raise RuntimeError(f"the server does not work: {first.error}")
+    def _call(self, path: str, **posted: Any) -> requests.Response:
+        call = requests.post if posted else requests.get
+        response = call(f"{self.server}{path}", timeout=60, allow_redirects=False, **posted)
+        response.raise_for_status()
+        return response
 
 
 def memory_of(pid: int) -> float:
@@ -160,12 +135,15 @@ def main() -> None:
     words = ["--queries", "1000", "--max-sessions", str(given.people + 1)]
     words += ["--workers", str(given.workers)]
     with label_server(given.model, *words) as (server, url, folder):
-        port = urllib.parse.urlsplit(url).port or 80
-        _wait_until_warm(port, given.model)
+        place = (f"http://{urllib.parse.urlsplit(url).netloc}", given.model)
+        first = Person(*place, 0.0, 0.0, 0)  # one question, so that the workers have loaded all
+        first.run()
+        if first.error is not None:
+            raise RuntimeError(f"the server does not work: {first.error}")
         memory_before = memory_of(server.pid)
         begun = time.monotonic()
         until = begun + given.seconds
-        people = [Person(port, given.model, given.watch, until, i) for i in range(given.people)]
+        people = [Person(*place, given.watch, until, i) for i in range(given.people)]
         for person in people:
             person.start()
         for person in people:

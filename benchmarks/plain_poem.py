@@ -47,19 +47,16 @@ class PlainPOEM:
     def __init__(self, model: POEMSAC, seed: int = 0) -> None:
         policy = model.policy
         self.settings = model
-        self.encoder, self.decoder, self.actor = map(
-            perceptron, (policy.encoder.mlp, policy.decoder.mlp, policy.actor.mlp)
-        )
-        self.policy_embedding, self.reward_embedding = map(
-            perceptron, (policy.policy_mapping, policy.reward_mapping)
-        )
+        networks = [policy.encoder.mlp, policy.decoder.mlp, policy.actor.mlp]
+        networks += [policy.policy_mapping, policy.reward_mapping]
+        plain = list(map(perceptron, networks))
+        self.encoder, self.decoder, self.actor, self.policy_embedding, self.reward_embedding = plain
         self.critics = [perceptron(member) for member in policy.critic.members]
         self.targets = copy.deepcopy(self.critics)
         assert model.log_ent_coef is not None
         self.log_alpha = model.log_ent_coef.detach().clone().requires_grad_()
         rate = model.policy.optimizer.param_groups[0]["lr"]
-        trained = [self.encoder, self.decoder, self.policy_embedding, self.reward_embedding]
-        trained += [self.actor, *self.critics]
+        trained = [*plain, *self.critics]
         self.optimizers = [th.optim.Adam(network.parameters(), lr=rate) for network in trained]
         self.alpha_optimizer = th.optim.Adam([self.log_alpha], lr=rate)
         assert model.epoch_context is not None

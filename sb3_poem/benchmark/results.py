@@ -262,12 +262,10 @@ def _handed_over(record: Record) -> bool:
 class Summary:
     """What several seeds earned.
 
-    :param n_seeds: How many.
     :param mean: Of the seeds' mean returns.
     :param deviation: Their standard deviation (n - 1); None for one seed.
     :param iqm: The interquartile mean over seeds and tasks.
-    :param low: The lower end of its 95 % interval; None for one seed, and where none is wanted.
-    :param high: The upper end.
+    :param iqm_low: Of its 95 % interval; None for one seed, and where none is wanted.
     :param task_error: Standard error over tasks of their returns, means over seeds; None for one
         task.
     """
@@ -276,8 +274,8 @@ class Summary:
     mean: float
     deviation: float | None
     iqm: float
-    low: float | None
-    high: float | None
+    iqm_low: float | None
+    iqm_high: float | None
     task_error: float | None
 
 

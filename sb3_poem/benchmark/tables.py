@@ -93,20 +93,12 @@ QUERIES = (1, 5, 10)
 class Row:
     """A method, or a yardstick, after some number of answers; what CSV and JSON hold.
 
-    :param condition: What all methods had to spend.
-    :param entry: The comparison.
-    :param oracle: Who answered.
-    :param method: The method; for a yardstick what it is.
-    :param label: As in tables.
     :param kind: "method", "limit" or "known".
     :param queries: After how many answers; None for "known".
     :param snapshot: The share of the training after which; None: all.
     :param samples: Environment steps of the training, mean over seeds.
-    :param mean: Mean over seeds.
-    :param deviation: Standard deviation over seeds (n - 1).
-    :param iqm: Interquartile mean over seeds and tasks, with its 95 % interval.
+    :param mean: And what follows: see :class:`Summary`.
     :param paper_mean: What the paper reports, with its deviation.
-    :param task_error: Standard error over tasks of their returns, means over seeds.
     :param success_rate: Mean over seeds and tasks, where the family has successes.
     """
 
@@ -285,15 +277,9 @@ def _rows(
                 queries=queries,
                 snapshot=one.snapshot,
                 samples=one.samples,
-                n_seeds=summary.n_seeds,
-                mean=summary.mean,
-                deviation=summary.deviation,
-                iqm=summary.iqm,
-                iqm_low=summary.low,
-                iqm_high=summary.high,
+                **vars(summary),
                 paper_mean=paper[0],
                 paper_deviation=paper[1],
-                task_error=summary.task_error,
                 success_rate=None if successes is None else successes[i],
             )
     variants = {METHODS[one.method].variant for one in some}

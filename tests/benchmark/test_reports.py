@@ -55,13 +55,13 @@ def test_means_deviations_and_interquartile_means() -> None:
     assert one.iqm == 17.0  # of 0 4 10 14 20 24 30 34 the middle four
     # Of a seed drawn for each task anew the sorted eight values lie between all of seed 0 and all
     # of seed 1.
-    assert 15.0 <= one.low < one.iqm < one.high <= 19.0
+    assert 15.0 <= one.iqm_low < one.iqm < one.iqm_high <= 19.0
     assert shifted.mean == one.mean + 100.0
     assert summarise(returns[:, :, None]) == summarise(
         returns[:, :, None]
     )  # a report is the same twice
     [single] = summarise(returns[:1, :, None])
-    assert (single.deviation, single.low, single.high) == (None, None, None)
+    assert (single.deviation, single.iqm_low, single.iqm_high) == (None, None, None)
     for bad in (returns, np.full((2, 2, 1), np.nan), np.empty((0, 3, 1))):
         with pytest.raises(ValueError, match="`returns` must be finite"):
             summarise(bad)
