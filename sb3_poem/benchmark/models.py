@@ -24,14 +24,7 @@ from sb3_poem.baselines import MAMLRewardModel, MetaReward, meta_train_reward
 from sb3_poem.baselines.fragments import default_fragment_length
 from sb3_poem.benchmark.methods import META_ITERATIONS, META_ITERATIONS_OF, VARIANTS
 from sb3_poem.benchmark.provenance import provenance
-from sb3_poem.benchmark.suites import (
-    FILE,
-    REVISION,
-    ModelKey,
-    digest,
-    family_id,
-    family_label,
-)
+from sb3_poem.benchmark.suites import FILE, REVISION, ModelKey, digest, family_id, family_label
 from sb3_poem.benchmark.training import (
     CHECKPOINT,
     LOG,
