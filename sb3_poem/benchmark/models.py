@@ -267,7 +267,8 @@ class ModelLibrary:
         nearest = min(usable, key=lambda steps: abs(steps - wanted), default=None)
         if nearest is None or abs(nearest - wanted) > plan.save_steps:
             raise ValueError(
-                f"{key} has no model that was saved near {wanted:,.0f} steps; there are: {sorted(usable)}"
+                f"{key} has no model that was saved near {wanted:,.0f} steps; there are: "
+                f"{sorted(usable)}"
             )
         return files[nearest]
 

@@ -312,7 +312,7 @@ def summarise(returns: np.ndarray, intervals: bool = True) -> list[Summary]:
 
 
 def _iqms(scores: np.ndarray) -> np.ndarray:
-    """(n_seeds, n_tasks, n_records) -> (n_records,): rliable's interquartile mean of each record."""
+    """(n_seeds, n_tasks, n_records) -> (n_records,): each record's interquartile mean."""
     return trim_mean(scores.reshape(-1, scores.shape[2]), proportiontocut=0.25, axis=0)
 
 

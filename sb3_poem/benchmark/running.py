@@ -24,8 +24,8 @@ from sb3_poem.common.vec_env import make_task_vec_env
 
 @dataclass
 class Plan:
-    """A run: cells to be run, in order; cells that the store has; and cells that cannot be run, with
-    the reason.
+    """A run: cells to be run, in order; cells that the store has; and cells that cannot be run,
+    with the reason.
     """
 
     todo: list[Cell] = field(default_factory=list)
@@ -93,7 +93,7 @@ def make_plan(
             plan.skipped.append((cell, reason))
         else:
             plan.todo.append(cell)
-    # By family and seed as they come, then by model, its final cells before those along its training
+    # By family and seed as they come, then by model, the final cells first
     places = list(dict.fromkeys((cell.env_id, cell.seed) for cell in plan.todo))
     models = list(dict.fromkeys(cell.model_key for cell in plan.todo))
     plan.todo.sort(

@@ -112,11 +112,13 @@ def _check_models(arguments: argparse.Namespace) -> None:
         if family not in families:
             known = ", ".join(sorted(map(family_label, families)))
             raise ValueError(
-                f"--model {text}: {family_label(family)} is none of the families of this run: {known}"
+                f"--model {text}: {family_label(family)} is none of the families of this run: "
+                f"{known}"
             )
         if seed not in seeds:
             raise ValueError(
-                f"--model {text}: {seed} is none of the seeds of this run: {', '.join(map(str, seeds))}"
+                f"--model {text}: {seed} is none of the seeds of this run: "
+                f"{', '.join(map(str, seeds))}"
             )
 
 

@@ -28,7 +28,8 @@ def add_benchmark(commands: Any, count: Count) -> None:
     parser = commands.add_parser(
         "benchmark",
         help="run the paper's comparisons and ablations, and report them",
-        description="Run suites of comparisons into a store of results, and make tables and figures of it.",
+        description="Run suites of comparisons into a store of results, and make tables and "
+        "figures of it.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

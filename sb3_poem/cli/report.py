@@ -68,9 +68,10 @@ class Report:
             return None
         n, episodes = len(self.known.candidate_latents), self.known.returns.shape[1]
         return (
-            f"task known: the best of {n} policies for each task, measured anew on {episodes} episodes.\n"
-            f"limit: the best 2^answers of those {n} for these very tasks, chosen with the tasks in "
-            "sight: an optimistic bound for error-free answers that choose among these policies, "
+            f"task known: the best of {n} policies for each task, measured anew on {episodes} "
+            "episodes.\n"
+            f"limit: the best 2^answers of those {n} for these very tasks, chosen with the tasks "
+            "in sight: an optimistic bound for error-free answers that choose among these policies, "
             "not for any method."
         )
 
@@ -123,7 +124,7 @@ def row_text(evaluation: AdaptationEvaluation) -> str:
 
 
 def _means(evaluation: AdaptationEvaluation) -> Iterator[tuple[int, float, float]]:
-    """Number of answers, mean return over tasks, its standard error (NaN for one task): a row each."""
+    """Number of answers, mean return over tasks, its standard error (NaN for one task)."""
     returns = evaluation.task_returns
     nothing = np.full(returns.shape[1], np.nan)
     errors = sem(returns) if len(returns) > 1 else nothing
