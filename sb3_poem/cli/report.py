@@ -71,8 +71,8 @@ class Report:
             f"task known: the best of {n} policies for each task, measured anew on {episodes} "
             "episodes.\n"
             f"limit: the best 2^answers of those {n} for these very tasks, chosen with the tasks "
-            "in sight: an optimistic bound for error-free answers that choose among these policies, "
-            "not for any method."
+            "in sight: an optimistic bound for error-free answers that choose among these "
+            "policies, not for any method."
         )
 
     def to_dict(self) -> dict[str, Any]:
