@@ -27,7 +27,7 @@ from mujoco.rollout import Rollout
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from poem_envs.vector import available_cores
-from sb3_poem import POEMSAC
+from sb3_poem import POEMSAC, TaskVecEnv
 from sb3_poem.benchmark.suites import family_name
 from sb3_poem.common.vec_env import make_task_vec_env
 
