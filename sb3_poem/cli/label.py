@@ -12,7 +12,7 @@ from rich.console import Console
 
 from sb3_poem.cli.outputs import check_output
 from sb3_poem.cli.packages import import_packages
-from sb3_poem.cli.subject import parse_env_kwargs
+from sb3_poem.cli.subject import parse_env_kwargs, say
 
 SHORTEST_PASSWORD = 12
 AUTH_VARIABLE = "SB3_POEM_AUTH"
@@ -21,9 +21,9 @@ AUTH_VARIABLE = "SB3_POEM_AUTH"
 def run_label(arguments: argparse.Namespace) -> None:
     """Run the command.
 
-    :param arguments: as ``sb3_poem.cli`` parsed them
-    :raises ValueError: if they do not fit
-    :raises OSError: if a file or a port cannot be had
+    :param arguments: As ``sb3_poem.cli`` parsed them
+    :raises ValueError: If they do not fit
+    :raises OSError: If a file or a port cannot be had
     """
     commands = {"export": run_export, "replay": run_replay, None: run_page}
     commands[arguments.label_command](arguments)
@@ -38,62 +38,52 @@ def run_page(arguments: argparse.Namespace) -> None:
     except ImportError as error:
         raise ValueError(f"the page needs {error.name}: pip install 'sb3_poem[label]'") from None
     from sb3_poem.label.access import LOOPBACK, Access, is_loopback
-    from sb3_poem.label.catalogue import read_catalogue
-    from sb3_poem.label.hosting import bind, link_host, make_server
-    from sb3_poem.label.server import make_app
-    from sb3_poem.label.sessions import Conversations
+    from sb3_poem.label.families import find_models
+    from sb3_poem.label.render_queue import RenderQueue, process_pool
+    from sb3_poem.label.rendering import adapter_options
+    from sb3_poem.label.server import bind, link_host, make_app, make_server
+    from sb3_poem.label.sessions import SessionManager
     from sb3_poem.label.store import Store
-    from sb3_poem.label.turns import adapter_options
-    from sb3_poem.label.workshop import Workshop, process_pool
 
-    console = Console()
     user, password = read_password(arguments.auth, arguments.auth_file)
     token = secrets.token_urlsafe(24) if arguments.token else None
-    if not is_loopback(arguments.host) and password is None and token is None:
+    is_open = not is_loopback(arguments.host)
+    if is_open and password is None and token is None:
         raise ValueError(
-            f"--host {arguments.host} lets other machines reach the page, where whoever comes can make this machine render "
-            "and read what it shows; add --token or --auth-file FILE"
+            f"--host {arguments.host} lets other machines reach the page, where whoever comes can "
+            "make this machine render and read what it shows; add --token or --auth-file FILE"
         )
-    import_packages(arguments.gym_packages)
+    workers, packages = arguments.workers, arguments.gym_packages
+    import_packages(packages)
     options = {"inference": arguments.inference, "mistake_rate": arguments.mistake_rate}
     adapter_options(options)  # says now what is out of range
-    catalogue = read_catalogue(
-        arguments.model, arguments.env, parse_env_kwargs(arguments.env_kwargs)
-    )
+    models = find_models(arguments.model, arguments.env, parse_env_kwargs(arguments.env_kwargs))
     listener = bind(arguments.host, arguments.port)
     port = listener.getsockname()[1]
     store = Store(arguments.store)
     store.remove_orphans()
-    conversations = Conversations(
+    sessions = SessionManager(
         store,
-        Workshop(
-            arguments.workers,
-            lambda: process_pool(arguments.workers, catalogue, arguments.gym_packages),
-        ),
-        catalogue,
+        RenderQueue(workers, lambda: process_pool(workers, models, packages)),
+        models,
         options,
         arguments.queries,
         arguments.max_sessions,
         arguments.seed,
     )
-    hosts = frozenset(
-        (*LOOPBACK, arguments.host.lower(), *(name.lower() for name in arguments.allow_host))
-    )
-    app = make_app(conversations, Access(user, password, token, hosts))
-    query = "" if token is None else f"/?token={token}"
+    hosts = LOOPBACK | {name.lower() for name in (arguments.host, *arguments.allow_host)}
+    app = make_app(sessions, Access(user, password, token, hosts))
     name = link_host(listener, arguments.host)
     name = f"[{name}]" if ":" in name else name
-    console.print(f"The page is at http://{name}:{port}{query}", soft_wrap=True, highlight=False)
-    console.print(
-        f"Models: {', '.join(choice.name for choice in catalogue)}. Answers are kept in {store.path}.",
-        soft_wrap=True,
-        highlight=False,
-    )
-    if not is_loopback(arguments.host):
-        console.print(
-            "Other machines can reach it: with the password or the token they can begin sessions and make this machine "
-            "render. The connection is not encrypted; put a proxy with TLS in front of it where others could listen.",
-            highlight=False,
+    query = "" if token is None else f"/?token={token}"
+    say(f"The page is at http://{name}:{port}{query}")
+    names = ", ".join(info.name for info in models)
+    say(f"Models: {names}. Answers are kept in {store.path}.")
+    if is_open:
+        say(
+            "Other machines can reach it: with the password or the token they can begin sessions "
+            "and make this machine render. The connection is not encrypted; put a proxy with TLS "
+            "in front of it where others could listen."
         )
     try:
         make_server(app, arguments.host, port).run(sockets=[listener])
@@ -104,8 +94,8 @@ def run_page(arguments: argparse.Namespace) -> None:
 def read_password(auth: str | None, file: Path | None) -> tuple[str | None, str | None]:
     """Read ``USER:PASSWORD`` from the flag, else from the file, else from the environment.
 
-    :raises ValueError: if it has another form, or the password is short
-    :raises OSError: if there is no such file
+    :raises ValueError: If it has another form, or the password is short
+    :raises OSError: If there is no such file
     """
     source = "--auth"
     if file is not None:
@@ -119,7 +109,8 @@ def read_password(auth: str | None, file: Path | None) -> tuple[str | None, str 
         raise ValueError(f"{source} must have the form USER:PASSWORD")
     if len(password) < SHORTEST_PASSWORD:
         raise ValueError(
-            f"{source}: the password must have at least {SHORTEST_PASSWORD} characters, but has {len(password)}"
+            f"{source}: the password must have at least {SHORTEST_PASSWORD} characters, "
+            f"but has {len(password)}"
         )
     return user, password
 
@@ -130,10 +121,10 @@ def run_export(arguments: argparse.Namespace) -> None:
 
     for path in arguments.out:
         check_output("--out", path, (".jsonl", ".parquet"))
-    store = open_store(arguments)
+    store = _open_store(arguments.store)
     for path in arguments.out:
         count = export(store, path, arguments.trajectories, arguments.undone)
-        Console().print(f"Wrote {count} answers to {path}", highlight=False)
+        say(f"Wrote {count} answers to {path}")
     store.close()
 
 
@@ -145,62 +136,51 @@ def run_replay(arguments: argparse.Namespace) -> None:
     from sb3_poem.resources import pretrained_folder
 
     check_output("--json", arguments.json, (".json",))
-    console = Console()
-    store = open_store(arguments)
+    store, given = _open_store(arguments.store), arguments.model
     options = {"inference": arguments.inference, "mistake_rate": arguments.mistake_rate}
-    results: list[dict[str, Any]] = []
-    left_out: list[str] = []
-    for session in store.sessions():
-        if not store.answers(session.id):
-            continue
-        with console.status(f"Session {session.id}"):
-            try:
-                # a store may come from anybody: it names no file to unpickle
-                model = load_model(arguments.model or pretrained_folder(session.model))
-            except FileNotFoundError:
-                if arguments.model is not None:
-                    raise
-                left_out.append(session.id)
-                console.print(
-                    f"Session {session.id} was recorded with a model {session.model!r} that does not ship: name it by --model",
-                    soft_wrap=True,
-                    highlight=False,
-                )
-                continue
-            # the store knows a model by its folder's name
-            is_own = (
-                arguments.model is None or Path(arguments.model).resolve().name == session.model
-            )
-            result = replay(store, session, model, options, arguments.seed or 0, is_own)
-        results.append(result)
-        console.print(
-            f"Session {session.id} ({session.model}): foretold {result['foretold']} of {result['decided']} answers. "
-            f"{result['sentence']}",
-            highlight=False,
-        )
-    if not results and not left_out:
+    answered = [session for session in store.sessions() if store.answers(session.id)]
+    if not answered:
         raise ValueError(f"--store {arguments.store} holds no answers")
+    results: list[dict[str, Any]] = []
+    for session in answered:
+        try:
+            # a store may come from anybody: it names no file to unpickle
+            model = load_model(given or pretrained_folder(session.model))
+        except FileNotFoundError:
+            if given is not None:
+                raise
+            say(
+                f"Session {session.id} was recorded with a model {session.model!r} that does not "
+                "ship: name it by --model"
+            )
+            continue
+        # the store knows a model by its folder's name
+        is_own = given is None or Path(given).resolve().name == session.model
+        with Console().status(f"Session {session.id}"):
+            results.append(replay(store, session, model, options, arguments.seed or 0, is_own))
+        say(
+            "Session {session} ({model}): foretold {foretold} of {decided} answers. "
+            "{sentence}".format_map(results[-1])
+        )
     if not results:
         raise ValueError(
             "no session could be replayed: name the model that they were recorded with by --model"
         )
     if arguments.json is not None:
         write_json_atomically(
-            arguments.json, {"model": arguments.model, "options": options, "sessions": results}
+            arguments.json, {"model": given, "options": options, "sessions": results}
         )
-        console.print(f"Wrote {arguments.json}", highlight=False)
+        say(f"Wrote {arguments.json}")
     store.close()
 
 
-def open_store(arguments: argparse.Namespace):  # type: ignore[no-untyped-def]
+def _open_store(folder: Path) -> Any:
     """The store that was named.
 
-    :raises ValueError: if there is none
+    :raises ValueError: If there is none
     """
     from sb3_poem.label.store import Store
 
-    if not (arguments.store / "answers.sqlite").is_file():
-        raise ValueError(
-            f"--store {arguments.store}: there are no answers there (no answers.sqlite)"
-        )
-    return Store(arguments.store)
+    if not (folder / "answers.sqlite").is_file():
+        raise ValueError(f"--store {folder}: there are no answers there (no answers.sqlite)")
+    return Store(folder)

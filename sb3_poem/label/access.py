@@ -1,5 +1,5 @@
-"""Who gets in, and with how much: host names, passwords, cross-site requests, sizes, and what a
-browser may do with a page.
+"""Who gets in, and with how much: host names, passwords, cross-site requests, sizes, what a browser
+may do with a page, how long the server waits for a client, and who goes when there are too many.
 """
 
 from __future__ import annotations
@@ -9,17 +9,22 @@ import base64
 import hmac
 import ipaddress
 import re
-from dataclasses import dataclass, field
-from urllib.parse import parse_qs
+from dataclasses import dataclass
+from typing import Any
 
+import h11
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from uvicorn.protocols.http.flow_control import service_unavailable
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
-MAX_BODY = 16 * 1024
+MAX_BODY = 16 * 1024  # bytes of a request
 # With the server's port, since a browser sends what one server of a host has set to all of them.
 COOKIE = "sb3_poem_access_{port}"
-LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
+LOOPBACK = frozenset(("localhost", "127.0.0.1", "[::1]"))
 # Somebody who guesses a password gets so many answers a second on each connection.
 PAUSE_AFTER_WRONG_PASSWORD = 0.5
 HEADERS = {
@@ -30,8 +35,20 @@ HEADERS = {
     "Permissions-Policy": "camera=(), microphone=(), geolocation=()",
 }
 CONTENT_POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; media-src 'self' blob:; "
-    "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors {ancestors}"
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
+    "media-src 'self' blob:; connect-src 'self'; form-action 'self'; base-uri 'none'; "
+    "frame-ancestors {ancestors}"
+)
+# Seconds for a request, headers and body, and between two requests.
+DEADLINE = 10.0
+MAX_CONNECTIONS = 256
+# Of one address: a browser opens six, and a class behind one router has one address.
+MAX_OF_ADDRESS = 64
+# Who has just come may say first what they want.
+GRACE = 0.1
+TOO_SLOW = (
+    b"HTTP/1.1 408 Request Timeout\r\nConnection: close\r\nContent-Type: text/plain\r\n\r\n"
+    b"the request took too long to arrive\n"
 )
 
 
@@ -40,7 +57,6 @@ class Access:
     """Who gets in.
 
     :param user: With ``password``, the name that a browser asks for.
-    :param password: See there.
     :param token: What the first address must carry as ``?token=``; a cookie remembers it.
     :param hosts: Host names under which the server answers when neither is asked for, so that no
         foreign page can reach it by a name of its own (DNS rebinding).
@@ -50,21 +66,12 @@ class Access:
     user: str | None = None
     password: str | None = None
     token: str | None = None
-    hosts: frozenset[str] = field(default_factory=lambda: frozenset(LOOPBACK))
+    hosts: frozenset[str] = LOOPBACK
     embedded: bool = False
-
-    @property
-    def is_guarded(self) -> bool:
-        """Whether a password or a token is asked for."""
-        return self.password is not None or self.token is not None
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach an address.
-
-    :param host: A name or an address.
-    :return: Whether it is loopback.
-    """
+    """Whether only this machine can reach an address, or a name."""
     if host == "localhost":
         return True
     try:
@@ -73,30 +80,22 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-class Gate:
-    """ASGI middleware in front of everything.
-
-    :param app: What is behind it.
-    :param access: Who gets in.
-    :param max_body: Largest body of a request, bytes.
+class AccessMiddleware:
+    """ASGI middleware in front of everything. A request's body is read here, of one that is too
+    large no more than the limit.
     """
 
-    def __init__(self, app: ASGIApp, access: Access, max_body: int = MAX_BODY) -> None:
+    def __init__(self, app: ASGIApp, access: Access) -> None:
         self.app = app
         self.access = access
-        self.max_body = max_body
-        ancestors = "*" if access.embedded else "'none'"
-        self._headers = {
-            **HEADERS,
-            "Content-Security-Policy": CONTENT_POLICY.format(ancestors=ancestors),
-        }
+        policy = CONTENT_POLICY.format(ancestors="*" if access.embedded else "'none'")
+        self._headers = {**HEADERS, "Content-Security-Policy": policy}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """See ASGI."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
-        headers = Headers(scope=scope)
 
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -105,127 +104,238 @@ class Gate:
                     outgoing.setdefault(name, value)
             await send(message)
 
-        refusal = await self._refusal(scope, headers)
-        if refusal is not None:
-            await refusal(scope, receive, send_with_headers)
+        request = Request(scope, receive)
+        try:
+            outcome = await self._admit(request) or await _body(request)
+        except ClientDisconnect:
             return
-        body = await self._body(headers, receive) if scope["method"] not in ("GET", "HEAD") else b""
-        if isinstance(body, Response):
-            await body(scope, receive, send_with_headers)
+        except HTTPException as error:
+            outcome = PlainTextResponse(f"{error.detail}\n", error.status_code, error.headers)
+        if isinstance(outcome, Response):
+            await outcome(scope, receive, send_with_headers)
             return
-        if body is None:
-            return
-        sent = False
+        messages: list[Message] = [{"type": "http.request", "body": outcome, "more_body": False}]
 
         async def receive_body() -> Message:
-            nonlocal sent
-            if sent:
-                return await receive()
-            sent = True
-            return {"type": "http.request", "body": body, "more_body": False}
+            return messages.pop() if messages else await receive()
 
         await self.app(scope, receive_body, send_with_headers)
 
-    async def _refusal(self, scope: Scope, headers: Headers) -> Response | None:
-        if (
-            not self.access.is_guarded
-            and _host_name(headers.get("host", "")) not in self.access.hosts
-        ):
-            return PlainTextResponse("this server does not answer under this host name\n", 421)
-        if scope["method"] not in ("GET", "HEAD") and _is_cross_site(headers):
-            return PlainTextResponse("requests from other sites are refused\n", 403)
-        if self.access.is_guarded:
-            return await self._ask_who(scope, headers)
-        return None
+    async def _admit(self, request: Request) -> Response | None:
+        """None lets a request in; a redirect takes the token out of its address.
 
-    async def _ask_who(self, scope: Scope, headers: Headers) -> Response | None:
-        access, authorization = self.access, headers.get("authorization", "")
-        if access.password is not None and _has_password(
-            authorization, access.user or "", access.password
-        ):
+        :raises HTTPException: If it is refused.
+        """
+        access, headers = self.access, request.headers
+        is_guarded = access.password is not None or access.token is not None
+        if not is_guarded and _host_name(headers.get("host", "")) not in access.hosts:
+            raise HTTPException(421, "this server does not answer under this host name")
+        if request.method not in ("GET", "HEAD") and _is_cross_site(headers):
+            raise HTTPException(403, "requests from other sites are refused")
+        if not is_guarded:
             return None
-        given = cookies = None
-        if access.token is not None:
-            name = COOKIE.format(port=scope["server"][1])
-            cookies = _cookies(headers, name)
-            if any(_same(cookie, access.token) for cookie in cookies):
+
+        authorization, given, cookie = headers.get("authorization", ""), "", ""
+        if access.password is not None:
+            credentials = f"{access.user or ''}:{access.password}"
+            if _is_same(_basic_credentials(authorization), credentials):
                 return None
-            given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
-            if _same(given, access.token):
+        if access.token is not None:
+            name = COOKIE.format(port=request.scope["server"][1])
+            cookie = request.cookies.get(name, "")
+            if _is_same(cookie, access.token):
+                return None
+            given = request.query_params.get("token", "")
+            if _is_same(given, access.token):
                 # One slash: what follows two is another host.
-                response = RedirectResponse("/" + scope["path"].lstrip("/"), 303)
+                response = RedirectResponse("/" + request.scope["path"].lstrip("/"), 303)
                 # Not "strict": a link that is clicked in somebody's mail would not be let in.
                 # Requests of other sites that write are refused in any case.
                 response.set_cookie(
                     name, access.token, httponly=True, samesite="lax", max_age=30 * 86400
                 )
                 return response
-        if authorization or cookies or given:
+        if authorization or cookie or given:
             await asyncio.sleep(PAUSE_AFTER_WRONG_PASSWORD)
-        asks = (
-            {"WWW-Authenticate": 'Basic realm="sb3-poem", charset="UTF-8"'}
-            if access.password is not None
-            else {}
-        )
-        return PlainTextResponse(
-            "this page needs the link with its token, or the password, of whoever started it\n",
+        asks = {"WWW-Authenticate": 'Basic realm="sb3-poem", charset="UTF-8"'}
+        raise HTTPException(
             401,
-            asks,
+            "this page needs the link with its token, or the password, of whoever started it",
+            asks if access.password is not None else None,
         )
 
-    async def _body(self, headers: Headers, receive: Receive) -> bytes | Response | None:
-        """The body; a refusal where it is too large, of which no more than the limit is read; None
-        of who has left.
-        """
-        too_large = PlainTextResponse(f"a request may hold {self.max_body} bytes at most\n", 413)
-        length = headers.get("content-length", "0")
-        if not re.fullmatch("[0-9]{1,9}", length) or int(length) > self.max_body:
-            return too_large
-        body = b""
-        while True:
-            message = await receive()
-            if message["type"] == "http.disconnect":
-                return None
-            body += message.get("body", b"")
-            if len(body) > self.max_body:
-                return too_large
-            if not message.get("more_body", False):
-                return body
+
+async def _body(request: Request) -> bytes:
+    if request.method in ("GET", "HEAD"):
+        return b""
+    too_large = HTTPException(413, f"a request may hold {MAX_BODY} bytes at most")
+    length = request.headers.get("content-length", "0")
+    if not re.fullmatch("[0-9]{1,9}", length) or int(length) > MAX_BODY:
+        raise too_large
+    body = b""
+    async for part in request.stream():
+        body += part
+        if len(body) > MAX_BODY:
+            raise too_large
+    return body
 
 
 def _host_name(host: str) -> str:
-    return (
-        host[: host.index("]") + 1]
-        if host.startswith("[") and "]" in host
-        else host.partition(":")[0]
-    ).lower()
+    """Without the port."""
+    match = re.match(r"\[[^\]]*\]|[^:]*", host)
+    return match[0].lower() if match else ""
 
 
 def _is_cross_site(headers: Headers) -> bool:
-    site = headers.get("sec-fetch-site")
+    site, origin = headers.get("sec-fetch-site"), headers.get("origin")
     if site is not None:
         return site not in ("same-origin", "none")
-    origin = headers.get("origin")
-    return (
-        origin is not None and origin.partition("://")[2].lower() != headers.get("host", "").lower()
-    )
+    host = headers.get("host", "").lower()
+    return origin is not None and origin.partition("://")[2].lower() != host
 
 
-def _has_password(authorization: str, user: str, password: str) -> bool:
+def _basic_credentials(authorization: str) -> str:
+    """``USER:PASSWORD`` of the header; nothing of another one."""
     scheme, _, credentials = authorization.partition(" ")
-    if scheme.lower() != "basic":
-        return False
     try:
-        given = base64.b64decode(credentials, validate=True).decode("utf-8")
+        decoded = base64.b64decode(credentials, validate=True).decode()
     except ValueError:  # no base64, or no UTF-8 in it
-        return False
-    return _same(given, f"{user}:{password}")
+        return ""
+    return decoded if scheme.lower() == "basic" else ""
 
 
-def _cookies(headers: Headers, name: str) -> list[str]:
-    pairs = (pair.strip().partition("=") for pair in headers.get("cookie", "").split(";"))
-    return [value for key, _, value in pairs if key == name]
+def _is_same(given: str, right: str) -> bool:
+    return hmac.compare_digest(given.encode("utf-8", "surrogatepass"), right.encode())
 
 
-def _same(given: str, right: str) -> bool:
-    return hmac.compare_digest(given.encode("utf-8", "surrogatepass"), right.encode("utf-8"))
+class Connection(H11Protocol):
+    """A connection that ends when the server has waited too long for its client: for the rest of a
+    request, for another one, or for an answer to be taken. Where there are too many, the one that
+    was waited for longest ends, and none whose answer is being made: whoever sends a whole request
+    at once is served, whatever else comes from their address.
+
+    :param deadline: Seconds for a request, and between two; of an answer some must be taken within
+        thrice as many.
+    :param options: See uvicorn.
+    """
+
+    def __init__(self, *, deadline: float = DEADLINE, **options: Any) -> None:
+        super().__init__(**options)
+        self.deadline = deadline
+        self.network = ""
+        self.since = 0.0
+        self.awaited: str | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._untaken = 0  # bytes
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """See asyncio."""
+        super().connection_made(transport)
+        self.network = network_of(self.client[0] if self.client else "")
+        self._watch()
+        self.loop.call_later(GRACE, self._make_room)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """See asyncio."""
+        super().connection_lost(exc)
+        self._await(None)
+
+    def data_received(self, data: bytes) -> None:
+        """See asyncio."""
+        super().data_received(data)
+        self._watch()
+
+    def on_response_complete(self) -> None:
+        """See uvicorn."""
+        super().on_response_complete()
+        self._watch()
+
+    def send_400_response(self, msg: str) -> None:
+        """See uvicorn, which goes on with the answer that it had begun."""
+        if self.cycle is not None:
+            self.cycle.disconnected = True
+        if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
+            super().send_400_response(msg)
+        else:
+            self._end()
+
+    def pause_writing(self) -> None:
+        """See asyncio."""
+        super().pause_writing()
+        self._watch()
+
+    def resume_writing(self) -> None:
+        """See asyncio."""
+        super().resume_writing()
+        self._await(None)  # a part was taken; the next has its own time
+        self._watch()
+
+    def _awaited_from_client(self) -> str | None:
+        if self.transport.get_write_buffer_size() > 0:
+            return "answer taken"
+        if self.conn.their_state is h11.SEND_BODY:
+            return "request"
+        if self.conn.their_state is h11.IDLE:
+            has_begun = self.cycle is None or self.conn.trailing_data[0]
+            return "request" if has_begun else "another request"
+        return None
+
+    def _watch(self) -> None:
+        awaited = self._awaited_from_client()
+        if awaited != self.awaited:
+            self._await(awaited)
+
+    def _await(self, awaited: str | None) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        self.awaited, self.since = awaited, self.loop.time()
+        if awaited is not None:
+            self._start_timer()
+
+    def _start_timer(self) -> None:
+        self._untaken = self.transport.get_write_buffer_size()
+        seconds = self.deadline * (3 if self._untaken else 1)
+        self._timer = self.loop.call_later(seconds, self._too_late)
+
+    def _too_late(self) -> None:
+        if self._awaited_from_client() != self.awaited:  # an answer that was taken without a word
+            self._watch()
+        elif 0 < self.transport.get_write_buffer_size() < self._untaken:
+            self._start_timer()
+        else:
+            if self.conn.their_state is h11.SEND_BODY and self.conn.our_state is h11.SEND_RESPONSE:
+                self.transport.write(TOO_SLOW)
+            self._end()
+
+    def _end(self) -> None:
+        self.connections.discard(self)
+        self.transport.abort()
+
+    def _make_room(self) -> None:
+        crowd = [one for one in self.connections if isinstance(one, Connection)]
+        neighbours = [one for one in crowd if one.network == self.network]
+        if len(neighbours) > MAX_OF_ADDRESS:
+            crowd = neighbours
+        elif len(crowd) <= MAX_CONNECTIONS:
+            return
+        awaited = [one for one in crowd if one.awaited is not None]
+        if awaited:
+            min(awaited, key=lambda one: one.since)._end()
+        else:  # all answers are being made: this one's next request is told to come later
+            self.app = service_unavailable  # type: ignore[assignment]
+
+
+def network_of(host: str) -> str:
+    """What counts as one address: an IPv4 address, and of IPv6 the network of 64 bits that one
+    household is given.
+    """
+    try:
+        address = ipaddress.ip_address(host)
+    except ValueError:
+        return host
+    if isinstance(address, ipaddress.IPv4Address):
+        return host
+    if address.ipv4_mapped is not None:
+        return str(address.ipv4_mapped)
+    return str(ipaddress.IPv6Address(int(address) >> 64 << 64))

@@ -14,12 +14,17 @@ from sb3_poem.label.families import as_points, describe
 NEIGHBOURS = 5
 # The sentence names the range that holds so much of the posterior.
 SHARE = 0.8
+# Of the eighths of a circle, in a video that looks at the robot from its right side.
+WAYS = (
+    *("right", "far right", "away from you", "far left"),
+    *("left", "near left", "towards you", "near right"),
+)
 
 
 def belief(adapter: Any, env_id: str) -> dict[str, Any]:
     """The posterior of an adapter, ready to draw.
 
-    :param adapter: A ``PreferenceAdapter``.
+    :param adapter: A ``PreferenceAdapter``, or what has its ``model`` and ``inference``.
     :param env_id: The environment's id, which says how tasks are drawn.
     :return: JSON-ready: ``picture`` ("place", "speed", "direction" or "projection"), ``points`` (n,
         1 or 2), ``weights`` (n,) summing to one, ``estimate`` (the point of the policy that would
@@ -29,14 +34,11 @@ def belief(adapter: Any, env_id: str) -> dict[str, Any]:
     everything = np.concatenate([latents, adapter.inference.estimate()[None, :]])
     tasks = np.asarray(adapter.model.train_tasks.tasks, dtype=np.float64)
     description = describe(env_id, tasks.shape[1])
-    picture = description.picture
+    picture, extent, unit = description.picture, description.extent, description.unit
     if picture == "projection":
         points, extent = _projection(adapter.model, everything)
     else:
-        points, extent = (
-            _points_of(adapter.model, everything, as_points(env_id, tasks)),
-            description.extent,
-        )
+        points = _points_of(adapter.model, everything, as_points(env_id, tasks))
     points, estimate = points[:-1], points[-1]
     return {
         "picture": picture,
@@ -44,16 +46,15 @@ def belief(adapter: Any, env_id: str) -> dict[str, Any]:
         "weights": np.round(weights, 6).tolist(),
         "estimate": np.round(estimate, 4).tolist(),
         "extent": float(extent),
-        "unit": description.unit,
-        "sentence": sentence(picture, points, weights, estimate, description.unit),
+        "unit": unit,
+        "sentence": sentence(picture, points, weights, estimate, unit),
     }
 
 
 def posterior(inference: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The latents that are still possible.
+    """The latents (n, d) that are still possible, and weights (n,) summing to one.
 
     :param inference: A ``LatentInference``.
-    :return: Latents (n, d), and weights (n,) summing to one.
     """
     if hasattr(inference, "particles"):
         return inference.particles, inference.weights
@@ -72,62 +73,53 @@ def sentence(
     :param weights: (n,) summing to one.
     :param estimate: (1 or 2,).
     :param unit: Of the numbers.
-    :return: One sentence.
     """
     if picture == "speed":
         low, high = weighted_quantiles(points[:, 0], weights, ((1 - SHARE) / 2, (1 + SHARE) / 2))
         return f"It believes that you want between {max(low, 0.0):.1f} and {high:.1f} {unit}."
     if picture == "direction":
         return _direction_sentence(points, weights)
-    distances = np.linalg.norm(points - estimate, axis=1)
-    radius = weighted_quantiles(distances, weights, (SHARE,))[0]
     if picture == "place":
-        x, y = estimate
-        across, upwards, about = (f"{round(value, 2):.2g}" for value in (x, y, radius))
-        return (
-            f"It believes that you mean a place near {across} across and {upwards} up, give or take {about} {unit}".strip()
-            + "."
-        )
-    return "Each dot is a behaviour that still fits your answers; the closer together they lie, the surer it is."
+        distances = np.linalg.norm(points - estimate, axis=1)
+        radius = weighted_quantiles(distances, weights, (SHARE,))[0]
+        across, upwards, about = (f"{round(value, 2):.2g}" for value in (*estimate, radius))
+        where = f"near {across} across and {upwards} up, give or take {about} {unit}".strip()
+        return f"It believes that you mean a place {where}."
+    return (
+        "Each dot is a behaviour that still fits your answers; the closer together they lie, the "
+        "surer it is."
+    )
 
 
 def weighted_quantiles(
     values: np.ndarray, weights: np.ndarray, shares: tuple[float, ...]
 ) -> list[float]:
-    """Quantiles of a weighted sample.
+    """The smallest value of a weighted sample below or at which lies each share.
 
     :param values: (n,).
     :param weights: (n,) summing to one.
     :param shares: Each in [0, 1].
-    :return: The smallest value below or at which lies each share.
     """
     order = np.argsort(values)
     cumulative = np.cumsum(weights[order])
     places = np.searchsorted(cumulative, np.asarray(shares) * cumulative[-1])
-    return [float(values[order[min(place, len(order) - 1)]]) for place in places]
+    return values[order[np.minimum(places, len(order) - 1)]].tolist()
 
 
 def _direction_sentence(points: np.ndarray, weights: np.ndarray) -> str:
     if np.abs(points[:, 1]).max() < 1e-9:  # one line: forward or backward
         forward = float(weights[points[:, 0] >= 0].sum())
-        way, share = ("to the right", forward) if forward >= 0.5 else ("to the left", 1.0 - forward)
-        return f"It is {100 * share:.0f} % sure that you want it to run {way} in the video."
+        way, share = ("right", forward) if forward >= 0.5 else ("left", 1.0 - forward)
+        return f"It is {100 * share:.0f} % sure that you want it to run to the {way} in the video."
     x, y = weights @ points
     angle = np.arctan2(y, x)
     away = np.abs(np.angle(np.exp(1j * (np.arctan2(points[:, 1], points[:, 0]) - angle))))
     spread = np.degrees(weighted_quantiles(away, weights, (SHARE,))[0])
-    names = (
-        "right",
-        "far right",
-        "away from you",
-        "far left",
-        "left",
-        "near left",
-        "towards you",
-        "near right",
+    way = WAYS[round(angle / (np.pi / 4)) % 8]
+    return (
+        f"It believes that you mean the direction {way} in the video, give or take "
+        f"{spread:.0f} degrees."
     )
-    name = names[round(angle / (np.pi / 4)) % 8]
-    return f"It believes that you mean the direction {name} in the video, give or take {spread:.0f} degrees."
 
 
 def _points_of(model: Any, latents: np.ndarray, train_points: np.ndarray) -> np.ndarray:
@@ -140,7 +132,7 @@ def _points_of(model: Any, latents: np.ndarray, train_points: np.ndarray) -> np.
     # the rest.
     scale = np.sqrt(spread / np.maximum(spread + variances.mean(axis=0), 1e-12))
     distances = np.linalg.norm((latents[:, None, :] - means[None, :, :]) * scale, axis=2)
-    nearest = np.argsort(distances, axis=1)[:, : min(NEIGHBOURS, len(means))]
+    nearest = np.argsort(distances, axis=1)[:, :NEIGHBOURS]
     closeness = 1.0 / (np.take_along_axis(distances, nearest, axis=1) + 1e-3)
     closeness /= closeness.sum(axis=1, keepdims=True)
     return np.einsum("mk,mkp->mp", closeness, train_points[nearest])

@@ -13,42 +13,27 @@ from sb3_poem.common.files import write_atomically
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.label.store import Session, Store
 
-#: What an answer's record holds, beside the trajectories where these are asked for.
-FIELDS = (
-    *(
-        "session",
-        "source",
-        "model",
-        "env_id",
-        "seed",
-        "number",
-        "preference",
-        "undone",
-        "wish",
-        "verdict",
-    ),
-    *(
-        "asked",
-        "shown",
-        "answered",
-        "seconds",
-        "video",
-        "fps",
-        "frames",
-        "left_latent",
-        "right_latent",
-    ),
-)
+#: What an answer's record holds, beside the trajectories where these are asked for, and the types
+#: of its columns in Parquet.
+FIELDS = {
+    **{"session": "int64", "source": "string", "model": "string", "env_id": "string"},
+    **{"seed": "int64", "number": "int64", "preference": "string", "undone": "bool"},
+    **{"wish": "string", "verdict": "string", "asked": "string", "shown": "string"},
+    **{"answered": "string", "seconds": "float64", "video": "string", "fps": "float64"},
+    **{"frames": "int64", "left_latent": "list", "right_latent": "list"},
+}
+# What one session's records have in common.
+COMMON = ("model", "env_id", "seed", "options", "wish")
 
 
 def records(
     store: Store, trajectories: bool = False, undone: bool = False
 ) -> Iterator[dict[str, Any]]:
-    """The answers of all sessions.
+    """The answers of all sessions: a JSON-ready record for each, in the order in which they were
+    given.
 
     :param trajectories: Whether observations, actions and reward features are in them.
     :param undone: Whether answers that were taken back are among them.
-    :return: A JSON-ready record for each, in the order in which they were given.
     """
     for row in store.records():
         if undone or row["undone"] is None:
@@ -56,41 +41,32 @@ def records(
 
 
 def session_record(store: Store, session: Session) -> dict[str, Any]:
-    """One session, as its person downloads it.
-
-    :return: JSON-ready; it names no file of the server.
-    """
-    own = [record for record in records(store) if record["session"] == session.id]
-    common = {
-        name: getattr(session, name) for name in ("model", "env_id", "seed", "options", "wish")
-    }
-    left_out = {"session", "source", "video", *common}
+    """One session, as its person downloads it, JSON-ready; it names no file of the server."""
+    left_out = {"session", "source", "video", *COMMON}
     return {
         "format": "sb3_poem answers 1",
-        **common,
+        **{name: getattr(session, name) for name in COMMON},
         "started": _time(session.created),
         "answers": [
             {name: value for name, value in record.items() if name not in left_out}
-            for record in own
+            for record in records(store)
+            if record["session"] == session.id
         ],
     }
 
 
 def export(store: Store, path: Path, trajectories: bool = False, undone: bool = False) -> int:
-    """Write all answers.
+    """Write all answers; see :func:`records`.
 
     :param path: The file, by whose suffix they become JSON Lines (``.jsonl``) or Parquet
         (``.parquet``).
-    :param trajectories: See :func:`records`.
-    :param undone: See :func:`records`.
     :return: How many.
     :raises ValueError: If the suffix is another.
     """
     rows = list(records(store, trajectories, undone))
     if path.suffix == ".jsonl":
-        write_atomically(
-            path, "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows).encode()
-        )
+        lines = [json.dumps(row, allow_nan=False) + "\n" for row in rows]
+        write_atomically(path, "".join(lines).encode())
     elif path.suffix == ".parquet":
         write_atomically(path, _parquet(rows, trajectories))
     else:
@@ -99,36 +75,25 @@ def export(store: Store, path: Path, trajectories: bool = False, undone: bool = 
 
 
 def _record(row: sqlite3.Row, videos: Path, trajectories: bool) -> dict[str, Any]:
-    shown = {
+    sides = {
         side: Trajectory.from_dict(json.loads(row[f"{side}_trajectory"]))
         for side in ("left", "right")
     }
-    begun = row["shown"] or row["asked"]
-    record = {
-        **{
-            name: row[name]
-            for name in ("session", "source", "model", "env_id", "seed", "number", "preference")
-        },
+    own = {
         "undone": row["undone"] is not None,
-        "wish": row["wish"],
-        "verdict": row["verdict"],
         "asked": _time(row["asked"]),
         "shown": None if row["shown"] is None else _time(row["shown"]),
         "answered": _time(row["answered"]),
-        "seconds": round(row["answered"] - begun, 3),
+        "seconds": round(row["answered"] - (row["shown"] or row["asked"]), 3),
         "video": str(videos / row["video"]),
-        "fps": row["fps"],
-        "frames": row["frames"],
-        "left_latent": shown["left"].latent.tolist(),
-        "right_latent": shown["right"].latent.tolist(),
+        **{f"{side}_latent": shown.latent.tolist() for side, shown in sides.items()},
     }
-    assert tuple(record) == FIELDS
-    if trajectories:
-        for side, trajectory in shown.items():
-            record[f"{side}_observations"] = trajectory.observations.tolist()
-            record[f"{side}_actions"] = trajectory.actions.tolist()
-            features = trajectory.reward_features
-            record[f"{side}_reward_features"] = None if features is None else features.tolist()
+    record = {name: own[name] if name in own else row[name] for name in FIELDS}
+    for side, shown in sides.items() if trajectories else ():
+        record[f"{side}_observations"] = shown.observations.tolist()
+        record[f"{side}_actions"] = shown.actions.tolist()
+        features = shown.reward_features
+        record[f"{side}_reward_features"] = None if features is None else features.tolist()
     return record
 
 
@@ -140,16 +105,18 @@ def _parquet(rows: list[dict[str, Any]], trajectories: bool) -> bytes:
         raise ValueError(
             "Parquet needs pyarrow: pip install 'sb3_poem[label]', or export to .jsonl"
         ) from None
-    numbers, table = pa.list_(pa.float64()), pa.list_(pa.list_(pa.float64()))
-    types = {name: pa.string() for name in FIELDS}
-    types |= dict.fromkeys(("session", "seed", "number", "frames"), pa.int64())
-    types |= dict.fromkeys(("seconds", "fps"), pa.float64())
-    types |= {"undone": pa.bool_(), "left_latent": numbers, "right_latent": numbers}
+    numbers = pa.list_(pa.float64())
+    types = [
+        (name, numbers if kind == "list" else pa.type_for_alias(kind))
+        for name, kind in FIELDS.items()
+    ]
     if trajectories:
         parts = ("observations", "actions", "reward_features")
-        types |= {f"{side}_{part}": table for side in ("left", "right") for part in parts}
+        types += [
+            (f"{side}_{part}", pa.list_(numbers)) for side in ("left", "right") for part in parts
+        ]
     sink = pa.BufferOutputStream()
-    parquet.write_table(pa.Table.from_pylist(rows, schema=pa.schema(list(types.items()))), sink)
+    parquet.write_table(pa.Table.from_pylist(rows, schema=pa.schema(types)), sink)
     return sink.getvalue().to_pybytes()
 
 

@@ -1,10 +1,18 @@
-"""What a task family is called on the page, and how its tasks are drawn."""
+"""Which trained models a person may choose from, what their task families are called on the page,
+and how tasks are drawn.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+
+from sb3_poem.common.foreign import environment_of
+from sb3_poem.pearl_sac.saving import CONFIG, read_config
+from sb3_poem.resources import find_folder, shipped_folder
 
 
 @dataclass(frozen=True)
@@ -25,7 +33,6 @@ class View:
 class Description:
     """A family in words for somebody who does not program.
 
-    :param title: Its name.
     :param hint: What one may wish for.
     :param picture: How its tasks are drawn: "place", "speed", "direction", or "projection" of the
         latent.
@@ -42,58 +49,48 @@ class Description:
     view: View | None = None
 
 
-PLACE_HINT = (
-    "Think of a place where it should go. It cannot see the place; your answers show the way."
-)
+BLIND = "It cannot see the place; your answers show the way."
+PLACE_HINT = f"Think of a place where it should go. {BLIND}"
 SPEED_HINT = "Think of a speed at which it should run, from standing still to as fast as it can."
 WAY_HINT = "Think of the way it should run: forward or backward."
 DIRECTION_HINT = "Think of a direction in which it should walk."
-REACH_HINT = "Think of a place that its hand should reach. It cannot see the place; your answers show the way."
-BOX_HINT = "Think of a place where the box should lie in the end. It cannot see the place; your answers show the way."
+REACH_HINT = f"Think of a place that its hand should reach. {BLIND}"
+BOX_HINT = f"Think of a place where the box should lie in the end. {BLIND}"
 ARM_HINT = "Think of what its hand should do, and where."
+OTHER_HINT = "Think of what it should do. Your answers show it."
 
 # The cameras of gymnasium-robotics' Fetch (azimuth 132 and elevation -14 degrees) and of Meta-World
 # ("corner2").
 FETCH_VIEW = View((1.342, 0.749, 0.535), (0.743, 0.669, 0.0), (-0.162, 0.180, 0.970))
 SAWYER_VIEW = View((0.0, 0.6, 0.2), (0.550, 0.833, -0.058), (-0.376, 0.310, 0.873))
 
+ANT, CHEETAH, ARM = "A four-legged robot", "A running cheetah", "A robot arm"
 DESCRIPTIONS = {
     "PointGoal": Description("A dot that goes to a place", PLACE_HINT, "place", extent=1.35),
-    "HalfCheetahVel": Description("A running cheetah: how fast?", SPEED_HINT, "speed", "m/s", 3.0),
-    "HalfCheetahFwdBack": Description("A running cheetah: which way?", WAY_HINT, "direction"),
-    "AntVel": Description("A four-legged robot: how fast?", SPEED_HINT, "speed", "m/s", 3.0),
-    "AntFwdBack": Description("A four-legged robot: which way?", WAY_HINT, "direction"),
-    "AntDir2D": Description(
-        "A four-legged robot: in which direction?", DIRECTION_HINT, "direction"
-    ),
+    "HalfCheetahVel": Description(f"{CHEETAH}: how fast?", SPEED_HINT, "speed", "m/s", 3.0),
+    "HalfCheetahFwdBack": Description(f"{CHEETAH}: which way?", WAY_HINT, "direction"),
+    "AntVel": Description(f"{ANT}: how fast?", SPEED_HINT, "speed", "m/s", 3.0),
+    "AntFwdBack": Description(f"{ANT}: which way?", WAY_HINT, "direction"),
+    "AntDir2D": Description(f"{ANT}: in which direction?", DIRECTION_HINT, "direction"),
     "HumanoidDir2D": Description("A humanoid: in which direction?", DIRECTION_HINT, "direction"),
-    "AntGoal": Description(
-        "A four-legged robot that goes to a place", PLACE_HINT, "place", "m", 3.5
-    ),
+    "AntGoal": Description(f"{ANT} that goes to a place", PLACE_HINT, "place", "m", 3.5),
     "FetchReach": Description(
-        "A robot arm that reaches for a place", REACH_HINT, "place", "m", 0.3, FETCH_VIEW
+        f"{ARM} that reaches for a place", REACH_HINT, "place", "m", 0.3, FETCH_VIEW
     ),
-    "FetchPush": Description(
-        "A robot arm that pushes a box", BOX_HINT, "place", "m", 0.3, FETCH_VIEW
-    ),
+    "FetchPush": Description(f"{ARM} that pushes a box", BOX_HINT, "place", "m", 0.3, FETCH_VIEW),
     "MetaWorldML1": Description(
-        "A robot arm at a table: where?", REACH_HINT, "place", "m", 0.4, SAWYER_VIEW
+        f"{ARM} at a table: where?", REACH_HINT, "place", "m", 0.4, SAWYER_VIEW
     ),
-    "MetaWorldML10": Description(
-        "A robot arm at a table: what, and where?", ARM_HINT, "projection"
-    ),
-    "AntMaze": Description("A four-legged robot in a maze", PLACE_HINT, "place", "m", 6.5),
+    "MetaWorldML10": Description(f"{ARM} at a table: what, and where?", ARM_HINT, "projection"),
+    "AntMaze": Description(f"{ANT} in a maze", PLACE_HINT, "place", "m", 6.5),
 }
-OTHER_HINT = "Think of what it should do. Your answers show it."
 
 
 def describe(env_id: str, task_dim: int | None = None) -> Description:
-    """The description of a family.
+    """The description of a family; one that is not known here gets a general one.
 
-    :param env_id: The environment's id.
     :param task_dim: Of its tasks, if known: those of some of Meta-World's manipulations are more
         than a place.
-    :return: Its description; families that are not known here get a general one.
     """
     name = env_id.rpartition("/")[2].rpartition("-v")[0] or env_id
     description = DESCRIPTIONS.get(name, Description(name, OTHER_HINT, "projection"))
@@ -105,7 +102,6 @@ def describe(env_id: str, task_dim: int | None = None) -> Description:
 def as_points(env_id: str, tasks: np.ndarray) -> np.ndarray:
     """Tasks as points that may be averaged: places, unit vectors of directions, speeds.
 
-    :param env_id: The environment's id.
     :param tasks: (n, task_dim).
     :return: (n, 1) speeds, or (n, 2) places or unit vectors, x to the right and y upwards in the
         videos.
@@ -114,8 +110,57 @@ def as_points(env_id: str, tasks: np.ndarray) -> np.ndarray:
     picture, view = description.picture, description.view
     if view is not None:
         return (tasks - view.origin) @ np.array([view.right, view.up]).T
-    if picture == "speed" or (picture == "place" and tasks.shape[1] >= 2):
-        return tasks[:, : 1 if picture == "speed" else 2]
+    if picture == "speed":
+        return tasks[:, :1]
+    if picture == "place" and tasks.shape[1] >= 2:
+        return tasks[:, :2]
     if env_id.rpartition("/")[2].startswith(("HalfCheetahFwdBack", "AntFwdBack")):
         return np.stack([tasks[:, 0], np.zeros(len(tasks))], axis=1)
     return np.stack([np.cos(tasks[:, 0]), np.sin(tasks[:, 0])], axis=1)
+
+
+@dataclass(frozen=True)
+class ModelInfo:
+    """A trained model that a person may choose. The browser names it; it never names a file.
+
+    :param name: Unique among those of a server.
+    :param env_id: The environment in which it is shown.
+    """
+
+    name: str
+    folder: Path
+    env_id: str
+    env_kwargs: tuple[tuple[str, Any], ...] = ()
+
+    @property
+    def description(self) -> Description:
+        """The family in words."""
+        return describe(self.env_id)
+
+
+def find_models(
+    model: str | None = None, env_id: str | None = None, env_kwargs: dict[str, Any] | None = None
+) -> list[ModelInfo]:
+    """The models of a folder, by name.
+
+    :param model: A pretrained model's folder, a folder of such folders, or the name of a shipped
+        model; None takes all that are shipped.
+    :param env_id: The environment in which they are shown; None takes each model's own.
+    :param env_kwargs: Arguments of the environment, over those that each model was trained with.
+    :raises FileNotFoundError: If there is none.
+    :raises ValueError: If a model is broken, or does not say its environment.
+    """
+    root = shipped_folder("pretrained") if model is None else find_folder(model)
+    configs = [root / CONFIG] if (root / CONFIG).is_file() else sorted(root.glob(f"*/{CONFIG}"))
+    if not configs:
+        raise FileNotFoundError(
+            f"--model {model}: {root} holds no pretrained model (a folder with {CONFIG})"
+        )
+    models = []
+    for folder in (file.parent for file in configs):
+        config = read_config(folder)
+        own = config["env_id"], config["env_kwargs"]
+        shown_in, arguments = environment_of(str(folder), *own, env_id, env_kwargs)
+        folder = folder.resolve()
+        models.append(ModelInfo(folder.name, folder, shown_in, tuple(sorted(arguments.items()))))
+    return models

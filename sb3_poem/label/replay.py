@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,19 +15,11 @@ from sb3_poem.adaptation.preference import Preference
 from sb3_poem.common.rollouts import policy_actions
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.label.beliefs import belief
+from sb3_poem.label.rendering import adapter_options
 from sb3_poem.label.store import Session, Store
-from sb3_poem.label.turns import adapter_options
 
 # Latents of another model among which the one is sought that acts most like a recorded trajectory.
 N_CANDIDATES = 256
-
-
-class _Replayed:
-    """As much of an adapter as a belief is drawn from."""
-
-    def __init__(self, model: Any, inference: Any) -> None:
-        self.model = model
-        self.inference = inference
 
 
 def replay(
@@ -59,7 +53,7 @@ def replay(
     inference = made.make_inference(model, inference_rng(seed))
     translator = None if is_own else _Translator(model, np.random.default_rng([seed, 1]))
     latents, errors, foretold, decided = [inference.estimate()], [], 0, 0
-    for item in store.conversation(session.id, before=2**31):
+    for item in store.adapter_answers(session.id, before=2**31):
         preference = Preference(item["preference"])
         left, right = (Trajectory.from_dict(item[side]) for side in ("left", "right"))
         _check_fits(model, left)
@@ -72,13 +66,14 @@ def replay(
             foretold += bool(np.sign(returns[0] - returns[1]) == SIGNS[preference])
         inference.tell(preference, left, right)
         latents.append(inference.estimate())
+    replayed: Any = SimpleNamespace(model=model, inference=inference)
     return {
         "session": session.id,
         "model": session.model,
         "foretold": foretold,
         "decided": decided,
         "latents": [latent.tolist() for latent in latents],
-        "sentence": belief(_Replayed(model, inference), session.env_id)["sentence"],
+        "sentence": belief(replayed, session.env_id)["sentence"],
         "action_error": float(np.sqrt(np.mean(np.square(errors)))) if errors else None,
     }
 
@@ -89,33 +84,20 @@ class _Translator:
     def __init__(self, model: Any, rng: np.random.Generator) -> None:
         self.model = model
         training = np.asarray(model.task_latents, dtype=np.float64)
-        self.latents = np.concatenate(
-            [training, model.sample_latents(N_CANDIDATES, rng, source="aggregate")]
-        )
+        others = model.sample_latents(N_CANDIDATES, rng, source="aggregate")
+        self.latents = np.concatenate([training, others])
 
     def __call__(self, trajectory: Trajectory) -> tuple[Trajectory, float]:
-        observations = trajectory.observations[:-1]
-        errors = [
-            float(
-                np.sqrt(
-                    np.mean(np.square(self._actions(observations, latent) - trajectory.actions))
-                )
-            )
-            for latent in self.latents
-        ]
+        errors = [self._error(trajectory, latent) for latent in self.latents]
         best = int(np.argmin(errors))
-        moved = Trajectory(
-            trajectory.observations,
-            trajectory.actions,
-            self.latents[best].copy(),
-            trajectory.reward_features,
-        )
-        return moved, errors[best]
+        return replace(trajectory, latent=self.latents[best].copy()), errors[best]
 
-    def _actions(self, observations: np.ndarray, latent: np.ndarray) -> np.ndarray:
-        return policy_actions(
-            self.model, observations, np.tile(latent, (len(observations), 1)), deterministic=True
-        )
+    def _error(self, trajectory: Trajectory, latent: np.ndarray) -> float:
+        """Root mean squared, of the actions."""
+        observations = trajectory.observations[:-1]
+        latents = np.tile(latent, (len(observations), 1))
+        actions = policy_actions(self.model, observations, latents, deterministic=True)
+        return float(np.sqrt(np.mean(np.square(actions - trajectory.actions))))
 
 
 def _check_fits(model: Any, trajectory: Trajectory) -> None:
@@ -123,6 +105,6 @@ def _check_fits(model: Any, trajectory: Trajectory) -> None:
     taken = (model.observation_space.shape[0], model.action_space.shape[0])
     if shown != taken:
         raise ValueError(
-            f"the recorded trajectories have {shown[0]} observations and {shown[1]} actions, but the model takes {taken[0]} "
-            f"and {taken[1]}; replay to a model of the same robot"
+            f"the recorded trajectories have {shown[0]} observations and {shown[1]} actions, but "
+            f"the model takes {taken[0]} and {taken[1]}; replay to a model of the same robot"
         )

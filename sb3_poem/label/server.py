@@ -1,18 +1,26 @@
-"""The web server: the start page, the page of a conversation, and the few requests that it makes."""
+"""The web server: the start page, the page of a conversation, the few requests that it makes, and
+running it all, until it is stopped or in a thread beside a notebook.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import ipaddress
 import json
 import logging
 import re
+import socket
+import threading
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs
 
 import jinja2
+import uvicorn
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
@@ -28,182 +36,163 @@ from starlette.responses import (
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from sb3_poem.label.access import Access, Gate
+from sb3_poem.adaptation.policy import AdaptedPolicy
+from sb3_poem.label.access import DEADLINE, Access, AccessMiddleware, Connection
 from sb3_poem.label.export import session_record
 from sb3_poem.label.families import describe
-from sb3_poem.label.sessions import Conversations, FullError
+from sb3_poem.label.rendering import StorageError
+from sb3_poem.label.sessions import FullError, SessionManager
 from sb3_poem.label.store import RefusedError, Session
-from sb3_poem.label.videos import StorageError
 
 _logger = logging.getLogger(__name__)
 
 PAGE = Path(__file__).with_name("page")
-MAX_WISH = 2000
+MAX_WISH = 2000  # characters
 LONGEST_TOKEN = 64
 DISK_FULL = (
-    "This could not be kept: the disk of this server is full, or cannot be written. What you answered before is safe; "
-    "tell whoever runs the page, and try again when there is room."
+    "This could not be kept: the disk of this server is full, or cannot be written. What you "
+    "answered before is safe; tell whoever runs the page, and try again when there is room."
 )
-# SQLite's whole numbers.
-LARGEST = 2**63 - 1
+LARGEST = 2**63 - 1  # of SQLite's whole numbers
+# Addresses of nobody, to ask the system from which of its own it would speak to the world.
+ELSEWHERE = {socket.AF_INET: "192.0.2.1", socket.AF_INET6: "2001:db8::1"}
+
+SessionEndpoint = Callable[[Request, Session], Awaitable[Response]]
 
 
-def make_app(conversations: Conversations, access: Access | None = None) -> Starlette:
-    """The application.
+def make_app(sessions: SessionManager, access: Access | None = None) -> Starlette:
+    """The ASGI application.
 
-    :param conversations: The sessions that it serves; they are closed with it.
+    :param sessions: Those that it serves; their queue is closed with it.
     :param access: Who gets in; None lets in who reaches the server by a name of this machine.
-    :return: An ASGI application.
     """
-    return _Pages(conversations).application(Access() if access is None else access)
+    return _Pages(sessions).application(access or Access())
 
 
 class _Pages:
-    def __init__(self, conversations: Conversations) -> None:
-        self.conversations = conversations
+    def __init__(self, sessions: SessionManager) -> None:
+        self.sessions = sessions
+        self.store = sessions.store
         self.templates = jinja2.Environment(loader=jinja2.FileSystemLoader(PAGE), autoescape=True)
 
     def application(self, access: Access) -> Starlette:
-        routes = [
-            Route("/", self.start_page),
-            Route("/start", self.start, methods=["POST"]),
-            Route("/s/{token}", self.page),
-            Route("/s/{token}/state", self.session(self.state)),
-            Route("/s/{token}/answer", self.session(self.answer), methods=["POST"]),
-            Route("/s/{token}/undo", self.session(self.undo), methods=["POST"]),
-            Route("/s/{token}/stop", self.session(self.stop), methods=["POST"]),
-            Route("/s/{token}/verdict", self.session(self.verdict), methods=["POST"]),
-            Route("/s/{token}/wish", self.session(self.wish), methods=["POST"]),
-            Route("/s/{token}/video/{number}", self.session(self.video)),
-            Route("/s/{token}/answers.json", self.session(self.answers)),
-            Route("/s/{token}/policy.safetensors", self.session(self.policy)),
-            Mount("/static", StaticFiles(directory=PAGE / "static")),
-        ]
+        store, post = self.store, self.action
         app = Starlette(
-            routes=routes,
-            middleware=[Middleware(Gate, access=access)],
+            routes=[
+                Route("/", self.start_page),
+                Route("/start", self.start, methods=["POST"]),
+                self.route("", self.page),
+                self.route("/state", self.state),
+                post("/answer", store.add_answer, question=int, preference=str),
+                post("/undo", store.undo, answered=int),
+                post("/stop", store.stop),
+                post("/verdict", store.judge, result=int, verdict=str),
+                self.route("/wish", self.wish, "POST"),
+                self.route("/video/{number}", self.video),
+                self.route("/answers.json", self.answers),
+                self.route("/policy.safetensors", self.policy),
+                Mount("/static", StaticFiles(directory=PAGE / "static")),
+            ],
+            middleware=[Middleware(AccessMiddleware, access=access)],
             exception_handlers=dict.fromkeys(
-                (HTTPException, RefusedError, FullError, StorageError), _say
+                (HTTPException, RefusedError, FullError, StorageError), _error_response
             ),
             lifespan=self.lifespan,
         )
         app.router.redirect_slashes = False  # to http://, behind a proxy with TLS
         return app
 
+    def route(self, path: str, endpoint: SessionEndpoint, method: str = "GET") -> Route:
+        """Of requests that belong to the session of the address's token."""
+
+        async def find_session(request: Request) -> Response:
+            token = request.path_params["token"]
+            session = await self.sessions.find(token) if len(token) <= LONGEST_TOKEN else None
+            if session is None:
+                await asyncio.sleep(0.05)
+                raise HTTPException(404, "There is no conversation under this link. Is it whole?")
+            return await endpoint(request, session)
+
+        return Route(f"/s/{{token}}{path}", find_session, methods=[method])
+
+    def action(self, path: str, change: Callable[..., object], **fields: type) -> Route:
+        """Of requests whose fields change the session in the store; the answer is what is shown
+        next.
+        """
+
+        async def act(request: Request, session: Session) -> Response:
+            data = await _fields(request, **fields)
+            await asyncio.to_thread(change, session.id, **data)
+            return await self.state(request, session)
+
+        return self.route(path, act, "POST")
+
     @contextlib.asynccontextmanager
     async def lifespan(self, _: Starlette) -> AsyncIterator[None]:
-        self.conversations.workshop.prepare()
+        self.sessions.queue.prepare()
         yield
-        await self.conversations.workshop.close()
+        await self.sessions.queue.close()
 
     async def start_page(self, _: Request) -> Response:
-        choices = list(self.conversations.catalogue.values())
-        return self._html("start.html", choices=choices, n_queries=self.conversations.n_queries)
+        models, n_queries = list(self.sessions.models.values()), self.sessions.n_queries
+        return self._html("start.html", models=models, n_queries=n_queries)
 
     async def start(self, request: Request) -> Response:
         fields = parse_qs((await request.body()).decode("utf-8", "replace"))
-        token = await self.conversations.begin(fields.get("model", [""])[0])
+        token = await self.sessions.begin(fields.get("model", [""])[0])
         return RedirectResponse(f"/s/{token}", 303)
 
-    async def page(self, request: Request) -> Response:
-        session = await self._find(request)
+    async def page(self, _: Request, session: Session) -> Response:
+        description = describe(session.env_id)
         return self._html(
-            "session.html", session=session, description=describe(session.env_id), max_wish=MAX_WISH
+            "session.html", session=session, description=description, max_wish=MAX_WISH
         )
-
-    def session(
-        self, handler: Callable[[Request, Session], Awaitable[Response]]
-    ) -> Callable[[Request], Awaitable[Response]]:
-        """A handler of requests that belong to the session of the address's token."""
-
-        async def handle(request: Request) -> Response:
-            return await handler(request, await self._find(request))
-
-        return handle
 
     async def state(self, _: Request, session: Session) -> Response:
-        return JSONResponse(await self.conversations.view(session))
-
-    async def answer(self, request: Request, session: Session) -> Response:
-        data = await _fields(request, question=int, preference=str)
-        await self.conversations.answer(session, data["question"], data["preference"])
-        return JSONResponse(await self.conversations.view(session))
-
-    async def undo(self, request: Request, session: Session) -> Response:
-        data = await _fields(request, answered=int)
-        await asyncio.to_thread(self.conversations.store.undo, session.id, data["answered"])
-        return JSONResponse(await self.conversations.view(session))
-
-    async def stop(self, request: Request, session: Session) -> Response:
-        await _fields(request)
-        await asyncio.to_thread(self.conversations.store.stop, session.id)
-        return JSONResponse(await self.conversations.view(session))
-
-    async def verdict(self, request: Request, session: Session) -> Response:
-        data = await _fields(request, result=int, verdict=str)
-        if data["verdict"] not in ("yes", "not quite"):
-            raise RefusedError('a verdict must be "yes" or "not quite"')
-        await asyncio.to_thread(
-            self.conversations.store.judge, session.id, data["result"], data["verdict"]
-        )
-        return JSONResponse(await self.conversations.view(session))
+        return JSONResponse(await self.sessions.view(session))
 
     async def wish(self, request: Request, session: Session) -> Response:
         data = await _fields(request, wish=str)
         if len(data["wish"]) > MAX_WISH:
             raise RefusedError(f"what you wish for may be {MAX_WISH} characters long at most")
-        await asyncio.to_thread(self.conversations.store.set_wish, session.id, data["wish"])
+        await asyncio.to_thread(self.store.set_wish, session.id, data["wish"])
         return JSONResponse({})
 
     async def video(self, request: Request, session: Session) -> Response:
-        number = re.fullmatch("[0-9]{1,18}", request.path_params["number"])
-        path = (
-            None
-            if number is None
-            else await asyncio.to_thread(self.conversations.video, session, int(number[0]))
-        )
+        number, path = request.path_params["number"], None
+        if re.fullmatch("[0-9]{1,18}", number):
+            path = await asyncio.to_thread(self.sessions.video, session, int(number))
         if path is None:
             raise HTTPException(404)
         # What a turn shows never changes, and only this browser may keep it.
-        return FileResponse(
-            path,
-            media_type="video/mp4",
-            headers={"Cache-Control": "private, max-age=86400, immutable"},
-        )
+        caching = {"Cache-Control": "private, max-age=86400, immutable"}
+        return FileResponse(path, media_type="video/mp4", headers=caching)
 
     async def answers(self, _: Request, session: Session) -> Response:
-        record = await asyncio.to_thread(session_record, self.conversations.store, session)
+        record = await asyncio.to_thread(session_record, self.store, session)
         text = json.dumps(record, indent=1, allow_nan=False) + "\n"
-        headers = {"Content-Disposition": 'attachment; filename="answers.json"'}
-        return Response(text, media_type="application/json", headers=headers)
+        return _download(text, "answers.json", "application/json")
 
     async def policy(self, _: Request, session: Session) -> Response:
         content = await asyncio.to_thread(self._adapted_policy, session)
-        headers = {"Content-Disposition": 'attachment; filename="adapted_policy.safetensors"'}
-        return Response(content, media_type="application/octet-stream", headers=headers)
+        return _download(content, "adapted_policy.safetensors", "application/octet-stream")
 
     def _adapted_policy(self, session: Session) -> bytes:
-        from sb3_poem.adaptation.policy import AdaptedPolicy
-
-        answered = len(self.conversations.store.answers(session.id))
-        turn = self.conversations.store.turn(session.id, "result", answered)
-        choice = self.conversations.catalogue.get(session.model)
-        if turn is None or choice is None:
+        answered = len(self.store.answers(session.id))
+        turn = self.store.turn(session.id, "result", answered)
+        info = self.sessions.models.get(session.model)
+        if turn is None or info is None:
             raise RefusedError("the policy can be downloaded once its result is shown")
-        return AdaptedPolicy(
-            self.conversations.load(choice), json.loads(turn["latent"]), answered
-        ).to_bytes()
-
-    async def _find(self, request: Request) -> Session:
-        token = request.path_params["token"]
-        session = await self.conversations.find(token) if len(token) <= LONGEST_TOKEN else None
-        if session is None:
-            await asyncio.sleep(0.05)
-            raise HTTPException(404, "There is no conversation under this link. Is it whole?")
-        return session
+        model = self.sessions.load(info)
+        return AdaptedPolicy(model, json.loads(turn["latent"]), answered).to_bytes()
 
     def _html(self, name: str, **values: Any) -> HTMLResponse:
         return HTMLResponse(self.templates.get_template(name).render(**values))
+
+
+def _download(content: str | bytes, name: str, media_type: str) -> Response:
+    headers = {"Content-Disposition": f'attachment; filename="{name}"'}
+    return Response(content, media_type=media_type, headers=headers)
 
 
 async def _fields(request: Request, **kinds: type) -> dict[str, Any]:
@@ -215,22 +204,22 @@ async def _fields(request: Request, **kinds: type) -> dict[str, Any]:
     except (ValueError, RecursionError):
         raise HTTPException(400, "the request is not JSON") from None
     if not isinstance(data, dict) or set(data) != set(kinds):
-        raise HTTPException(
-            400, f"the request must be a JSON object with {', '.join(kinds) or 'no fields'}"
-        )
+        names = ", ".join(kinds) or "no fields"
+        raise HTTPException(400, f"the request must be a JSON object with {names}")
     for name, kind in kinds.items():
-        if type(data[name]) is not kind or (kind is int and not 0 <= data[name] <= LARGEST):
-            raise HTTPException(
-                400, f"`{name}` must be {'a whole number' if kind is int else 'a text'}"
-            )
-        if kind is str and any("\ud800" <= character <= "\udfff" for character in data[name]):
+        value: Any = data[name]
+        is_kind = isinstance(value, kind) and not isinstance(value, bool)
+        if not is_kind or (kind is int and not 0 <= value <= LARGEST):
+            what = "a whole number" if kind is int else "a text"
+            raise HTTPException(400, f"`{name}` must be {what}")
+        if kind is str and any("\ud800" <= character <= "\udfff" for character in value):
             raise HTTPException(400, f"`{name}` holds half a character (a lone surrogate)")
     return data
 
 
-async def _say(request: Request, error: Exception) -> Response:
+async def _error_response(request: Request, error: Exception) -> Response:
     """A sentence: plain for who sees it as a page, else JSON."""
-    words, headers = str(error), None
+    words, status, headers = str(error), 409, None
     if isinstance(error, HTTPException):
         words, status, headers = error.detail, error.status_code, error.headers
     elif isinstance(error, StorageError):
@@ -238,8 +227,89 @@ async def _say(request: Request, error: Exception) -> Response:
         words, status = DISK_FULL, 507
     elif isinstance(error, FullError):
         status, headers = 503, {"Retry-After": "60"}
-    else:
-        status = 409
     if "text/html" in request.headers.get("accept", ""):
         return PlainTextResponse(f"{words}\n", status, headers)
     return JSONResponse({"error": words}, status, headers)
+
+
+def make_server(app: Starlette, host: str, port: int, deadline: float = DEADLINE) -> uvicorn.Server:
+    """A server, not yet running.
+
+    :param deadline: Seconds that a client has for a request.
+    """
+    config = uvicorn.Config(
+        app,
+        host=host,
+        port=port,
+        access_log=False,  # the addresses of sessions are their keys
+        log_level="warning",
+        server_header=False,
+        proxy_headers=False,  # nothing depends on what they say
+        http=partial(Connection, deadline=deadline),  # type: ignore[arg-type]
+        ws="none",
+        timeout_keep_alive=15,
+        timeout_graceful_shutdown=3,
+    )
+    return uvicorn.Server(config)
+
+
+def bind(host: str, port: int) -> socket.socket:
+    """Take a port before anything else is started; who comes meanwhile waits, and is not turned
+    away.
+
+    :param port: 0 takes a free one.
+    :raises ValueError: If there is no such port.
+    :raises OSError: If it is taken, or the address is not this machine's.
+    """
+    if not 0 <= port <= 65535:
+        raise ValueError(f"--port {port}: must be between 0 and 65535")
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    both = family is socket.AF_INET6 and socket.has_dualstack_ipv6()
+    try:
+        return socket.create_server(
+            (host.strip("[]"), port), family=family, backlog=128, dualstack_ipv6=both
+        )
+    except OSError as error:
+        raise OSError(f"--host {host} --port {port}: {error.strerror or error}") from error
+
+
+def link_host(listener: socket.socket, host: str) -> str:
+    """The host of a link to a server: the address that was asked for; for one that stands for all
+    of this machine's, such as ``0.0.0.0``, one at which the machine is reached.
+    """
+    if not ipaddress.ip_address(listener.getsockname()[0]).is_unspecified:
+        return host.strip("[]")
+    for family in (listener.family, socket.AF_INET):  # an IPv6 socket takes IPv4 too
+        with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
+            probe.connect((ELSEWHERE[family], 9))  # sends nothing
+            return str(probe.getsockname()[0])
+    return "localhost"
+
+
+class BackgroundServer:
+    """A server on loopback in a thread of its own.
+
+    :param port: 0 takes a free one.
+    :param deadline: Seconds that a client has for a request.
+    :raises RuntimeError: If it does not start.
+    """
+
+    def __init__(self, app: Starlette, port: int = 0, deadline: float = DEADLINE) -> None:
+        self._listener = bind("127.0.0.1", port)
+        self.port: int = self._listener.getsockname()[1]
+        self._server = make_server(app, "127.0.0.1", self.port, deadline)
+        self._thread = threading.Thread(
+            target=self._server.run, args=([self._listener],), daemon=True
+        )
+        self._thread.start()
+        give_up = time.monotonic() + 10.0
+        while not self._server.started:
+            if not self._thread.is_alive() or time.monotonic() > give_up:
+                raise RuntimeError(f"the page's server did not start on port {self.port}")
+            time.sleep(0.01)
+
+    def close(self) -> None:
+        """Stop it."""
+        self._server.should_exit = True
+        self._thread.join(timeout=10.0)
+        self._listener.close()

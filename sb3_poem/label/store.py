@@ -7,18 +7,21 @@ from __future__ import annotations
 import hashlib
 import json
 import secrets
+import shutil
 import sqlite3
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from sb3_poem.label.turns import Turn
-from sb3_poem.label.videos import StorageError
+from sb3_poem.adaptation.human import HumanAnswer
+from sb3_poem.label.rendering import StorageError, Turn
 
+PREFERENCES = ("left", "right", "equal")
+VERDICTS = ("yes", "not quite")
 SCHEMA_VERSION = 1
 SCHEMA = """
 CREATE TABLE sessions (
@@ -81,10 +84,9 @@ class Session:
     :param id: Its number.
     :param source: "page", "notebook" or "terminal".
     :param model: The model's name.
-    :param env_id: The environment's id.
     :param seed: Of the adaptation.
-    :param options: Of the adaptation.
-    :param step: Questions between results.
+    :param options: Of the adaptation, JSON-ready.
+    :param step: Questions before the first result, and between results.
     :param target: The next result comes after so many answers.
     :param stopped: Whether the person asked for the result before.
     :param wish: In the person's own words.
@@ -106,9 +108,11 @@ class Session:
 
 class Store:
     """The store. One connection, used by one thread at a time; several processes may open the same
-    file.
+    file. Sessions, turns and answers are named by their numbers, and a turn's place by the number
+    of answers before it.
 
-    Each method raises :class:`~sb3_poem.label.videos.StorageError` if the disk is full or broken.
+    Each method raises :class:`~sb3_poem.label.rendering.StorageError` if the disk is full or
+    broken.
 
     :param folder: Where; it is made if missing, for its owner alone. ``answers.sqlite`` is the
         store, ``videos/`` holds the videos.
@@ -122,7 +126,7 @@ class Store:
         self.videos.mkdir(mode=0o700, exist_ok=True)
         self.path = self.folder / "answers.sqlite"
         self._lock = threading.RLock()
-        with self._speaking():
+        with self._locked():
             self._connection = sqlite3.connect(
                 self.path, timeout=30.0, isolation_level=None, check_same_thread=False
             )
@@ -146,49 +150,34 @@ class Store:
         step: int = 10,
         source: str = "page",
     ) -> tuple[Session, str]:
-        """Begin a conversation.
+        """Begin a conversation; see :class:`Session`.
 
-        :param model: The model's name.
-        :param env_id: The environment's id.
-        :param seed: Of the adaptation.
-        :param options: Of the adaptation, JSON-ready.
-        :param step: Questions before the first result, and between results.
-        :param source: "page", "notebook" or "terminal".
         :return: The session, and the token of its link, of which only a hash is kept.
         """
         token = secrets.token_urlsafe(32)
-        row = (
-            _hash(token),
-            source,
-            model,
-            env_id,
-            seed,
-            json.dumps(options),
-            step,
-            step,
-            time.time(),
-        )
-        columns = "token_hash, source, model, env_id, seed, options, step, target, created"
-        with self._transaction() as connection:
-            cursor = connection.execute(
-                f"INSERT INTO sessions ({columns}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", row
+        with self._transaction():
+            number = self._insert(
+                "sessions",
+                token_hash=_hash(token),
+                source=source,
+                model=model,
+                env_id=env_id,
+                seed=seed,
+                options=json.dumps(options),
+                step=step,
+                target=step,
+                created=time.time(),
             )
-        assert cursor.lastrowid is not None
-        return self.session(cursor.lastrowid), token
+        return self.session(number), token
 
     def find(self, token: str) -> Session | None:
-        """The session of a link.
-
-        :param token: The link's token.
-        :return: The session, or None.
-        """
+        """The session of a link's token, if there is one."""
         row = self._one("SELECT * FROM sessions WHERE token_hash = ?", _hash(token))
         return None if row is None else _session(row)
 
     def session(self, number: int) -> Session:
         """A session.
 
-        :return: The session.
         :raises KeyError: If there is none.
         """
         row = self._one("SELECT * FROM sessions WHERE id = ?", number)
@@ -201,47 +190,34 @@ class Store:
         return [_session(row) for row in self._all("SELECT * FROM sessions ORDER BY id")]
 
     def answers(self, session: int) -> list[sqlite3.Row]:
-        """The answers in force, in order.
-
-        :param session: The session's number.
-        :return: Rows of ``answers``.
-        """
+        """The rows of the answers in force, in order."""
         return self._all(
             "SELECT * FROM answers WHERE session = ? AND undone IS NULL ORDER BY number", session
         )
 
     def turn(self, session: int, kind: str, number: int) -> sqlite3.Row | None:
-        """A turn that counts, without what is large.
+        """The row of a turn that counts, if there is one, without what is large.
 
-        :param session: The session's number.
         :param kind: "question" or "result".
-        :param number: Answers before it.
-        :return: The row, or None.
         """
-        columns = (
-            "id, session, kind, number, belief, latent, video, fps, frames, created, shown, verdict"
+        return self._one(
+            "SELECT id, session, kind, number, belief, latent, video, fps, frames, created, shown, "
+            "verdict FROM turns WHERE session = ? AND kind = ? AND number = ? AND dropped IS NULL",
+            *(session, kind, number),
         )
-        query = f"SELECT {columns} FROM turns WHERE session = ? AND kind = ? AND number = ? AND dropped IS NULL"
-        return self._one(query, session, kind, number)
 
     def whole_turn(self, turn: int) -> sqlite3.Row | None:
-        """All of a turn, whether it counts or not.
-
-        :param turn: Its number.
-        :return: The row, or None.
-        """
+        """The whole row of a turn, whether it counts or not."""
         return self._one("SELECT * FROM turns WHERE id = ?", turn)
 
-    def conversation(self, session: int, before: int) -> list[dict[str, Any]]:
-        """The first answers with their trajectories, as an adapter's dictionary holds them.
-
-        :param session: The session's number.
-        :param before: How many.
-        :return: ``preference``, ``left`` and ``right`` of each.
+    def adapter_answers(self, session: int, before: int) -> list[dict[str, Any]]:
+        """The first so many answers with their trajectories, as an adapter's dictionary holds them:
+        ``preference``, ``left`` and ``right`` of each.
         """
-        query = """SELECT answers.preference, turns.left_trajectory, turns.right_trajectory FROM answers
-            JOIN turns ON turns.id = answers.question
-            WHERE answers.session = ? AND answers.undone IS NULL AND answers.number < ? ORDER BY answers.number"""
+        query = """SELECT answers.preference, turns.left_trajectory, turns.right_trajectory
+            FROM answers JOIN turns ON turns.id = answers.question
+            WHERE answers.session = ? AND answers.undone IS NULL AND answers.number < ?
+            ORDER BY answers.number"""
         return [
             {"preference": row[0], "left": json.loads(row[1]), "right": json.loads(row[2])}
             for row in self._all(query, session, before)
@@ -257,80 +233,65 @@ class Store:
         video: str,
         created: float | None = None,
         shown: float | None = None,
-    ) -> bool:
+    ) -> int | None:
         """Keep a turn, if the conversation still is where it was made for, and it has not been kept
         already.
 
-        :param session: The session's number.
-        :param kind: "question" or "result".
-        :param number: Answers before it.
-        :param last_answer: The number in the store of the last of these; None at the start.
+        :param last_answer: The last of the answers before it; None at the start.
         :param video: Its file's name within ``videos/``.
         :param created: When it was made, seconds since 1970; None is now.
         :param shown: When it was shown; None is not yet.
-        :return: Whether it was kept.
+        :return: The turn's number; None if it was not kept.
         """
-        columns = "session, kind, number, state, left_trajectory, right_trajectory, belief, latent, video, fps, frames, created"
-        columns += ", shown"
-        contents = map(_json, (turn.state, turn.left, turn.right, turn.belief, turn.latent))
-        made = time.time() if created is None else created
-        row: tuple[Any, ...] = (
-            session,
-            kind,
-            number,
-            *contents,
-            video,
-            turn.fps,
-            turn.frames,
-            made,
-            shown,
-        )
-        with self._transaction() as connection:
+        with self._transaction():
             here = [answer["id"] for answer in self.answers(session)]
-            if (
-                here[number - 1] if 0 < number <= len(here) else None
-            ) != last_answer or number > len(here):
-                return False
+            if number > len(here) or (here[number - 1] if number else None) != last_answer:
+                return None
             if self.turn(session, kind, number) is not None:
-                return False
-            connection.execute(
-                f"INSERT INTO turns ({columns}) VALUES ({', '.join('?' * len(row))})", row
+                return None
+            return self._insert(
+                "turns",
+                session=session,
+                kind=kind,
+                number=number,
+                state=_json(turn.state),
+                left_trajectory=_json(turn.left),
+                right_trajectory=_json(turn.right),
+                belief=_json(turn.belief),
+                latent=_json(turn.latent),
+                video=video,
+                fps=turn.fps,
+                frames=turn.frames,
+                created=time.time() if created is None else created,
+                shown=shown,
             )
-        return True
 
     def mark_shown(self, turn: int) -> None:
-        """Note that a turn has been shown, the first time.
-
-        :param turn: Its number.
-        """
-        with self._transaction() as connection:
-            connection.execute(
+        """Note that a turn has been shown, the first time."""
+        with self._transaction() as execute:
+            execute(
                 "UPDATE turns SET shown = ? WHERE id = ? AND shown IS NULL", (time.time(), turn)
             )
 
     def note_film(self, turn: int, fps: float, frames: int) -> None:
-        """Note how a turn's video moves that was filmed again.
-
-        :param turn: Its number.
-        :param fps: Frames per second.
-        :param frames: How many.
-        """
-        with self._transaction() as connection:
-            connection.execute(
-                "UPDATE turns SET fps = ?, frames = ? WHERE id = ?", (fps, frames, turn)
-            )
+        """Note how a turn's video moves that was filmed again."""
+        with self._transaction() as execute:
+            execute("UPDATE turns SET fps = ?, frames = ? WHERE id = ?", (fps, frames, turn))
 
     def add_answer(self, session: int, question: int, preference: str) -> int:
         """Keep an answer. Once this returns, it is on the disk. The same answer again is no second
         one.
 
-        :param session: The session's number.
-        :param question: The number of the question's turn.
+        :param question: The question's turn.
         :param preference: "left", "right" or "equal".
-        :return: The answer's number in the store.
-        :raises RefusedError: If that question is not the one that waits.
+        :return: The answer's number.
+        :raises RefusedError: If it is no answer, or that question is not the one that waits.
         """
-        with self._transaction() as connection:
+        if preference not in PREFERENCES:
+            raise RefusedError(
+                f'an answer must be "left", "right" or "equal", but is {preference[:20]!r}'
+            )
+        with self._transaction():
             answers = self.answers(session)
             for answer in answers:
                 if answer["question"] == question and answer["preference"] == preference:
@@ -343,100 +304,95 @@ class Store:
             about = self.session(session)
             if about.stopped or len(answers) >= about.target:
                 raise RefusedError("the questions are over for now; the result is shown")
-            cursor = connection.execute(
-                "INSERT INTO answers (session, question, number, preference, created) VALUES (?, ?, ?, ?, ?)",
-                (session, question, len(answers), preference, time.time()),
+            return self._insert(
+                "answers",
+                session=session,
+                question=question,
+                number=len(answers),
+                preference=preference,
+                created=time.time(),
             )
-        assert cursor.lastrowid is not None
-        return cursor.lastrowid
 
     def undo(self, session: int, answered: int) -> None:
         """Take the last answer back; or, after an early stop, go back to the question that waited.
 
-        :param session: The session's number.
         :param answered: How many answers there were where the undo was asked for; so that a
             repeated one takes back no more.
         :raises RefusedError: If there is nothing to take back, or the conversation is somewhere
             else by now.
         """
-        with self._transaction() as connection:
+        with self._transaction() as execute:
             answers = self.answers(session)
             if answered != len(answers):
                 raise RefusedError("the conversation has moved on; look again at the page")
             if self.session(session).stopped:
-                connection.execute("UPDATE sessions SET stopped = 0 WHERE id = ?", (session,))
+                execute("UPDATE sessions SET stopped = 0 WHERE id = ?", (session,))
                 return
             if not answers:
                 raise RefusedError("there is no answer to take back")
             now = time.time()
-            connection.execute(
-                "UPDATE answers SET undone = ? WHERE id = ?", (now, answers[-1]["id"])
-            )
-            connection.execute(
-                "UPDATE turns SET dropped = ? WHERE session = ? AND number >= ? AND dropped IS NULL",
+            execute("UPDATE answers SET undone = ? WHERE id = ?", (now, answers[-1]["id"]))
+            execute(
+                "UPDATE turns SET dropped = ? "
+                "WHERE session = ? AND number >= ? AND dropped IS NULL",
                 (now, session, answered),
             )
 
     def stop(self, session: int) -> None:
-        """Show the result after the answers so far.
-
-        :param session: The session's number.
-        """
-        with self._transaction() as connection:
-            connection.execute("UPDATE sessions SET stopped = 1 WHERE id = ?", (session,))
+        """Show the result after the answers so far."""
+        with self._transaction() as execute:
+            execute("UPDATE sessions SET stopped = 1 WHERE id = ?", (session,))
 
     def judge(self, session: int, result: int, verdict: str) -> None:
         """Keep what the person says of a result; "not quite" asks for more questions. The same
         verdict again changes nothing.
 
-        :param session: The session's number.
-        :param result: The number of the result's turn.
+        :param result: The result's turn.
         :param verdict: "yes" or "not quite".
-        :raises RefusedError: If that result is not the one that is shown.
+        :raises RefusedError: If it is no verdict, or that result is not the one that is shown.
         """
-        with self._transaction() as connection:
+        if verdict not in VERDICTS:
+            raise RefusedError('a verdict must be "yes" or "not quite"')
+        with self._transaction() as execute:
             about, answered = self.session(session), len(self.answers(session))
             current = self.turn(session, "result", answered)
-            if (
-                current is None
-                or current["id"] != result
-                or not (about.stopped or answered >= about.target)
-            ):
+            is_over = about.stopped or answered >= about.target
+            if current is None or current["id"] != result or not is_over:
                 raise RefusedError(
                     "this result is not the one that is shown; look again at the page"
                 )
-            connection.execute(
+            execute(
                 "UPDATE turns SET verdict = ?, verdict_time = ? WHERE id = ?",
                 (verdict, time.time(), result),
             )
             if verdict == "not quite":
-                connection.execute(
+                execute(
                     "UPDATE sessions SET stopped = 0, target = ? WHERE id = ?",
                     (answered + about.step, session),
                 )
 
     def set_wish(self, session: int, wish: str) -> None:
-        """Keep what the person wants, in their own words.
+        """Keep what the person wants, in their own words."""
+        with self._transaction() as execute:
+            execute("UPDATE sessions SET wish = ? WHERE id = ?", (wish, session))
 
-        :param session: The session's number.
-        :param wish: The words.
-        """
-        with self._transaction() as connection:
-            connection.execute("UPDATE sessions SET wish = ? WHERE id = ?", (wish, session))
-
-    def records(self) -> Iterator[sqlite3.Row]:
+    def records(self) -> list[sqlite3.Row]:
         """All answers of all sessions with their questions, those that were taken back too, in the
         order of time.
         """
-        query = """SELECT sessions.id AS session, sessions.source, sessions.model, sessions.env_id, sessions.seed,
-            sessions.options, sessions.wish, answers.number, answers.preference, answers.created AS answered,
-            answers.undone, turns.created AS asked, turns.shown, turns.video, turns.fps, turns.frames,
-            turns.left_trajectory, turns.right_trajectory,
-            (SELECT results.verdict FROM turns AS results WHERE results.session = sessions.id AND results.kind = 'result'
-                AND results.verdict IS NOT NULL AND results.dropped IS NULL ORDER BY results.number DESC LIMIT 1) AS verdict
-            FROM answers JOIN sessions ON sessions.id = answers.session JOIN turns ON turns.id = answers.question
+        return self._all(
+            """SELECT sessions.id AS session, sessions.source, sessions.model, sessions.env_id,
+                sessions.seed, sessions.options, sessions.wish, answers.number, answers.preference,
+                answers.created AS answered, answers.undone, turns.created AS asked, turns.shown,
+                turns.video, turns.fps, turns.frames, turns.left_trajectory, turns.right_trajectory,
+                (SELECT results.verdict FROM turns AS results
+                    WHERE results.session = sessions.id AND results.kind = 'result'
+                    AND results.verdict IS NOT NULL AND results.dropped IS NULL
+                    ORDER BY results.number DESC LIMIT 1) AS verdict
+            FROM answers JOIN sessions ON sessions.id = answers.session
+                JOIN turns ON turns.id = answers.question
             ORDER BY answers.id"""
-        yield from self._all(query)
+        )
 
     def remove_orphans(self) -> int:
         """Delete videos that no turn names: rendered ahead for an answer that was not given, or cut
@@ -445,54 +401,54 @@ class Store:
         :return: How many.
         """
         kept = {row["video"] for row in self._all("SELECT video FROM turns")}
-        orphans = [
-            file for file in self.videos.iterdir() if file.is_file() and file.name not in kept
-        ]
+        files = [file for file in self.videos.iterdir() if file.is_file()]
+        orphans = [file for file in files if file.name not in kept]
         for file in orphans:
             file.unlink(missing_ok=True)
         return len(orphans)
 
     @contextmanager
-    def _speaking(self) -> Iterator[None]:
+    def _locked(self) -> Iterator[None]:
         """One thread at a time, and SQLite's errors as sentences."""
         with self._lock:
             try:
                 yield
             except sqlite3.DatabaseError as error:
                 hint = " (is the disk full?)" if "disk I/O" in str(error) else ""
-                raise StorageError(
-                    f"{self.path} cannot be read or written: {error}{hint}"
-                ) from error
+                words = f"{self.path} cannot be read or written: {error}{hint}"
+                raise StorageError(words) from error
 
     @contextmanager
-    def _transaction(self) -> Iterator[sqlite3.Connection]:
-        with self._speaking():
+    def _transaction(self) -> Iterator[Callable[..., sqlite3.Cursor]]:
+        with self._locked(), self._connection:
             self._connection.execute("BEGIN IMMEDIATE")
-            try:
-                yield self._connection
-                self._connection.execute("COMMIT")
-            finally:
-                if self._connection.in_transaction:
-                    self._connection.execute("ROLLBACK")
+            yield self._connection.execute
 
     def _make_tables(self) -> None:
-        with self._transaction() as connection:
-            version = connection.execute("PRAGMA user_version").fetchone()[0]
+        with self._transaction() as execute:
+            version = execute("PRAGMA user_version").fetchone()[0]
             if version not in (0, SCHEMA_VERSION):
                 raise ValueError(
-                    f"{self.path} is a store of version {version}; this program reads {SCHEMA_VERSION}"
+                    f"{self.path} is a store of version {version}; "
+                    f"this program reads {SCHEMA_VERSION}"
                 )
             if version == 0:
                 for statement in SCHEMA.split(";"):
-                    connection.execute(statement)
-                connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+                    execute(statement)
+                execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+
+    def _insert(self, table: str, **values: Any) -> int:
+        """Within a transaction; the row's number."""
+        names, places = ", ".join(values), ", ".join(f":{name}" for name in values)
+        statement = f"INSERT INTO {table} ({names}) VALUES ({places})"
+        return self._connection.execute(statement, values).lastrowid or 0
 
     def _one(self, query: str, *arguments: Any) -> sqlite3.Row | None:
-        with self._speaking():
+        with self._locked():
             return self._connection.execute(query, arguments).fetchone()
 
     def _all(self, query: str, *arguments: Any) -> list[sqlite3.Row]:
-        with self._speaking():
+        with self._locked():
             return self._connection.execute(query, arguments).fetchall()
 
 
@@ -505,9 +461,68 @@ def _json(value: Any) -> str | None:
 
 
 def _session(row: sqlite3.Row) -> Session:
-    names = ("id", "source", "model", "env_id", "seed", "step", "target", "wish", "created")
+    values = {field.name: row[field.name] for field in fields(Session)}
     return Session(
-        **{name: row[name] for name in names},
-        options=json.loads(row["options"]),
-        stopped=bool(row["stopped"]),
+        **{**values, "options": json.loads(row["options"]), "stopped": bool(row["stopped"])}
     )
+
+
+class StoreRecorder:
+    """Keeps what a ``HumanOracle`` is told at a terminal, in the same store as the page's answers:
+    ``HumanOracle(record=StoreRecorder(...))``.
+
+    :param model: The model's name.
+    :param seed: Of the adaptation.
+    :param options: Of the adaptation, JSON-ready.
+    :param n_queries: How many answers there will be at most.
+    :param wish: What the person wants, in their own words.
+    :param resume: Whether to go on with the last terminal session that has answers and agrees in
+        all of this, if there is one. The adapter must be told first what :meth:`kept` gives.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        model: str,
+        env_id: str,
+        seed: int,
+        options: dict[str, Any] | None = None,
+        n_queries: int = 10,
+        wish: str = "",
+        resume: bool = False,
+    ) -> None:
+        self.store = store
+        about = (model, env_id, seed, options or {}, n_queries)
+        found = self._last_session(*about) if resume else None
+        self.resumed = found is not None
+        self.session = found or store.create_session(*about, source="terminal")[0]
+        if wish:
+            store.set_wish(self.session.id, wish)
+
+    def _last_session(self, *about: Any) -> Session | None:
+        for session in reversed(self.store.sessions()):
+            facts = (session.model, session.env_id, session.seed, session.options, session.step)
+            if session.source == "terminal" and facts == about and self.store.answers(session.id):
+                return session
+        return None
+
+    def kept(self) -> list[dict[str, Any]]:
+        """The session's answers so far: ``preference``, ``left`` and ``right`` of each."""
+        return self.store.adapter_answers(self.session.id, 2**31)
+
+    def __call__(self, answer: HumanAnswer) -> None:
+        """Keep an answer; it is on the disk when this returns."""
+        store, session = self.store, self.session.id
+        before = store.answers(session)
+        last, number = before[-1]["id"] if before else None, len(before)
+        name = f"{session}-terminal-{number + 1:03d}{answer.video.suffix}"
+        shutil.copyfile(answer.video, store.videos / name)
+        left, right = answer.left, answer.right
+        frames = max(len(left.frames or ()), len(right.frames or ()))
+        turn = Turn(None, left.to_dict(), right.to_dict(), None, None, answer.fps, frames)
+        question = store.add_turn(
+            session, "question", number, last, turn, name, answer.asked, answer.shown
+        )
+        if question is None:
+            raise RefusedError(f"session {session} has been answered elsewhere meanwhile")
+        store.add_answer(session, question, answer.preference.value)

@@ -12,14 +12,14 @@ from typing import Any
 
 from poem_envs.headless import release_graphics
 from sb3_poem.adaptation.adapter import PreferenceAdapter
+from sb3_poem.adaptation.policy import AdaptedPolicy
 from sb3_poem.label.access import Access
-from sb3_poem.label.catalogue import Choice
-from sb3_poem.label.hosting import BackgroundServer
-from sb3_poem.label.server import make_app
-from sb3_poem.label.sessions import Conversations
+from sb3_poem.label.families import ModelInfo
+from sb3_poem.label.render_queue import RenderQueue
+from sb3_poem.label.rendering import CONVERSATION, Renderer, Turn, TurnRequest
+from sb3_poem.label.server import BackgroundServer, make_app
+from sb3_poem.label.sessions import SessionManager
 from sb3_poem.label.store import Session, Store
-from sb3_poem.label.turns import CONVERSATION, Bench, Request, Turn
-from sb3_poem.label.workshop import Workshop
 
 
 class LabelWidget:
@@ -64,33 +64,26 @@ class LabelWidget:
         self.adapter = adapter
         self.height = height
         env_id = getattr(adapter.model, "env_id", None) or "?"
-        self._start = {
+        start = {
             name: value for name, value in adapter.to_dict().items() if name not in CONVERSATION
         }
-        bench = _AdaptersBench(adapter.model, adapter.env, env_id, self._start)
-        self._temporary = tempfile.TemporaryDirectory() if store is None else None
-        self._store = Store(
-            Path(self._temporary.name) if self._temporary is not None else Path(store or ".")
-        )
+        renderer = _AdaptersRenderer(adapter.model, adapter.env, env_id, start)
+        self._temporary = tempfile.TemporaryDirectory()  # not used where a folder is given
+        self._store = Store(self._temporary.name if store is None else store)
         release_graphics()  # the environment may have rendered in this thread
         # One thread: a graphics context belongs to one at a time.
         self._thread = ThreadPoolExecutor(1)
-        workshop = Workshop(1, lambda: self._thread, bench.turn)
-        choice = Choice("notebook", Path(), type(adapter.model).__name__, env_id)
+        queue = RenderQueue(1, lambda: self._thread, renderer.turn)
+        info = ModelInfo("notebook", Path(), env_id)
         options = {**adapter.options.to_dict(), "notebook": True}
-        self._conversations = Conversations(
-            self._store,
-            workshop,
-            [choice],
-            options,
-            adapter.options.n_queries,
-            1,
-            load=lambda _: adapter.model,
+        n_queries = adapter.options.n_queries
+        sessions = SessionManager(
+            self._store, queue, [info], options, n_queries, 1, load=lambda _: adapter.model
         )
         self._session, token = self._store.create_session(
-            choice.name, env_id, adapter.seed, options, adapter.options.n_queries, source="notebook"
+            info.name, env_id, adapter.seed, options, n_queries, source="notebook"
         )
-        self._server = BackgroundServer(make_app(self._conversations, Access(embedded=True)), port)
+        self._server = BackgroundServer(make_app(sessions, Access(embedded=True)), port)
         self.url = f"http://127.0.0.1:{self._server.port}/s/{token}"
 
     @property
@@ -99,36 +92,28 @@ class LabelWidget:
         return self._store.session(self._session.id)
 
     def sync(self) -> PreferenceAdapter:
-        """Bring the adapter to where the person stands.
-
-        :return: It.
-        """
+        """The adapter, brought to where the person stands."""
         number = self._session.id
         answered = len(self._store.answers(number))
-        turn = None
-        for kind in ("question", "result"):
-            turn = turn or self._store.turn(number, kind, answered)
-        if turn is None:
+        turn = self._store.turn(number, "question", answered) or self._store.turn(
+            number, "result", answered
+        )
+        row = None if turn is None else self._store.whole_turn(turn["id"])
+        if row is None:
             raise RuntimeError(
-                "the page is still preparing what follows from the last answer; try again in a moment"
+                "the page is still preparing what follows from the last answer; try again in a "
+                "moment"
             )
-        row = self._store.whole_turn(turn["id"])
-        assert row is not None
-        pending = None
-        if row["left_trajectory"] is not None:
-            pending = {
-                "left": json.loads(row["left_trajectory"]),
-                "right": json.loads(row["right_trajectory"]),
-            }
-        answers = self._store.conversation(number, answered)
+        sides = {
+            side: json.loads(row[f"{side}_trajectory"] or "null") for side in ("left", "right")
+        }
+        answers = self._store.adapter_answers(number, answered)
+        pending = None if sides["left"] is None else sides
         self.adapter.restore({**json.loads(row["state"]), "answers": answers, "pending": pending})
         return self.adapter
 
-    def policy(self) -> Any:
-        """The policy for the person's answers so far.
-
-        :return: An :class:`~sb3_poem.adaptation.AdaptedPolicy`.
-        """
+    def policy(self) -> AdaptedPolicy:
+        """The policy for the person's answers so far."""
         return self.sync().policy()
 
     def close(self) -> None:
@@ -136,8 +121,7 @@ class LabelWidget:
         self._server.close()
         self._thread.shutdown(cancel_futures=True)
         self._store.close()
-        if self._temporary is not None:
-            self._temporary.cleanup()
+        self._temporary.cleanup()
 
     def _repr_html_(self) -> str:
         return (
@@ -146,20 +130,20 @@ class LabelWidget:
         )
 
 
-class _AdaptersBench(Bench):
+class _AdaptersRenderer(Renderer):
     """Makes turns with a given adapter's model, environment, options and seed."""
 
     def __init__(self, model: Any, env: Any, env_id: str, start: dict[str, Any]) -> None:
         super().__init__(model, env, env_id)
         self._start = start
 
-    def turn(self, request: Request) -> Turn:
-        """See :class:`Bench`. What it rendered with is the caller's again afterwards."""
+    def turn(self, request: TurnRequest) -> Turn:
+        """See :class:`Renderer`. What it rendered with is the caller's again afterwards."""
         try:
             return super().turn(request)
         finally:
             release_graphics()
 
-    def adapter(self, request: Request) -> PreferenceAdapter:
-        """See :class:`Bench`."""
+    def adapter(self, request: TurnRequest) -> PreferenceAdapter:
+        """See :class:`Renderer`."""
         return super().adapter(replace(request, state=request.state or self._start))

@@ -25,7 +25,7 @@ from sb3_poem import PEARLSAC, POEMSAC, PreferenceAdapter, cli
 from sb3_poem.adaptation import AdaptedPolicy
 from sb3_poem.common.foreign import environment_of
 from sb3_poem.common.vec_env import make_task_vec_env
-from sb3_poem.label.catalogue import read_catalogue
+from sb3_poem.label.families import find_models
 from sb3_poem.loading import load_model
 
 ADAPT = ["--queries", "1", "--tasks", "1", "--episodes", "1", "--record", "0"]
@@ -120,7 +120,7 @@ def test_an_id_imports_nothing(
     with refused("env_id is .* must be a plain one"):
         read(folder)
     with refused("env_id is .* must be a plain one"):
-        read_catalogue(str(folder))
+        find_models(str(folder))
     assert not trap.exists()
 
 
@@ -221,7 +221,7 @@ def test_arguments_that_a_file_may_not_give(
         f"model asks for {env_id} with {next(iter(env_kwargs))}=.*{message}.*say so yourself: "
         "--env-kwargs"
     ):
-        read_catalogue(str(folder))
+        find_models(str(folder))
     assert not trap.exists()
 
 
@@ -287,7 +287,7 @@ def test_a_model_keeps_what_its_environment_was_made_with_beyond_its_registratio
         ):
             register(**registered)
             small(POEMSAC, make_task_vec_env("test/Edge-v0", 1, **given)).save_pretrained(tmp_path)
-            assert dict(read_catalogue(str(tmp_path))[0].env_kwargs) == given
+            assert dict(find_models(str(tmp_path))[0].env_kwargs) == given
     finally:
         del gym.registry["test/Edge-v0"]
 
@@ -368,7 +368,7 @@ def test_json_that_only_looks_small(folder: Path, text: str) -> None:
     for read in (
         READERS["from_pretrained"],
         READERS["load_model"],
-        lambda folder: read_catalogue(str(folder)),
+        lambda folder: find_models(str(folder)),
     ):
         with refused("config.json is (truncated, or no configuration|not of this version)"):
             read(folder)

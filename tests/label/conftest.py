@@ -8,18 +8,18 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import pytest
-from label_world import make_conversations
+from label_world import make_sessions
 
-from sb3_poem.label.catalogue import Choice, read_catalogue
-from sb3_poem.label.sessions import Conversations
+from sb3_poem.label.families import ModelInfo, find_models
+from sb3_poem.label.sessions import SessionManager
 from sb3_poem.label.store import Store
 
 T = TypeVar("T")
 
 
 @pytest.fixture(scope="session")
-def point_goal() -> Choice:
-    return next(choice for choice in read_catalogue() if choice.name == "PointGoal")
+def point_goal() -> ModelInfo:
+    return find_models("PointGoal")[0]
 
 
 @pytest.fixture
@@ -30,19 +30,21 @@ def store(tmp_path: Path):
 
 
 @pytest.fixture
-def with_conversations(store: Store, point_goal: Choice) -> Callable[..., Any]:
-    """Runs ``talk(conversations)`` as one life of a server; what the store holds stays for the
-    next.
-    """
+def run_server(store: Store, point_goal: ModelInfo) -> Callable[..., Any]:
+    """Runs ``life(sessions)`` as one life of a server; what the store holds stays for the next."""
 
-    def run(talk: Callable[[Conversations], Coroutine[Any, Any, T]], **options: Any) -> T:
-        async def life() -> T:
-            conversations = make_conversations(store, point_goal, **options)
+    def run(
+        life: Callable[[SessionManager], Coroutine[Any, Any, T]],
+        info: ModelInfo = point_goal,
+        **options: Any,
+    ) -> T:
+        async def whole_life() -> T:
+            sessions = make_sessions(store, info, **options)
             try:
-                return await talk(conversations)
+                return await life(sessions)
             finally:
-                await conversations.workshop.close()
+                await sessions.queue.close()
 
-        return asyncio.run(life())
+        return asyncio.run(whole_life())
 
     return run

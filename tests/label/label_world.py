@@ -7,33 +7,29 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from sb3_poem.label.catalogue import Choice
-from sb3_poem.label.sessions import Conversations
+from sb3_poem.label.families import ModelInfo
+from sb3_poem.label.render_queue import RenderQueue
+from sb3_poem.label.sessions import SessionManager
 from sb3_poem.label.store import Session, Store
-from sb3_poem.label.workshop import Workshop
 
 
-def make_conversations(
-    store: Store, choice: Choice, ahead: bool = False, **options: Any
-) -> Conversations:
-    """A server's conversations; rendering ahead, which triples the work, is for the tests that ask
-    for it.
+def make_sessions(
+    store: Store, info: ModelInfo, render_ahead: bool = False, **options: Any
+) -> SessionManager:
+    """A server's sessions; rendering ahead, which triples the work, is for the tests that ask for
+    it.
     """
-    conversations = Conversations(
-        store, Workshop(1, lambda: ThreadPoolExecutor(1)), [choice], seed=5, **options
-    )
-    if not ahead:
-        conversations._render_ahead = lambda *_: None  # type: ignore[method-assign]
-    return conversations
+    queue = RenderQueue(1, lambda: ThreadPoolExecutor(1))
+    return SessionManager(store, queue, [info], seed=5, render_ahead=render_ahead, **options)
 
 
 async def settled(
-    conversations: Conversations, session: Session, seconds: float = 60.0
+    sessions: SessionManager, session: Session, seconds: float = 60.0
 ) -> dict[str, Any]:
     """The session's view once nothing is being prepared."""
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
-        view = await conversations.view(session)
+        view = await sessions.view(session)
         assert "failed" not in view, view
         if view["phase"] != "preparing":
             return view

@@ -12,7 +12,7 @@ import pytest
 
 from sb3_poem.label.beliefs import belief, posterior, sentence, weighted_quantiles
 from sb3_poem.label.families import as_points, describe
-from sb3_poem.label.videos import HEIGHT, WIDTH, fit, pair
+from sb3_poem.label.rendering import HEIGHT, WIDTH, fit, pair
 from sb3_poem.pearl_sac.train_tasks import TrainTasks
 
 

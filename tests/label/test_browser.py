@@ -21,9 +21,9 @@ from sb3_poem.adaptation import PreferenceAdapter, ReturnOracle, evaluate_latent
 from sb3_poem.adaptation.noise import MistakeNoise
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.common.vec_env import make_task_vec_env
-from sb3_poem.label.catalogue import Choice, read_catalogue
+from sb3_poem.label.families import ModelInfo, find_models
+from sb3_poem.label.rendering import load_shown_model
 from sb3_poem.label.store import Store
-from sb3_poem.label.turns import load_choice
 
 playwright_api = pytest.importorskip(
     "playwright.sync_api", reason="the Python package playwright is not installed"
@@ -41,22 +41,14 @@ SHOWN = "() => typeof view !== 'undefined' && view !== null && view.phase !== 'p
 class Server:
     """``sb3-poem label`` in a process of its own, which may be killed and started again."""
 
-    def __init__(self, store: Path, model: str) -> None:
-        self.store, self.model, self.port = store, model, 0
+    def __init__(self, store: Path, model: str, queries: int = 5) -> None:
+        self.store, self.model, self.queries, self.port = store, model, queries, 0
         self.start()
 
     def start(self) -> None:
-        command = [
-            sys.executable,
-            "-m",
-            "sb3_poem.cli",
-            "label",
-            "--model",
-            self.model,
-            "--port",
-            str(self.port),
-        ]
-        command += ["--store", str(self.store), "--seed", str(SEED), "--workers", "1"]
+        command = [sys.executable, "-m", "sb3_poem.cli", "label", "--model", self.model]
+        command += ["--port", str(self.port), "--store", str(self.store), "--workers", "1"]
+        command += ["--queries", str(self.queries), "--seed", str(SEED)]
         self.process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
         )
@@ -125,11 +117,11 @@ def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
 class Person:
     """Answers by the true return of what was shown, as an oracle that knows the task."""
 
-    def __init__(self, server: Server, page: Any, choice: Choice, task: float) -> None:
+    def __init__(self, server: Server, page: Any, info: ModelInfo, task: float) -> None:
         self.page = page
         self.token = page.url.rpartition("/s/")[2]
         self.task = np.array([task])
-        self.oracle = ReturnOracle(gym.make(choice.env_id), self.task)
+        self.oracle = ReturnOracle(gym.make(info.env_id), self.task)
         self.store = server.store
 
     def judge(self) -> str:
@@ -184,17 +176,17 @@ class Person:
 
 
 def begin(
-    open_page: Callable[..., Any], server: Server, choice: Choice, task: float, **options: Any
+    open_page: Callable[..., Any], server: Server, info: ModelInfo, task: float, **options: Any
 ) -> Person:
     page = open_page(server.url, **options)
-    page.click(f"button[value={choice.name}]")
+    page.click(f"button[value={info.name}]")
     page.wait_for_function(SHOWN)
-    return Person(server, page, choice, task)
+    return Person(server, page, info, task)
 
 
-def returns(choice: Choice, latents: np.ndarray, task: float) -> np.ndarray:
+def returns(info: ModelInfo, latents: np.ndarray, task: float) -> np.ndarray:
     """True returns of latents, the mean of the same ten episodes each."""
-    env, model = make_task_vec_env(choice.env_id, 10), load_choice(choice)
+    env, model = make_task_vec_env(info.env_id, 10), load_shown_model(info)
     values = [
         evaluate_latents(model, env, latent[None, :], np.array([[task]]), 10, seed=77).mean()
         for latent in latents
@@ -203,36 +195,36 @@ def returns(choice: Choice, latents: np.ndarray, task: float) -> np.ndarray:
     return np.array(values)
 
 
-def oracles_latents(choice: Choice, task: float) -> np.ndarray:
-    """Before any answer, and after ten by ``ReturnOracle``."""
-    oracle = ReturnOracle(gym.make(choice.env_id), np.array([task]))
-    adapter = PreferenceAdapter(
-        load_choice(choice), choice.env_id, oracle=oracle, seed=SEED, noise_model=MistakeNoise(0.05)
-    )
+def oracles_latents(info: ModelInfo, task: float, n_queries: int) -> np.ndarray:
+    """Before any answer, and after those by ``ReturnOracle``."""
+    oracle = ReturnOracle(gym.make(info.env_id), np.array([task]))
+    options: dict[str, Any] = {"n_queries": n_queries, "noise_model": MistakeNoise(0.05)}
+    model = load_shown_model(info)
+    adapter = PreferenceAdapter(model, info.env_id, oracle=oracle, seed=SEED, **options)
     before = adapter.policy().latent
     return np.stack([before, adapter.adapt().latent])
 
 
-def assert_learned(choice: Choice, person: Person, task: float) -> None:
-    before, by_oracle, by_person = returns(
-        choice, np.vstack([oracles_latents(choice, task), person.learned()]), task
-    )
-    # What ReturnOracle's ten answers gained, a person on the page must gain, but for a hundredth.
+def assert_learned(info: ModelInfo, person: Person, task: float) -> None:
+    by_others = oracles_latents(info, task, len(person.stored()))
+    latents = np.vstack([by_others, person.learned()])
+    before, by_oracle, by_person = returns(info, latents, task)
+    # What ReturnOracle's answers gained, a person on the page must gain, but for a hundredth.
     assert by_oracle > before
     assert by_person >= by_oracle - 0.01 * (by_oracle - before), (before, by_oracle, by_person)
 
 
-def test_ten_clicks_teach_what_the_oracle_teaches(
-    open_page: Callable[..., Any], server: Server, point_goal: Choice, tmp_path: Path
+def test_clicks_teach_what_the_oracle_teaches(
+    open_page: Callable[..., Any], server: Server, point_goal: ModelInfo, tmp_path: Path
 ) -> None:
     person = begin(open_page, server, point_goal, 2.2)
     page = person.page
     page.fill("#wish", "up and to the left")
     before = page.text_content("#belief-sentence")
-    person.answer(10)
+    person.answer(server.queries)
     assert page.evaluate("() => view.phase") == "result"
     assert page.text_content("#belief-sentence") != before
-    assert len(person.stored()) == 10
+    assert len(person.stored()) == server.queries
     assert_learned(point_goal, person, 2.2)
     page.click('[data-verdict="yes"]')
     page.wait_for_selector("#thanks:visible")
@@ -251,7 +243,7 @@ def test_ten_clicks_teach_what_the_oracle_teaches(
 
 
 def test_undo_and_reload_in_the_middle(
-    open_page: Callable[..., Any], server: Server, point_goal: Choice
+    open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
 ) -> None:
     person = begin(open_page, server, point_goal, 0.4)
     page = person.page
@@ -277,7 +269,7 @@ def test_undo_and_reload_in_the_middle(
 
 
 def test_two_people_and_a_second_tab(
-    open_page: Callable[..., Any], server: Server, point_goal: Choice
+    open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
 ) -> None:
     ann, ben = begin(open_page, server, point_goal, 0.3), begin(open_page, server, point_goal, 2.8)
     assert ann.token != ben.token
@@ -295,7 +287,7 @@ def test_two_people_and_a_second_tab(
 
 
 def test_the_keyboard_alone(
-    open_page: Callable[..., Any], server: Server, point_goal: Choice
+    open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
 ) -> None:
     page = open_page(server.url)
     page.keyboard.press("Tab")
@@ -331,7 +323,7 @@ def test_the_keyboard_alone(
 
 
 def test_both_halves_of_the_film_are_in_step(
-    open_page: Callable[..., Any], server: Server, point_goal: Choice
+    open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
 ) -> None:
     person = begin(open_page, server, point_goal, 1.0)
     page = person.page
@@ -356,7 +348,7 @@ def test_both_halves_of_the_film_are_in_step(
     assert min(spread) > 20  # the dot is on either screen
 
 
-def test_a_phone(open_page: Callable[..., Any], server: Server, point_goal: Choice) -> None:
+def test_a_phone(open_page: Callable[..., Any], server: Server, point_goal: ModelInfo) -> None:
     person = begin(
         open_page, server, point_goal, 2.0, viewport=PHONE, has_touch=True, is_mobile=True
     )
@@ -375,38 +367,32 @@ def test_a_phone(open_page: Callable[..., Any], server: Server, point_goal: Choi
 
 
 def test_the_server_is_killed_in_the_middle(
-    open_page: Callable[..., Any], point_goal: Choice, tmp_path: Path
+    open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
 ) -> None:
-    server = Server(tmp_path, "PointGoal")
-    try:
-        person = begin(open_page, server, point_goal, 2.5)
-        page = person.page
-        person.answer(2)
-        page.keyboard.press("ArrowLeft")
-        page.wait_for_function(
-            "() => view.answered === 3"
-        )  # kept, and what follows perhaps not yet made
-        server.kill()
-        assert len(person.stored()) == 3
-        server.start()
-        page.reload()
-        page.wait_for_function(SHOWN)
-        assert person.answered() == 3
-        page.click("#undo")
-        page.wait_for_function("() => view.answered === 2 && !busy")
-        person.answer(2)
-        assert len(person.stored()) == 4
-    finally:
-        server.stop()
+    person = begin(open_page, server, point_goal, 2.5)
+    page = person.page
+    person.answer(1)
+    page.keyboard.press("ArrowLeft")
+    page.wait_for_function("() => view.answered === 2")  # kept; what follows perhaps not yet made
+    server.kill()
+    assert len(person.stored()) == 2
+    server.start()
+    page.reload()
+    page.wait_for_function(SHOWN)
+    assert person.answered() == 2
+    page.click("#undo")
+    page.wait_for_function("() => view.answered === 1 && !busy")
+    person.answer(2)
+    assert len(person.stored()) == 3
 
 
 @pytest.mark.slow
 def test_a_running_robot_learns_its_speed(open_page: Callable[..., Any], tmp_path: Path) -> None:
-    choice = next(choice for choice in read_catalogue() if choice.name == "HalfCheetahVel")
-    server = Server(tmp_path, "HalfCheetahVel")
+    info = find_models("HalfCheetahVel")[0]
+    server = Server(tmp_path, "HalfCheetahVel", queries=10)
     try:
-        person = begin(open_page, server, choice, 1.3)
+        person = begin(open_page, server, info, 1.3)
         person.answer(10)
-        assert_learned(choice, person, 1.3)
+        assert_learned(info, person, 1.3)
     finally:
         server.stop()

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from label_world import make_conversations
+from label_world import make_sessions
 from starlette.applications import Starlette
 from starlette.responses import PlainTextResponse
 from starlette.routing import Route
@@ -30,13 +30,11 @@ from starlette.testclient import TestClient
 from sb3_poem import cli
 from sb3_poem.cli.label import read_password
 from sb3_poem.label import sessions
-from sb3_poem.label.access import MAX_BODY, Access
-from sb3_poem.label.catalogue import Choice
-from sb3_poem.label.connections import MAX_OF_ADDRESS, network_of
-from sb3_poem.label.hosting import BackgroundServer, bind, link_host
-from sb3_poem.label.server import DISK_FULL, make_app
+from sb3_poem.label.access import MAX_BODY, MAX_OF_ADDRESS, Access, network_of
+from sb3_poem.label.families import ModelInfo
+from sb3_poem.label.rendering import StorageError, write_clip
+from sb3_poem.label.server import DISK_FULL, BackgroundServer, bind, link_host, make_app
 from sb3_poem.label.store import Store
-from sb3_poem.label.videos import StorageError, write_clip
 
 HALF = b"GET / HTTP/1.1\r\nHost: localhost\r\nX-Waiting: "
 PASSWORD = "a long password"
@@ -45,14 +43,14 @@ Serve = Callable[..., int]
 
 
 @pytest.fixture
-def serve(store: Store, point_goal: Choice) -> Iterator[Serve]:
+def serve(store: Store, point_goal: ModelInfo) -> Iterator[Serve]:
     """Starts the page, or another application, on loopback; gives the port."""
     servers = []
 
     def start(
         app: Starlette | None = None, deadline: float = 10.0, access: Access | None = None
     ) -> int:
-        page = app or make_app(make_conversations(store, point_goal), access)
+        page = app or make_app(make_sessions(store, point_goal), access)
         servers.append(BackgroundServer(page, deadline=deadline))
         return servers[-1].port
 
@@ -315,12 +313,12 @@ def full_disk(room: int = 0) -> Iterator[None]:
 
 def test_a_full_disk_is_a_sentence_and_what_was_answered_stays(
     store: Store,
-    point_goal: Choice,
+    point_goal: ModelInfo,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.setattr(sessions, "RETRY_SECONDS", 0.0)
-    app = make_app(make_conversations(store, point_goal))
+    app = make_app(make_sessions(store, point_goal))
     with TestClient(app, base_url="http://localhost", follow_redirects=False) as client:
 
         def state(wanted: int) -> dict[str, Any]:

@@ -22,30 +22,30 @@ from sb3_poem.adaptation import HumanOracle, PreferenceAdapter, ReturnOracle
 from sb3_poem.adaptation.policy import AdaptedPolicy
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.label import LabelWidget, StoreRecorder
-from sb3_poem.label.catalogue import Choice
 from sb3_poem.label.export import FIELDS, export, records
+from sb3_poem.label.families import ModelInfo
+from sb3_poem.label.rendering import load_shown_model
 from sb3_poem.label.replay import replay
-from sb3_poem.label.sessions import Conversations
+from sb3_poem.label.sessions import SessionManager
 from sb3_poem.label.store import Session, Store
-from sb3_poem.label.turns import load_choice
 from sb3_poem.resources import pretrained_folder
 
 TASK = np.array([0.7])
 
 
 @pytest.fixture
-def answered(with_conversations: Callable[..., Any], store: Store, point_goal: Choice) -> Session:
+def answered(run_server: Callable[..., Any], store: Store, point_goal: ModelInfo) -> Session:
     """A session whose four answers are by true return; the first was given the wrong way, and taken
     back.
     """
     oracle = ReturnOracle(gym.make(point_goal.env_id), TASK)
 
-    async def talk(conversations: Conversations) -> Session:
-        session = await conversations.find(await conversations.begin("PointGoal"))
+    async def life(sessions: SessionManager) -> Session:
+        session = await sessions.find(await sessions.begin("PointGoal"))
         assert session is not None
         wrong_first = True
         while len(store.answers(session.id)) < 4:
-            view = await settled(conversations, session)
+            view = await settled(sessions, session)
             row = store.whole_turn(view["turn"]["id"])
             assert row is not None
             sides = [
@@ -54,13 +54,13 @@ def answered(with_conversations: Callable[..., Any], store: Store, point_goal: C
             ]
             right = oracle(*sides).value
             wrong = {"left": "right", "right": "left", "equal": "left"}[right]
-            await conversations.answer(session, view["turn"]["id"], wrong if wrong_first else right)
+            store.add_answer(session.id, view["turn"]["id"], wrong if wrong_first else right)
             if wrong_first:
                 store.undo(session.id, 1)
                 wrong_first = False
         return session
 
-    session = with_conversations(talk)
+    session = run_server(life)
     store.set_wish(session.id, 'right, "and" up\n☺')
     return session
 
@@ -74,7 +74,7 @@ def test_both_formats_hold_the_same_answers(
     assert export(store, tmp_path / "a.parquet", trajectories=True) == 4
     lines = [json.loads(line) for line in (tmp_path / "a.jsonl").read_text().splitlines()]
     assert lines == parquet.read_table(tmp_path / "a.parquet").to_pylist()
-    asked = store.conversation(answered.id, 4)
+    asked = store.adapter_answers(answered.id, 4)
     for line, item in zip(lines, asked, strict=True):
         left = Trajectory.from_dict(item["left"])
         assert line["preference"] == item["preference"]
@@ -90,9 +90,9 @@ def test_both_formats_hold_the_same_answers(
 
 
 def test_replay_to_the_same_rule_ends_where_the_session_ended(
-    answered: Session, store: Store, point_goal: Choice
+    answered: Session, store: Store, point_goal: ModelInfo
 ) -> None:
-    model = load_choice(point_goal)
+    model = load_shown_model(point_goal)
     result = replay(store, answered, model, {"mistake_rate": 0.05}, seed=answered.seed)
     assert len(result["latents"]) == 5
     assert result["action_error"] is None
@@ -195,7 +195,7 @@ def test_wrong_commands_say_what_is_wrong(
 
 
 def test_the_terminals_answers_are_in_the_same_store(
-    store: Store, point_goal: Choice, tmp_path: Path
+    store: Store, point_goal: ModelInfo, tmp_path: Path
 ) -> None:
     replies = iter(["l", "nonsense", "e"])
     recorder = StoreRecorder(store, "PointGoal", point_goal.env_id, seed=3, wish="left")
@@ -203,7 +203,7 @@ def test_the_terminals_answers_are_in_the_same_store(
         tmp_path / "gifs", read=lambda _: next(replies), write=lambda _: None, record=recorder
     )
     adapter = PreferenceAdapter(
-        load_choice(point_goal), point_goal.env_id, oracle=oracle, seed=3, n_queries=2
+        load_shown_model(point_goal), point_goal.env_id, oracle=oracle, seed=3, n_queries=2
     )
     adapter.adapt()
     kept = list(records(store))
@@ -215,8 +215,8 @@ def test_the_terminals_answers_are_in_the_same_store(
     assert Path(kept[0]["video"]).read_bytes().startswith(b"GIF8")
 
 
-def test_the_widget_moves_the_adapter(point_goal: Choice, tmp_path: Path) -> None:
-    model = load_choice(point_goal)
+def test_the_widget_moves_the_adapter(point_goal: ModelInfo, tmp_path: Path) -> None:
+    model = load_shown_model(point_goal)
     env = gym.make(point_goal.env_id, render_mode="rgb_array", width=64, height=48)
     adapter = PreferenceAdapter(model, env, seed=8, n_queries=3)
     alone = PreferenceAdapter(model, point_goal.env_id, seed=8, n_queries=3)
@@ -266,8 +266,8 @@ def _post(url: str, body: dict[str, Any]) -> None:
     urllib.request.urlopen(request).close()
 
 
-def test_an_adapted_policy_is_one_file(point_goal: Choice, tmp_path: Path) -> None:
-    model = load_choice(point_goal)
+def test_an_adapted_policy_is_one_file(point_goal: ModelInfo, tmp_path: Path) -> None:
+    model = load_shown_model(point_goal)
     latent = np.random.default_rng(0).standard_normal(model.latent_dim)
     policy = AdaptedPolicy(model, latent, 7)
     path = tmp_path / "policy.safetensors"
@@ -293,6 +293,7 @@ def test_the_widget_takes_an_environment_that_was_rendered_and_gives_it_back(qua
         render_quality=quality,
         width=64,
         height=64,
+        max_episode_steps=12,
     )
     try:
         env.reset(seed=0)

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from sb3_poem.label.rendering import Turn
 from sb3_poem.label.store import RefusedError, Store
-from sb3_poem.label.turns import Turn
 
 TRAJECTORY = {"observations": None}
 

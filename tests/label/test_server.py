@@ -11,12 +11,12 @@ from urllib.parse import urljoin, urlsplit
 
 import numpy as np
 import pytest
-from label_world import make_conversations
+from label_world import make_sessions
 from starlette.testclient import TestClient
 
 from sb3_poem.adaptation.policy import AdaptedPolicy
 from sb3_poem.label.access import MAX_BODY, PAUSE_AFTER_WRONG_PASSWORD, Access, is_loopback
-from sb3_poem.label.catalogue import Choice
+from sb3_poem.label.families import ModelInfo
 from sb3_poem.label.server import make_app
 from sb3_poem.label.store import Store
 
@@ -25,10 +25,10 @@ HOST = "http://localhost"
 
 @pytest.fixture(scope="module")
 def served(
-    tmp_path_factory: pytest.TempPathFactory, point_goal: Choice
+    tmp_path_factory: pytest.TempPathFactory, point_goal: ModelInfo
 ) -> Iterator[tuple[TestClient, Store]]:
     store = Store(tmp_path_factory.mktemp("served"))
-    app = make_app(make_conversations(store, point_goal, n_queries=3, max_sessions=30))
+    app = make_app(make_sessions(store, point_goal, n_queries=3, max_sessions=30))
     with TestClient(app, base_url=HOST, follow_redirects=False) as client:
         yield client, store
     store.close()
@@ -314,10 +314,10 @@ def test_pages_load_nothing_from_elsewhere(served: tuple[TestClient, Store]) -> 
 
 
 @pytest.fixture
-def guarded(store: Store, point_goal: Choice) -> Iterator[TestClient]:
+def guarded(store: Store, point_goal: ModelInfo) -> Iterator[TestClient]:
     access = Access(user="ann", password="a long password", token="t" * 32)
     with TestClient(
-        make_app(make_conversations(store, point_goal), access),
+        make_app(make_sessions(store, point_goal), access),
         base_url=HOST,
         follow_redirects=False,
     ) as client:
@@ -378,11 +378,11 @@ def test_a_token_leads_to_no_other_site(guarded: TestClient, path: str) -> None:
     assert urlsplit(urljoin(HOST, entry.headers["location"])).netloc == "localhost"
 
 
-def test_two_servers_of_one_host_keep_their_cookies(store: Store, point_goal: Choice) -> None:
+def test_two_servers_of_one_host_keep_their_cookies(store: Store, point_goal: ModelInfo) -> None:
     jar = ""
     clients = []
     for port, token in ((7860, "a" * 32), (7861, "b" * 32)):
-        app = make_app(make_conversations(store, point_goal), Access(token=token))
+        app = make_app(make_sessions(store, point_goal), Access(token=token))
         clients.append(TestClient(app, base_url=f"{HOST}:{port}", follow_redirects=False))
         jar += clients[-1].get(f"/?token={token}").headers["set-cookie"].partition(";")[0] + "; "
         clients[-1].cookies.clear()

@@ -1,4 +1,4 @@
-"""Conversations: the same questions and the same posterior, whether rendered ahead, resumed, undone
+"""SessionManager: the same questions and the same posterior, whether rendered ahead, resumed, undone
 or computed anew.
 """
 
@@ -6,39 +6,40 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import pytest
-from label_world import make_conversations, settled
+from gymnasium.envs.registration import load_env_creator
+from label_world import make_sessions, settled
 
 from sb3_poem.adaptation.adapter import PreferenceAdapter
 from sb3_poem.adaptation.noise import MistakeNoise
-from sb3_poem.label import turns
-from sb3_poem.label.catalogue import Choice
-from sb3_poem.label.sessions import Conversations, FullError
+from sb3_poem.label.families import ModelInfo
+from sb3_poem.label.rendering import load_shown_model
+from sb3_poem.label.sessions import FullError, SessionManager
 from sb3_poem.label.store import RefusedError, Session, Store
-from sb3_poem.label.turns import load_choice
 
 ANSWERS = ("left", "right", "equal", "left")
 
 
-async def begin(conversations: Conversations) -> tuple[Session, str]:
-    token = await conversations.begin("PointGoal")
-    session = await conversations.find(token)
+async def begin(sessions: SessionManager) -> tuple[Session, str]:
+    token = await sessions.begin("PointGoal")
+    session = await sessions.find(token)
     assert session is not None
     return session, token
 
 
-async def talk_through(
-    conversations: Conversations, session: Session, answers: tuple[str, ...]
+async def give_answers(
+    sessions: SessionManager, session: Session, answers: tuple[str, ...]
 ) -> dict[str, Any]:
-    view = await settled(conversations, session)
+    view = await settled(sessions, session)
     for preference in answers:
-        await conversations.answer(session, view["turn"]["id"], preference)
-        view = await settled(conversations, session)
+        sessions.store.add_answer(session.id, view["turn"]["id"], preference)
+        view = await settled(sessions, session)
     return view
 
 
@@ -55,15 +56,15 @@ def contents(
 
 
 def test_the_page_asks_what_an_adapter_asks(
-    with_conversations: Callable[..., Any], store: Store, point_goal: Choice
+    run_server: Callable[..., Any], store: Store, point_goal: ModelInfo
 ) -> None:
-    async def talk(conversations: Conversations) -> Session:
-        session, _ = await begin(conversations)
-        await talk_through(conversations, session, ANSWERS)
+    async def life(sessions: SessionManager) -> Session:
+        session, _ = await begin(sessions)
+        await give_answers(sessions, session, ANSWERS)
         return session
 
-    session = with_conversations(talk)
-    model = load_choice(point_goal)
+    session = run_server(life)
+    model = load_shown_model(point_goal)
     adapter = PreferenceAdapter(model, "poem/PointGoal-v0", seed=5, noise_model=MistakeNoise(0.05))
     for number, preference in enumerate(ANSWERS):
         query = adapter.ask()
@@ -75,188 +76,193 @@ def test_the_page_asks_what_an_adapter_asks(
 
 
 def test_a_new_server_continues_at_the_same_question_with_the_same_posterior(
-    with_conversations: Callable[..., Any], store: Store
+    run_server: Callable[..., Any], store: Store
 ) -> None:
-    async def first_half(conversations: Conversations) -> str:
-        session, token = await begin(conversations)
-        view = await talk_through(conversations, session, ANSWERS[:2])
+    async def first_half(sessions: SessionManager) -> str:
+        session, token = await begin(sessions)
+        view = await give_answers(sessions, session, ANSWERS[:2])
         # The third is given, and the server ends before anything follows from it.
-        await conversations.answer(session, view["turn"]["id"], ANSWERS[2])
+        sessions.store.add_answer(session.id, view["turn"]["id"], ANSWERS[2])
         return token
 
-    token = with_conversations(first_half)
+    token = run_server(first_half)
 
-    async def second_half(conversations: Conversations) -> tuple[Session, dict[str, Any]]:
-        session = await conversations.find(token)
+    async def second_half(sessions: SessionManager) -> tuple[Session, dict[str, Any]]:
+        session = await sessions.find(token)
         assert session is not None
-        view = await settled(conversations, session)
+        view = await settled(sessions, session)
         assert view["answered"] == 3
-        await conversations.answer(session, view["turn"]["id"], ANSWERS[3])
-        return session, await settled(conversations, session)
+        sessions.store.add_answer(session.id, view["turn"]["id"], ANSWERS[3])
+        return session, await settled(sessions, session)
 
-    resumed, view = with_conversations(second_half)
+    resumed, view = run_server(second_half)
 
-    async def in_one_go(conversations: Conversations) -> tuple[Session, dict[str, Any]]:
-        session, _ = await begin(conversations)
-        return session, await talk_through(conversations, session, ANSWERS)
+    async def in_one_go(sessions: SessionManager) -> tuple[Session, dict[str, Any]]:
+        session, _ = await begin(sessions)
+        return session, await give_answers(sessions, session, ANSWERS)
 
-    whole, whole_view = with_conversations(in_one_go)
+    whole, whole_view = run_server(in_one_go)
     assert view["belief"] == whole_view["belief"]
     for number in range(len(ANSWERS) + 1):
         assert contents(store, resumed, number) == contents(store, whole, number)
 
 
 def test_a_session_does_not_go_on_with_a_model_of_other_weights(
-    with_conversations: Callable[..., Any], store: Store, point_goal: Choice, tmp_path: Path
+    run_server: Callable[..., Any], store: Store, point_goal: ModelInfo, tmp_path: Path
 ) -> None:
-    async def first_half(conversations: Conversations) -> str:
-        session, token = await begin(conversations)
-        view = await settled(conversations, session)
-        await conversations.answer(session, view["turn"]["id"], "left")
+    async def first_half(sessions: SessionManager) -> str:
+        session, token = await begin(sessions)
+        view = await settled(sessions, session)
+        sessions.store.add_answer(session.id, view["turn"]["id"], "left")
         return token
 
-    token = with_conversations(first_half)
-    model = load_choice(point_goal)
+    token = run_server(first_half)
+    model = load_shown_model(point_goal)
     model.train_tasks.latent_means += 0.1
     model.save_pretrained(tmp_path / "PointGoal")
 
     async def second_half() -> str:
-        conversations = make_conversations(
-            store, replace(point_goal, folder=tmp_path / "PointGoal")
-        )
-        session = await conversations.find(token)
+        sessions = make_sessions(store, replace(point_goal, folder=tmp_path / "PointGoal"))
+        session = await sessions.find(token)
         assert session is not None
-        view = await conversations.view(session)
+        view = await sessions.view(session)
         for _ in range(600):
             if "failed" in view:
                 break
             await asyncio.sleep(0.05)
-            view = await conversations.view(session)
-        await conversations.workshop.close()
+            view = await sessions.view(session)
+        await sessions.queue.close()
         return view["failed"]
 
     assert "with a model of other weights" in asyncio.run(second_half())
 
 
 def test_undo_and_the_same_answer_lead_to_the_same_question(
-    with_conversations: Callable[..., Any], store: Store
+    run_server: Callable[..., Any], store: Store
 ) -> None:
-    async def talk(conversations: Conversations) -> None:
-        session, _ = await begin(conversations)
-        await talk_through(conversations, session, ANSWERS)
+    async def life(sessions: SessionManager) -> None:
+        session, _ = await begin(sessions)
+        await give_answers(sessions, session, ANSWERS)
         before = [contents(store, session, number) for number in range(5)]
         for answered in (4, 3, 2, 1):
             store.undo(session.id, answered)
-        view = await settled(conversations, session)
+        view = await settled(sessions, session)
         assert (view["answered"], view["can_undo"]) == (0, False)
         assert contents(store, session, 0) == before[0]
-        await talk_through(conversations, session, ("right",))
+        await give_answers(sessions, session, ("right",))
         assert contents(store, session, 1) != before[1]
         store.undo(session.id, 1)
-        await talk_through(conversations, session, ANSWERS)
+        await give_answers(sessions, session, ANSWERS)
         assert [contents(store, session, number) for number in range(5)] == before
 
-    with_conversations(talk)
+    run_server(life)
 
 
 def test_the_likely_next_pairs_are_rendered_ahead(
-    with_conversations: Callable[..., Any], store: Store
+    run_server: Callable[..., Any], store: Store
 ) -> None:
-    async def talk(conversations: Conversations) -> None:
-        session, _ = await begin(conversations)
-        view = await settled(conversations, session)
-        jobs = conversations._present[session.id].jobs
-        assert {key[1] for key in jobs} == {"left", "right", "equal"}
-        ahead = {key[1]: job for key, job in jobs.items()}
-        await asyncio.gather(*(job.done for job in ahead.values()))
-        await conversations.answer(session, view["turn"]["id"], "right")
-        await settled(conversations, session)
-        turn = store.turn(session.id, "question", 1)
-        assert turn is not None
-        assert (
-            turn["video"] == ahead["right"].request.video.name
-        )  # what was rendered ahead, not another
-        assert not ahead["left"].request.video.exists()
+    async def life(sessions: SessionManager) -> None:
+        session, _ = await begin(sessions)
+        view = await settled(sessions, session)
+        first = store.videos / store.turn(session.id, "question", 0)["video"]
+        ahead: set[Path] = set()
+        while len(ahead) < 3:  # one for each answer
+            await asyncio.sleep(0.02)
+            ahead = set(store.videos.glob("[0-9]*.mp4")) - {first}
+        store.add_answer(session.id, view["turn"]["id"], "right")
+        await settled(sessions, session)
+        used = store.videos / store.turn(session.id, "question", 1)["video"]
+        assert used in ahead
+        assert [path for path in ahead if path.exists()] == [used]
 
-    with_conversations(talk, ahead=True)
+    run_server(life, render_ahead=True)
 
 
 def test_after_the_last_answer_comes_the_result_and_not_quite_asks_more(
-    with_conversations: Callable[..., Any], store: Store
+    run_server: Callable[..., Any], store: Store
 ) -> None:
-    async def talk(conversations: Conversations) -> None:
-        session, _ = await begin(conversations)
-        view = await talk_through(conversations, session, ("left", "right"))
+    async def life(sessions: SessionManager) -> None:
+        session, _ = await begin(sessions)
+        view = await give_answers(sessions, session, ("left", "right"))
         assert (view["phase"], view["answered"], view["target"]) == ("result", 2, 2)
         store.judge(session.id, view["turn"]["id"], "not quite")
-        view = await settled(conversations, session)
+        view = await settled(sessions, session)
         assert (view["phase"], view["target"]) == ("question", 4)
-        view = await talk_through(conversations, session, ("left",))
+        view = await give_answers(sessions, session, ("left",))
         store.stop(session.id)
-        view = await settled(conversations, session)
+        view = await settled(sessions, session)
         assert (view["phase"], view["answered"]) == ("result", 3)
 
-    with_conversations(talk, n_queries=2)
+    run_server(life, n_queries=2)
 
 
 def test_a_video_that_was_deleted_is_filmed_again(
-    with_conversations: Callable[..., Any], store: Store
+    run_server: Callable[..., Any], store: Store
 ) -> None:
-    async def talk(conversations: Conversations) -> None:
-        session, _ = await begin(conversations)
-        view = await talk_through(conversations, session, ("left",))
+    async def life(sessions: SessionManager) -> None:
+        session, _ = await begin(sessions)
+        view = await give_answers(sessions, session, ("left",))
         before = contents(store, session, 1)
-        path = conversations.video(session, view["turn"]["id"])
+        path = sessions.video(session, view["turn"]["id"])
         assert path is not None
         path.unlink()
-        await settled(conversations, session)
+        await settled(sessions, session)
         assert contents(store, session, 1) == before
 
-    with_conversations(talk)
+    run_server(life)
 
 
-def test_no_more_people_than_the_server_takes(with_conversations: Callable[..., Any]) -> None:
-    async def talk(conversations: Conversations) -> None:
-        await begin(conversations)
+def test_no_more_people_than_the_server_takes(run_server: Callable[..., Any]) -> None:
+    async def life(sessions: SessionManager) -> None:
+        await begin(sessions)
         with pytest.raises(FullError, match="1 people"):
-            await conversations.begin("PointGoal")
+            await sessions.begin("PointGoal")
         with pytest.raises(RefusedError, match="no model"):
-            await conversations.begin("../PointGoal")
+            await sessions.begin("../PointGoal")
 
-    with_conversations(talk, max_sessions=1)
+    run_server(life, max_sessions=1)
+
+
+@pytest.fixture
+def fast_point_goal(point_goal: ModelInfo) -> Iterator[ModelInfo]:
+    """One that is drawn forty times a second."""
+    spec = gym.spec(point_goal.env_id)
+    assert isinstance(spec.entry_point, str)
+    family = load_env_creator(spec.entry_point)
+    metadata = {**family.metadata, "render_fps": 40}
+    entry_point = type("FastPointGoal", (family,), {"metadata": metadata})
+    gym.register("test/Fast-v0", entry_point, max_episode_steps=spec.max_episode_steps)
+    yield replace(point_goal, env_id="test/Fast-v0")
+    del gym.registry["test/Fast-v0"]
 
 
 def test_films_show_every_second_step_while_more_people_are_at_work_than_workers(
-    with_conversations: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+    run_server: Callable[..., Any], fast_point_goal: ModelInfo
 ) -> None:
-    monkeypatch.setattr(turns, "SMOOTH_FPS", 2.0)
-
     def last_ones_film(people: int) -> dict[str, Any]:
-        async def talk(conversations: Conversations) -> dict[str, Any]:
-            sessions = [(await begin(conversations))[0] for _ in range(people)]
-            return (await settled(conversations, sessions[-1]))["turn"]
+        async def life(sessions: SessionManager) -> dict[str, Any]:
+            begun = [(await begin(sessions))[0] for _ in range(people)]
+            return (await settled(sessions, begun[-1]))["turn"]
 
-        return with_conversations(talk)
+        return run_server(life, fast_point_goal)
 
     alone, crowded = last_ones_film(1), last_ones_film(2)  # of one worker
     assert (crowded["fps"], crowded["frames"]) == (alone["fps"] / 2, -(-alone["frames"] // 2))
 
 
 def test_a_film_made_again_while_crowded_is_described_as_it_is(
-    with_conversations: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+    run_server: Callable[..., Any], fast_point_goal: ModelInfo
 ) -> None:
-    monkeypatch.setattr(turns, "SMOOTH_FPS", 2.0)
-
-    async def talk(conversations: Conversations) -> tuple[Any, Any]:
-        first, _ = await begin(conversations)
-        before = (await settled(conversations, first))["turn"]
-        path = conversations.video(first, before["id"])
+    async def life(sessions: SessionManager) -> tuple[Any, Any]:
+        first, _ = await begin(sessions)
+        before = (await settled(sessions, first))["turn"]
+        path = sessions.video(first, before["id"])
         assert path is not None
         path.unlink()
-        await begin(conversations)
-        return before, (await settled(conversations, first))["turn"]
+        await begin(sessions)
+        return before, (await settled(sessions, first))["turn"]
 
-    before, after = with_conversations(talk)
+    before, after = run_server(life, fast_point_goal)
     assert (after["id"], after["fps"], after["frames"]) == (
         before["id"],
         before["fps"] / 2,

@@ -1,53 +1,69 @@
-"""Where turns are made: a few workers, what somebody waits for first, what may be wanted next in
-the time that is left.
+"""The queue of turns to render: a few workers, what somebody waits for first, what may be wanted
+next in the time that is left.
 """
 
 from __future__ import annotations
 
 import asyncio
+import importlib
 import itertools
 import logging
 import multiprocessing
 import os
+import signal
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
-from typing import Any
+from enum import IntEnum
 
-from sb3_poem.label.catalogue import Choice
-from sb3_poem.label.turns import BENCHES, NotWantedError, Request, Turn, bench_of, make_turn
+import torch as th
+
+from sb3_poem.label.families import ModelInfo
+from sb3_poem.label.rendering import (
+    MAX_RENDERERS,
+    RenderCancelledError,
+    Turn,
+    TurnRequest,
+    make_turn,
+    renderer_of,
+)
 
 _logger = logging.getLogger(__name__)
 
-#: Urgencies: somebody waits; likely to be wanted next; possibly.
-WAITED_FOR, LIKELY, POSSIBLE = 0, 1, 2
 # A worker that dies (say the system ran out of memory) is replaced, and its turn made once more.
 ATTEMPTS = 2
+
+
+class Priority(IntEnum):
+    """The smaller, the sooner."""
+
+    WAITED_FOR = 0
+    LIKELY = 1
+    POSSIBLE = 2
 
 
 @dataclass(eq=False)
 class Job:
     """A turn that is being made, or will be.
 
-    :param request: What from.
-    :param urgency: The smaller, the sooner.
+    :param priority: May change while it waits.
+    :param order: Among those of one priority.
     :param done: Its turn, when it is there.
     """
 
-    request: Request
-    urgency: int
+    request: TurnRequest
+    priority: Priority
     order: int
     done: asyncio.Future[Turn] = field(
         default_factory=lambda: asyncio.get_running_loop().create_future()
     )
-    running: bool = False
-    discarded: bool = False
+    cancelled: bool = False
 
 
-class Workshop:
-    """Makes turns on an executor, in the order of their urgency. All methods belong to one event
+class RenderQueue:
+    """Makes turns on an executor, in the order of their priority. All methods belong to one event
     loop.
 
     :param n_workers: How many turns are made at a time.
@@ -59,7 +75,7 @@ class Workshop:
         self,
         n_workers: int = 2,
         make_executor: Callable[[], Executor] | None = None,
-        make: Callable[[Request], Turn] = make_turn,
+        make: Callable[[TurnRequest], Turn] = make_turn,
     ) -> None:
         self.n_workers = n_workers
         self._make_executor = make_executor or (lambda: process_pool(n_workers))
@@ -75,27 +91,18 @@ class Workshop:
         if self._executor is None:
             self._executor = self._make_executor()
         for _ in range(self.n_workers):
-            self._executor.submit(_nothing)
+            self._executor.submit(os.getpid)
 
-    def submit(self, request: Request, urgency: int) -> Job:
-        """Have a turn made.
-
-        :param request: What from.
-        :param urgency: See above.
-        :return: The job.
-        """
-        job = Job(request, urgency, next(self._count))
+    def submit(self, request: TurnRequest, priority: Priority) -> Job:
+        """Have a turn made."""
+        job = Job(request, priority, next(self._count))
         self._waiting.append(job)
         self._start_jobs()
         return job
 
-    def hurry(self, job: Job) -> None:
-        """Somebody waits for a job now."""
-        job.urgency = WAITED_FOR
-
-    def discard(self, job: Job) -> None:
+    def cancel(self, job: Job) -> None:
         """Nobody will want a job's turn: do not start it, or stop it soon, and delete its video."""
-        job.discarded = True
+        job.cancelled = True
         if job in self._waiting:
             self._waiting.remove(job)
             job.done.cancel()
@@ -103,11 +110,6 @@ class Workshop:
             job.request.video.unlink(missing_ok=True)
         else:
             job.request.marker.unlink(missing_ok=True)
-
-    @property
-    def n_waiting(self) -> int:
-        """How many jobs have not been started."""
-        return len(self._waiting)
 
     async def close(self) -> None:
         """Start nothing any more, and end the workers once they have made what they are at."""
@@ -122,9 +124,8 @@ class Workshop:
 
     def _start_jobs(self) -> None:
         while self._waiting and len(self._running) < self.n_workers and not self._closed:
-            job = min(self._waiting, key=lambda job: (job.urgency, job.order))
+            job = min(self._waiting, key=lambda job: (job.priority, job.order))
             self._waiting.remove(job)
-            job.running = True
             task = asyncio.get_running_loop().create_task(self._run(job))
             self._running.add(task)
             task.add_done_callback(self._finished)
@@ -134,92 +135,76 @@ class Workshop:
         self._start_jobs()
 
     async def _run(self, job: Job) -> None:
+        request = job.request
         try:
-            job.request.marker.touch()
-            turn = await self._attempt(job.request)
+            request.marker.touch()
+            turn = await self._attempt(request)
         except asyncio.CancelledError:
             job.done.cancel()
             raise
-        except NotWantedError:
+        except RenderCancelledError:
             job.done.cancel()
             return
         except Exception as error:
-            _logger.error(
-                "a %s of %s could not be made: %r",
-                job.request.wanted,
-                job.request.choice.name,
-                error,
-            )
+            words = "a %s of %s could not be made: %r"
+            _logger.error(words, request.kind, request.model.name, error)
             if not job.done.done():
                 job.done.set_exception(error)
                 job.done.exception()  # somebody may wait for it or not
             return
         finally:
-            job.request.marker.unlink(missing_ok=True)
-        if job.discarded:
-            job.request.video.unlink(missing_ok=True)
+            request.marker.unlink(missing_ok=True)
+        if job.cancelled:
+            request.video.unlink(missing_ok=True)
         if not job.done.done():
             job.done.set_result(turn)
 
-    async def _attempt(self, request: Request) -> Turn:
-        for attempt in range(ATTEMPTS):
-            if self._executor is None:
-                self._executor = self._make_executor()
-            executor = self._executor
-            try:
-                return await asyncio.get_running_loop().run_in_executor(
-                    executor, self._make, request
-                )
-            except BrokenProcessPool:
-                if self._executor is executor:
-                    self._executor = None
-                if attempt + 1 == ATTEMPTS:
-                    raise
-                _logger.warning("a worker process ended unexpectedly; starting another")
-        raise AssertionError("unreachable")
+    async def _attempt(self, request: TurnRequest, attempts: int = ATTEMPTS) -> Turn:
+        if self._executor is None:
+            self._executor = self._make_executor()
+        executor = self._executor
+        try:
+            return await asyncio.get_running_loop().run_in_executor(executor, self._make, request)
+        except BrokenProcessPool:
+            if self._executor is executor:
+                self._executor = None
+            if attempts == 1:
+                raise
+        _logger.warning("a worker process ended unexpectedly; starting another")
+        return await self._attempt(request, attempts - 1)
 
 
 def process_pool(
-    n_workers: int, choices: Sequence[Choice] = (), packages: Sequence[str] = ()
+    n_workers: int, models: Sequence[ModelInfo] = (), packages: Sequence[str] = ()
 ) -> ProcessPoolExecutor:
     """Worker processes that end with this one, even if it is killed.
 
-    :param n_workers: How many.
-    :param choices: Models that they load at once.
+    :param models: They load these at once.
     :param packages: Modules that register environments; they import these first.
-    :return: The pool.
     """
-    context: Any = multiprocessing.get_context("spawn")
-    arguments = (tuple(choices), tuple(packages))
     return ProcessPoolExecutor(
-        n_workers, mp_context=context, initializer=_begin_worker, initargs=arguments
+        n_workers,
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=_begin_worker,
+        initargs=(tuple(models), tuple(packages)),
     )
 
 
-def _nothing() -> None:
-    pass
-
-
-def _begin_worker(choices: tuple[Choice, ...], packages: tuple[str, ...]) -> None:
-    import importlib
-    import signal
-
-    import torch
-
+def _begin_worker(models: tuple[ModelInfo, ...], packages: tuple[str, ...]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent says when to stop
-    torch.set_num_threads(1)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def end_with_parent() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=end_with_parent, daemon=True).start()
+    th.set_num_threads(1)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     for package in packages:
         importlib.import_module(package)
-    for choice in choices[:BENCHES]:
+    for info in models[:MAX_RENDERERS]:
         try:
-            bench_of(choice).warm_up()
+            renderer_of(info).warm_up()
         except Exception as error:  # the session that chooses it says so; the others go on
-            _logger.error("the model %s cannot be shown: %r", choice.name, error)
+            _logger.error("the model %s cannot be shown: %r", info.name, error)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

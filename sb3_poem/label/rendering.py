@@ -1,5 +1,5 @@
 """One turn of a conversation, as a pure function: the state before, and the answer, give the state
-after and its video.
+after and its video, which is small, quick to encode, and to the frame seekable in every browser.
 
 Nothing is remembered between turns but models and environments, so any process may compute any turn
 of any session, ahead of time or again; the same input always gives the same turn, bit for bit.
@@ -8,6 +8,8 @@ of any session, ahead of time or again; the same input always gives the same tur
 from __future__ import annotations
 
 import contextlib
+import os
+import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -16,6 +18,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_poem.adaptation.adapter import PreferenceAdapter
 from sb3_poem.adaptation.noise import MistakeNoise
@@ -24,9 +27,13 @@ from sb3_poem.adaptation.preference import Preference
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
+from sb3_poem.common.vec_env import make_shown_env
+from sb3_poem.common.video import side_by_side
 from sb3_poem.label.beliefs import belief
-from sb3_poem.label.catalogue import Choice
-from sb3_poem.label.videos import HEIGHT, WIDTH, fit, pair, write_clip
+from sb3_poem.label.families import ModelInfo
+from sb3_poem.loading import BY_CLASS_NAME
+from sb3_poem.pearl_sac.saving import read_config
+from sb3_poem.poem_sac import POEMSAC
 
 # The result's rollout starts as no question's does.
 RESULT_ROLLOUT = 1_000_000
@@ -39,32 +46,47 @@ SMOOTH_FPS = 8.0
 # out.
 FILM_FPS = 20.0
 #: Models that a process keeps.
-BENCHES = 4
+MAX_RENDERERS = 4
 #: What an adapter's dictionary holds of its conversation; the rest is the ``state`` of a turn.
 CONVERSATION = ("answers", "pending")
+WIDTH, HEIGHT = 320, 240
+# Frames between which a player can start: seeking decodes at most so many.
+KEYFRAME_DISTANCE = 10
+ENCODER = [
+    *("-an", "-c:v", "libx264", "-pix_fmt", "yuv420p"),
+    *("-preset", "ultrafast", "-crf", "24", "-bf", "0", "-threads", "1"),
+    *("-g", str(KEYFRAME_DISTANCE), "-movflags", "+faststart"),
+]
+
+
+class StorageError(OSError):
+    """What cannot be kept: the disk is full, say."""
+
+
+class RenderCancelledError(Exception):
+    """A turn's marker was taken away while it was made."""
 
 
 @dataclass(frozen=True)
-class Request:
+class TurnRequest:
     """What a turn is made from.
 
-    :param choice: The model and its environment.
     :param seed: Of the adaptation.
     :param options: Of the adapter.
-    :param wanted: "question" or "result".
+    :param kind: "question" or "result".
     :param video: The file to write.
     :param state: The state of the turn before; None at the start.
     :param answers: The answers before that turn: ``preference``, ``left``, ``right``.
     :param pending: That turn's question: ``left``, ``right``.
-    :param preference: The answer to it; None at the start, and to film the question again.
+    :param preference: The answer to it; None at the start.
     :param film_every: How many steps lie between two frames of the video, if it moves smoothly
         enough then.
     """
 
-    choice: Choice
+    model: ModelInfo
     seed: int
     options: dict[str, Any]
-    wanted: str
+    kind: str
     video: Path
     state: dict[str, Any] | None = None
     answers: Sequence[dict[str, Any]] = ()
@@ -74,12 +96,8 @@ class Request:
 
     @property
     def marker(self) -> Path:
-        """A file that whoever asks may keep while the turn is wanted: taking it away ends the work."""
+        """A file that whoever asks may keep while the turn is wanted: its end is the work's."""
         return self.video.with_suffix(".wanted")
-
-
-class NotWantedError(Exception):
-    """A turn's marker was taken away while it was made."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +107,6 @@ class Turn:
     :param state: What the next turn is made from, beside the conversation; None where none follows
         (at a terminal), as then are belief and latent.
     :param left: The question's left trajectory; None in a result.
-    :param right: The right one.
     :param belief: As :func:`sb3_poem.label.beliefs.belief` gives it.
     :param latent: (d,) of the policy that would be taken now.
     :param fps: Of the video.
@@ -108,7 +125,7 @@ class Turn:
 class _Watches:
     """Stands for the person where the adapter asks who answers: somebody who needs to see.
 
-    :param film_every: See :class:`Request`.
+    :param film_every: See :class:`TurnRequest`.
     """
 
     def __init__(self, film_every: int) -> None:
@@ -119,38 +136,42 @@ class _Watches:
         raise RuntimeError("a person answers on the page; adapt() cannot ask")
 
 
-class Bench:
-    """A model and its environment, which renders.
-
-    :param env: An SB3 ``VecEnv`` that renders RGB images.
-    """
+class Renderer:
+    """A model and its environment, an SB3 ``VecEnv`` that renders RGB images."""
 
     def __init__(self, model: Any, env: Any, env_id: str) -> None:
         if env.render_mode != "rgb_array":
             raise ValueError(
-                f'`env` must be made with render_mode="rgb_array" to be shown, but has {env.render_mode!r}'
+                '`env` must be made with render_mode="rgb_array" to be shown, but has '
+                f"{env.render_mode!r}"
             )
         self.model = model
         self.env = env
         self.env_id = env_id
         self.fps = FamilyView(env).render_fps
 
-    def turn(self, request: Request) -> Turn:
-        """Make a turn, and write its video.
-
-        :param request: What it is made from.
-        :return: The turn.
-        """
+    def turn(self, request: TurnRequest) -> Turn:
+        """Make a turn, and write its video."""
         adapter = self.adapter(request)
         if request.preference is not None:
             adapter.tell(request.preference)
         believed, latent = belief(adapter, self.env_id), adapter.policy().latent
-        if request.wanted == "question":
+        every = self._film_every(request)
+        if request.kind == "question":
             query = adapter.ask()
-            frames = pair(query.left.frames or [], query.right.frames or [])
+            frames = pair(query.left.frames or (), query.right.frames or ())
         else:
-            frames = self._film(adapter, latent, self._film_every(request))
-        fps = self.fps / self._film_every(request)
+            clip = rollout_latents(
+                self.model,
+                self.env,
+                latent[None, :],
+                None,
+                [rollout_seed(adapter.seed, RESULT_ROLLOUT)],
+                adapter.options.deterministic,
+                frames=every,
+            )[0]
+            frames = [*map(fit, clip.frames or ())]
+        fps = self.fps / every
         write_clip(frames, request.video, fps)
         data = adapter.to_dict()
         pending = data["pending"] or {"left": None, "right": None}
@@ -164,12 +185,8 @@ class Bench:
         latent = np.zeros((1, self.model.latent_dim))
         rollout_latents(self.model, self.env, latent, None, [0], frames=True, max_steps=2)
 
-    def adapter(self, request: Request) -> PreferenceAdapter:
-        """The adapter as it was before the answer.
-
-        :param request: What a turn is made from.
-        :return: The adapter.
-        """
+    def adapter(self, request: TurnRequest) -> PreferenceAdapter:
+        """The adapter as it was before the answer."""
         # The session counts the questions; the adapter must only be ready for one more.
         n_queries = len(request.answers) + 2
         if request.state is None:
@@ -187,30 +204,19 @@ class Bench:
             data, self.model, self.env, oracle=_Watches(self._film_every(request))
         )
 
-    def _film_every(self, request: Request) -> int:
-        every = max(
-            1, int(self.fps / FILM_FPS)
-        )  # of what moves faster than films do not all steps are filmed
-        return (
-            every * request.film_every
-            if self.fps / (every * request.film_every) >= SMOOTH_FPS
-            else every
-        )
+    def _film_every(self, request: TurnRequest) -> int:
+        return film_every(self.fps, request.film_every)
 
-    def _film(
-        self, adapter: PreferenceAdapter, latent: np.ndarray, film_every: int
-    ) -> list[np.ndarray]:
-        seed = rollout_seed(adapter.seed, RESULT_ROLLOUT)
-        clip = rollout_latents(
-            self.model,
-            self.env,
-            latent[None, :],
-            None,
-            [seed],
-            adapter.options.deterministic,
-            frames=film_every,
-        )[0]
-        return [fit(frame) for frame in clip.frames or []]
+
+def film_every(fps: float, wanted: int) -> int:
+    """How many steps lie between two frames of a film.
+
+    :param fps: Steps per second.
+    :param wanted: How many times fewer frames than usual there should be; not where it would move
+        in jerks then.
+    """
+    every = max(1, int(fps / FILM_FPS))  # what moves faster than films do is not filmed whole
+    return every * wanted if fps / (every * wanted) >= SMOOTH_FPS else every
 
 
 def adapter_options(options: dict[str, Any]) -> dict[str, Any]:
@@ -223,36 +229,28 @@ def adapter_options(options: dict[str, Any]) -> dict[str, Any]:
     return {"noise_model": MistakeNoise(others.pop("mistake_rate", 0.05)), **others}
 
 
-def make_turn(request: Request) -> Turn:
+def make_turn(request: TurnRequest) -> Turn:
     """Make a turn in this process, which keeps models and environments that it has used.
 
-    :param request: What it is made from.
-    :return: The turn.
-    :raises NotWantedError: If there was a marker, and it is taken away.
+    :raises RenderCancelledError: If there was a marker, and it is taken away.
     """
-    bench = bench_of(request.choice)
-    bench.env.env_method("render_while", request.marker if request.marker.exists() else None)
-    family = FamilyView(bench.env)
+    renderer = renderer_of(request.model)
+    renderer.env.env_method("render_while", request.marker if request.marker.exists() else None)
+    family = FamilyView(renderer.env)
     family.set_tasks(family.sample_tasks(1, np.random.default_rng([TASK_STREAM, request.seed])))
-    return bench.turn(request)
+    return renderer.turn(request)
 
 
-@lru_cache(maxsize=BENCHES)
-def bench_of(choice: Choice) -> Bench:
-    """Load a model and make its environment.
-
-    :param choice: Which.
-    :return: Both, ready.
-    """
-    from stable_baselines3.common.vec_env import DummyVecEnv
-
+@lru_cache(maxsize=MAX_RENDERERS)
+def renderer_of(info: ModelInfo) -> Renderer:
+    """Load a model and make its environment."""
     env = DummyVecEnv(
-        [lambda: _RendersWhileWanted(make_env(choice.env_id, dict(choice.env_kwargs)))]
+        [lambda: CancellableRendering(make_env(info.env_id, **dict(info.env_kwargs)))]
     )
-    return Bench(load_choice(choice), env, choice.env_id)
+    return Renderer(load_shown_model(info), env, info.env_id)
 
 
-class _RendersWhileWanted(gym.Wrapper):
+class CancellableRendering(gym.Wrapper):
     """Rendering is what takes long in a turn, so there it is looked whether the turn is still
     wanted.
     """
@@ -262,42 +260,81 @@ class _RendersWhileWanted(gym.Wrapper):
     def render_while(self, marker: Path | None) -> None:
         """From now on.
 
-        :param marker: A file without which rendering raises :class:`NotWantedError`; None renders
-            always.
+        :param marker: A file without which rendering raises :class:`RenderCancelledError`; None
+            renders always.
         """
         self._marker = marker
 
     def render(self) -> Any:
         """See :class:`gymnasium.Env`."""
         if self._marker is not None and not self._marker.exists():
-            raise NotWantedError
+            raise RenderCancelledError
         return super().render()
 
 
-def load_choice(choice: Choice) -> Any:
-    """Load a model.
-
-    :param choice: Which.
-    :return: The model.
-    """
-    from sb3_poem.pearl_sac import PEARLSAC
-    from sb3_poem.poem_sac import POEMSAC
-
-    algorithm: type[PEARLSAC] = PEARLSAC if choice.algorithm == PEARLSAC.__name__ else POEMSAC
-    return algorithm.from_pretrained(choice.folder, device="cpu")
+def load_shown_model(info: ModelInfo) -> Any:
+    """Load a model from its folder, whatever else has its name."""
+    algorithm = BY_CLASS_NAME.get(read_config(info.folder)["algorithm"], POEMSAC)
+    return algorithm.from_pretrained(info.folder, device="cpu")
 
 
-def make_env(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env:
+def make_env(env_id: str, **env_kwargs: Any) -> gym.Env:
     """An environment that renders, small and fast where it can.
 
-    :param env_kwargs: Its arguments.
-    :return: The environment.
     :raises ValueError: If it cannot render RGB images.
     """
-    from sb3_poem.common.vec_env import make_shown_env
-
     small = {"width": WIDTH, "height": HEIGHT}
     for extra in ({**small, "render_quality": "fast"}, small):
         with contextlib.suppress(TypeError):  # it does not take these
             return make_shown_env(env_id, "rgb_array", **{**extra, **env_kwargs})
     return make_shown_env(env_id, "rgb_array", **env_kwargs)
+
+
+def write_clip(frames: Sequence[np.ndarray], path: Path, fps: float) -> None:
+    """Write frames as MP4 (H.264), completely or not at all.
+
+    :param frames: (height, width, 3) uint8 each, of one size.
+    :param path: A file that ends in ``.mp4``, in a folder that exists.
+    :raises StorageError: If it cannot be written.
+    """
+    from imageio_ffmpeg import get_ffmpeg_exe
+
+    height, width = frames[0].shape[:2]
+    size = f"{width}x{height}"
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", f"{fps:.02f}", "-i", "-"]
+    temporary = path.with_name(f".writing-{path.name}")
+    command = [get_ffmpeg_exe(), "-y", "-v", "error", *source, *ENCODER, str(temporary)]
+    try:
+        # Not imageio's writer, which takes no notice when ffmpeg fails at the end.
+        pixels = b"".join(frame.tobytes() for frame in frames)
+        done = subprocess.run(command, input=pixels, capture_output=True, check=False)
+        if done.returncode != 0:
+            words = done.stderr.decode(errors="replace").partition("\n")[0]
+            raise OSError(f"ffmpeg ended with status {done.returncode} {words}")
+        with open(temporary, "rb") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        raise StorageError(f"{path} cannot be written: {error}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def pair(left: Sequence[np.ndarray], right: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Two clips beside each other in the page's size: in one file they cannot fall out of step."""
+    return side_by_side([*map(fit, left)], [*map(fit, right)], gap=0)
+
+
+def fit(frame: np.ndarray) -> np.ndarray:
+    """A frame in the page's size, whole, with bars of its corner's colour where its shape is
+    another.
+
+    :param frame: (height, width, 3) uint8.
+    :return: (:data:`HEIGHT`, :data:`WIDTH`, 3) uint8.
+    """
+    if frame.shape[:2] == (HEIGHT, WIDTH):
+        return frame
+    from PIL import Image, ImageOps
+
+    image, corner = Image.fromarray(frame), tuple(frame[0, 0].tolist())
+    return np.asarray(ImageOps.pad(image, (WIDTH, HEIGHT), Image.Resampling.BILINEAR, color=corner))

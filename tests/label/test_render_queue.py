@@ -1,4 +1,4 @@
-"""The workshop: what nobody wants any more makes room."""
+"""The render queue: what nobody wants any more makes room."""
 
 from __future__ import annotations
 
@@ -6,38 +6,37 @@ import asyncio
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
 import gymnasium
 import pytest
 
-from sb3_poem.label.catalogue import Choice
-from sb3_poem.label.turns import (
-    Bench,
-    NotWantedError,
-    Request,
+from sb3_poem.label.families import ModelInfo
+from sb3_poem.label.render_queue import Priority, RenderQueue, process_pool
+from sb3_poem.label.rendering import (
+    CancellableRendering,
+    RenderCancelledError,
     Turn,
-    _RendersWhileWanted,
+    TurnRequest,
+    film_every,
     make_env,
     make_turn,
 )
-from sb3_poem.label.workshop import LIKELY, WAITED_FOR, Workshop, process_pool
 
 TURN = Turn(None, None, None, None, None, 20.0, 1)
 
 
-def request(choice: Choice, folder: Path, name: str) -> Request:
-    return Request(choice, 5, {}, "question", folder / f"{name}.mp4")
+def request(info: ModelInfo, folder: Path, name: str) -> TurnRequest:
+    return TurnRequest(info, 5, {}, "question", folder / f"{name}.mp4")
 
 
 def test_a_turn_that_nobody_wants_any_more_is_stopped_for_the_next(
-    point_goal: Choice, tmp_path: Path
+    point_goal: ModelInfo, tmp_path: Path
 ) -> None:
     started = threading.Event()
 
-    def make(wanted: Request) -> Turn:
+    def make(wanted: TurnRequest) -> Turn:
         if wanted.video.stem == "next":
             return TURN
         started.set()
@@ -45,54 +44,56 @@ def test_a_turn_that_nobody_wants_any_more_is_stopped_for_the_next(
         while wanted.marker.exists():  # a turn that would take half a minute
             assert time.monotonic() < deadline, "nobody stopped this turn"
             time.sleep(0.005)
-        raise NotWantedError
+        raise RenderCancelledError
 
-    async def talk() -> None:
-        workshop = Workshop(1, lambda: ThreadPoolExecutor(1), make)
-        unwanted = workshop.submit(request(point_goal, tmp_path, "unwanted"), LIKELY)
-        following = workshop.submit(request(point_goal, tmp_path, "next"), WAITED_FOR)
+    async def life() -> None:
+        queue = RenderQueue(1, lambda: ThreadPoolExecutor(1), make)
+        unwanted = queue.submit(request(point_goal, tmp_path, "unwanted"), Priority.LIKELY)
+        following = queue.submit(request(point_goal, tmp_path, "next"), Priority.WAITED_FOR)
         await asyncio.to_thread(started.wait, 10.0)
         assert not following.done.done()
-        workshop.discard(unwanted)
+        queue.cancel(unwanted)
         assert await asyncio.wait_for(following.done, 10.0) is TURN
         assert unwanted.done.cancelled()
-        await workshop.close()
+        await queue.close()
 
-    asyncio.run(talk())
+    asyncio.run(life())
     assert not list(tmp_path.iterdir())
 
 
-def test_rendering_ends_when_the_marker_is_taken_away(point_goal: Choice, tmp_path: Path) -> None:
-    env = _RendersWhileWanted(make_env(point_goal.env_id, {}))
+def test_rendering_ends_when_the_marker_is_taken_away(
+    point_goal: ModelInfo, tmp_path: Path
+) -> None:
+    env = CancellableRendering(make_env(point_goal.env_id))
     env.reset(seed=0)
     marker = tmp_path / "turn.wanted"
     marker.touch()
     env.render_while(marker)
     assert env.render().ndim == 3
     marker.unlink()
-    with pytest.raises(NotWantedError):
+    with pytest.raises(RenderCancelledError):
         env.render()
     env.render_while(None)
     assert env.render().ndim == 3
 
 
 def test_a_worker_leaves_a_turn_whose_marker_goes(
-    point_goal: Choice, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    point_goal: ModelInfo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wanted = request(point_goal, tmp_path, "turn")
     images = 0
-    render = _RendersWhileWanted.render
+    render = CancellableRendering.render
 
-    def render_and_lose_interest(env: _RendersWhileWanted) -> object:
+    def render_and_lose_interest(env: CancellableRendering) -> object:
         nonlocal images
         images += 1
         if images == 3:
             wanted.marker.unlink()
         return render(env)
 
-    monkeypatch.setattr(_RendersWhileWanted, "render", render_and_lose_interest)
+    monkeypatch.setattr(CancellableRendering, "render", render_and_lose_interest)
     wanted.marker.touch()
-    with pytest.raises(NotWantedError):
+    with pytest.raises(RenderCancelledError):
         make_turn(wanted)
     assert images == 3
     assert not list(tmp_path.iterdir())
@@ -104,16 +105,8 @@ def test_a_worker_leaves_a_turn_whose_marker_goes(
 @pytest.mark.parametrize(
     ("fps", "alone", "crowded"), [(10, 1, 1), (20, 1, 2), (25, 1, 2), (80, 4, 8)]
 )
-def test_films_show_about_twenty_frames_a_second(
-    point_goal: Choice, tmp_path: Path, fps: int, alone: int, crowded: int
-) -> None:
-    bench = object.__new__(Bench)
-    bench.fps = float(fps)
-    wanted = request(point_goal, tmp_path, "turn")
-    assert [bench._film_every(replace(wanted, film_every=every)) for every in (1, 2)] == [
-        alone,
-        crowded,
-    ]
+def test_films_show_about_twenty_frames_a_second(fps: int, alone: int, crowded: int) -> None:
+    assert [film_every(fps, wanted) for wanted in (1, 2)] == [alone, crowded]
 
 
 def test_workers_know_the_packages_that_register_environments(
