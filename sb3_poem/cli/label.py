@@ -5,6 +5,7 @@ others make of these.
 import argparse
 import os
 import secrets
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +32,9 @@ def run_label(arguments: argparse.Namespace) -> None:
 
 def run_page(arguments: argparse.Namespace) -> None:
     """Serve the page until it is stopped."""
-    try:
-        import jinja2  # noqa: F401
-        import starlette  # noqa: F401
-        import uvicorn  # noqa: F401
-    except ImportError as error:
-        raise ValueError(f"the page needs {error.name}: pip install 'sb3_poem[label]'") from None
+    for package in ("jinja2", "starlette", "uvicorn"):
+        if find_spec(package) is None:
+            raise ValueError(f"the page needs {package}: pip install 'sb3_poem[label]'")
     from sb3_poem.label.access import LOOPBACK, Access, is_loopback
     from sb3_poem.label.families import find_models
     from sb3_poem.label.render_queue import RenderQueue, process_pool

@@ -229,24 +229,20 @@ class Connection(H11Protocol):
         self._untaken = 0  # bytes
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """See asyncio."""
         super().connection_made(transport)
         self.network = network_of(self.client[0] if self.client else "")
         self._watch()
         self.loop.call_later(GRACE, self._make_room)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """See asyncio."""
         super().connection_lost(exc)
         self._await(None)
 
     def data_received(self, data: bytes) -> None:
-        """See asyncio."""
         super().data_received(data)
         self._watch()
 
     def on_response_complete(self) -> None:
-        """See uvicorn."""
         super().on_response_complete()
         self._watch()
 
@@ -260,12 +256,10 @@ class Connection(H11Protocol):
             self._end()
 
     def pause_writing(self) -> None:
-        """See asyncio."""
         super().pause_writing()
         self._watch()
 
     def resume_writing(self) -> None:
-        """See asyncio."""
         super().resume_writing()
         self._await(None)  # a part was taken; the next has its own time
         self._watch()

@@ -27,16 +27,16 @@ COMMON = ("model", "env_id", "seed", "options", "wish")
 
 
 def records(
-    store: Store, trajectories: bool = False, undone: bool = False
+    store: Store, trajectories: bool = False, undone: bool = False, session: int | None = None
 ) -> Iterator[dict[str, Any]]:
-    """The answers of all sessions: a JSON-ready record for each, in the order in which they were
-    given.
+    """The answers of one session or of all: a JSON-ready record for each, in the order in which
+    they were given.
 
     :param trajectories: Whether observations, actions and reward features are in them.
     :param undone: Whether answers that were taken back are among them.
     """
     for row in store.records():
-        if undone or row["undone"] is None:
+        if session in (None, row["session"]) and (undone or row["undone"] is None):
             yield _record(row, store.videos.resolve(), trajectories)
 
 
@@ -49,8 +49,7 @@ def session_record(store: Store, session: Session) -> dict[str, Any]:
         "started": _time(session.created),
         "answers": [
             {name: value for name, value in record.items() if name not in left_out}
-            for record in records(store)
-            if record["session"] == session.id
+            for record in records(store, session=session.id)
         ],
     }
 

@@ -42,12 +42,11 @@ from sb3_poem.label.export import session_record
 from sb3_poem.label.families import describe
 from sb3_poem.label.rendering import StorageError
 from sb3_poem.label.sessions import FullError, SessionManager
-from sb3_poem.label.store import RefusedError, Session
+from sb3_poem.label.store import MAX_WISH, RefusedError, Session
 
 _logger = logging.getLogger(__name__)
 
 PAGE = Path(__file__).with_name("page")
-MAX_WISH = 2000  # characters
 LONGEST_TOKEN = 64
 DISK_FULL = (
     "This could not be kept: the disk of this server is full, or cannot be written. What you "
@@ -87,7 +86,7 @@ class _Pages:
                 post("/undo", store.undo, answered=int),
                 post("/stop", store.stop),
                 post("/verdict", store.judge, result=int, verdict=str),
-                self.route("/wish", self.wish, "POST"),
+                post("/wish", store.set_wish, wish=str),
                 self.route("/video/{number}", self.video),
                 self.route("/answers.json", self.answers),
                 self.route("/policy.safetensors", self.policy),
@@ -150,13 +149,6 @@ class _Pages:
 
     async def state(self, _: Request, session: Session) -> Response:
         return JSONResponse(await self.sessions.view(session))
-
-    async def wish(self, request: Request, session: Session) -> Response:
-        data = await _fields(request, wish=str)
-        if len(data["wish"]) > MAX_WISH:
-            raise RefusedError(f"what you wish for may be {MAX_WISH} characters long at most")
-        await asyncio.to_thread(self.store.set_wish, session.id, data["wish"])
-        return JSONResponse({})
 
     async def video(self, request: Request, session: Session) -> Response:
         number, path = request.path_params["number"], None

@@ -11,13 +11,14 @@ import secrets
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from sb3_poem.adaptation.adapter import OtherModelError
 from sb3_poem.label.families import ModelInfo
 from sb3_poem.label.render_queue import Job, Priority, RenderQueue
-from sb3_poem.label.rendering import StorageError, Turn, TurnRequest, load_shown_model
+from sb3_poem.label.rendering import StorageError, TurnRequest, load_shown_model
 from sb3_poem.label.store import PREFERENCES, RefusedError, Session, Store
 
 _logger = logging.getLogger(__name__)
@@ -129,8 +130,7 @@ class SessionManager:
         :raises StorageError: If it cannot be kept.
         """
         active = self._activate(session)
-        session, answered, kind, turn, before = await asyncio.to_thread(self._look, session.id)
-        shown = turn or before
+        session, answered, kind, turn, shown = await asyncio.to_thread(self._look, session.id)
         view: dict[str, Any] = {
             "phase": "preparing",
             "model": session.model,
@@ -182,9 +182,7 @@ class SessionManager:
         about = (info, session.seed, session.options, key.kind, video)
         if key.question is None:
             return TurnRequest(*about, film_every=film_every)
-        question = self.store.whole_turn(key.question)
-        if question is None:
-            raise RefusedError("the question before is missing")
+        question: Any = self.store.whole_turn(key.question)
         return TurnRequest(
             *about,
             json.loads(question["state"]),
@@ -198,14 +196,11 @@ class SessionManager:
         """The session as it is now, its answers, the kind of turn that should be shown, that turn,
         and where it is missing the question before it.
         """
-        session = self.store.session(number)
-        answered = len(self.store.answers(number))
+        session, answered = self.store.session(number), len(self.store.answers(number))
         kind = "result" if session.stopped or answered >= session.target else "question"
-        turn, before = self.store.turn(number, kind, answered), None
-        for earlier in (answered, answered - 1):
-            if turn is None and before is None:
-                before = self.store.turn(number, "question", earlier)
-        return session, answered, kind, turn, before
+        turn = self.store.turn(number, kind, answered)
+        question = partial(self.store.turn, number, "question")
+        return session, answered, kind, turn, turn or question(answered) or question(answered - 1)
 
     def _activate(self, session: Session) -> _Active:
         if session.id not in self._active:
@@ -264,27 +259,13 @@ class SessionManager:
             )
             active.jobs.pop(key, None)
             if not is_kept:
-                await asyncio.to_thread(self._put_back, session, answered, kind, video, made)
+                video.unlink(missing_ok=True)
             active.failed = None
         except Exception as error:
             words = "session %d: the %s after %d answers could not be made: %s"
             trace = None if isinstance(error, WORDED_ERRORS) else error
             _logger.error(words, session.id, kind, answered, error, exc_info=trace)
             active.failed, active.failed_at = error, time.monotonic()
-
-    def _put_back(
-        self, session: Session, answered: int, kind: str, video: Path, made: Turn
-    ) -> None:
-        """Of a turn that is kept already, the video takes the place of one that somebody deleted;
-        else it is not needed.
-        """
-        turn = self.store.turn(session.id, kind, answered)
-        if turn is None or (self.store.videos / turn["video"]).is_file():
-            video.unlink(missing_ok=True)
-            return
-        # First: whoever finds the film finds what it is.
-        self.store.note_film(turn["id"], made.fps, made.frames)
-        video.replace(self.store.videos / turn["video"])
 
     def _render_ahead(self, session: Session, answered: int, question: int) -> None:
         """Begin what follows from each of the three answers."""

@@ -22,6 +22,7 @@ from sb3_poem.label.rendering import StorageError, Turn
 
 PREFERENCES = ("left", "right", "equal")
 VERDICTS = ("yes", "not quite")
+MAX_WISH = 2000  # characters
 SCHEMA_VERSION = 1
 SCHEMA = """
 CREATE TABLE sessions (
@@ -30,13 +31,13 @@ CREATE TABLE sessions (
     source TEXT NOT NULL,            -- 'page', 'notebook' or 'terminal'
     model TEXT NOT NULL,
     env_id TEXT NOT NULL,
-    seed INTEGER NOT NULL,
-    options TEXT NOT NULL,           -- JSON
+    seed INTEGER NOT NULL,           -- of the adaptation
+    options TEXT NOT NULL,           -- of the adaptation, JSON
     step INTEGER NOT NULL,           -- questions before the first result, and between results
     target INTEGER NOT NULL,         -- the next result comes after so many answers
-    stopped INTEGER NOT NULL DEFAULT 0,
-    wish TEXT NOT NULL DEFAULT '',
-    created REAL NOT NULL
+    stopped INTEGER NOT NULL DEFAULT 0,  -- whether the person asked for the result before
+    wish TEXT NOT NULL DEFAULT '',   -- in the person's own words
+    created REAL NOT NULL            -- seconds since 1970, as all times
 );
 CREATE TABLE turns (
     id INTEGER PRIMARY KEY,
@@ -79,19 +80,7 @@ class RefusedError(ValueError):
 
 @dataclass(frozen=True)
 class Session:
-    """A person's conversation.
-
-    :param id: Its number.
-    :param source: "page", "notebook" or "terminal".
-    :param model: The model's name.
-    :param seed: Of the adaptation.
-    :param options: Of the adaptation, JSON-ready.
-    :param step: Questions before the first result, and between results.
-    :param target: The next result comes after so many answers.
-    :param stopped: Whether the person asked for the result before.
-    :param wish: In the person's own words.
-    :param created: Seconds since 1970.
-    """
+    """A person's conversation: a row of the table ``sessions``."""
 
     id: int
     source: str
@@ -235,7 +224,7 @@ class Store:
         shown: float | None = None,
     ) -> int | None:
         """Keep a turn, if the conversation still is where it was made for, and it has not been kept
-        already.
+        already; of one that has, the video takes the place of one that somebody deleted.
 
         :param last_answer: The last of the answers before it; None at the start.
         :param video: Its file's name within ``videos/``.
@@ -243,12 +232,19 @@ class Store:
         :param shown: When it was shown; None is not yet.
         :return: The turn's number; None if it was not kept.
         """
-        with self._transaction():
+        with self._transaction() as execute:
             here = [answer["id"] for answer in self.answers(session)]
             if number > len(here) or (here[number - 1] if number else None) != last_answer:
                 return None
-            if self.turn(session, kind, number) is not None:
-                return None
+            kept = self.turn(session, kind, number)
+            if kept is not None:
+                if (self.videos / kept["video"]).is_file():
+                    return None
+                execute(
+                    "UPDATE turns SET video = ?, fps = ?, frames = ? WHERE id = ?",
+                    (video, turn.fps, turn.frames, kept["id"]),
+                )
+                return int(kept["id"])
             return self._insert(
                 "turns",
                 session=session,
@@ -272,11 +268,6 @@ class Store:
             execute(
                 "UPDATE turns SET shown = ? WHERE id = ? AND shown IS NULL", (time.time(), turn)
             )
-
-    def note_film(self, turn: int, fps: float, frames: int) -> None:
-        """Note how a turn's video moves that was filmed again."""
-        with self._transaction() as execute:
-            execute("UPDATE turns SET fps = ?, frames = ? WHERE id = ?", (fps, frames, turn))
 
     def add_answer(self, session: int, question: int, preference: str) -> int:
         """Keep an answer. Once this returns, it is on the disk. The same answer again is no second
@@ -372,7 +363,12 @@ class Store:
                 )
 
     def set_wish(self, session: int, wish: str) -> None:
-        """Keep what the person wants, in their own words."""
+        """Keep what the person wants, in their own words.
+
+        :raises RefusedError: If it is too long.
+        """
+        if len(wish) > MAX_WISH:
+            raise RefusedError(f"what you wish for may be {MAX_WISH} characters long at most")
         with self._transaction() as execute:
             execute("UPDATE sessions SET wish = ? WHERE id = ?", (wish, session))
 

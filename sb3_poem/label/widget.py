@@ -8,7 +8,6 @@ import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from poem_envs.headless import release_graphics
 from sb3_poem.adaptation.adapter import PreferenceAdapter
@@ -67,13 +66,21 @@ class LabelWidget:
         start = {
             name: value for name, value in adapter.to_dict().items() if name not in CONVERSATION
         }
-        renderer = _AdaptersRenderer(adapter.model, adapter.env, env_id, start)
+        renderer = Renderer(adapter.model, adapter.env, env_id)
+
+        def make(request: TurnRequest) -> Turn:
+            """What it rendered with is the caller's again afterwards."""
+            try:
+                return renderer.turn(replace(request, state=request.state or start))
+            finally:
+                release_graphics()
+
         self._temporary = tempfile.TemporaryDirectory()  # not used where a folder is given
         self._store = Store(self._temporary.name if store is None else store)
         release_graphics()  # the environment may have rendered in this thread
         # One thread: a graphics context belongs to one at a time.
         self._thread = ThreadPoolExecutor(1)
-        queue = RenderQueue(1, lambda: self._thread, renderer.turn)
+        queue = RenderQueue(1, lambda: self._thread, make)
         info = ModelInfo("notebook", Path(), env_id)
         options = {**adapter.options.to_dict(), "notebook": True}
         n_queries = adapter.options.n_queries
@@ -128,22 +135,3 @@ class LabelWidget:
             f'<iframe src="{html.escape(self.url)}" width="100%" height="{self.height}" '
             f'style="border:0" title="Which one is better?"></iframe>'
         )
-
-
-class _AdaptersRenderer(Renderer):
-    """Makes turns with a given adapter's model, environment, options and seed."""
-
-    def __init__(self, model: Any, env: Any, env_id: str, start: dict[str, Any]) -> None:
-        super().__init__(model, env, env_id)
-        self._start = start
-
-    def turn(self, request: TurnRequest) -> Turn:
-        """See :class:`Renderer`. What it rendered with is the caller's again afterwards."""
-        try:
-            return super().turn(request)
-        finally:
-            release_graphics()
-
-    def adapter(self, request: TurnRequest) -> PreferenceAdapter:
-        """See :class:`Renderer`."""
-        return super().adapter(replace(request, state=request.state or self._start))

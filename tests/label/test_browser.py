@@ -339,7 +339,8 @@ def test_both_halves_of_the_film_are_in_step(
     spread = page.evaluate(
         """() => ['left', 'right'].map(side => {
             const canvas = document.getElementById(side + '-screen');
-            const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
+            const context = canvas.getContext('2d');
+            const data = context.getImageData(0, 0, canvas.width, canvas.height).data;
             let blue = 0;
             for (let i = 0; i < data.length; i += 4) blue += data[i + 2] - data[i] > 60;
             return blue;

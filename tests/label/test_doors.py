@@ -36,6 +36,7 @@ from sb3_poem.label.rendering import StorageError, write_clip
 from sb3_poem.label.server import DISK_FULL, BackgroundServer, bind, link_host, make_app
 from sb3_poem.label.store import Store
 
+POST = b"POST /start HTTP/1.1\r\nHost: localhost\r\n"
 HALF = b"GET / HTTP/1.1\r\nHost: localhost\r\nX-Waiting: "
 PASSWORD = "a long password"
 
@@ -136,7 +137,7 @@ def test_300_half_open_connections_shut_nobody_out(
 def test_a_slow_body_ends_at_the_deadline_while_others_are_served(serve: Serve) -> None:
     port = serve(deadline=0.6)
     begun = time.monotonic()
-    slow = connect(port, b"POST /start HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000\r\n\r\n")
+    slow = connect(port, POST + b"Content-Length: 1000\r\n\r\n")
     with contextlib.suppress(ConnectionError):
         while time.monotonic() < begun + 3.0 and is_open(slow):
             slow.sendall(b"x")  # a byte now and then is no reason to wait longer
@@ -146,10 +147,7 @@ def test_a_slow_body_ends_at_the_deadline_while_others_are_served(serve: Serve) 
 
 
 def test_a_request_that_takes_too_long_is_told_so(serve: Serve) -> None:
-    slow = connect(
-        serve(deadline=0.2),
-        b"POST /start HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\nmodel=",
-    )
+    slow = connect(serve(deadline=0.2), POST + b"Content-Length: 9\r\n\r\nmodel=")
     answer = read_all(slow)
     assert answer.startswith(b"HTTP/1.1 408 ")
     assert b"took too long" in answer
@@ -161,9 +159,9 @@ def test_a_request_that_takes_too_long_is_told_so(serve: Serve) -> None:
         b"",
         b"GET /nowhere HTTP/1.1\r\nHost: localhost\r\n\r\n",
         b"GET /nowhere HTTP/1.1\r\nHost: localhost\r\n\r\nGET / HTTP/1.1\r\nHo",
-        b"POST /start HTTP/1.1\r\nHost: localhost\r\nContent-Length: 99999\r\n\r\nx",
-        b"POST /start HTTP/1.1\r\nHost: localhost\r\nContent-Length: 99999\r\n\r\n" + b"x" * 99999,
-        b"POST /start HTTP/1.1\r\nHost: localhost\r\nExpect: 100-continue\r\nContent-Length: 5\r\n\r\n",
+        POST + b"Content-Length: 99999\r\n\r\nx",
+        POST + b"Content-Length: 99999\r\n\r\n" + b"x" * 99999,
+        POST + b"Expect: 100-continue\r\nContent-Length: 5\r\n\r\n",
         b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\r\n",
     ],
 )
@@ -244,24 +242,10 @@ def test_an_address_is_what_one_household_has(host: str, network: str) -> None:
         (b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * 5000, b"400"),
         (b"GET http://evil.example/ HTTP/1.1\r\nHost: localhost\r\n\r\n", b"404"),
         (b"CONNECT evil.example:443 HTTP/1.1\r\nHost: localhost\r\n\r\n", b"404"),
-        (
-            b"POST /start HTTP/1.1\r\nHost: localhost\r\nOrigin: http://[\r\nContent-Length: 0\r\n\r\n",
-            b"403",
-        ),
-        (
-            b"POST /start HTTP/1.1\r\nHost: localhost\r\nContent-Length: "
-            + b"9" * 5000
-            + b"\r\n\r\n",
-            b"400",
-        ),
-        (
-            b"POST /start HTTP/1.1\r\nHost: localhost\r\nContent-Length: 3\r\nContent-Length: 4\r\n\r\nabc",
-            b"400",
-        ),
-        (
-            b"POST /start HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n-1\r\n",
-            b"400",
-        ),
+        (POST + b"Origin: http://[\r\nContent-Length: 0\r\n\r\n", b"403"),
+        (POST + b"Content-Length: " + b"9" * 5000 + b"\r\n\r\n", b"400"),
+        (POST + b"Content-Length: 3\r\nContent-Length: 4\r\n\r\nabc", b"400"),
+        (POST + b"Transfer-Encoding: chunked\r\n\r\n-1\r\n", b"400"),
         (b"POST /start HTTP/1.1\r\nHost: evil\r\nTransfer-Encoding: chunked\r\n\r\n-1\r\n", b"400"),
     ],
 )
@@ -277,10 +261,7 @@ def test_what_is_no_request_is_refused_without_an_error(
 def test_a_body_that_goes_wrong_after_the_answer_ends_the_connection(serve: Serve) -> None:
     port = serve()
     large = b"%x\r\n" % (2 * MAX_BODY) + b"x" * (2 * MAX_BODY)
-    connection = connect(
-        port,
-        b"POST /start HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n" + large,
-    )
+    connection = connect(port, POST + b"Transfer-Encoding: chunked\r\n\r\n" + large)
     assert connection.recv(65536).startswith(b"HTTP/1.1 413 ")
     connection.sendall(b"\r\n-1\r\n")
     read_all(connection, seconds=3.0)
@@ -289,10 +270,7 @@ def test_a_body_that_goes_wrong_after_the_answer_ends_the_connection(serve: Serv
 
 def test_a_body_that_breaks_off_is_no_request(serve: Serve, store: Store) -> None:
     port = serve()
-    cut = connect(
-        port,
-        b"POST /start HTTP/1.1\r\nHost: localhost\r\nContent-Length: 99\r\n\r\nmodel=PointGoal",
-    )
+    cut = connect(port, POST + b"Content-Length: 99\r\n\r\nmodel=PointGoal")
     assert status(port) == 200
     cut.close()
     time.sleep(0.1)

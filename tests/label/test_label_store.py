@@ -103,6 +103,7 @@ def test_a_turn_made_for_an_answer_that_was_taken_back_is_not_kept(store: Store)
     again = store.add_answer(session, question["id"], "right")
     assert not store.add_turn(session, "question", 1, given, turn(), "late.mp4")
     assert store.add_turn(session, "question", 1, again, turn(), "new.mp4")
+    (store.videos / "new.mp4").touch()
     assert not store.add_turn(session, "question", 1, again, turn(), "twice.mp4")
 
 

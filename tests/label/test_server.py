@@ -317,9 +317,7 @@ def test_pages_load_nothing_from_elsewhere(served: tuple[TestClient, Store]) -> 
 def guarded(store: Store, point_goal: ModelInfo) -> Iterator[TestClient]:
     access = Access(user="ann", password="a long password", token="t" * 32)
     with TestClient(
-        make_app(make_sessions(store, point_goal), access),
-        base_url=HOST,
-        follow_redirects=False,
+        make_app(make_sessions(store, point_goal), access), base_url=HOST, follow_redirects=False
     ) as client:
         yield client
 

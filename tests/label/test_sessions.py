@@ -1,5 +1,5 @@
-"""SessionManager: the same questions and the same posterior, whether rendered ahead, resumed, undone
-or computed anew.
+"""Sessions: the same questions and the same posterior, whether rendered ahead, resumed, undone or
+computed anew.
 """
 
 from __future__ import annotations
