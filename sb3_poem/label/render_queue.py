@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import asyncio
 import importlib
-import itertools
 import logging
 import multiprocessing
 import os
@@ -49,13 +48,11 @@ class Job:
     """A turn that is being made, or will be.
 
     :param priority: May change while it waits.
-    :param order: Among those of one priority.
     :param done: Its turn, when it is there.
     """
 
     request: TurnRequest
     priority: Priority
-    order: int
     done: asyncio.Future[Turn] = field(
         default_factory=lambda: asyncio.get_running_loop().create_future()
     )
@@ -80,22 +77,19 @@ class RenderQueue:
         self.n_workers = n_workers
         self._make_executor = make_executor or (lambda: process_pool(n_workers))
         self._make = make
-        self._executor: Executor | None = None
+        self._executor = self._make_executor()
         self._waiting: list[Job] = []
         self._running: set[asyncio.Task[None]] = set()
-        self._count = itertools.count()
         self._closed = False
 
     def prepare(self) -> None:
         """Start the workers now, so that the first person does not wait for it."""
-        if self._executor is None:
-            self._executor = self._make_executor()
         for _ in range(self.n_workers):
             self._executor.submit(os.getpid)
 
     def submit(self, request: TurnRequest, priority: Priority) -> Job:
         """Have a turn made."""
-        job = Job(request, priority, next(self._count))
+        job = Job(request, priority)
         self._waiting.append(job)
         self._start_jobs()
         return job
@@ -119,12 +113,11 @@ class RenderQueue:
         self._waiting.clear()
         for task in self._running:
             task.cancel()
-        if self._executor is not None:
-            await asyncio.to_thread(self._executor.shutdown, wait=True, cancel_futures=True)
+        await asyncio.to_thread(self._executor.shutdown, wait=True, cancel_futures=True)
 
     def _start_jobs(self) -> None:
         while self._waiting and len(self._running) < self.n_workers and not self._closed:
-            job = min(self._waiting, key=lambda job: (job.priority, job.order))
+            job = min(self._waiting, key=lambda job: job.priority)  # of several the first
             self._waiting.remove(job)
             task = asyncio.get_running_loop().create_task(self._run(job))
             self._running.add(task)
@@ -160,14 +153,12 @@ class RenderQueue:
             job.done.set_result(turn)
 
     async def _attempt(self, request: TurnRequest, attempts: int = ATTEMPTS) -> Turn:
-        if self._executor is None:
-            self._executor = self._make_executor()
         executor = self._executor
         try:
             return await asyncio.get_running_loop().run_in_executor(executor, self._make, request)
         except BrokenProcessPool:
             if self._executor is executor:
-                self._executor = None
+                self._executor = self._make_executor()
             if attempts == 1:
                 raise
         _logger.warning("a worker process ended unexpectedly; starting another")

@@ -180,17 +180,8 @@ class SessionManager:
         film_every = CROWDED_FILM_EVERY if self._is_crowded() else 1
         video = self.store.videos / f"{session.id}-{secrets.token_hex(12)}.mp4"
         about = (info, session.seed, session.options, key.kind, video)
-        if key.question is None:
-            return TurnRequest(*about, film_every=film_every)
-        question: Any = self.store.whole_turn(key.question)
-        return TurnRequest(
-            *about,
-            json.loads(question["state"]),
-            self.store.adapter_answers(session.id, question["number"]),
-            {side: json.loads(question[f"{side}_trajectory"]) for side in ("left", "right")},
-            key.preference,
-            film_every,
-        )
+        before = {} if key.question is None else self.store.adapter_data(key.question)
+        return TurnRequest(*about, **before, preference=key.preference, film_every=film_every)
 
     def _look(self, number: int) -> tuple[Session, int, str, Any, Any]:
         """The session as it is now, its answers, the kind of turn that should be shown, that turn,

@@ -212,6 +212,18 @@ class Store:
             for row in self._all(query, session, before)
         ]
 
+    def adapter_data(self, turn: int) -> dict[str, Any]:
+        """What the adapter's dictionary held when a turn was made: ``answers``, ``pending``, and
+        the rest as ``state``.
+        """
+        row: Any = self.whole_turn(turn)
+        pair = {side: json.loads(row[f"{side}_trajectory"] or "null") for side in ("left", "right")}
+        return {
+            "state": json.loads(row["state"]),
+            "answers": self.adapter_answers(row["session"], row["number"]),
+            "pending": pair if pair["left"] is not None else None,
+        }
+
     def add_turn(
         self,
         session: int,

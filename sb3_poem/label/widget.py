@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import json
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -100,23 +99,16 @@ class LabelWidget:
 
     def sync(self) -> PreferenceAdapter:
         """The adapter, brought to where the person stands."""
-        number = self._session.id
-        answered = len(self._store.answers(number))
-        turn = self._store.turn(number, "question", answered) or self._store.turn(
-            number, "result", answered
-        )
-        row = None if turn is None else self._store.whole_turn(turn["id"])
-        if row is None:
+        session, store = self._session.id, self._store
+        answered = len(store.answers(session))
+        turn = store.turn(session, "question", answered) or store.turn(session, "result", answered)
+        if turn is None:
             raise RuntimeError(
                 "the page is still preparing what follows from the last answer; try again in a "
                 "moment"
             )
-        sides = {
-            side: json.loads(row[f"{side}_trajectory"] or "null") for side in ("left", "right")
-        }
-        answers = self._store.adapter_answers(number, answered)
-        pending = None if sides["left"] is None else sides
-        self.adapter.restore({**json.loads(row["state"]), "answers": answers, "pending": pending})
+        data = store.adapter_data(turn["id"])
+        self.adapter.restore({**data.pop("state"), **data})
         return self.adapter
 
     def policy(self) -> AdaptedPolicy:
