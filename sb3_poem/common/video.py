@@ -75,11 +75,15 @@ def _with_captions(clips: Sequence[Sequence[Frame]], captions: Sequence[str]) ->
 
 
 def side_by_side(
-    left: Sequence[Frame], right: Sequence[Frame], captions: tuple[str, str] | None = None
+    left: Sequence[Frame],
+    right: Sequence[Frame],
+    captions: tuple[str, str] | None = None,
+    gap: int = GAP,
 ) -> list[Frame]:
     """Two clips beside each other, under a line of text each if there are captions; the shorter one
     holds its last frame.
 
+    :param gap: White columns between them
     :raises ValueError: a clip is empty, or their heights differ
     """
     if len(left) == 0 or len(right) == 0:
@@ -89,7 +93,7 @@ def side_by_side(
         raise ValueError(f"both clips need the same height, got {heights[0]} and {heights[1]}")
     if captions is not None:
         left, right = _with_captions((left, right), captions)
-    bar = np.full((left[0].shape[0], GAP, 3), 255, dtype=np.uint8)
+    bar = np.full((left[0].shape[0], gap, 3), 255, dtype=np.uint8)
     n = max(len(left), len(right))
     lefts, rights = ([*clip, *[clip[-1]] * (n - len(clip))] for clip in (left, right))
     return [np.concatenate([a, bar, b], axis=1) for a, b in zip(lefts, rights, strict=True)]
