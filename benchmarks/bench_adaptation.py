@@ -16,7 +16,8 @@ import numpy as np
 import torch as th
 
 from sb3_poem import POEMSAC, Preference
-from sb3_poem.adaptation.options import AdaptationOptions, inference_rng
+from sb3_poem.adaptation import Rule, named_rule
+from sb3_poem.adaptation.rule import Setting, inference_rng
 from sb3_poem.common.trajectory import Trajectory
 
 # The paper's candidates, what Bayesian inference takes unless told otherwise, and many.
@@ -46,17 +47,14 @@ def trajectory(latent: np.ndarray, rng: np.random.Generator) -> Trajectory:
     return Trajectory(rng.standard_normal((STEPS + 1, 17)), actions, latent)
 
 
-def milliseconds(
-    model: POEMSAC, n_answers: int, n_tasks: int, seed: int, **options: Any
-) -> np.ndarray:
+def milliseconds(model: POEMSAC, n_answers: int, n_tasks: int, seed: int, rule: Rule) -> np.ndarray:
     """Of ``ask`` and ``tell``, for all tasks together, (n_answers, 2)."""
-    settings = AdaptationOptions(n_queries=n_answers, **options)
-    inferences = [settings.make_inference(model, inference_rng(seed + i)) for i in range(n_tasks)]
+    inferences = [rule.start(model, inference_rng(seed + i), Setting()) for i in range(n_tasks)]
     rng = np.random.default_rng(seed)
     taken = np.zeros((n_answers, 2))
     for question in range(n_answers):
         started = time.perf_counter()
-        pairs = [inference.ask_latents() for inference in inferences]
+        pairs = [inference.ask() for inference in inferences]
         taken[question, 0] = time.perf_counter() - started
         shown = [(trajectory(left, rng), trajectory(right, rng)) for left, right in pairs]
         answers = [Preference.LEFT if rng.random() < 0.5 else Preference.RIGHT for _ in pairs]
@@ -79,7 +77,7 @@ def main() -> None:
             for repeat in range(repeats if n == CANDIDATES[0] else 1):
                 for rule, options in RULES.items():  # in turns
                     taken = milliseconds(
-                        model, max(ANSWERS[n]), 1, repeat, n_candidates=n, **options
+                        model, max(ANSWERS[n]), 1, repeat, named_rule(n_candidates=n, **options)
                     )
                     runs[rule].append(taken.sum(axis=1))
             for rule, of_rule in runs.items():
@@ -89,7 +87,11 @@ def main() -> None:
                 results.append({"rule": rule, "d": dim, "candidates": n, **worst, **means})
     model = make_model(5)
     many = {
-        rule: float(milliseconds(model, 10, 30, 0, n_candidates=100, **options).sum(axis=1).mean())
+        rule: float(
+            milliseconds(model, 10, 30, 0, named_rule(n_candidates=100, **options))
+            .sum(axis=1)
+            .mean()
+        )
         for rule, options in RULES.items()
     }
     shown = ["rule", "d", "candidates", *(f"k = {k}" for k in ANSWERS[100]), "worst"]

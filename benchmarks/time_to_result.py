@@ -16,7 +16,7 @@ from common import DEVICE, ZOO, arguments, table, write
 from rl_zoo3.utils import linear_schedule
 
 from sb3_poem import POEMSAC
-from sb3_poem.adaptation.evaluation import evaluate_adaptation
+from sb3_poem.adaptation import evaluate_adaptation, named_rule
 from sb3_poem.benchmark.suites import family_name
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.vec_env import make_task_vec_env
@@ -70,7 +70,7 @@ class Clock(EpochCallback):
                 record_at=(N_QUERIES,),
                 n_episodes=N_EPISODES,
                 seed=self.test_seed,
-                inference=rule,
+                rule=named_rule(rule),
             )
             found[rule] = result.after(N_QUERIES)
         self.evaluations.append(found)

@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 from common import RESULTS, arguments, table, write
 
-from sb3_poem.adaptation.evaluation import evaluation_seed, known_task_return, return_matrix
+from sb3_poem.adaptation.evaluation import evaluation_seed
+from sb3_poem.adaptation.known_task import known_task_return, return_matrix
 from sb3_poem.adaptation.limits import best_codebook
 from sb3_poem.benchmark.cells import SEED_STRIDE, SELECTION_EPISODES
 from sb3_poem.benchmark.suites import Budget

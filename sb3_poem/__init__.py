@@ -13,16 +13,18 @@ from poem_envs import set_task  # which registers the environments, too
 
 if TYPE_CHECKING:
     from sb3_poem.adaptation import (
+        Bayes,
         BoltzmannOracle,
         HumanOracle,
         MistakeOracle,
+        Paper,
         Preference,
         PreferenceAdapter,
         Query,
         ReturnOracle,
     )
     from sb3_poem.adaptation.callback import AdaptationEvalCallback
-    from sb3_poem.baselines import ANOLEAdapter, MAMLRewardAdapter, RewardOracleAdapter
+    from sb3_poem.baselines import ANOLE, MAMLReward, RewardOracle
     from sb3_poem.common.vec_env import TaskVecEnv
     from sb3_poem.pearl_sac import PEARLSAC
     from sb3_poem.pearl_sac.callbacks import TrainingCheckpointCallback
@@ -35,9 +37,9 @@ _HOME = {
     "sb3_poem.pearl_sac": ("PEARLSAC",),
     "sb3_poem.pearl_sac.callbacks": ("TrainingCheckpointCallback",),
     "sb3_poem.common.vec_env": ("TaskVecEnv",),
-    "sb3_poem.baselines": ("ANOLEAdapter", "MAMLRewardAdapter", "RewardOracleAdapter"),
+    "sb3_poem.baselines": ("ANOLE", "MAMLReward", "RewardOracle"),
     "sb3_poem.adaptation": (
-        *("PreferenceAdapter", "Preference", "Query"),
+        *("PreferenceAdapter", "Bayes", "Paper", "Preference", "Query"),
         *("ReturnOracle", "BoltzmannOracle", "MistakeOracle", "HumanOracle"),
     ),
     "sb3_poem.adaptation.callback": ("AdaptationEvalCallback",),

@@ -26,14 +26,16 @@ import numpy as np
 import torch as th
 
 from sb3_poem import (
+    ANOLE,
     PEARLSAC,
     POEMSAC,
-    ANOLEAdapter,
-    MAMLRewardAdapter,
+    Bayes,
+    MAMLReward,
+    Paper,
     ReturnOracle,
-    RewardOracleAdapter,
+    RewardOracle,
 )
-from sb3_poem.adaptation import adapt_tasks
+from sb3_poem.adaptation import Rule, adapt_tasks
 from sb3_poem.baselines import MAMLRewardModel, meta_train_reward, rollout_fragments
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.loading import load_model
@@ -159,10 +161,10 @@ def adapted(model: Any, env_id: str, env_kwargs: dict[str, Any], **options: Any)
     return digest([result.latents, np.frombuffer(answers.encode(), dtype=np.uint8)])
 
 
-def shipped(name: str, rule: str) -> str:
+def shipped(name: str, rule: Rule) -> str:
     """Adaptation of a model that ships."""
     model = load_model(name, "cpu")
-    return adapted(model, model.env_id, model.env_kwargs, inference=rule)
+    return adapted(model, model.env_id, model.env_kwargs, rule=rule)
 
 
 def baseline(name: str) -> str:
@@ -172,13 +174,11 @@ def baseline(name: str) -> str:
     run = partial(adapted, env_id=POINT_GOAL, env_kwargs={})
     if name in ("berlekamp", "greedy", "random"):
         fragments = rollout_fragments(model, env, 40, 8, seed=1)
-        return run(model, adapter=ANOLEAdapter, strategy=name, library=fragments)
+        return run(model, rule=ANOLE(strategy=name), library=fragments)
     if name == "reward oracle":
-        return run(model, adapter=RewardOracleAdapter)
+        return run(model, rule=RewardOracle())
     reward = meta_train_reward(model, n_iterations=20, seed=1)
-    return run(
-        MAMLRewardModel(reward, model), adapter=MAMLRewardAdapter, n_queries=2, gradient_steps=5
-    )
+    return run(MAMLRewardModel(reward, model), rule=MAMLReward(gradient_steps=5), n_queries=2)
 
 
 def measures() -> Iterator[tuple[str, Callable[[], str]]]:
@@ -189,8 +189,8 @@ def measures() -> Iterator[tuple[str, Callable[[], str]]]:
     for name in ("berlekamp", "greedy", "random", "reward oracle", "MAML-reward"):
         yield f"baseline {name}", partial(baseline, name)
     for name in pretrained_names():
-        for rule in ("bayes", "paper"):
-            yield f"adapt {name} {rule}", partial(shipped, name, rule)
+        for rule in (Bayes(), Paper()):
+            yield f"adapt {name} {type(rule).__name__.lower()}", partial(shipped, name, rule)
 
 
 def main() -> None:

@@ -26,6 +26,7 @@ from sb3_poem.adaptation import (
     evaluate_adaptation,
     information_limit,
     known_task_return,
+    named_rule,
 )
 from sb3_poem.cli.subject import parse_env_kwargs
 from sb3_poem.common.vec_env import make_task_vec_env
@@ -92,8 +93,7 @@ def test_json_holds_what_the_library_measures(
         record_at=range(4),
         n_episodes=2,
         seed=5,
-        inference=inference,
-        **options,
+        rule=named_rule(inference, **options),
     )
     assert options.items() <= result.items()
     assert result["queries"] == [0, 1, 2, 3]

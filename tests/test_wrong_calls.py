@@ -26,17 +26,19 @@ from poem_envs import GoalFamily, TaskFamily
 from poem_envs.point_goal import PointGoalEnv
 from poem_envs.testing import check_task_family
 from sb3_poem import (
+    ANOLE,
     PEARLSAC,
     POEMSAC,
     AdaptationEvalCallback,
-    ANOLEAdapter,
+    Bayes,
     BoltzmannOracle,
     HumanOracle,
-    MAMLRewardAdapter,
+    MAMLReward,
     MistakeOracle,
+    Paper,
     PreferenceAdapter,
     ReturnOracle,
-    RewardOracleAdapter,
+    RewardOracle,
     TaskVecEnv,
     TrainingCheckpointCallback,
 )
@@ -62,7 +64,7 @@ def adapter(model: Any = None, env: Any = POINT_GOAL, **arguments: Any) -> Prefe
 
 
 def asked() -> PreferenceAdapter:
-    one = adapter(n_queries=1, n_candidates=20, seed=0)
+    one = adapter(n_queries=1, rule=Bayes(n_particles=20), seed=0)
     one.ask()
     return one
 
@@ -90,10 +92,6 @@ def evaluated(tasks: Any = ((1.0,),), **options: Any) -> Any:
 
 def vec() -> TaskVecEnv:
     return make_task_vec_env(POINT_GOAL, 2)
-
-
-def anole(**arguments: Any) -> ANOLEAdapter:
-    return ANOLEAdapter(trained(), POINT_GOAL, **arguments)
 
 
 def policy(**kwargs: Any) -> POEMSAC:
@@ -310,13 +308,15 @@ ADAPTERS = [
     argument(adapter, "n_queries", 0, "at least 1"),
     argument(adapter, "n_queries", 2.5),
     argument(adapter, "n_queries", "ten"),
-    argument(adapter, "inference", "bayesian", "'bayes'"),
-    argument(adapter, "query_rule", "best", "information-gain"),
-    argument(adapter, "n_candidates", 1, "2"),
-    argument(adapter, "candidates", "posterior", "aggregate"),
-    argument(adapter, "likelihood", "logistic", "decoder"),
-    argument(adapter, "decision", "mean", "posterior-mean"),
-    argument(adapter, "noise_model", 0.2, "NoiseModel|MistakeNoise"),
+    argument(adapter, "rule", "bayes", r"rule=Bayes\(\)"),
+    refused("rule a class", lambda _: adapter(rule=Paper), r"rule...class Paper...Paper\(\)"),
+    argument(Bayes, "query_rule", "best", "information-gain"),
+    argument(Bayes, "n_particles", 1, "2"),
+    argument(Bayes, "candidates", "posterior", "aggregate"),
+    argument(Bayes, "likelihood", "logistic", "decoder"),
+    argument(Bayes, "decision", "mean", "posterior-mean"),
+    argument(Bayes, "noise_model", 0.2, "NoiseModel|MistakeNoise"),
+    argument(Paper, "n_candidates", 1, "2"),
     refused(
         "oracle a class",
         lambda _: adapter(oracle=ReturnOracle),
@@ -347,24 +347,22 @@ ADAPTERS = [
         "text.json is not",
     ),
     refused("load elsewhere", lambda s: moved_to(POEMSAC.load(s / "other.zip"), s), "weights"),
-    argument(anole, "strategy", "best", "berlekamp"),
-    argument(anole, "mistake_rate", 0.7, r"0\.5"),
+    argument(ANOLE, "strategy", "best", "berlekamp"),
+    argument(ANOLE, "mistake_rate", 0.7, r"0\.5"),
     refused(
         "ANOLE without experience",
-        lambda s: ANOLEAdapter(POEMSAC.load(s / "poem.zip"), POINT_GOAL),
+        lambda s: adapter(POEMSAC.load(s / "poem.zip"), rule=ANOLE()),
         "load_replay_buffer",
     ),
     refused(
         "MAML of POEMSAC",
-        lambda _: MAMLRewardAdapter(trained(), POINT_GOAL),
+        lambda _: adapter(rule=MAMLReward()),
         "MAMLRewardModel...meta_train_reward",
     ),
-    refused(
-        "RewardOracle of POEMSAC", lambda _: RewardOracleAdapter(trained(), POINT_GOAL), "PEARLSAC"
-    ),
+    refused("RewardOracle of POEMSAC", lambda _: adapter(rule=RewardOracle()), "PEARLSAC"),
     refused(
         "RewardOracle n_queries",
-        lambda _: RewardOracleAdapter(trained(PEARLSAC), POINT_GOAL, n_queries=2.5),
+        lambda _: adapter(trained(PEARLSAC), rule=RewardOracle(), n_queries=2.5),
         "n_queries...2.5",
     ),
     refused(
@@ -440,8 +438,8 @@ TOOLS = [
     argument(AdaptationEvalCallback, "record_at", (), "at least one"),
     refused(
         "AdaptationEvalCallback's options",
-        lambda _: AdaptationEvalCallback(adaptation_kwargs={"inferense": "paper"}),
-        "inferense",
+        lambda _: AdaptationEvalCallback(adaptation_kwargs={"inference": "paper"}),
+        "inference...rule|rule...inference",
     ),
     refused(
         "AdaptationEvalCallback on SAC",

@@ -12,6 +12,7 @@ from scipy.special import ndtr
 from stable_baselines3.common.vec_env import VecEnv
 
 from poem_envs import TaskFamily
+from sb3_poem.adaptation import MetaModel
 from sb3_poem.common.trajectory import Trajectory
 
 TOP_SPEED = 3.0
@@ -157,7 +158,7 @@ class Blinded(gym.Wrapper):
         return observation, float("nan"), terminated, truncated, {}
 
 
-class SpeedModel:
+class SpeedModel(MetaModel):
     """The perfect model of :class:`SpeedEnv`: the first entry of z is the normal score of the
     speed, the others do nothing.
 
@@ -168,7 +169,8 @@ class SpeedModel:
     observation_space = SpeedEnv.observation_space
     action_space = SpeedEnv.action_space
     horizon = HORIZON
-    env_id = None
+    task_latents: Any = None
+    aggregate_to_prior_kl = 0.0
     seed = 0
 
     def __init__(self, latent_dim: int = 5, scale: float = 10.0, error: float = 0.05) -> None:

@@ -5,32 +5,56 @@ they thin out.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from sb3_poem.adaptation.decisions import DECISIONS, decide
-from sb3_poem.adaptation.inference import (
-    Answer,
-    LatentInference,
-    Shown,
-    latent_of,
-    preference_log_likelihood,
+from sb3_poem.adaptation.meta_model import HasRewardDecoder, HasSimilarity, MetaModel
+from sb3_poem.adaptation.noise import (
+    PROBIT_SLOPE,
+    BoltzmannNoise,
+    ExactNoise,
+    NoiseModel,
+    Values,
+    noise_model_from_dict,
 )
-from sb3_poem.adaptation.moves import (
+from sb3_poem.adaptation.particles import (
     WIDENING,
     elliptical_slice_moves,
     fit_gaussian,
     kernel_neighbours,
     systematic_resample,
 )
-from sb3_poem.adaptation.noise import PROBIT_SLOPE, BoltzmannNoise, ExactNoise, NoiseModel
-from sb3_poem.adaptation.preference import Preference
-from sb3_poem.adaptation.queries import most_informative_pair, worst_case_pair
-from sb3_poem.adaptation.queries import random_pair as draw_random_pair
+from sb3_poem.adaptation.preference import Preference, preference_log_likelihood
+from sb3_poem.adaptation.priors import SOURCES, make_prior
+from sb3_poem.adaptation.queries import (
+    QUERY_RULES,
+    check_epsilon,
+    most_informative_pair,
+    random_pair,
+    worst_case_pair,
+)
+from sb3_poem.adaptation.rule import (
+    Answer,
+    Inference,
+    Rule,
+    Setting,
+    Shown,
+    Snapshot,
+    check_choice,
+    latent_of,
+    trajectories_of,
+)
+from sb3_poem.common.checks import check_whole
 from sb3_poem.common.trajectory import Trajectory
 
 LIKELIHOODS = ("decoder", "similarity")
+
+# Nats between the aggregate posterior and N(0, I) up to which draws of the latter are as good as
+# trained latents.
+PRIOR_COVERS = 0.3
 
 # Policies that a question may compare: the posterior's own, and as many from the prior. The pair
 # that splits a narrow posterior best usually lies outside it (to tell 1.0 from 1.1 show 0.8 and
@@ -41,8 +65,7 @@ QUERY_PARTICLES = 128
 # The prior's policies that tell, at a decision, how widely S spreads.
 REFERENCE_POLICIES = 128
 # Smallest resolvable difference of S, as a share of the spread of its differences over random
-# triples. A Gaussian error of that size turns over 3 % of random preferences, which is what
-# well-trained models were seen to get wrong.
+# triples. A Gaussian error of that size turns over 3 % of random preferences.
 SIMILARITY_RESOLUTION = 0.1
 # The same for choosing a question. It only has to keep apart policies that do the same; a coarser
 # one would not tell a pair that halves a narrow posterior from one that lies beside it.
@@ -54,18 +77,12 @@ ERROR_CORRELATION = 10.0
 MOVE_SWEEPS = 2
 MOVE_TRIES = 6
 # Moves by the decoder: tries of a particle, and the decoder's evaluations (latents times decoded
-# steps) that one answer may spend on them: half of what the answer's own two trajectories take with
-# 100 particles. On a family of known truth budgets from nothing to many times this one differed by
-# no more than seeds do.
+# steps) that one answer may spend on them.
 DECODER_TRIES = 2
 DECODER_MOVE_STEPS = 2_500
-# Steps of a trajectory that the decoder sees. From every eighth of HalfCheetah's the returns'
-# difference was within 4.0 of that from all (every fourth: 2.5), where the decoder's own error is
-# 3.5 and the differences spread over 155. A robot that runs at 10 m/s swings through its speeds
-# within eight steps, and a difference came out as 24 that had the other sign. So what thinning does
-# is measured for each answer.
+# Steps of a trajectory that the decoder sees. What is lost by leaving out the others depends on the
+# robot, so it is measured for each answer, by particles whose returns are predicted from all steps.
 DECODED_STEPS = 25
-# Particles whose returns are predicted from all steps as well, which tells that.
 FULLY_DECODED = 8
 # Width of the kernel that replaces a copy of a particle by a neighbour, as a share of the
 # particles' own spread.
@@ -83,102 +100,176 @@ class Thinning(NamedTuple):
 
     @classmethod
     def fit(cls, thin: np.ndarray, full: np.ndarray) -> Thinning:
-        """By ridge regression: the more is added to differences that hardly vary, the flatter the
-        line.
-
-        :param thin: (n,) differences decoded from some steps.
-        :param full: (n,) the same decoded from all.
-        :return: The line.
+        """Fit differences (n,) decoded from some steps and from all, by ridge regression: the more
+        is added to differences that hardly vary, the flatter the line.
         """
         added = full - thin
         covariance = np.mean((thin - thin.mean()) * added)
         slope = covariance / max(thin.var() + np.square(added).mean(), 1e-12)
         intercept = added.mean() - slope * thin.mean()
-        return cls(
-            float(intercept),
-            float(slope),
-            float(np.sqrt(np.square(added - intercept - slope * thin).mean())),
-        )
+        error = np.sqrt(np.square(added - intercept - slope * thin).mean())
+        return cls(float(intercept), float(slope), float(error))
 
 
-class BayesInference(LatentInference):
+@dataclass(frozen=True, repr=False)
+class Bayes(Rule):
     """Posterior weights proportional to the prior times the likelihood of the answers under the
     oracle's own noise model; questions by expected information gain; the latent of highest expected
     fitness.
 
-    *Likelihood from the decoder*: the reward decoder predicts, for every particle, the returns of the two trajectories
-    that were shown; the noise model turns the difference into the probability of the answer. The
-    predicted difference is trusted only as far as the decoder's own residual allows.
+    *Likelihood from the decoder*: the reward decoder predicts, for every particle, the returns of
+    the two trajectories that were shown; the noise model turns the difference into the probability
+    of the answer. The predicted difference is trusted only as far as the decoder's own residual
+    allows.
 
-    *Likelihood from S*: S(z, z_left) - S(z, z_right) takes the place of the returns' difference. S has an order but no
-    unit: for error-free answers every positive multiple of it makes the same predictions. What
-    scale it has comes from training, where it is the log-odds of being right about error-free
-    labels. So the model's doubt is one logistic unit of S while training is young. Once training
-    separates nearly all pairs, however, the cross-entropy is lowered by scaling S up without end,
-    and its odds turn overconfident. So the unit is never taken smaller than a fixed share of the
-    spread of S.
+    *Likelihood from S*: S(z, z_left) - S(z, z_right) takes the place of the returns' difference. S
+    has an order but no unit: for error-free answers every positive multiple of it makes the same
+    predictions. What scale it has comes from training, where it is the log-odds of being right
+    about error-free labels. So the model's doubt is one logistic unit of S while training is young.
+    Once training separates nearly all pairs, however, the cross-entropy is lowered by scaling S up
+    without end, and its odds turn overconfident. So the unit is never taken smaller than a fixed
+    share of the spread of S.
 
-    *Thinning*: when half of the particles carry no weight they are resampled and moved by elliptical slice sampling around
-    the posterior's own mean and covariance. Moves are bounded. One by the decoder evaluates all
-    trajectories that were ever shown, so only as many particles move as a budget allows; the copies
-    that are left over are replaced by neighbours, drawn from a kernel that keeps the particles'
-    mean and covariance (Liu & West 2001). A pool of fixed draws would be empty after a few answers;
-    this one has as many different particles after fifty, in any dimension.
+    *Thinning*: when half of the particles carry no weight they are resampled and moved by
+    elliptical slice sampling around the posterior's own mean and covariance. Moves are bounded. One
+    by the decoder evaluates all trajectories that were ever shown, so only as many particles move
+    as a budget allows; the copies that are left over are replaced by neighbours, drawn from a
+    kernel that keeps the particles' mean and covariance (Liu & West 2001). A pool of fixed draws
+    would be empty after a few answers; this one has as many different particles after fifty, in any
+    dimension.
 
-    :param model: A trained model.
-    :param n_candidates: Number of particles.
-    :param epsilon: Tolerated error of eq. 9, used by query_rule="worst-case" alone.
-    :param candidates: "prior" or "aggregate".
-    :param query_rule: "information-gain", "worst-case" or "random".
-    :param rng: The generator.
+    :param n_particles: How many, at least 2.
+    :param query_rule: "information-gain", "worst-case" (eq. 10) or "random".
+    :param candidates: Where particles come from: "prior" (N(0, I)) or "aggregate" (the training
+        tasks' posteriors and what lies between neighbours); None takes the prior, unless the
+        aggregate is far from it.
     :param likelihood: "decoder" or "similarity"; None takes the decoder where the model has one and
-        knows its error.
-    :param decision: See :data:`sb3_poem.adaptation.decisions.DECISIONS`.
-    :param noise_model: How the oracle errs; None stands for an error-free one.
-    :param library: Trajectories to ask about instead of new rollouts (for instance those of the
-        training policies on this robot): the decoder tells beforehand what each is worth to every
-        particle.
-    :raises ValueError: If an option is unknown, or needs what the model does not have.
+        knows its error, which takes tasks that share their dynamics.
+    :param decision: "expected-fitness", "posterior-mean" or "most-likely", see
+        :func:`sb3_poem.adaptation.decisions.decide`.
+    :param noise_model: How the oracle errs; None takes ``oracle.noise_model`` where there is one,
+        else no error.
+    :param epsilon: Tolerated error of eq. 9, in [0, 0.5), for ``query_rule="worst-case"``.
+    :raises ValueError: If an option is out of its range.
     """
+
+    n_particles: int = 400
+    query_rule: str = "information-gain"
+    candidates: str | None = None
+    likelihood: str | None = None
+    decision: str = "expected-fitness"
+    noise_model: NoiseModel | None = None
+    epsilon: float = 0.1
+
+    def __post_init__(self) -> None:
+        check_whole("n_particles", self.n_particles, 2)  # a question compares two
+        check_choice("query_rule", self.query_rule, QUERY_RULES)
+        check_choice("candidates", self.candidates, (*SOURCES, None))
+        check_choice("likelihood", self.likelihood, (*LIKELIHOODS, None))
+        check_choice("decision", self.decision, DECISIONS)
+        check_epsilon(self.epsilon)
+        if self.noise_model is not None and not hasattr(self.noise_model, "probability_left"):
+            raise ValueError(
+                "`noise_model` must be None or an object as MistakeNoise(0.2), "
+                f"but is {self.noise_model!r}"
+            )
+
+    def answered_by(self, oracle: Any) -> Bayes:
+        """See :class:`Rule`: with the oracle's own noise model, unless one was chosen."""
+        noise_model = self.noise_model or getattr(oracle, "noise_model", None) or ExactNoise()
+        return replace(self, noise_model=noise_model)
+
+    def check(self, model: MetaModel, setting: Setting) -> None:
+        """See :class:`Rule`: the likelihood and the questions need what not all models have."""
+        super().check(model, setting)
+        name, noise, compares = (
+            type(model).__name__,
+            self.noise_model,
+            isinstance(model, HasSimilarity),
+        )
+        likelihood = self.likelihood_with(model)
+        if likelihood == "decoder" and not _knows_its_decoder(model):
+            error = getattr(model, "predicted_rewards_error", np.nan)
+            raise ValueError(
+                'likelihood="decoder" needs a model with `predicted_returns` and a finite '
+                f"`predicted_rewards_error`, which is {error} for this {name}: it is known once a "
+                "model has been trained on tasks that share their dynamics"
+            )
+        if likelihood == "similarity" and not compares:
+            needs = "needs a model with `similarities` (POEMSAC)"
+            raise ValueError(f'likelihood="similarity" {needs}; {name} has none')
+        if likelihood == "similarity" and isinstance(noise, BoltzmannNoise) and noise.beta:
+            raise ValueError(
+                f"a Boltzmann oracle of fixed beta ({noise.beta}) needs returns, which S does not "
+                'give: choose likelihood="decoder"'
+            )
+        if setting.library is None:
+            if not compares and self.query_rule != "random":
+                raise ValueError(
+                    f'query_rule="{self.query_rule}" needs a model with a similarity S or a '
+                    f"`library` of trajectories, and {name} has no similarity; choose "
+                    'query_rule="random" or pass a library'
+                )
+        elif not isinstance(model, HasRewardDecoder):
+            raise ValueError("`library` needs a model with a reward decoder (predicted_returns)")
+        elif self.query_rule == "worst-case":
+            instead = 'with a library use "information-gain"'
+            raise ValueError(f'query_rule="worst-case" compares candidates by S; {instead}')
+
+    def likelihood_with(self, model: MetaModel) -> str:
+        """Which one is used with a model."""
+        return self.likelihood or ("decoder" if _knows_its_decoder(model) else "similarity")
+
+    def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> BayesInference:
+        """See :class:`Rule`."""
+        return BayesInference(self, model, rng, setting.library)
+
+    def to_dict(self) -> dict[str, Any]:
+        """See :class:`Rule`."""
+        data, noise = super().to_dict(), self.noise_model
+        data["options"]["noise_model"] = None if noise is None else noise.to_dict()
+        return data
+
+    @classmethod
+    def _of_options(cls, options: dict[str, Any]) -> Bayes:
+        noise = options["noise_model"]
+        noise_model = None if noise is None else noise_model_from_dict(noise)
+        return cls(**{**options, "noise_model": noise_model})
+
+
+class BayesInference(Inference):
+    """See :class:`Bayes`."""
+
+    state = ("particles", "log_weights", "scale", "calibration", "thinning")
 
     def __init__(
         self,
+        rule: Bayes,
         model: Any,
-        n_candidates: int = 400,
-        epsilon: float = 0.1,
-        candidates: str = "prior",
-        query_rule: str = "information-gain",
-        rng: np.random.Generator | None = None,
-        likelihood: str | None = None,
-        decision: str = "expected-fitness",
-        noise_model: NoiseModel | None = None,
+        rng: np.random.Generator,
         library: Sequence[Trajectory] | None = None,
     ) -> None:
-        super().__init__(
-            model, n_candidates, epsilon, candidates, query_rule, rng or np.random.default_rng()
-        )
-        self.has_similarity = hasattr(model, "similarities")
-        self.likelihood = _check_likelihood(model, likelihood)
-        if decision not in DECISIONS:
-            raise ValueError(f"`decision` must be one of {DECISIONS}, but is {decision!r}")
-        self.decision = decision
-        self.noise_model: NoiseModel = ExactNoise() if noise_model is None else noise_model
+        super().__init__(rng)
+        self.rule, self.model = rule, model
+        self.has_similarity = isinstance(model, HasSimilarity)
+        self.likelihood = rule.likelihood_with(model)
+        self.noise_model: NoiseModel = rule.noise_model or ExactNoise()
         self.library = None if library is None else list(library)
-        self._check_options()
-        self.particles = self.prior.balanced_sample(n_candidates, self.rng)
-        self.log_weights = np.zeros(n_candidates)
-        # Of a generator of its own: it must not move the particles', and is the same after a
-        # restart.
+        far = model.aggregate_to_prior_kl > PRIOR_COVERS
+        self.prior = make_prior(model, rule.candidates or ("aggregate" if far else "prior"), rng)
+        self.particles = self.prior.balanced_sample(rule.n_particles, rng)
+        self.log_weights = np.zeros(rule.n_particles)
+        # Of a generator of its own, which does not move the particles' and begins alike every time.
         self._reference = self.prior.balanced_sample(REFERENCE_POLICIES, np.random.default_rng(0))
-        self._spread, self._unit = self._similarity_scale()
+        self.scale = self._similarity_scale()
         # Sums over answers that tie S to the decoder's returns: S dS, S dR, |R| and their number.
-        self._calibration = np.zeros(4)
-        self._thinning: list[Thinning] = []
+        self.calibration = np.zeros(4)
+        self.thinning = np.zeros((0, 3))  # a Thinning of each answer
         self._library_returns: np.ndarray | None = None
 
     @property
     def weights(self) -> np.ndarray:
-        """(n_candidates,) posterior weights, summing to one."""
+        """(n_particles,) posterior weights, summing to one."""
         weights = np.exp(self.log_weights - self.log_weights.max())
         return weights / weights.sum()
 
@@ -187,114 +278,81 @@ class BayesInference(LatentInference):
         """How many equally weighted particles the weighted ones are worth."""
         return float(1.0 / np.square(self.weights).sum())
 
-    def ask_latents(self) -> tuple[np.ndarray, np.ndarray]:
-        """See :class:`LatentInference`."""
+    def ask(self) -> tuple[Shown, Shown]:
+        """See :class:`Inference`."""
         if self.library is not None:
-            first, second = self.ask_library()
-            return self.library[first].latent.copy(), self.library[second].latent.copy()
+            first, second = self._ask_about(self.library)
+            return self.library[first], self.library[second]
         policies = self._query_policies()
-        if self.query_rule == "random":
-            first, second = draw_random_pair(len(policies), self.rng)
+        if self.rule.query_rule == "random":
+            first, second = random_pair(len(policies), self.rng)
             return policies[first], policies[second]
         particles, weights = self._query_particles()
         similarities = self.model.similarities(particles, policies)
-        if self.query_rule == "worst-case":
-            first, second = worst_case_pair(similarities, self.epsilon, weights)
+        if self.rule.query_rule == "worst-case":
+            first, second = worst_case_pair(similarities, self.rule.epsilon, weights)
         else:
             slope, magnitude, noise = self._return_unit()
-            error = QUERY_RESOLUTION * self._spread
-            first, second = most_informative_pair(
-                slope * similarities, weights, noise, slope * error, magnitude
-            )
+            error = slope * (QUERY_RESOLUTION * self._spread)
+            values = slope * similarities
+            first, second = most_informative_pair(values, weights, noise, error, magnitude)
         return policies[first], policies[second]
 
-    def ask_library(self) -> tuple[int, int]:
-        """See :class:`LatentInference`."""
-        if self.library is None:
-            return super().ask_library()
-        if self.query_rule == "random":
-            return draw_random_pair(len(self.library), self.rng)
+    def _ask_about(self, library: list[Trajectory]) -> tuple[int, int]:
+        if self.rule.query_rule == "random":
+            return random_pair(len(library), self.rng)
         if self._library_returns is None:
-            self._library_returns = self.model.predicted_returns(
-                self.particles, self.library, DECODED_STEPS
-            )
+            returns = self.model.predicted_returns(self.particles, library, DECODED_STEPS)
+            self._library_returns = returns
         returns = self._library_returns
-        steps = float(np.mean([len(trajectory) for trajectory in self.library]))
+        error = self._decoder_error(2.0 * float(np.mean([len(item) for item in library])))
         magnitude = float(2.0 * np.abs(returns).mean())
-        return most_informative_pair(
-            returns, self.weights, self.noise_model, self._decoder_error(2.0 * steps), magnitude
-        )
+        return most_informative_pair(returns, self.weights, self.noise_model, error, magnitude)
 
     def tell(self, preference: Preference, left: Shown, right: Shown) -> None:
-        """See :class:`LatentInference`."""
-        if self.likelihood == "decoder" and not (
-            isinstance(left, Trajectory) and isinstance(right, Trajectory)
-        ):
-            raise ValueError(
-                'likelihood="decoder" needs the two trajectories that were shown, not their latents alone; '
-                'pass them, or choose likelihood="similarity"'
-            )
+        """See :class:`Inference`."""
+        if self.likelihood == "decoder":
+            trajectories_of('likelihood="decoder"', left, right)
         answer = Answer(preference, left, right)
-        self.log_weights = self.log_weights + self._answer_log_likelihoods(
-            self.particles, [answer], new=True
-        )
+        told = self._answer_log_likelihoods(self.particles, [answer], new=True)
+        self.log_weights = self.log_weights + told
         self.answers.append(answer)
-        if self.effective_size < self.n_candidates / 2:
+        if self.effective_size < len(self.particles) / 2:
             self._rejuvenate()
 
     def estimate(self) -> np.ndarray:
-        """See :class:`LatentInference`."""
-        training = getattr(self.model, "task_latents", None)
-        model, has_holes = self.model if self.has_similarity else None, self.prior.has_holes
+        """See :class:`Inference`."""
         return decide(
-            self.decision, model, self.particles, self.weights, training, self._reference, has_holes
+            self.rule.decision,
+            self.model if self.has_similarity else None,
+            self.particles,
+            self.weights,
+            self.model.task_latents,
+            self._reference,
+            self.prior.has_holes,
         )
 
-    def _check_options(self) -> None:
-        if (
-            self.likelihood == "similarity"
-            and isinstance(self.noise_model, BoltzmannNoise)
-            and self.noise_model.beta
-        ):
-            raise ValueError(
-                f"a Boltzmann oracle of fixed beta ({self.noise_model.beta}) needs returns, which S does not give: "
-                'choose likelihood="decoder"'
-            )
-        if self.library is not None:
-            if len(self.library) < 2:
-                raise ValueError(
-                    f"`library` must hold at least 2 trajectories, but holds {len(self.library)}"
-                )
-            if not hasattr(self.model, "predicted_returns"):
-                raise ValueError(
-                    "`library` needs a model with a reward decoder (predicted_returns)"
-                )
-            if self.query_rule == "worst-case":
-                raise ValueError(
-                    'query_rule="worst-case" compares candidates by S; with a library use "information-gain"'
-                )
-        elif not self.has_similarity and self.query_rule != "random":
-            raise ValueError(
-                f'query_rule="{self.query_rule}" needs a model with a similarity S or a `library` of trajectories, '
-                f'and {type(self.model).__name__} has no similarity; choose query_rule="random" or pass a library'
-            )
-
-    def _similarity_scale(self) -> tuple[float, float]:
+    def _similarity_scale(self) -> np.ndarray:
         """The spread of S's differences, and the unit in which a difference counts as one logistic
         unit of doubt.
         """
         if not self.has_similarity:
-            return 1.0, 1.0
+            return np.ones(2)
         similarities = self.model.similarities(self.particles, self.particles)
         # Twice the variance within a row is the mean squared difference of two of its entries.
         spread = float(np.sqrt(2.0 * similarities.var(axis=1).mean()))
-        return max(spread, 1e-12), max(1.0, SIMILARITY_RESOLUTION * spread / PROBIT_SLOPE)
+        unit = SIMILARITY_RESOLUTION * spread / PROBIT_SLOPE
+        return np.array([max(spread, 1e-12), max(1.0, unit)])
+
+    @property
+    def _spread(self) -> float:
+        return float(self.scale[0])
 
     def _return_unit(self) -> tuple[float, float, NoiseModel]:
         """Slope from S to returns, the returns' typical magnitude, and the noise model that fits
         this unit.
         """
-        cross, square, magnitude, count = self._calibration
+        cross, square, magnitude, count = self.calibration
         if count and cross > 0:
             return float(cross / square), float(magnitude / count), self.noise_model
         # No trajectory has tied S to returns yet (or none can). Noise models that only ask for the
@@ -303,25 +361,24 @@ class BayesInference(LatentInference):
         fixed = isinstance(self.noise_model, BoltzmannNoise) and self.noise_model.beta is not None
         return 1.0, 2.0 * self._spread, ExactNoise() if fixed else self.noise_model
 
-    def _decoder_error(self, steps: np.ndarray | float) -> Any:
+    def _decoder_error(self, steps: Values) -> Any:
         return self.model.predicted_rewards_error * np.sqrt(steps * ERROR_CORRELATION)
 
     def _answer_log_likelihoods(
         self, latents: np.ndarray, answers: Sequence[Answer], new: bool = False
     ) -> np.ndarray:
-        """(m,) log P(answers | latent); of a new one, on the particles, what else it tells is
-        noted.
-        """
+        """(m,) log P(answers | latent) of (m, d); what else a new answer tells is noted."""
         shown = [item for answer in answers for item in (answer.left, answer.right)]
-        error: np.ndarray | float
-        magnitude: np.ndarray | float
+        error: Values
+        magnitude: Values
         if self.likelihood == "decoder":
             values = self.model.predicted_returns(latents, shown, DECODED_STEPS)  # (m, 2 k)
             left, right = values[:, 0::2], values[:, 1::2]
             steps = np.array([len(item) for item in shown], dtype=np.float64)
             if new:
-                self._thinning.append(self._measure_thinning(shown, values))
-            intercepts, slopes, errors = self._thinning_of(len(answers)).T
+                measured = self._measure_thinning(shown, values)
+                self.thinning = np.concatenate([self.thinning, [measured]])
+            intercepts, slopes, errors = self.thinning[-len(answers) :].T
             error = np.hypot(self._decoder_error(steps[0::2] + steps[1::2]), errors)
             magnitude = np.abs(left) + np.abs(right)
             difference = left - right
@@ -331,32 +388,25 @@ class BayesInference(LatentInference):
         else:
             values = self.model.similarities(latents, np.stack([latent_of(item) for item in shown]))
             difference = values[:, 0::2] - values[:, 1::2]
-            error, magnitude = self._unit * PROBIT_SLOPE, 2.0 * self._spread
+            error, magnitude = float(self.scale[1]) * PROBIT_SLOPE, 2.0 * self._spread
         probability = self.noise_model.probability_left(difference, error, magnitude)
-        return preference_log_likelihood(
-            np.log(probability), np.log1p(-probability), [a.preference for a in answers]
-        )
+        told = [answer.preference for answer in answers]
+        return preference_log_likelihood(np.log(probability), np.log1p(-probability), told)
 
     def _measure_thinning(self, shown: Sequence[Shown], thin: np.ndarray) -> Thinning:
         if max(map(len, shown)) <= DECODED_STEPS:
             return Thinning()
         quantiles = (np.arange(FULLY_DECODED) + 0.5) / FULLY_DECODED
-        some = np.searchsorted(np.cumsum(self.weights), quantiles).clip(max=self.n_candidates - 1)
+        some = np.searchsorted(np.cumsum(self.weights), quantiles).clip(max=len(self.particles) - 1)
         full = self.model.predicted_returns(self.particles[some], shown)
         return Thinning.fit(thin[some, 0] - thin[some, 1], full[:, 0] - full[:, 1])
 
-    def _thinning_of(self, n: int) -> np.ndarray:
-        """(n, 3), of the last n answers; none where it was not measured."""
-        known = self._thinning[-n:]
-        return np.array([Thinning()] * (n - len(known)) + known)
-
     def _calibrate(self, latents: np.ndarray, shown: Sequence[Shown], returns: np.ndarray) -> None:
-        similarities = self.model.similarities(
-            latents, np.stack([latent_of(item) for item in shown])
-        )
+        shown_latents = np.stack([latent_of(item) for item in shown])
+        similarities = self.model.similarities(latents, shown_latents)
         s = similarities[:, 0] - similarities[:, 1]
         magnitude = np.abs(returns).sum(axis=1).mean()
-        self._calibration += [s @ (returns[:, 0] - returns[:, 1]), s @ s, magnitude, 1.0]
+        self.calibration += [s @ (returns[:, 0] - returns[:, 1]), s @ s, magnitude, 1.0]
 
     def _query_policies(self) -> np.ndarray:
         """(QUERY_POLICIES, d): draws of the posterior and of the prior."""
@@ -364,7 +414,7 @@ class BayesInference(LatentInference):
         return np.concatenate([posterior, self.prior.sample(QUERY_POLICIES // 2, self.rng)])
 
     def _query_particles(self) -> tuple[np.ndarray, np.ndarray]:
-        if self.n_candidates <= QUERY_PARTICLES:
+        if len(self.particles) <= QUERY_PARTICLES:
             return self.particles, self.weights
         chosen = systematic_resample(self.weights, QUERY_PARTICLES, self.rng)
         return self.particles[chosen], np.full(QUERY_PARTICLES, 1.0 / QUERY_PARTICLES)
@@ -372,20 +422,17 @@ class BayesInference(LatentInference):
     def _rejuvenate(self) -> None:
         """Resample, and replace what is now double, at bounded cost."""
         mean, factor = fit_gaussian(self.particles, self.weights)
-        chosen = systematic_resample(self.weights, self.n_candidates, self.rng)
+        chosen = systematic_resample(self.weights, len(self.particles), self.rng)
         copies = np.flatnonzero(np.concatenate([[False], chosen[1:] == chosen[:-1]]))
         self.particles = self.particles[chosen]
-        self.log_weights = np.zeros(self.n_candidates)
+        self.log_weights = np.zeros(len(self.particles))
         self._library_returns = None
         if self.likelihood == "similarity":
-            self._move(np.arange(self.n_candidates), MOVE_SWEEPS, MOVE_TRIES, mean, factor)
+            self._move(np.arange(len(self.particles)), MOVE_SWEEPS, MOVE_TRIES, mean, factor)
             return
         # One evaluation more than tries: where a particle stands now has to be weighed, too.
-        steps = sum(
-            min(len(item), DECODED_STEPS)
-            for answer in self.answers
-            for item in (answer.left, answer.right)
-        )
+        shown = [item for answer in self.answers for item in (answer.left, answer.right)]
+        steps = sum(min(len(item), DECODED_STEPS) for item in shown)
         affordable = DECODER_MOVE_STEPS // (steps * (DECODER_TRIES + 1))
         order = self.rng.permutation(len(copies))
         self._move(copies[order[:affordable]], 1, DECODER_TRIES, mean, factor)
@@ -415,41 +462,11 @@ class BayesInference(LatentInference):
             )
         self.particles[moved] = particles
 
-    def _arrays(self) -> dict[str, np.ndarray]:
-        return {
-            "particles": self.particles,
-            "log_weights": self.log_weights,
-            "scale": np.array([self._spread, self._unit]),
-            "calibration": self._calibration,
-            "thinning": np.array(self._thinning).reshape(-1, 3),
-        }
-
-    def _set_arrays(self, arrays: dict[str, np.ndarray]) -> None:
-        self.particles = arrays["particles"]
-        self.log_weights = arrays["log_weights"]
-        self._spread, self._unit = (float(value) for value in arrays["scale"])
-        self._calibration = arrays["calibration"].copy()
-        self._thinning = [
-            Thinning(*row) for row in arrays.get("thinning", np.zeros((0, 3))).tolist()
-        ]
+    def restore(self, snapshot: Snapshot, answers: list[Answer]) -> None:
+        """See :class:`Inference`."""
+        super().restore(snapshot, answers)
         self._library_returns = None
 
 
-def _check_likelihood(model: Any, likelihood: str | None) -> str:
-    error = float(getattr(model, "predicted_rewards_error", np.nan))
-    decoder_is_known = hasattr(model, "predicted_returns") and np.isfinite(error)
-    if likelihood is None:
-        likelihood = "decoder" if decoder_is_known else "similarity"
-    if likelihood not in LIKELIHOODS:
-        raise ValueError(f"`likelihood` must be one of {LIKELIHOODS}, but is {likelihood!r}")
-    name = type(model).__name__
-    if likelihood == "similarity" and not hasattr(model, "similarities"):
-        raise ValueError(
-            f'likelihood="similarity" needs a model with `similarities` (POEMSAC); {name} has none'
-        )
-    if likelihood == "decoder" and not decoder_is_known:
-        raise ValueError(
-            f'likelihood="decoder" needs a model with `predicted_returns` and a finite `predicted_rewards_error`, which is '
-            f"{error} for this {name}: it is known once a model has been trained on tasks that share their dynamics"
-        )
-    return likelihood
+def _knows_its_decoder(model: MetaModel) -> bool:
+    return isinstance(model, HasRewardDecoder) and bool(np.isfinite(model.predicted_rewards_error))

@@ -9,20 +9,18 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_poem.adaptation.adapter import PreferenceAdapter
+from sb3_poem.adaptation.bayes import Bayes
 from sb3_poem.adaptation.environments import check_model_fits
-from sb3_poem.adaptation.evaluation import (
-    evaluate_adaptation,
-    evaluate_latents,
-    known_task_return,
-    preference_order,
-)
+from sb3_poem.adaptation.evaluation import evaluate_adaptation, evaluate_episodes
+from sb3_poem.adaptation.known_task import known_task_return, preference_order
+from sb3_poem.adaptation.meta_model import HasSimilarity
+from sb3_poem.adaptation.rule import as_rule
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.pearl_sac.callbacks import EpochCallback
 
-# Options of adapt_tasks that are not the adapter's
-OF_ADAPT_TASKS = {"adapter", "library", "oracle_factory", "progress_bar"}
+#: What ``adaptation_kwargs`` may hold; the rest of :func:`evaluate_adaptation` is said otherwise.
+ADAPTATION_KWARGS = ("rule", "oracle_factory", "deterministic", "library", "progress_bar")
 
 
 class AdaptationEvalCallback(EpochCallback):
@@ -45,14 +43,15 @@ class AdaptationEvalCallback(EpochCallback):
     :param best_model_save_path: Folder for ``best_model.zip``, the model of the highest return
         after the most answers. A run that is resumed with the same folder goes on comparing with it
     :param seed: Seed of the held-out tasks and of everything else here
-    :param adaptation_kwargs: Options of :func:`sb3_poem.adaptation.adapt_tasks`, for instance
-        ``inference``. A model without a similarity is asked random queries unless they say
+    :param adaptation_kwargs: Arguments of :func:`sb3_poem.adaptation.evaluate_adaptation`, for
+        instance ``rule``. A model without a similarity is asked random queries unless they say
         otherwise
     :param env_kwargs: Arguments of the environment that differ from training's, for instance a
         ``split`` of its tasks
     :param verbose: 1 prints each result
     :raises ValueError: for a number of tasks or episodes below 1; when training starts, for an
-        environment that is not registered, or options that ``adapt_tasks`` does not take
+        environment that is not registered, or a rule that the model does not do for
+    :raises TypeError: for ``adaptation_kwargs`` of another kind
     :raises OSError: when training starts, if the folder cannot be made
     """
 
@@ -70,26 +69,21 @@ class AdaptationEvalCallback(EpochCallback):
     ) -> None:
         super().__init__(every, verbose)
         if n_tasks < 1 or n_episodes < 1:
-            raise ValueError(
-                f"n_tasks and n_episodes must be at least 1, got {n_tasks} and {n_episodes}"
-            )
+            got = f"{n_tasks} and {n_episodes}"
+            raise ValueError(f"n_tasks and n_episodes must be at least 1, got {got}")
         if not record_at:
-            raise ValueError(
-                f"record_at must hold at least one number of answers, got {record_at!r}"
-            )
-        self.n_tasks = n_tasks
+            raise ValueError(f"record_at must hold at least one number, got {record_at!r}")
+        self.n_tasks, self.n_episodes, self.seed = n_tasks, n_episodes, seed
         self.record_at = tuple(record_at)
-        self.n_episodes = n_episodes
-        self.best_model_save_path = (
-            None if best_model_save_path is None else Path(best_model_save_path)
-        )
-        self.seed = seed
+        folder = best_model_save_path
+        self.best_model_save_path = None if folder is None else Path(folder)
         self.adaptation_kwargs = dict(adaptation_kwargs or {})
         self.env_kwargs = dict(env_kwargs or {})
-        adapter = self.adaptation_kwargs.get("adapter", PreferenceAdapter)
-        adapter.make_options(
-            **{k: v for k, v in self.adaptation_kwargs.items() if k not in OF_ADAPT_TASKS}
-        )
+        for name in self.adaptation_kwargs:
+            if name not in ADAPTATION_KWARGS:
+                raise TypeError(f"adaptation_kwargs takes {ADAPTATION_KWARGS}, but has {name!r}")
+        if self.adaptation_kwargs.get("rule") is not None:
+            as_rule(self.adaptation_kwargs["rule"])
         self.best_return = -np.inf
         self.last_evaluation: dict[str, float] = {}
         self._env: VecEnv | None = None
@@ -105,37 +99,32 @@ class AdaptationEvalCallback(EpochCallback):
 
     @property
     def _best_model(self) -> Path | None:
-        return (
-            None
-            if self.best_model_save_path is None
-            else self.best_model_save_path / "best_model.zip"
-        )
+        folder = self.best_model_save_path
+        return None if folder is None else folder / "best_model.zip"
 
     def _make_env(self) -> tuple[VecEnv, np.ndarray]:
         if self._env is None:
             spec = self.model.family.spec
             if spec is None:
                 raise ValueError(
-                    "AdaptationEvalCallback makes copies of the environment, which must be registered with Gymnasium; "
-                    "register it, or call evaluate_adaptation with a vector environment of your own"
+                    "AdaptationEvalCallback makes copies of the environment, which must be "
+                    "registered with Gymnasium; register it, or call evaluate_adaptation with a "
+                    "vector environment of your own"
                 )
-            limit = spec.max_episode_steps
-            arguments = {**spec.kwargs, **self.env_kwargs}
-            self._env = make_task_vec_env(
-                spec.id, 2 * self.n_tasks, max_episode_steps=limit, **arguments
-            )
+            arguments = {"max_episode_steps": spec.max_episode_steps, **spec.kwargs}
+            arguments |= self.env_kwargs
+            self._env = make_task_vec_env(spec.id, 2 * self.n_tasks, **arguments)
             check_model_fits(self.model, self._env)
         family = FamilyView(self._env)
         family.check_same_family(self.model.task_space, self.model.reward_feature_dim)
-        if family.all_tasks is not None and len(family.all_tasks) <= self.n_tasks:
-            return self._env, family.all_tasks
-        return self._env, family.sample_tasks(self.n_tasks, np.random.default_rng(self.seed))
+        distinct = self.n_tasks if family.all_tasks is None else len(family.all_tasks)
+        return self._env, family.test_tasks(min(distinct, self.n_tasks), self.seed)
 
     def _on_epoch(self) -> None:
         env, tasks = self._make_env()
         options: dict[str, Any] = {"seed": self.seed, "n_episodes": self.n_episodes}
-        if not hasattr(self.model, "similarities") and "adapter" not in self.adaptation_kwargs:
-            self.adaptation_kwargs.setdefault("query_rule", "random")
+        if not isinstance(self.model, HasSimilarity):
+            self.adaptation_kwargs.setdefault("rule", Bayes(query_rule="random"))
         result = evaluate_adaptation(
             self.model, env, tasks, record_at=self.record_at, **options, **self.adaptation_kwargs
         )
@@ -147,10 +136,9 @@ class AdaptationEvalCallback(EpochCallback):
             metrics.update({f"success_rate_after_{k}_queries": rate for k, rate in rates})
             metrics["known_task_success_rate"] = known.success_rate
         metrics["coverage_loss"] = self._coverage_loss(env)
-        if hasattr(self.model, "similarities"):
-            metrics["preference_accuracy"], metrics["kendall_tau"] = preference_order(
-                self.model, known
-            )
+        if isinstance(self.model, HasSimilarity):
+            accuracy, tau = preference_order(self.model, known)
+            metrics |= {"preference_accuracy": accuracy, "kendall_tau": tau}
         for name, value in metrics.items():
             self.logger.record(f"eval/{name}", value)
         self.last_evaluation = metrics
@@ -171,11 +159,11 @@ class AdaptationEvalCallback(EpochCallback):
         own, tasks = self.model.task_latents[chosen], self.model.train_tasks.tasks[chosen]
         draws = rng.standard_normal((1000, self.model.latent_dim))
         nearest = draws[((own[:, None, :] - draws[None, :, :]) ** 2).sum(axis=2).argmin(axis=1)]
-        returns = [
-            evaluate_latents(self.model, env, latents, tasks, 1, self.seed).mean()
+        of_own, of_nearest = (
+            evaluate_episodes(self.model, env, latents, tasks, 1, self.seed).returns.mean()
             for latents in (own, nearest)
-        ]
-        return float(returns[0] - returns[1])
+        )
+        return float(of_own - of_nearest)
 
     def _on_training_end(self) -> None:
         super()._on_training_end()

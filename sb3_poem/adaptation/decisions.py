@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+
+from sb3_poem.adaptation.meta_model import HasSimilarity
 
 DECISIONS = ("expected-fitness", "posterior-mean", "most-likely")
 
@@ -20,37 +20,32 @@ ALIKE = 0.5
 
 def decide(
     decision: str,
-    model: Any | None,
+    model: HasSimilarity | None,
     particles: np.ndarray,
     weights: np.ndarray,
     training_latents: np.ndarray | None,
     reference: np.ndarray,
     has_holes: bool = False,
 ) -> np.ndarray:
-    """The latent to act on.
+    """The latent to act on, (d,).
 
-    - "expected-fitness": the posterior mean if its policy is nearly as fit as any, else the middle of those options that S
-      does not tell from the fittest. Fitness is S(z, option), averaged over the posterior of z; options are the particles,
-      the posterior mean and the training tasks' latents. Highest likelihood would run to extreme latents, as the likelihood
-      grows with their norm, and so would highest fitness alone; and the mean of two separate modes fits neither.
+    - "expected-fitness": the posterior mean if its policy is nearly as fit as any, else the middle
+      of those options that S does not tell from the fittest. Fitness is S(z, option), averaged over
+      the posterior of z; options are the particles, the posterior mean and the training tasks'
+      latents. Highest likelihood would run to extreme latents, as the likelihood grows with their
+      norm, and so would highest fitness alone; and the mean of two separate modes fits neither.
     - "posterior-mean": the weighted mean of the particles.
     - "most-likely": the particle of the largest weight.
 
-    :param decision: One of these.
-    :param model: A model with ``similarity``; None leaves only the other two, and
-        "expected-fitness" then means the particle nearest to the posterior mean, which lies within
-        a mode.
+    :param model: None leaves only the other two, and "expected-fitness" then means the particle
+        nearest to the posterior mean, which lies within a mode.
     :param particles: (n, d).
     :param weights: (n,) summing to one.
     :param training_latents: (N, d) or None.
     :param reference: (m, d) draws of the prior, whose policies give S its unit.
     :param has_holes: Whether the prior is a mixture, with latents between its parts that no
         training has seen: S may think much of their policies, so the posterior mean is no option.
-    :return: (d,).
-    :raises ValueError: If the decision is unknown.
     """
-    if decision not in DECISIONS:
-        raise ValueError(f"`decision` must be one of {DECISIONS}, but is {decision!r}")
     if decision == "most-likely":
         return particles[np.argmax(weights)].copy()
     mean = weights @ particles
@@ -80,12 +75,9 @@ def decide(
 
 
 def standard_scores(similarities: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """S in units that are the same for all tasks, as those of large norm would outvote the others.
-
-    :param similarities: (n, options) S(z_i, option).
-    :param reference: (n, m) S(z_i, policy) of the prior's policies, whose mean and standard
-        deviation are 0 and 1.
-    :return: (n, options).
+    """S(z_i, option), (n, options), in units that are the same for all tasks, as those of large
+    norm would outvote the others: S(z_i, policy) of the prior's policies, (n, m), has mean 0 and
+    standard deviation 1.
     """
     scale = reference.std(axis=1, keepdims=True)
     return (similarities - reference.mean(axis=1, keepdims=True)) / np.maximum(scale, 1e-12)

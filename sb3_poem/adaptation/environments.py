@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
-from typing import TYPE_CHECKING, Any, TypeAlias, Union
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias, Union
 
 import gymnasium as gym
 
 from poem_envs.registration import plain_id
+from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.common.family_view import FamilyView, vectorised
 
 if TYPE_CHECKING:
@@ -19,16 +22,15 @@ COPIES = 60
 
 
 def model_and_env(
-    model: Any, env: Env, n_copies: int = COPIES, render: bool = False
-) -> tuple[Any, VecEnv]:
-    """What adaptation is given, as it works with it.
+    model: MetaModel | str | Path, env: Env, n_copies: int = COPIES, render: bool = False
+) -> tuple[MetaModel, VecEnv]:
+    """What adaptation is given, as it works with it: a model, and a vector environment.
 
     :param model: A model, a file or folder of one, or the name of one that ships.
     :param env: A ``gym.Env``, its id, a Gymnasium ``VectorEnv`` or an SB3 ``VecEnv``; the latter
         stays as it is. The id on which the model was trained makes it with the same arguments.
     :param n_copies: How many copies an id makes.
     :param render: Whether they render RGB images.
-    :return: The model, and a vector environment.
     :raises TypeError: If one of them is something else.
     :raises FileNotFoundError: If there is no such model.
     :raises ValueError: If the model's file asks for what it may not, see
@@ -40,55 +42,55 @@ def model_and_env(
     from sb3_poem.common.vec_env import as_task_vec_env, make_task_vec_env
     from sb3_poem.loading import as_model
 
-    model = as_model(model)
+    found: MetaModel = as_model(model)
     if isinstance(env, VecEnv):
-        return model, env
+        return found, env
     if isinstance(env, str):
-        own = getattr(model, "env_id", None), getattr(model, "env_kwargs", {})
-        _, arguments = environment_of(describe_model(model), *own, plain_id(env))
+        source, own = describe_model(found), (found.env_id, found.env_kwargs)
+        _, arguments = environment_of(source, *own, plain_id(env))
         if render:
             arguments["render_mode"] = "rgb_array"
-        return model, make_task_vec_env(env, n_copies, **arguments)
+        return found, make_task_vec_env(env, n_copies, **arguments)
     if isinstance(env, gym.Env):
-        return model, vectorised(env)
+        return found, vectorised(env)
     if isinstance(env, gym.vector.VectorEnv):
-        return model, as_task_vec_env(env)
-    raise TypeError(
-        f"`env` must be a gymnasium.Env, an id, a Gymnasium VectorEnv or an SB3 VecEnv, but is {env!r}"
-    )
+        return found, as_task_vec_env(env)
+    kinds = "a gymnasium.Env, an id, a Gymnasium VectorEnv or an SB3 VecEnv"
+    raise TypeError(f"`env` must be {kinds}, but is {env!r}")
 
 
-def check_model_fits(model: Any, vec_env: VecEnv) -> None:
+def check_model_fits(model: MetaModel, vec_env: VecEnv) -> None:
     """Refuse a model of other observations, actions or tasks.
 
     :raises ValueError: If a space differs, or a wrapper changes what is seen, done or paid.
     """
-    names = ["observation_space", "action_space"]
-    family = FamilyView.of(vec_env)
+    family, names = FamilyView.of(vec_env), ["observation_space", "action_space"]
     if family is not None:
         family.unknown_wrappers()  # refuses those that change what is seen, done or paid
-    if hasattr(model, "task_space") and family is not None:
-        names.append("task_space")
+        names += ["task_space"] * (model.task_space is not None)
     for name in names:
-        expected, given = getattr(model, name), getattr(vec_env if family is None else family, name)
+        expected, given = getattr(model, name), getattr(family or vec_env, name)
         if expected != given:
             raise ValueError(
-                f"the model does not belong to this environment: its {name} is {expected} ({describe_model(model)}), but "
-                f"the environment's is {given}"
+                f"the model does not belong to this environment: its {name} is {expected} "
+                f"({describe_model(model)}), but the environment's is {given}"
             )
 
 
-def warn_if_untrained(model: Any) -> None:
-    """Warn of a model that no adaptation can help."""
-    if getattr(model, "num_timesteps", None) == 0:
-        warnings.warn(
-            f"{describe_model(model)} has not been trained (num_timesteps is 0), so that its policies differ by chance "
-            "alone; call learn(), or load a trained one",
-            stacklevel=4,
-        )
+def warn_if_untrained(model: MetaModel) -> None:
+    """Warn of a model that no adaptation can help, at the line of the caller's own that gave it."""
+    if model.num_timesteps != 0:
+        return
+    frame, level = sys._getframe(), 1
+    while frame.f_back and frame.f_globals["__name__"].startswith("sb3_poem."):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(
+        f"{describe_model(model)} has not been trained (num_timesteps is 0), so that its policies "
+        "differ by chance alone; call learn(), or load a trained one",
+        stacklevel=level,
+    )
 
 
-def describe_model(model: Any) -> str:
+def describe_model(model: MetaModel) -> str:
     """A model in a few words: its class, and the environment that it was trained on."""
-    env_id = getattr(model, "env_id", None)
-    return type(model).__name__ + ("" if env_id is None else f" on {env_id}")
+    return type(model).__name__ + ("" if model.env_id is None else f" on {model.env_id}")

@@ -23,9 +23,6 @@ ANSWERS = {
 class HumanAnswer:
     """An answer, with all that is known of it.
 
-    :param preference: The answer.
-    :param left: The trajectory on the left.
-    :param right: That on the right.
     :param video: The file in which both were shown.
     :param fps: Its frames per second.
     :param asked: When the question came up, seconds since 1970.
@@ -73,24 +70,17 @@ class HumanOracle:
     ) -> None:
         if video_format not in ("gif", "mp4"):
             raise ValueError(f'`video_format` must be "gif" or "mp4", but is {video_format!r}')
-        self.folder = Path(folder)
-        self.video_format = video_format
-        self.fps = fps
+        self.folder, self.video_format, self.fps = Path(folder), video_format, fps
         self.noise_model: NoiseModel = MistakeNoise(mistake_rate)
         self.n_asked = 0
-        self._read = read
-        self._write = write
-        self._record = record
+        self._read, self._write, self._record = read, write, record
 
     def __repr__(self) -> str:
         return f"HumanOracle({self.n_asked} asked, videos in {self.folder})"
 
     def __call__(self, left: Trajectory, right: Trajectory) -> Preference:
-        """Write the video, and ask until an answer is understood.
+        """Write the video of two trajectories with frames, and ask until an answer is understood.
 
-        :param left: A trajectory with frames.
-        :param right: Another.
-        :return: The answer.
         :raises ValueError: If a trajectory has no frames.
         :raises EOFError: If standard input has ended, or is closed.
         """

@@ -31,10 +31,8 @@ def information_limit(
     EQUAL, which tells a little more than LEFT or RIGHT alone, is not provided for.
 
     :param returns: (n_tasks, n_policies) return of each policy on each task (J).
-    :param k: Number of answers.
     :param noise_model: How the oracle errs; None is an oracle that does not.
     :param ordered: See :func:`best_codebook`.
-    :return: The mean return over the tasks.
     :raises ValueError: If the matrix is empty or not finite, k is negative, or the noise model is
         of an unknown kind.
     """
@@ -52,19 +50,17 @@ def information_limit(
 
 def best_codebook(returns: np.ndarray, size: int, *, ordered: bool = False) -> np.ndarray:
     """The set of policies of a given size with the highest mean over tasks of the best return
-    (k-medoids on the matrix).
+    (k-medoids on the matrix): (min(size, n_policies),) indices, ascending.
 
     Found exactly where all sets can be tried, or by dynamic programming where tasks lie on a line
     (``ordered``); else by greedy choice and swaps, which may lie slightly below the optimum.
 
     :param returns: (n_tasks, n_policies).
-    :param size: How many policies, at least 1.
     :param ordered: Whether the rows are in the order of a one-dimensional task parameter. The
         optimum is then found among all ways to cut the line into ``size`` intervals, one policy
         each. That is exact if of any two policies the one is better up to some task and the other
         from there on, as with a goal speed; noise in the returns may break this, so the general
         search is tried too.
-    :return: (min(size, n_policies),) policy indices, ascending.
     :raises ValueError: If the matrix is empty or not finite, or the size is below 1.
     """
     returns = _check_returns(returns)
@@ -78,17 +74,14 @@ def best_codebook(returns: np.ndarray, size: int, *, ordered: bool = False) -> n
         return books[np.argmax(returns[:, books].max(axis=2).mean(axis=0))]
     found = [_swap(returns, _greedy(returns, size))]
     if ordered:
-        found.append(_fill(returns, best_intervals(returns, size), size))
+        # Two intervals may share a policy: others are added, the best first.
+        found.append(_greedy(returns, size, best_intervals(returns, size)))
     return np.sort(max(found, key=lambda book: _value(returns, book)))
 
 
 def best_intervals(returns: np.ndarray, size: int) -> np.ndarray:
     """The policies of the best cut of an ordered list of tasks into at most ``size`` intervals, by
-    dynamic programming.
-
-    :param returns: (n_tasks, n_policies), rows in the order of the task parameter.
-    :param size: How many intervals at most.
-    :return: Policy indices, ascending and each once, at most ``size``.
+    dynamic programming: at most ``size`` indices, ascending and each once.
     """
     n_tasks = len(returns)
     sums = np.concatenate([np.zeros((1, returns.shape[1])), np.cumsum(returns, axis=0)])
@@ -111,18 +104,13 @@ def best_intervals(returns: np.ndarray, size: int) -> np.ndarray:
     return np.array(sorted(chosen))
 
 
-def _fill(returns: np.ndarray, chosen: np.ndarray, size: int) -> np.ndarray:
-    """Two intervals may share a policy; add others, the best first."""
-    return _greedy(returns, size, chosen) if len(chosen) < size else chosen
-
-
 def _value(returns: np.ndarray, book: np.ndarray) -> float:
     return float(returns[:, book].max(axis=1).mean())
 
 
 def _greedy(returns: np.ndarray, size: int, first: Sequence[int] | np.ndarray = ()) -> np.ndarray:
     chosen = [int(policy) for policy in first]
-    best = returns[:, chosen].max(axis=1) if chosen else np.full(len(returns), -np.inf)
+    best = returns[:, chosen].max(axis=1, initial=-np.inf)
     for _ in range(size - len(chosen)):
         gains = np.maximum(returns, best[:, None]).mean(axis=0)
         gains[chosen] = -np.inf
@@ -138,8 +126,7 @@ def _swap(returns: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     for _ in range(MAX_SWAP_ROUNDS):
         improved = False
         for position in range(len(chosen)):
-            others = np.delete(chosen, position)
-            rest = returns[:, others].max(axis=1) if len(others) else np.full(len(returns), -np.inf)
+            rest = returns[:, np.delete(chosen, position)].max(axis=1, initial=-np.inf)
             values = np.maximum(returns, rest[:, None]).mean(axis=0)
             candidate = int(np.argmax(values))
             if values[candidate] > value + 1e-12 * max(1.0, abs(value)):
@@ -152,9 +139,8 @@ def _swap(returns: np.ndarray, chosen: np.ndarray) -> np.ndarray:
 def _check_returns(returns: np.ndarray) -> np.ndarray:
     returns = np.asarray(returns, dtype=np.float64)
     if returns.ndim != 2 or 0 in returns.shape:
-        raise ValueError(
-            f"`returns` must have shape (n_tasks, n_policies), neither 0, but has shape {returns.shape}"
-        )
+        expected = "(n_tasks, n_policies), neither 0"
+        raise ValueError(f"`returns` must have shape {expected}, but has shape {returns.shape}")
     if not np.isfinite(returns).all():
         raise ValueError("`returns` must be finite")
     return returns

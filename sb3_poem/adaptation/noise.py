@@ -23,12 +23,14 @@ PROBIT_SLOPE = 1.702
 # answers nothing to speak of.
 LAPSE = 0.01
 
+Values = np.ndarray | float
+
 
 class NoiseModel(Protocol):
     """P(LEFT) from the difference of two returns."""
 
     def probability_left(
-        self, difference: np.ndarray, error: np.ndarray | float, magnitude: np.ndarray | float
+        self, difference: np.ndarray, error: Values, magnitude: Values
     ) -> np.ndarray:
         """Probability that the oracle says LEFT, given that it says LEFT or RIGHT.
 
@@ -43,17 +45,13 @@ class NoiseModel(Protocol):
         """JSON-ready; :func:`noise_model_from_dict` reads it."""
 
 
-def _logistic(x: np.ndarray, slope: np.ndarray | float) -> np.ndarray:
+def _logistic(x: np.ndarray, slope: Values) -> np.ndarray:
+    # It stays float32 if it is; whole numbers would cut the slope off.
     x = np.asarray(x)
-    x = x.astype(
-        np.result_type(x.dtype, np.float32), copy=False
-    )  # stays float32 if it is; whole numbers would cut the slope off
-    with np.errstate(
-        over="ignore"
-    ):  # to infinity, which is as good as 80: lapses hide what is left of the other answer
+    x = x.astype(np.result_type(x.dtype, np.float32), copy=False)
+    with np.errstate(over="ignore"):  # infinity is as good as 80, where lapses hide what is left
         y = np.asarray(x * np.asarray(-slope, dtype=x.dtype))
-    # in place: for all pairs of a question, new memory for every operation takes longer than the
-    # operation
+    # In place: new memory for every operation on a question's pairs takes longer than it.
     np.exp(np.clip(y, -80.0, 80.0, out=y), out=y)
     y += 1.0
     return np.reciprocal(y, out=y)
@@ -80,7 +78,7 @@ class ExactNoise(_Serialisable):
     kind = "exact"
 
     def probability_left(
-        self, difference: np.ndarray, error: np.ndarray | float, magnitude: np.ndarray | float
+        self, difference: np.ndarray, error: Values, magnitude: Values
     ) -> np.ndarray:
         """See :class:`NoiseModel`."""
         return _with_lapse(_logistic(difference, PROBIT_SLOPE / np.maximum(error, 1e-12)))
@@ -101,12 +99,11 @@ class MistakeNoise(_Serialisable):
             raise ValueError(f"`rate` must lie in [0, 0.5], but is {self.rate}")
 
     def probability_left(
-        self, difference: np.ndarray, error: np.ndarray | float, magnitude: np.ndarray | float
+        self, difference: np.ndarray, error: Values, magnitude: Values
     ) -> np.ndarray:
         """See :class:`NoiseModel`."""
-        return self.rate + (1.0 - 2.0 * self.rate) * ExactNoise().probability_left(
-            difference, error, magnitude
-        )
+        right = ExactNoise().probability_left(difference, error, magnitude)
+        return self.rate + (1.0 - 2.0 * self.rate) * right
 
 
 @dataclass(frozen=True)
@@ -125,7 +122,7 @@ class BoltzmannNoise(_Serialisable):
             raise ValueError(f"`beta` must be positive and finite, or None, but is {self.beta}")
 
     def probability_left(
-        self, difference: np.ndarray, error: np.ndarray | float, magnitude: np.ndarray | float
+        self, difference: np.ndarray, error: Values, magnitude: Values
     ) -> np.ndarray:
         """See :class:`NoiseModel`."""
         beta = 1.0 / np.maximum(magnitude, 1e-12) if self.beta is None else self.beta
@@ -139,8 +136,6 @@ _KINDS: dict[str, type] = {cls.kind: cls for cls in (ExactNoise, MistakeNoise, B
 def noise_model_from_dict(data: dict[str, Any]) -> NoiseModel:
     """Read what a noise model's ``to_dict`` wrote.
 
-    :param data: The dictionary.
-    :return: The noise model.
     :raises ValueError: If its kind is unknown.
     """
     arguments = dict(data)

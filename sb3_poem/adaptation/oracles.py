@@ -40,16 +40,15 @@ class TaskOracle(ABC):
     ) -> None:
         self.env = env
         self.task = None if task is None else np.asarray(task, dtype=np.float64)
-        # A stream of its own: an adaptation with the same seed draws its candidates from another
-        # (``inference_rng``).
+        # A stream of its own: an adaptation's inference with the same seed draws from another.
         self.rng = np.random.default_rng(None if seed is None else [seed, ORACLE_STREAM])
 
     def __repr__(self) -> str:
-        shown = {
-            name: value for name, value in vars(self).items() if name not in ("env", "task", "rng")
-        }
-        shown["task"] = "the environment's" if self.task is None else self.task.tolist()
-        return f"{type(self).__name__}({', '.join(f'{name}={value}' for name, value in shown.items())})"
+        own = {name: value for name, value in vars(self).items() if name not in ("env", "rng")}
+        task = own.pop("task")
+        own["task"] = "the environment's" if task is None else task.tolist()
+        shown = ", ".join(f"{name}={value}" for name, value in own.items())
+        return f"{type(self).__name__}({shown})"
 
     @property
     @abstractmethod
@@ -61,12 +60,7 @@ class TaskOracle(ABC):
         """Answer from the two true returns."""
 
     def bind(self, env: gym.Env | VecEnv, task: np.ndarray | None = None) -> TaskOracle:
-        """Give the oracle its environment, and perhaps its task.
-
-        :param env: See the class.
-        :param task: See the class; None leaves the task as it is.
-        :return: The oracle itself.
-        """
+        """Give the oracle its environment, and its task unless that is None; returns itself."""
         self.env = env
         if task is not None:
             self.task = np.asarray(task, dtype=np.float64)
@@ -75,36 +69,30 @@ class TaskOracle(ABC):
     def __call__(self, left: Trajectory, right: Trajectory) -> Preference:
         """Compare two trajectories.
 
-        :param left: One.
-        :param right: The other.
-        :return: Which is better.
         :raises ValueError: If a trajectory has no reward features.
         :raises RuntimeError: If no environment was given.
         """
         return self._compare(self.true_return(left), self.true_return(right))
 
     def true_return(self, trajectory: Trajectory) -> float:
-        """The undiscounted return of a trajectory under the task.
+        """The undiscounted return of a trajectory under the task, from its reward features.
 
-        :param trajectory: It, with its reward features.
-        :return: The sum of its rewards.
         :raises ValueError: If it has no reward features, or its return is not finite.
         :raises RuntimeError: If no environment was given.
         """
+        name = type(self).__name__
         if self.env is None:
-            raise RuntimeError(
-                f"{type(self).__name__} has no environment: pass `env` or call bind(env)"
-            )
+            raise RuntimeError(f"{name} has no environment: pass `env` or call bind(env)")
         if trajectory.reward_features is None:
             raise ValueError(
-                f"{type(self).__name__} computes returns from reward features, but the trajectory has none: its environment "
-                'gave no info["reward_features"]. Use an oracle that does not need them, such as HumanOracle.'
+                f"{name} computes returns from reward features, but the trajectory has none: its "
+                'environment gave no info["reward_features"]. Use an oracle that does not need '
+                "them, such as HumanOracle."
             )
         value = float(np.sum(step_rewards(self.env, self.task, trajectory)))
         if not np.isfinite(value):
-            raise ValueError(
-                f"the true return of a trajectory is {value}; its reward features are not finite"
-            )
+            why = "its reward features are not finite"
+            raise ValueError(f"the true return of a trajectory is {value}; {why}")
         return value
 
 
@@ -127,9 +115,7 @@ class BoltzmannOracle(TaskOracle):
     of the time, and ten answers carry less than two bits.
 
     :param beta: Inverse temperature; None is the paper's 1 / (|R_left| + |R_right|).
-    :param env: See :class:`TaskOracle`.
-    :param task: See :class:`TaskOracle`.
-    :param seed: Seeds the answers.
+    :param seed: Seeds the answers; for the others see :class:`TaskOracle`.
     :raises ValueError: If beta is not positive.
     """
 
@@ -161,9 +147,7 @@ class MistakeOracle(TaskOracle):
     """The right answer, flipped with a fixed probability. Equal returns stay EQUAL.
 
     :param rate: The probability, in [0, 1]; 1 always lies. The noise model knows rates up to 0.5.
-    :param env: See :class:`TaskOracle`.
-    :param task: See :class:`TaskOracle`.
-    :param seed: Seeds the mistakes.
+    :param seed: Seeds the mistakes; for the others see :class:`TaskOracle`.
     :raises ValueError: If the rate is out of its range.
     """
 
@@ -193,19 +177,13 @@ class MistakeOracle(TaskOracle):
 def step_rewards(
     env: gym.Env | VecEnv, task: np.ndarray | None, trajectory: Trajectory
 ) -> np.ndarray:
-    """The true rewards of a trajectory.
+    """The true rewards (T,) of a trajectory; for the arguments see :class:`TaskOracle`.
 
-    :param env: A task family: a ``gym.Env``, or an SB3 ``VecEnv`` of them.
-    :param task: (task_dim,); None takes the one in effect in ``env`` (in a ``VecEnv``, in its first
-        copy).
-    :param trajectory: It, with its reward features.
-    :return: (T,).
     :raises ValueError: If it has no reward features, or the environment is no task family.
     """
     if trajectory.reward_features is None:
-        raise ValueError(
-            'the trajectory has no reward features: its environment gave no info["reward_features"]'
-        )
+        gave = 'its environment gave no info["reward_features"]'
+        raise ValueError(f"the trajectory has no reward features: {gave}")
     family = FamilyView(vectorised(env))
     return family.compute_rewards(family.task if task is None else task, trajectory.reward_features)
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sb3_poem.adaptation.environments import describe_model
+from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.common.files import write_atomically
 
 if TYPE_CHECKING:
@@ -33,16 +34,15 @@ class AdaptedPolicy:
     """
 
     def __init__(
-        self, model: Any, latent: np.ndarray, n_answers: int = 0, env: VecEnv | None = None
+        self, model: MetaModel, latent: np.ndarray, n_answers: int = 0, env: VecEnv | None = None
     ) -> None:
-        self.model = model
+        self.model: Any = model
         self.n_answers = n_answers
         self.env = env
         self.latent = np.array(latent, dtype=np.float64)
         if self.latent.shape != (model.latent_dim,):
-            raise ValueError(
-                f"`latent` has shape {self.latent.shape}, but those of the model have ({model.latent_dim},)"
-            )
+            expected = f"those of the model have ({model.latent_dim},)"
+            raise ValueError(f"`latent` has shape {self.latent.shape}, but {expected}")
         if not np.isfinite(self.latent).all():
             raise ValueError(f"`latent` must be finite, but is {self.latent}")
         self.observation_space = model.observation_space
@@ -50,7 +50,8 @@ class AdaptedPolicy:
 
     def __repr__(self) -> str:
         latent = ", ".join(f"{value:.2f}" for value in self.latent)
-        return f"AdaptedPolicy({describe_model(self.model)}, {self.n_answers} answers, latent=[{latent}])"
+        model, answers = describe_model(self.model), f"{self.n_answers} answers"
+        return f"AdaptedPolicy({model}, {answers}, latent=[{latent}])"
 
     def predict(
         self,
@@ -59,13 +60,12 @@ class AdaptedPolicy:
         episode_start: np.ndarray | None = None,
         deterministic: bool = True,
     ) -> tuple[np.ndarray, Any]:
-        """Act.
+        """SB3's ``predict``: actions (act_dim,) or (n, act_dim), and the latents as SB3's state.
 
         :param observation: (obs_dim,) or (n, obs_dim).
         :param state: Ignored: the latent is fixed. It is there for SB3's callers.
         :param episode_start: Ignored: nothing is remembered within an episode.
         :param deterministic: Whether to take the mode.
-        :return: Actions, (act_dim,) or (n, act_dim), and the latents as SB3's state.
         """
         observation = np.asarray(observation)
         single = observation.ndim == len(self.observation_space.shape)
@@ -74,10 +74,9 @@ class AdaptedPolicy:
         return actions, latents
 
     def to_bytes(self) -> bytes:
-        """The policy as one safetensors file: the model, its configuration in the header, the
-        latent and the number of answers. Nothing in it can run code.
-
-        :return: The file's content, which :meth:`from_bytes` reads.
+        """The policy as one safetensors file, which :meth:`from_bytes` reads: the model, its
+        configuration in the header, the latent and the number of answers. Nothing in it can run
+        code.
         """
         import torch as th
         from safetensors.torch import save
@@ -90,9 +89,8 @@ class AdaptedPolicy:
         return save({**named, LATENT: th.as_tensor(self.latent)}, facts)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write :meth:`to_bytes` to a file.
+        """Write :meth:`to_bytes` to a file, whose name should end in ``.safetensors``.
 
-        :param path: The file, whose name should end in ``.safetensors``.
         :raises OSError: If it cannot be written.
         """
         write_atomically(Path(path), self.to_bytes())
@@ -101,9 +99,6 @@ class AdaptedPolicy:
     def load(cls, path: str | os.PathLike[str], device: str = "auto") -> AdaptedPolicy:
         """Read what :meth:`save` wrote, or what the page for answering gives for download.
 
-        :param path: The file.
-        :param device: "auto", "cpu", "cuda".
-        :return: The policy.
         :raises FileNotFoundError: If there is no such file.
         :raises ValueError: If it is truncated, or of another program.
         """
@@ -115,18 +110,15 @@ class AdaptedPolicy:
     ) -> AdaptedPolicy:
         """Read what :meth:`to_bytes` gave.
 
-        :param device: "auto", "cpu", "cuda".
         :param source: Where it comes from, for the message.
-        :return: The policy.
         :raises ValueError: If it is truncated, or of another program.
         """
         import torch as th
         from safetensors import SafetensorError
         from safetensors.torch import load
 
-        from sb3_poem.pearl_sac import PEARLSAC
+        from sb3_poem.loading import BY_CLASS_NAME
         from sb3_poem.pearl_sac.saving import build_model, parse_config
-        from sb3_poem.poem_sac import POEMSAC
 
         try:
             tensors = load(content)
@@ -140,21 +132,17 @@ class AdaptedPolicy:
                 f"{facts.get('format')!r}, expected {FORMAT!r}"
             )
         config = parse_config(facts.get("config", ""), source)
-        algorithms: dict[str, type[PEARLSAC]] = {"POEMSAC": POEMSAC, "PEARLSAC": PEARLSAC}
-        if config["algorithm"] not in algorithms:
-            raise ValueError(
-                f"{source} holds a {config['algorithm']}, known are {', '.join(algorithms)}"
-            )
-        latent, n_answers = (
-            tensors.pop(LATENT, th.zeros(0)).double().numpy(),
-            facts.get("n_answers", ""),
-        )
+        algorithm = BY_CLASS_NAME.get(config["algorithm"])
+        if algorithm is None:
+            known = ", ".join(BY_CLASS_NAME)
+            raise ValueError(f"{source} holds a {config['algorithm']}, known are {known}")
+        latent = tensors.pop(LATENT, th.zeros(0)).double().numpy()
         parts = {name.removeprefix(MODEL_PREFIX): value for name, value in tensors.items()}
-        model = build_model(algorithms[config["algorithm"]], config, parts, source, device)
+        model = build_model(algorithm, config, parts, source, device)
+        n_answers = facts.get("n_answers", "")
         if not re.fullmatch("[0-9]{1,9}", n_answers):
-            raise ValueError(
-                f"{source} is broken: n_answers must be a whole number, but is {n_answers[:20]!r}"
-            )
+            wrong = f"n_answers must be a whole number, but is {n_answers[:20]!r}"
+            raise ValueError(f"{source} is broken: {wrong}")
         try:
             return cls(model, latent, int(n_answers))
         except ValueError as error:

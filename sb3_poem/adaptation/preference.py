@@ -7,6 +7,8 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sb3_poem.common.trajectory import Trajectory
 
 
@@ -18,32 +20,30 @@ class Preference(Enum):
     EQUAL = "equal"
 
 
+SIGNS = {Preference.LEFT: 1.0, Preference.RIGHT: -1.0, Preference.EQUAL: 0.0}
+
+
 @dataclass(frozen=True, eq=False)
 class Query:
-    """A question: which is better?
-
-    :param left: A trajectory on the new task.
-    :param right: Another one.
-    """
+    """A question: which of two trajectories on the new task is better?"""
 
     left: Trajectory
     right: Trajectory
 
     def to_video(self, path: str | Path, fps: float = 20.0) -> Path:
-        """Write both side by side, as MP4 or GIF by the file's suffix.
+        """Write both side by side, as MP4 or GIF by the suffix of the file, whose path is returned;
+        missing folders are made.
 
-        :param path: The file; missing folders are made.
         :param fps: Frames per second.
-        :return: The path.
         :raises ValueError: If they have no frames, or the suffix is another.
         """
         from sb3_poem.common.video import side_by_side, write_video
 
         if not self.left.frames or not self.right.frames:
             raise ValueError(
-                "the question has no frames to show: ask for them by PreferenceAdapter(..., render=True) "
-                "or oracle=HumanOracle(), with an environment's id, or an environment made with "
-                'render_mode="rgb_array"'
+                "the question has no frames to show: ask for them by PreferenceAdapter(..., "
+                "render=True) or oracle=HumanOracle(), with an environment's id, or an environment "
+                'made with render_mode="rgb_array"'
             )
         frames = side_by_side(self.left.frames, self.right.frames, ("LEFT", "RIGHT"))
         return write_video(frames, path, fps)
@@ -55,8 +55,6 @@ def as_preference(answer: Any) -> Preference:
     Numbers and booleans are refused, because their meaning is a convention that differs between
     programs, and a preference read the wrong way round is worse than none.
 
-    :param answer: What an oracle returned.
-    :return: The preference.
     :raises ValueError: If it is another word.
     :raises TypeError: If it is anything else.
     """
@@ -66,10 +64,24 @@ def as_preference(answer: Any) -> Preference:
         try:
             return Preference(answer)
         except ValueError:
-            raise ValueError(
-                f'an answer must be "left", "right" or "equal", but is {answer!r}'
-            ) from None
+            words = '"left", "right" or "equal"'
+            raise ValueError(f"an answer must be {words}, but is {answer!r}") from None
     raise TypeError(
         "an answer must be Preference.LEFT, Preference.RIGHT or Preference.EQUAL (or the word), "
         f"but is {answer!r} of type {type(answer).__name__}"
     )
+
+
+def preference_log_likelihood(
+    log_left: np.ndarray, log_right: np.ndarray, answers: list[Preference]
+) -> np.ndarray:
+    """(m,) log-likelihood of k answers from the log-probabilities of LEFT and RIGHT.
+
+    EQUAL has the geometric mean of both: it is largest where neither is more probable and, other
+    than half of each, it tells a latent that calls the two alike from one that is sure of either.
+
+    :param log_left: (m, k) log P(LEFT) of k questions under m latents.
+    :param log_right: (m, k) log P(RIGHT).
+    """
+    left_share = 0.5 + 0.5 * np.array([SIGNS[answer] for answer in answers])
+    return log_left @ left_share + log_right @ (1.0 - left_share)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
+from sb3_poem.adaptation.meta_model import MetaModel
+
 SOURCES = ("prior", "aggregate")
+N_CENTRES = 256
 
 
 class Prior(Protocol):
@@ -27,10 +30,7 @@ class Prior(Protocol):
 
 
 class GaussianPrior:
-    """N(0, I), Algorithm 2's own prior.
-
-    :param dim: The latents' dimension d.
-    """
+    """N(0, I) of d dimensions, Algorithm 2's own prior."""
 
     has_holes = False
 
@@ -96,18 +96,8 @@ class AggregatePrior:
         return peak + np.log(np.exp(exponents - peak[:, None]).mean(axis=1))
 
 
-def make_prior(model: Any, source: str, rng: np.random.Generator, n_centres: int = 256) -> Prior:
-    """The prior of a model.
-
-    :param model: A trained model.
-    :param source: "prior" or "aggregate".
-    :param rng: Draws the centres of the aggregate mixture.
-    :param n_centres: How many.
-    :return: The prior.
-    :raises ValueError: If the source is unknown.
-    """
+def make_prior(model: MetaModel, source: str, rng: np.random.Generator) -> Prior:
+    """The prior of a model from one of ``SOURCES``; the aggregate's centres are drawn."""
     if source == "prior":
         return GaussianPrior(model.latent_dim)
-    if source == "aggregate":
-        return AggregatePrior(model.sample_latents(n_centres, rng, source="aggregate"))
-    raise ValueError(f"`candidates` must be one of {SOURCES}, but is {source!r}")
+    return AggregatePrior(model.sample_latents(N_CENTRES, rng, source="aggregate"))

@@ -17,13 +17,19 @@ QUERY_RULES = ("worst-case", "information-gain", "random")
 BLOCK_ENTRIES = 2**17
 
 
-def tolerance(epsilon: float) -> float:
-    """How far S(z, z') may fall below S(z, z'') while eq. 9 still holds. The appendix's proof has
-    the opposite sign, which would shrink the half-space and exclude the true latent; eq. 9 itself
-    widens it.
+def check_epsilon(epsilon: float) -> None:
+    """Refuse a tolerated error outside [0, 0.5).
 
-    :param epsilon: The tolerated error, in [0, 0.5).
-    :return: log((1 + 2 epsilon) / (1 - 2 epsilon)) >= 0.
+    :raises ValueError: Names the value.
+    """
+    if not 0.0 <= epsilon < 0.5:
+        raise ValueError(f"`epsilon` must lie in [0, 0.5), but is {epsilon}")
+
+
+def tolerance(epsilon: float) -> float:
+    """How far S(z, z') may fall below S(z, z'') while eq. 9 still holds: log((1 + 2 epsilon) / (1 -
+    2 epsilon)) >= 0. The appendix's proof has the opposite sign, which would shrink the half-space
+    and exclude the true latent; eq. 9 itself widens it.
     """
     return float(np.log1p(2.0 * epsilon) - np.log1p(-2.0 * epsilon))
 
@@ -32,12 +38,11 @@ def worst_case_sizes(
     similarities: np.ndarray, epsilon: float, weights: np.ndarray | None = None
 ) -> np.ndarray:
     """For each pair of policies, the larger of the two sets of latents that may survive the answer
-    (eq. 10's objective).
+    (eq. 10's objective), (n (n - 1) / 2,) in the order of ``numpy.triu_indices(n, 1)``.
 
     :param similarities: (m, n) S(z_i, z_j) of m latents and n policies.
     :param epsilon: The tolerated error of eq. 9.
     :param weights: (m,) a latent's weight; None counts each as one.
-    :return: (n (n - 1) / 2,), in the order of ``numpy.triu_indices(n, 1)``.
     """
     first, second = _pairs(similarities.shape[1])
     rows, slack = _policy_rows(similarities), tolerance(epsilon)
@@ -46,43 +51,32 @@ def worst_case_sizes(
     for start in range(0, len(first), block):
         some = slice(start, start + block)
         difference = rows[first[some]] - rows[second[some]]
-        survives_first, survives_second = difference >= -slack, difference <= slack
-        if weights is None:
-            larger = np.maximum(
-                np.count_nonzero(survives_first, axis=1), np.count_nonzero(survives_second, axis=1)
-            )
-        else:
-            larger = np.maximum(survives_first @ weights, survives_second @ weights)
-        sizes[some] = larger
+        survivors = difference >= -slack, difference <= slack
+        sizes[some] = np.maximum(
+            *(np.count_nonzero(s, axis=1) if weights is None else s @ weights for s in survivors)
+        )
     return sizes
 
 
 def worst_case_pair(
     similarities: np.ndarray, epsilon: float, weights: np.ndarray | None = None
 ) -> tuple[int, int]:
-    """The pair of policies after whose worse answer the fewest latents survive (eq. 10). Of equally
-    good pairs the first.
-
-    :param similarities: (m, n).
-    :param epsilon: The tolerated error of eq. 9.
-    :param weights: (m,) a latent's weight; None counts each as one.
-    :return: Two different policy indices.
+    """The pair of policies after whose worse answer the fewest latents survive (eq. 10), of equally
+    good ones the first; for the arguments see :func:`worst_case_sizes`.
     """
-    return pair_at(
-        int(np.argmin(worst_case_sizes(similarities, epsilon, weights))), similarities.shape[1]
-    )
+    sizes = worst_case_sizes(similarities, epsilon, weights)
+    return pair_at(int(np.argmin(sizes)), similarities.shape[1])
 
 
 def information_gains(probabilities: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Expected information gain of a question: the entropy of the answer minus its mean entropy
-    under each latent.
+    """Expected information gain of questions, (pairs,) in nats: the entropy of the answer minus its
+    mean entropy under each latent.
 
     Of two policies that do the same, every latent says 1/2, so the gain is 0: a resolution limit
     within the probabilities is what keeps questions apart that nobody could answer.
 
     :param probabilities: (pairs, m) P(LEFT) under each latent.
     :param weights: (m,) summing to one.
-    :return: (pairs,) in nats.
     """
     weights = weights.astype(probabilities.dtype, copy=False)
     return _entropy(probabilities @ weights) - _entropy(probabilities) @ weights
@@ -98,29 +92,20 @@ def most_informative_pair(
     :param noise: The oracle's noise model.
     :param error: Standard deviation of a predicted difference.
     :param magnitude: Typical sum of both returns' absolute values, same unit.
-    :return: Two different policy indices.
     """
     probabilities = noise.probability_left(pair_differences(values), error, magnitude)
     return pair_at(int(np.argmax(information_gains(probabilities, weights))), values.shape[1])
 
 
 def random_pair(n: int, rng: np.random.Generator) -> tuple[int, int]:
-    """Two different policies, uniformly.
-
-    :param n: How many there are, at least 2.
-    :param rng: The generator.
-    :return: Two different indices.
-    """
+    """Two different ones of n policies, uniformly."""
     first, second = rng.choice(n, size=2, replace=False)
     return int(first), int(second)
 
 
 def pair_differences(values: np.ndarray) -> np.ndarray:
-    """What each latent says of each pair of policies.
-
-    :param values: (m, n) of m latents and n policies.
-    :return: (n (n - 1) / 2, m) the first policy's value minus the second's, pairs in the order of
-        ``numpy.triu_indices(n, 1)``.
+    """What each of m latents says of each pair of n policies: (n (n - 1) / 2, m) the first one's
+    value (m, n) minus the second's, pairs in the order of ``numpy.triu_indices(n, 1)``.
     """
     first, second = _pairs(values.shape[1])
     rows = _policy_rows(values)
@@ -130,12 +115,7 @@ def pair_differences(values: np.ndarray) -> np.ndarray:
 
 
 def pair_at(index: int, n: int) -> tuple[int, int]:
-    """The policies of a pair.
-
-    :param index: Its place in the order of :func:`pair_differences`.
-    :param n: How many policies there are.
-    :return: Two indices, the smaller first.
-    """
+    """The policies of a pair, by its place in the order of :func:`pair_differences`."""
     first, second = _pairs(n)
     return int(first[index]), int(second[index])
 

@@ -14,7 +14,7 @@ TOLERANCE = 1e-4  # nats
 
 
 def answer_capacity(noise: NoiseModel | None, returns: np.ndarray) -> float:
-    """The most that one answer (left or right) can tell, whatever is asked.
+    """The most that one answer (left or right) can tell, whatever is asked: bits, in [0, 1].
 
     It is the capacity of the binary symmetric channel at the oracle's smallest probability of a
     mistake. Of the probabilities of LEFT that questions can bring about only the extremes matter,
@@ -25,7 +25,6 @@ def answer_capacity(noise: NoiseModel | None, returns: np.ndarray) -> float:
     :param returns: (n_tasks, n_policies). With a fixed ``beta`` an answer is the surer the larger
         the difference of returns, and no question is supposed to show a larger one than there is
         between two policies here.
-    :return: Bits, in [0, 1].
     :raises ValueError: If the noise model is of a kind whose capacity is not known.
     """
     if noise is None or isinstance(noise, ExactNoise):
@@ -33,14 +32,12 @@ def answer_capacity(noise: NoiseModel | None, returns: np.ndarray) -> float:
     if isinstance(noise, MistakeNoise):
         mistake = noise.rate
     elif isinstance(noise, BoltzmannNoise):
-        # The paper's beta makes the exponent |R_left - R_right| / (|R_left| + |R_right|), at most
-        # 1.
+        # The paper's exponent, |R_left - R_right| / (|R_left| + |R_right|), is at most 1.
         exponent = 1.0 if noise.beta is None else noise.beta * float(np.ptp(returns, axis=1).max())
         mistake = float(0.5 * (1.0 - np.tanh(0.5 * exponent)))
     else:
-        raise ValueError(
-            f"`noise_model` must be ExactNoise, MistakeNoise or BoltzmannNoise, but is of type {type(noise).__name__}"
-        )
+        known, name = "ExactNoise, MistakeNoise or BoltzmannNoise", type(noise).__name__
+        raise ValueError(f"`noise_model` must be {known}, but is of type {name}")
     return 1.0 - _binary_entropy(mistake)
 
 
@@ -54,8 +51,6 @@ def rate_distortion_limit(returns: np.ndarray, bits: float) -> float:
     (Csiszar 1974): where iterations are stopped early it is too high, never too low.
 
     :param returns: (n_tasks, n_policies), finite.
-    :param bits: At least 0.
-    :return: The bound.
     :raises ValueError: If ``bits`` is negative.
     """
     if not bits >= 0:
@@ -73,9 +68,8 @@ def rate_distortion_limit(returns: np.ndarray, bits: float) -> float:
         return (nats + _log_partition(scaled, slope)) / slope
 
     # The dual is convex in 1 / slope, hence unimodal in its logarithm.
-    found = minimize_scalar(
-        bound, bounds=(np.log(1e-2), np.log(1e5)), method="bounded", options={"xatol": 1e-2}
-    )
+    bounds, options = (np.log(1e-2), np.log(1e5)), {"xatol": 1e-2}
+    found = minimize_scalar(bound, bounds=bounds, method="bounded", options=options)
     return min(best, float(returns.max() + scale * found.fun))
 
 

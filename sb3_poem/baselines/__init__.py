@@ -1,17 +1,17 @@
-"""What POEM is compared with, behind the same ask and tell."""
+"""What POEM is compared with: rules like any other."""
 
-from sb3_poem.baselines.anole import ANOLEAdapter
+from sb3_poem.baselines.anole import ANOLE
 from sb3_poem.baselines.fragments import replay_fragments, rollout_fragments, training_rollouts
-from sb3_poem.baselines.maml_adapter import MAMLRewardAdapter, MAMLRewardModel
-from sb3_poem.baselines.maml_reward import MetaReward, meta_train_reward
-from sb3_poem.baselines.reward_oracle import RewardOracleAdapter
+from sb3_poem.baselines.maml_reward import MAMLReward, MAMLRewardModel
+from sb3_poem.baselines.meta_reward import MetaReward, meta_train_reward
+from sb3_poem.baselines.reward_oracle import RewardOracle
 
 __all__ = [
-    "ANOLEAdapter",
-    "MAMLRewardAdapter",
+    "ANOLE",
+    "MAMLReward",
     "MAMLRewardModel",
     "MetaReward",
-    "RewardOracleAdapter",
+    "RewardOracle",
     "meta_train_reward",
     "replay_fragments",
     "rollout_fragments",

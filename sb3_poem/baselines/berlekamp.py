@@ -26,14 +26,12 @@ def berlekamp_volumes(contradictions: np.ndarray, n_left: int, budget: int) -> n
 def worst_case_volumes(
     differences: np.ndarray, contradictions: np.ndarray, n_left: int, budget: int
 ) -> np.ndarray:
-    """The volume that the worse of two answers leaves, over all candidates.
+    """(n_pairs,) the volume that the worse of two answers leaves, over all candidates.
 
     :param differences: (n_candidates, n_pairs) predicted return of the left fragment minus that of
         the right one.
     :param contradictions: (n_candidates,) of the answers so far.
     :param n_left: Questions to come after this one.
-    :param budget: Lies that all answers together may hold.
-    :return: (n_pairs,).
     """
     kept = berlekamp_volumes(contradictions, n_left, budget)
     lost = kept - berlekamp_volumes(contradictions + 1, n_left, budget)
@@ -44,10 +42,6 @@ def worst_case_volumes(
 
 def n_distinguishable(n_queries: int, budget: int) -> int:
     """How many candidates so many answers with so many lies can tell apart at most (the
-    sphere-packing bound).
-
-    :param n_queries: K.
-    :param budget: E.
-    :return: 2^K over the number of ways to lie, rounded down.
+    sphere-packing bound): 2^K over the number of ways to lie, rounded down.
     """
     return 2**n_queries // sum(comb(n_queries, lies) for lies in range(budget + 1))

@@ -1,4 +1,4 @@
-"""Meta-learning a reward network from preferences by MAML (Finn et al. 2017; Hejna & Sadigh 2023)."""
+"""Meta-learning a reward from preferences by MAML (Finn et al. 2017; Hejna & Sadigh 2023)."""
 
 from __future__ import annotations
 
@@ -51,12 +51,8 @@ class RewardNetwork(nn.Module):
 def preference_loss(
     network: nn.Module, parameters: Parameters, pairs: PreferencePairs
 ) -> th.Tensor:
-    """Bradley-Terry cross-entropy of the sums of predicted rewards.
-
-    :param network: A :class:`RewardNetwork`.
-    :param parameters: Its parameters, by name.
-    :param pairs: Of one task.
-    :return: The mean over the pairs.
+    """Bradley-Terry cross-entropy of the sums of predicted rewards; the mean over one
+    task's pairs.
     """
     both = functional_call(network, parameters, (th.stack([pairs.left, pairs.right]),)).sum(dim=-1)
     logit = both[0] - both[1]
@@ -72,12 +68,6 @@ def adapt_parameters(
 ) -> Parameters:
     """MAML's inner loop: gradient steps on one task's preferences. It can be differentiated, and
     mapped over tasks.
-
-    :param parameters: Where to start.
-    :param pairs: The task's preferences.
-    :param learning_rate: Of the steps.
-    :param steps: How many.
-    :return: The adapted parameters.
     """
     slope = grad(preference_loss, argnums=1)
     for _ in range(steps):
@@ -99,17 +89,13 @@ def maml_loss(
     """MAML's outer objective: how well the adapted networks predict other preferences of their
     tasks. Its gradient passes through the inner loop.
 
-    :param parameters: The common start.
     :param support: (tasks, pairs, ...) what each task adapts to.
     :param query: (tasks, pairs, ...) what it is judged by.
-    :param learning_rate: Of the inner loop.
-    :param steps: Of the inner loop.
     :return: The mean over the tasks.
     """
 
     def task_loss(some: PreferencePairs, others: PreferencePairs) -> th.Tensor:
-        return preference_loss(
-            network, adapt_parameters(network, parameters, some, learning_rate, steps), others
-        )
+        adapted = adapt_parameters(network, parameters, some, learning_rate, steps)
+        return preference_loss(network, adapted, others)
 
     return vmap(task_loss)(support, query).mean()

@@ -1,290 +1,263 @@
-"""A meta-trained reward, which a few answers adapt to a task (Hejna & Sadigh 2023)."""
+"""MAML-reward: the answers adapt the reward, and SAC learns from what was shown."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
+import contextlib
+import copy
+import random
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
-from safetensors import SafetensorError
-from safetensors.torch import load as load_tensors
-from safetensors.torch import save as tensors_to_bytes
+from stable_baselines3 import SAC
+from stable_baselines3.common.logger import Logger
 
+from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.preference import Preference
-from sb3_poem.adaptation.state import read_json, write_json_atomically
-from sb3_poem.baselines.fragments import default_fragment_length, replay_fragments
-from sb3_poem.baselines.maml import (
-    Parameters,
-    PreferencePairs,
-    RewardNetwork,
-    adapt_parameters,
-    maml_loss,
+from sb3_poem.adaptation.rule import (
+    Answer,
+    Inference,
+    Rule,
+    Setting,
+    Shown,
+    Snapshot,
+    trajectories_of,
 )
+from sb3_poem.baselines.meta_reward import MetaReward
+from sb3_poem.baselines.transitions import standardised
 from sb3_poem.common.checks import check_whole
-from sb3_poem.common.digest import digest_of
-from sb3_poem.common.files import write_atomically
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.trajectory import Trajectory
 
-FORMAT = "sb3_poem meta reward 1"
-WEIGHTS, CONFIG = "reward.safetensors", "reward.json"
-LABELS = {Preference.LEFT: 1.0, Preference.RIGHT: 0.0, Preference.EQUAL: 0.5}
+if TYPE_CHECKING:
+    from sb3_poem.pearl_sac import PEARLSAC
 
 
-class JudgedPair(NamedTuple):
-    """An answer, with what stood left and right."""
+class MAMLRewardModel(MetaModel):
+    """A meta-trained reward with the face of a model. Its policies are SAC's after so many answers
+    to some task; a "latent" names one by its number, and says with its second entry, 1 or -1, with
+    which sign exploration noise is added: so two rollouts of one policy from equal seeds differ.
 
-    preference: Preference
-    left: Trajectory
-    right: Trajectory
-
-
-def _standardisation(policy: Any) -> dict[str, th.Tensor]:
-    """By what observations are standardised; the parameters mean something only together with it."""
-    return {"obs_mean": policy.obs_norm.mean, "obs_std": policy.obs_norm.std}
-
-
-class MetaReward:
-    """A reward network from which a few preferences lead to a task's reward.
-
-    :param policy: A :class:`LatentPolicy`, whose standardisation of observations is used.
-    :param net_arch: Hidden layers of the network.
-    :param inner_learning_rate: Step size of MAML's inner loop.
-    :param inner_steps: Gradient steps of the inner loop.
-    :param seed: Of the initial parameters.
+    :param reward: The meta-trained reward.
+    :param model: The :class:`PEARLSAC` that it was meta-trained with, for spaces and horizon.
     """
 
-    def __init__(
-        self,
-        policy: Any,
-        net_arch: Sequence[int] = (64, 64),
-        inner_learning_rate: float = 0.1,
-        inner_steps: int = 5,
-        seed: int = 0,
-    ) -> None:
-        if not inner_learning_rate > 0:
-            raise ValueError(
-                f"`inner_learning_rate` must be positive, but is {inner_learning_rate}"
-            )
-        check_whole("inner_steps", inner_steps, 1)
-        self.policy, self.inner_learning_rate, self.inner_steps = (
-            policy,
-            inner_learning_rate,
-            inner_steps,
-        )
-        self.net_arch = tuple(int(width) for width in net_arch)
-        in_dim = 2 * spaces.flatdim(policy.observation_space) + spaces.flatdim(policy.action_space)
-        with th.random.fork_rng():
-            th.manual_seed(seed)
-            self.network = RewardNetwork(in_dim, net_arch).to(policy.device)
-        self.parameters: Parameters = {
-            name: value.detach().clone() for name, value in self.network.named_parameters()
-        }
+    latent_dim = 2
+    observation_space: Any = None
+    action_space: Any = None
+    horizon: int = 0
+    env_id: str | None = None
+
+    def __init__(self, reward: MetaReward, model: PEARLSAC) -> None:
+        self.reward = reward
+        self.observation_space, self.action_space = model.observation_space, model.action_space
+        self.horizon, self.env_id = model.horizon or 0, model.env_id
+        self.actors: list[Any] = []
+
+    def __repr__(self) -> str:
+        return f"MAMLRewardModel({self.env_id})"
 
     @property
     def digest(self) -> str:
-        """Of its numbers, the standardisation's included."""
-        return digest_of({**self.parameters, **_standardisation(self.policy)})
+        """Of the meta-trained reward's numbers."""
+        return self.reward.digest
 
-    def save(self, folder: str | Path) -> None:
-        """Write the parameters as safetensors and the settings as JSON.
+    def sample_latents(self, n: int, rng: np.random.Generator, source: str = "prior") -> np.ndarray:
+        """There are no policies but those that answers led to."""
+        raise NotImplementedError("a MAMLRewardModel has no policies before the first answer")
 
-        :param folder: Where; made if missing.
-        :raises OSError: If it cannot be written.
-        """
-        folder = Path(folder)
-        tensors = {
-            f"network.{name}": value.detach().cpu().contiguous()
-            for name, value in self.parameters.items()
-        }
-        tensors |= {
-            name: value.cpu().contiguous() for name, value in _standardisation(self.policy).items()
-        }
-        config = {
-            "format": FORMAT,
-            "net_arch": list(self.net_arch),
-            "inner_learning_rate": self.inner_learning_rate,
-            "inner_steps": self.inner_steps,
-        }
-        write_atomically(folder / WEIGHTS, tensors_to_bytes(tensors))
-        write_json_atomically(folder / CONFIG, config)
+    def add(self, actor: Any) -> np.ndarray:
+        """Keep a copy of an actor, and give its latent (2,)."""
+        self.actors.append(copy.deepcopy(actor).eval())
+        return np.array([len(self.actors) - 1, 1.0])
 
-    @classmethod
-    def load(cls, folder: str | Path, policy: Any) -> MetaReward:
-        """Read what :meth:`save` wrote.
-
-        :param policy: The :class:`LatentPolicy` with which it was meta-trained.
-        :return: The meta-trained reward.
-        :raises FileNotFoundError: If the folder does not hold one.
-        :raises ValueError: If a file is broken or of another version, or the policy is another one.
-        """
-        folder = Path(folder)
-        if not (folder / CONFIG).is_file():
-            raise FileNotFoundError(f"{folder} holds no meta-trained reward: it has no {CONFIG}")
-        config = read_json(folder / CONFIG)
-        if config.get("format") != FORMAT:
-            raise ValueError(
-                f"{folder / CONFIG} is not of this version of sb3_poem (expected format {FORMAT!r})"
-            )
-        try:
-            tensors = load_tensors((folder / WEIGHTS).read_bytes())
-        except SafetensorError as error:
-            raise ValueError(
-                f"{folder / WEIGHTS} is truncated, or no safetensors file: {error}"
-            ) from error
-        for name, value in _standardisation(policy).items():
-            own = value.cpu()
-            if (
-                name not in tensors
-                or tensors[name].shape != own.shape
-                or not th.equal(tensors[name], own)
-            ):
-                raise ValueError(
-                    f"`policy` is not the one with which the reward in {folder} was meta-trained: its {name} differs; "
-                    "load the same model again"
-                )
-        meta = cls(policy, config["net_arch"], config["inner_learning_rate"], config["inner_steps"])
-        names = {f"network.{name}": value.shape for name, value in meta.parameters.items()}
-        if names != {name: tensors[name].shape for name in tensors if name.startswith("network.")}:
-            raise ValueError(
-                f"{folder / WEIGHTS} does not hold the network that {CONFIG} describes"
-            )
-        meta.parameters = {
-            name: tensors[f"network.{name}"].to(policy.device) for name in meta.parameters
-        }
-        return meta
-
-    def transitions(self, trajectory: Trajectory) -> th.Tensor:
-        """(T, in_dim + 1) standardised (s, a, s') of a trajectory, and 1."""
-        policy = self.policy
+    def predict(
+        self,
+        observation: np.ndarray,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[np.ndarray, Any]:
+        """SB3's, with latents (2,) or (n, 2) as state."""
+        obs = np.atleast_2d(np.asarray(observation, dtype=np.float32))
+        latents = np.broadcast_to(np.asarray(state, dtype=np.float64), (len(obs), 2))
+        policy = self.reward.policy
+        actions = np.empty((len(obs), *self.action_space.shape), dtype=np.float32)
         with th.no_grad():
-            obs = policy.standardise(
-                th.as_tensor(trajectory.observations, dtype=th.float32, device=policy.device)
-            )
-            actions = policy.scale_action_batch(
-                th.as_tensor(trajectory.actions, dtype=th.float32, device=policy.device)
-            )
-            return th.cat([obs[:-1], actions, obs[1:], obs.new_ones(len(actions), 1)], dim=1)
-
-    def adapted(self, answers: Sequence[JudgedPair]) -> Parameters:
-        """The reward after some answers.
-
-        :param answers: The answers, each with trajectories of any length.
-        :return: Parameters of the network.
-        """
-        parameters = self.parameters
-        if not answers:
-            return parameters
-        longest = max(len(shown) for answer in answers for shown in (answer.left, answer.right))
-        left, right = (
-            th.stack([_filled(self.transitions(shown), longest) for shown in side])
-            for side in zip(*((answer.left, answer.right) for answer in answers), strict=True)
-        )
-        label = th.tensor([LABELS[answer.preference] for answer in answers], device=left.device)
-        pairs = PreferencePairs(left, right, label)
-        adapted = adapt_parameters(
-            self.network, parameters, pairs, self.inner_learning_rate, self.inner_steps
-        )
-        return {name: value.detach() for name, value in adapted.items()}
-
-    def rewards(self, parameters: Parameters, trajectory: Trajectory) -> np.ndarray:
-        """Predicted rewards.
-
-        :param parameters: What :meth:`adapted` gave.
-        :return: (T,), in the network's own unit.
-        """
-        with th.no_grad():
-            predicted = th.func.functional_call(
-                self.network, parameters, (self.transitions(trajectory),)
-            )
-        return predicted.double().cpu().numpy()
+            inputs = policy.standardise(th.as_tensor(obs, device=policy.device))
+            noise = th.randn(actions.shape)
+            for number in np.unique(latents[:, 0]).astype(int):
+                rows = np.flatnonzero(latents[:, 0] == number)
+                mean, log_std, _ = self.actors[number].get_action_dist_params(inputs[rows].cpu())
+                if not deterministic:
+                    sign = th.as_tensor(latents[rows, 1:], dtype=th.float32)
+                    mean = mean + sign * log_std.exp() * noise[rows]
+                actions[rows] = mean.tanh().numpy()
+        space = self.action_space
+        actions = np.clip(policy.unscale_action(actions), space.low, space.high)
+        return (actions[0] if np.ndim(observation) == 1 else actions), state
 
 
-def meta_train_reward(
-    model: Any,
-    n_iterations: int = 500,
-    n_fragments: int = 500,
-    fragment_length: int | None = None,
-    tasks_per_batch: int = 16,
-    n_support: int = 10,
-    n_query: int = 10,
-    learning_rate: float = 1e-3,
-    seed: int = 0,
-    **arguments: Any,
-) -> MetaReward:
-    """Meta-train a reward on the preferences of a model's training tasks about fragments from its
-    replay buffer.
+@dataclass(frozen=True, repr=False)
+class MAMLReward(Rule):
+    """MAML-reward (Hejna & Sadigh 2023): a meta-trained reward is adapted to the answers, and SB3's
+    SAC learns the policy on it from the trajectories that were shown, at most 2 K.
 
-    Every training task judges fragments of all of them, so the family must share dynamics.
+    After each answer the reward is adapted anew from the meta-trained start to all answers,
+    everything that was shown is relabelled with it, and SAC goes on learning from that. What is
+    learnt follows from the seed and the answers alone, so a saved adaptation keeps no networks:
+    they are learnt again. Questions show exploring policies: nothing else brings SAC its
+    experience.
 
-    :param model: A trained :class:`PEARLSAC` with its environment and its replay buffer.
-    :param n_iterations: Steps of the outer loop.
-    :param n_fragments: Fragments that pairs are drawn from.
-    :param fragment_length: Steps of a fragment; None takes 50, or an episode that is shorter.
-    :param tasks_per_batch: Tasks in an outer step (all, if there are fewer).
-    :param n_support: Pairs that a task adapts to.
-    :param n_query: Pairs that it is judged by.
-    :param learning_rate: Of Adam in the outer loop.
-    :param seed: Of everything.
-    :param arguments: Of :class:`MetaReward`.
-    :return: The meta-trained reward.
-    :raises ValueError: If the family does not share dynamics, or the replay buffer is empty.
+    The model is a :class:`MAMLRewardModel`.
+
+    :param gradient_steps: SAC's gradient steps after each answer.
+    :param batch_size: SAC's.
+    :param learning_rate: SAC's.
+    :param gamma: SAC's.
+    :raises ValueError: If an option is out of its range.
     """
-    if not model.family.shared_dynamics:
-        raise ValueError(
-            f"`model` must be of a family whose tasks share their dynamics, but those of {model.family.env_id} do not: "
-            "MAML-reward lets every training task judge all tasks' fragments"
-        )
-    if not model.replay_buffer.counts.any():
-        raise ValueError(
-            "`model` has an empty replay buffer (a loaded model has none): call load_replay_buffer"
-        )
-    for name, value in (
-        ("n_iterations", n_iterations),
-        ("n_support", n_support),
-        ("n_query", n_query),
-    ):
-        check_whole(name, value, 1)
-    rng = np.random.default_rng([seed, 5])
-    meta = MetaReward(model.policy, seed=seed, **arguments)
-    length = default_fragment_length(model.horizon) if fragment_length is None else fragment_length
-    fragments = replay_fragments(model, n_fragments, length, rng)
-    inputs = th.stack([meta.transitions(fragment) for fragment in fragments])
-    features = np.stack([np.asarray(fragment.reward_features) for fragment in fragments])
-    returns = model.family.compute_rewards(
-        model.train_tasks.tasks[:, None, None, :], features[None]
-    ).sum(axis=2)
-    parameters = {name: value.requires_grad_() for name, value in meta.parameters.items()}
-    optimizer = th.optim.Adam(parameters.values(), lr=learning_rate)
-    n_tasks = min(tasks_per_batch, len(returns))
-    for _ in range(n_iterations):
-        tasks = rng.choice(len(returns), size=n_tasks, replace=False)
-        support, query = (_judged(inputs, returns, tasks, n, rng) for n in (n_support, n_query))
-        optimizer.zero_grad()
-        maml_loss(
-            meta.network, parameters, support, query, meta.inner_learning_rate, meta.inner_steps
-        ).backward()
-        optimizer.step()
-    meta.parameters = {name: value.detach() for name, value in parameters.items()}
-    return meta
+
+    gradient_steps: int = 200
+    batch_size: int = 128
+    learning_rate: float = 1e-3
+    gamma: float = 0.99
+
+    explores = True
+    refuses_library = "SAC learns from rollouts on the new task"
+
+    def __post_init__(self) -> None:
+        for name in ("gradient_steps", "batch_size"):
+            check_whole(name, getattr(self, name), 1)
+        if not self.learning_rate > 0:
+            raise ValueError(f"`learning_rate` must be positive, but is {self.learning_rate}")
+        if not 0.0 <= self.gamma <= 1.0:
+            raise ValueError(f"`gamma` must lie in [0, 1], but is {self.gamma}")
+
+    def check(self, model: MetaModel, setting: Setting) -> None:
+        """See :class:`Rule`: it needs a meta-trained reward, and tasks that share dynamics."""
+        if not isinstance(model, MAMLRewardModel):
+            raise ValueError(
+                f"`model` must be a MAMLRewardModel, but is of type {type(model).__name__}; make "
+                "one by MAMLRewardModel(meta_train_reward(model), model)"
+            )
+        super().check(model, setting)
+        family = None if setting.env is None else FamilyView.of(setting.env)
+        if family is not None and not family.shared_dynamics:
+            raise ValueError(
+                "`env` must be of a family whose tasks share their dynamics: MAML-reward's network "
+                "was trained on what tasks say of each other's fragments"
+            )
+
+    def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> MAMLRewardInference:
+        """See :class:`Rule`."""
+        return MAMLRewardInference(self, model, rng, setting.n_queries)
 
 
-def _judged(
-    inputs: th.Tensor,
-    returns: np.ndarray,
-    tasks: np.ndarray,
-    n_pairs: int,
-    rng: np.random.Generator,
-) -> PreferencePairs:
-    left, right = rng.integers(len(inputs), size=(2, len(tasks), n_pairs))
-    rows = tasks[:, None]
-    label = 0.5 + 0.5 * np.sign(returns[rows, left] - returns[rows, right])
-    return PreferencePairs(
-        inputs[left], inputs[right], th.as_tensor(label, dtype=inputs.dtype, device=inputs.device)
+class MAMLRewardInference(Inference):
+    """See :class:`MAMLReward`."""
+
+    state = ("seed",)
+
+    def __init__(
+        self, rule: MAMLReward, model: MAMLRewardModel, rng: np.random.Generator, n_queries: int
+    ) -> None:
+        super().__init__(rng)
+        self.rule, self.model, self.n_queries = rule, model, n_queries
+        self.seed = np.array([rng.integers(2**31)])
+        self._restart()
+
+    def _restart(self) -> None:
+        self.answers: list[Answer] = []
+        with _seeded(int(self.seed[0])):
+            self.sac = _make_sac(self.model, self.rule, self.n_queries)
+        self.latent = self.model.add(self.sac.actor)
+
+    def ask(self) -> tuple[Shown, Shown]:
+        """See :class:`Inference`: the current policy twice, with opposite exploration noise."""
+        return self._both_signs()
+
+    def same_latents(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See :class:`Inference`: the current policy, whose number in the file was another."""
+        return self._both_signs()
+
+    def _both_signs(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.latent.copy(), self.latent * np.array([1.0, -1.0])
+
+    def tell(self, preference: Preference, left: Shown, right: Shown) -> None:
+        """See :class:`Inference`."""
+        trajectories_of("MAML-reward", left, right)
+        self.answers.append(Answer(preference, left, right))
+        parameters = self.model.reward.adapted(self.answers)
+        shown = [
+            trajectory
+            for answer in self.answers
+            for trajectory in trajectories_of("MAML-reward", answer.left, answer.right)
+        ]
+        rewards = [self.model.reward.rewards(parameters, trajectory) for trajectory in shown]
+        # Preferences fix no unit; SAC's entropy needs one.
+        scale = max(float(np.concatenate(rewards).std()), 1e-6)
+        with _seeded(int(self.seed[0]) + len(self.answers)):
+            self._fill_buffer(shown, [row / scale for row in rewards])
+            self.sac.train(self.rule.gradient_steps, self.rule.batch_size)
+        self.latent = self.model.add(self.sac.actor)
+
+    def estimate(self) -> np.ndarray:
+        """See :class:`Inference`: the latest policy."""
+        return self.latent.copy()
+
+    def restore(self, snapshot: Snapshot, answers: list[Answer]) -> None:
+        """See :class:`Inference`: the answers are told again."""
+        super().restore(snapshot, [])
+        self._restart()
+        for answer in answers:
+            self.tell(answer.preference, answer.left, answer.right)
+
+    def _fill_buffer(self, shown: list[Trajectory], rewards: list[np.ndarray]) -> None:
+        buffer, policy = self.sac.replay_buffer, self.model.reward.policy
+        assert buffer is not None
+        buffer.reset()
+        for trajectory, row in zip(shown, rewards, strict=True):
+            obs = standardised(policy, trajectory).cpu().numpy()
+            actions = policy.scale_action(trajectory.actions)
+            # Nothing ends but by the time limit, unless an episode is shorter than that.
+            ended = len(trajectory) < self.model.horizon
+            for t in range(len(trajectory)):
+                done = ended and t == len(trajectory) - 1
+                buffer.add(obs[t], obs[t + 1], actions[t], row[t], np.array([done]), [{}])
+
+
+def _make_sac(model: MAMLRewardModel, rule: MAMLReward, n_queries: int) -> SAC:
+    """SAC without an environment: it learns from trajectories that it is given."""
+    sac = SAC(
+        "MlpPolicy",
+        None,  # type: ignore[arg-type]
+        learning_rate=rule.learning_rate,
+        gamma=rule.gamma,
+        buffer_size=2 * n_queries * model.horizon,
+        target_entropy=-float(np.prod(model.action_space.shape)),
+        device="cpu",
+        _init_setup_model=False,
     )
+    sac.observation_space, sac.action_space = model.observation_space, model.action_space
+    sac.n_envs = 1
+    sac._setup_model()
+    sac.set_logger(Logger(None, []))
+    return sac
 
 
-def _filled(rows: th.Tensor, length: int) -> th.Tensor:
-    return th.cat([rows, rows.new_zeros(length - len(rows), rows.shape[1])])
+@contextlib.contextmanager
+def _seeded(seed: int) -> Iterator[None]:
+    """SB3 draws from the global generators: seed them, and hand them back as they were."""
+    python, numpy = random.getstate(), np.random.get_state()  # noqa: NPY002
+    with th.random.fork_rng():
+        random.seed(seed)
+        np.random.seed(seed % 2**32)  # noqa: NPY002
+        th.manual_seed(seed)
+        try:
+            yield
+        finally:
+            random.setstate(python)
+            np.random.set_state(numpy)  # noqa: NPY002

@@ -14,17 +14,14 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_poem.adaptation import (
     BoltzmannOracle,
     MistakeOracle,
-    PreferenceAdapter,
     ReturnOracle,
     TaskOracle,
 )
-from sb3_poem.adaptation.evaluation import evaluate_adaptation, known_task_return, preference_order
-from sb3_poem.baselines import (
-    ANOLEAdapter,
-    MAMLRewardAdapter,
-    RewardOracleAdapter,
-    rollout_fragments,
-)
+from sb3_poem.adaptation.evaluation import evaluate_adaptation
+from sb3_poem.adaptation.known_task import known_task_return, preference_order
+from sb3_poem.adaptation.meta_model import HasSimilarity
+from sb3_poem.baselines import ANOLE, MAMLRewardModel, rollout_fragments
+from sb3_poem.baselines.anole import has_experience
 from sb3_poem.baselines.fragments import default_fragment_length
 from sb3_poem.benchmark.models import ModelLibrary, Say
 from sb3_poem.benchmark.provenance import provenance
@@ -33,12 +30,6 @@ from sb3_poem.benchmark.suites import Cell, OracleSpec
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.vec_env import make_task_vec_env
 
-ADAPTERS: dict[str, type[PreferenceAdapter]] = {
-    "preference": PreferenceAdapter,
-    "anole": ANOLEAdapter,
-    "maml": MAMLRewardAdapter,
-    "oracle": RewardOracleAdapter,
-}
 SELECTION_EPISODES = 3
 SEED_STRIDE = 10_000
 DIGITS = 4  # of returns in the store
@@ -60,14 +51,17 @@ def run_cell(cell: Cell, library: ModelLibrary, say: Say = print) -> Record:
         model = library.load(cell.model_key, env, cell.snapshot)
         tasks = FamilyView(env).test_tasks(cell.budget.tasks, cell.budget.task_seed)
         started = time.perf_counter()
-        measure = _measure_known if cell.definition.kind == "known" else _measure_adaptation
+        measure = _measure_known if cell.definition.rule is None else _measure_adaptation
         result = measure(cell, model, env, tasks)
         result["seconds"] = round(time.perf_counter() - started, 2)
     finally:
         env.close()
     trained = training if cell.snapshot is None else {**training, "snapshot": cell.snapshot}
-    result["training_samples"] = int(getattr(model, "num_timesteps", training.get("env_steps", 0)))
-    result["updates"] = int(getattr(model, "_n_updates", training.get("updates", 0)))
+    if isinstance(model, MAMLRewardModel):
+        samples, updates = training.get("env_steps", 0), training.get("updates", 0)
+    else:
+        samples, updates = model.num_timesteps, model._n_updates
+    result |= {"training_samples": int(samples), "updates": int(updates)}
     result["training_seconds"] = training.get("seconds")
     result["training_cpu_seconds"] = training.get("cpu_seconds")
     about = {
@@ -112,26 +106,25 @@ def _episode_seed(cell: Cell) -> int:
 
 
 def _measure_adaptation(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) -> dict[str, Any]:
-    kind, options, budget = cell.definition.kind, dict(cell.options), cell.budget
-    fragments = None
-    if kind == "anole":
-        options.setdefault("fragment_length", default_fragment_length(model.horizon))
-        if not _has_experience(model):
-            settings = ANOLEAdapter.make_options(**options)
-            fragments = rollout_fragments(
-                model, env, 2 * settings.n_pairs, options["fragment_length"], cell.seed
-            )
-            options["library"] = fragments
+    rule, budget = cell.definition.make_rule(**dict(cell.overrides)), cell.budget
+    fragments, shown = None, {}
+    if isinstance(rule, ANOLE):
+        length = rule.fragment_length or default_fragment_length(model.horizon)
+        source = "replay buffer"
+        if not has_experience(model):
+            source = "rollouts of the training tasks"
+            fragments = rollout_fragments(model, env, 2 * rule.n_pairs, length, cell.seed)
+        shown = {"fragments": source, "fragment_length": length}
     evaluation = evaluate_adaptation(
         model,
         env,
         tasks,
         make_oracle_factory(cell.oracle),
+        rule=rule,
         record_at=budget.record_at,
         n_episodes=budget.episodes,
         seed=_episode_seed(cell),
-        adapter=ADAPTERS[kind],
-        **options,
+        library=fragments,
     )
     answers = [[answer.value for answer in row] for row in evaluation.preferences]
     data: dict[str, Any] = {
@@ -141,13 +134,9 @@ def _measure_adaptation(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) 
         "task_deviations": _rounded(evaluation.returns.std(axis=2)),
         "answers": ["".join(answer[0] for answer in row) for row in answers],
         # ANOLE shows what it has; the others roll two trajectories out for each question.
-        "adaptation_trajectories": 0 if kind == "anole" else 2 * sum(map(len, answers)),
+        "adaptation_trajectories": 0 if shown else 2 * sum(map(len, answers)),
+        **shown,
     }
-    if kind == "anole":
-        data["fragments"] = (
-            "replay buffer" if fragments is None else "rollouts of the training tasks"
-        )
-        data["fragment_length"] = options["fragment_length"]
     if evaluation.successes is not None:
         data["task_success_rates"] = _rounded(evaluation.successes.mean(axis=2))
     return data
@@ -174,15 +163,10 @@ def _measure_known(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) -> di
     }
     if known.successes is not None:
         data["task_success_rates"] = _rounded(known.successes.mean(axis=1))
-    if hasattr(model, "similarities"):
+    if isinstance(model, HasSimilarity):
         accuracy, tau = preference_order(model, known)
         data |= {"preference_accuracy": _number(accuracy), "kendall_tau": _number(tau)}
     return data
-
-
-def _has_experience(model: Any) -> bool:
-    buffer = getattr(model, "replay_buffer", None)
-    return buffer is not None and bool(buffer.counts.any())
 
 
 def _rounded(values: np.ndarray, digits: int = DIGITS) -> Any:

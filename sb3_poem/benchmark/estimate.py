@@ -9,9 +9,9 @@ from typing import Any
 
 import torch as th
 
-from sb3_poem.adaptation.evaluation import LATENTS_WITH_OWN_DYNAMICS, LATENTS_WITH_SHARED_DYNAMICS
+from sb3_poem.adaptation.known_task import LATENTS_WITH_OWN_DYNAMICS, LATENTS_WITH_SHARED_DYNAMICS
+from sb3_poem.baselines import ANOLE, MAMLReward
 from sb3_poem.baselines.fragments import default_fragment_length
-from sb3_poem.baselines.maml_adapter import MAMLRewardOptions
 from sb3_poem.benchmark.cells import SELECTION_EPISODES
 from sb3_poem.benchmark.methods import META_ITERATIONS, META_ITERATIONS_OF, VARIANTS
 from sb3_poem.benchmark.suites import Cell, ModelKey
@@ -25,9 +25,9 @@ PROCESS_SECONDS = 6.0
 # speed as it does.
 #: Of an iteration of MAML-reward's meta-training
 UPDATES_PER_META_ITERATION = 18
-#: Of what is computed for an answer and the next question, by inference rule or strategy; the
-#: others are quick
-UPDATES_PER_ANSWER = {"bayes": 0.7, "berlekamp": 2.0}
+#: Of what is computed for an answer and the next question, by rule; the others are quick, as
+#: is ANOLE where it asks at random
+UPDATES_PER_ANSWER = {"Bayes": 0.7, "ANOLE": 2.0}
 #: Of the same with ANOLE's greedy strategy, for each step of a fragment
 UPDATES_PER_GREEDY_STEP = 0.65
 # MAML-reward adapts by SAC's gradient steps, which cost as much as the model's own.
@@ -97,14 +97,9 @@ def cell_seconds(cell: Cell, pace: Pace) -> float:
 
     :param pace: On its family.
     """
-    budget, facts, kind, options = (
-        cell.budget,
-        family_facts(cell.env_id),
-        cell.definition.kind,
-        cell.options,
-    )
+    budget, facts, method = cell.budget, family_facts(cell.env_id), cell.definition
     queries = budget.record_at[-1]
-    if kind == "known":
+    if method.rule is None:
         latents = (
             LATENTS_WITH_SHARED_DYNAMICS
             if facts.shared_dynamics
@@ -115,11 +110,14 @@ def cell_seconds(cell: Cell, pace: Pace) -> float:
         )
         return episodes * facts.horizon * pace.step
     episodes = budget.tasks * budget.episodes * len(budget.record_at)
-    if kind != "anole":  # which asks about what there is
+    rule = method.make_rule(**dict(cell.overrides))
+    if method.rule != "ANOLE":  # which asks about what there is
         episodes += budget.tasks * 2 * queries
-    updates = UPDATES_PER_ANSWER.get(str(options.get("inference", options.get("strategy"))), 0.0)
-    if options.get("strategy") == "greedy":
+    updates = UPDATES_PER_ANSWER.get(method.rule, 0.0)
+    if isinstance(rule, ANOLE) and rule.strategy == "greedy":
         updates = UPDATES_PER_GREEDY_STEP * default_fragment_length(facts.horizon)
-    if kind == "maml":
-        updates = options.get("gradient_steps", MAMLRewardOptions.gradient_steps)
+    elif isinstance(rule, ANOLE) and rule.strategy == "random":
+        updates = 0.0
+    elif isinstance(rule, MAMLReward):
+        updates = rule.gradient_steps
     return episodes * facts.horizon * pace.step + budget.tasks * queries * updates * pace.update

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sb3_poem.adaptation import Rule
 
 EPSILONS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4)
 LATENT_DIMS = (2, 10)  # beside the default, 5
@@ -17,8 +20,18 @@ META_ITERATIONS = 500
 META_ITERATIONS_OF = {"PointGoal": 100}
 
 SHARED_DYNAMICS_REASONS = {
-    "anole": "ANOLE asks which fragment of the training tasks is better on the new task, and here these show another world",
-    "maml": "MAML-reward learns from what tasks say of each other's fragments",
+    "ANOLE": "ANOLE asks which fragment of the training tasks is better on the new task, and here these show another world",
+    "MAMLReward": "MAML-reward learns from what tasks say of each other's fragments",
+}
+
+# How the identity of a cell, which records keep, says what a rule is.
+RECORDED: dict[str | None, tuple[str, dict[str, str]]] = {
+    "Bayes": ("preference", {"inference": "bayes"}),
+    "Paper": ("preference", {"inference": "paper"}),
+    "ANOLE": ("anole", {}),
+    "MAMLReward": ("maml", {}),
+    "RewardOracle": ("oracle", {}),
+    None: ("known", {}),
 }
 
 
@@ -45,16 +58,15 @@ class Method:
     :param name: As on the command line.
     :param label: As in tables and figures.
     :param variant: The model that it adapts.
-    :param kind: "preference", "anole", "maml", "oracle", or "known" for what the model's policies
-        could earn.
-    :param options: Of the adapter.
+    :param rule: The rule's name in :mod:`sb3_poem`; None for what the model's policies could earn.
+    :param options: Of the rule.
     :param paper_row: Its row in Table 3 of Xu & Zhu 2025.
     """
 
     name: str
     label: str
     variant: str
-    kind: str
+    rule: str | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
     paper_row: str | None = None
 
@@ -64,9 +76,26 @@ class Method:
         :param shared_dynamics: Whether the family's tasks share their dynamics.
         :return: The reason.
         """
-        if shared_dynamics or self.kind not in SHARED_DYNAMICS_REASONS:
+        if shared_dynamics or self.rule not in SHARED_DYNAMICS_REASONS:
             return None
-        return f"its tasks do not share their dynamics, and {SHARED_DYNAMICS_REASONS[self.kind]}"
+        return f"its tasks do not share their dynamics, and {SHARED_DYNAMICS_REASONS[self.rule]}"
+
+    def make_rule(self, **changes: Any) -> Rule:
+        """The rule, with these changes of its options.
+
+        :raises ValueError: If the method has none.
+        """
+        import sb3_poem
+
+        if self.rule is None:
+            raise ValueError(f"{self.name} infers nothing")
+        rule: Rule = getattr(sb3_poem, self.rule)(**{**self.options, **changes})
+        return rule
+
+    def recorded(self, changes: Mapping[str, Any]) -> dict[str, Any]:
+        """What a cell's identity says of the rule, with these changes of its options."""
+        kind, words = RECORDED[self.rule]
+        return {"kind": kind, "options": {**words, **self.options, **changes}}
 
 
 def _variants() -> dict[str, Variant]:
@@ -83,19 +112,19 @@ def _variants() -> dict[str, Variant]:
 
 def _methods() -> dict[str, Method]:
     methods = [
-        Method("poem-bayes", "POEM (Bayes)", "poem", "preference", {"inference": "bayes"}, "POEM"),
-        Method("poem-paper", "POEM (paper)", "poem", "preference", {"inference": "paper"}, "POEM"),
-        Method("anole", "ANOLE", "pearl", "anole", {"strategy": "berlekamp"}, "ANOLE"),
-        Method(
-            "anole-greedy", "ANOLE-greedy", "pearl", "anole", {"strategy": "greedy"}, "ANOLE-greedy"
+        Method("poem-bayes", "POEM (Bayes)", "poem", "Bayes", paper_row="POEM"),
+        Method("poem-paper", "POEM (paper)", "poem", "Paper", paper_row="POEM"),
+        Method("anole", "ANOLE", "pearl", "ANOLE", {"strategy": "berlekamp"}, "ANOLE"),
+        *(
+            Method(
+                f"anole-{way}", f"ANOLE-{way}", "pearl", "ANOLE", {"strategy": way}, f"ANOLE-{way}"
+            )
+            for way in ("greedy", "random")
         ),
-        Method(
-            "anole-random", "ANOLE-random", "pearl", "anole", {"strategy": "random"}, "ANOLE-random"
-        ),
-        Method("maml-reward", "MAML-reward", "maml-reward", "maml", {}, "MAML-reward"),
-        Method("reward-oracle", "reward oracle", "pearl", "oracle"),
-        Method("known-task", "task known (POEM's policies)", "poem", "known"),
-        Method("known-task-pearl", "task known (PEARL's policies)", "pearl", "known"),
+        Method("maml-reward", "MAML-reward", "maml-reward", "MAMLReward", paper_row="MAML-reward"),
+        Method("reward-oracle", "reward oracle", "pearl", "RewardOracle"),
+        Method("known-task", "task known (POEM's policies)", "poem"),
+        Method("known-task-pearl", "task known (PEARL's policies)", "pearl"),
     ]
     ablations = {
         "poem-inner": "inner product",
@@ -103,39 +132,21 @@ def _methods() -> dict[str, Method]:
         **{f"poem-d{d}": f"d = {d}" for d in LATENT_DIMS},
     }
     for variant, label in ablations.items():
-        methods.append(Method(f"known-task-{variant}", f"task known ({label})", variant, "known"))
-        for inference, prefix in INFERENCE_LABELS.items():
-            options = {"inference": inference}
-            methods.append(
-                Method(
-                    f"{variant}-{inference}", f"{prefix}, {label}", variant, "preference", options
-                )
-            )
-    for inference, prefix in INFERENCE_LABELS.items():
-        for rule in QUERY_RULES:
-            if rule != DEFAULT_QUERY_RULE[inference]:
-                asked = {"inference": inference, "query_rule": rule}
-                methods.append(
-                    Method(
-                        f"poem-{inference}-{rule}",
-                        f"{prefix}, {rule} queries",
-                        "poem",
-                        "preference",
-                        asked,
-                    )
-                )
+        methods.append(Method(f"known-task-{variant}", f"task known ({label})", variant))
+        for inference, poem in INFERENCE_LABELS.items():
+            name, rule = f"{variant}-{inference}", inference.capitalize()
+            methods.append(Method(name, f"{poem}, {label}", variant, rule))
+    for inference, poem in INFERENCE_LABELS.items():
+        for asked in QUERY_RULES:
+            if asked != DEFAULT_QUERY_RULE[inference]:
+                name, label = f"poem-{inference}-{asked}", f"{poem}, {asked} queries"
+                rule, options = inference.capitalize(), {"query_rule": asked}
+                methods.append(Method(name, label, "poem", rule, options))
     for epsilon in EPSILONS:
         # 0.1 is the default, and so the same cell as poem-paper.
-        tolerant = {"inference": "paper", **({} if epsilon == 0.1 else {"epsilon": epsilon})}
-        methods.append(
-            Method(
-                f"poem-paper-epsilon-{epsilon:g}",
-                f"epsilon = {epsilon:g}",
-                "poem",
-                "preference",
-                tolerant,
-            )
-        )
+        tolerant = {} if epsilon == 0.1 else {"epsilon": epsilon}
+        name, label = f"poem-paper-epsilon-{epsilon:g}", f"epsilon = {epsilon:g}"
+        methods.append(Method(name, label, "poem", "Paper", tolerant))
     return {method.name: method for method in methods}
 
 

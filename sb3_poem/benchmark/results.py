@@ -11,7 +11,7 @@ import numpy as np
 from rliable import library, metrics
 from scipy.stats import sem, trim_mean
 
-from sb3_poem.adaptation.evaluation import KnownTaskReturn
+from sb3_poem.adaptation.known_task import KnownTaskReturn
 from sb3_poem.benchmark.cells import make_oracle_factory
 from sb3_poem.benchmark.methods import METHODS
 from sb3_poem.benchmark.store import Record

@@ -221,15 +221,15 @@ def export_model(cells: Sequence[Cell], library: ModelLibrary, store: Store, fol
     missing = [str(cell) for cell in cells if cell.key not in records]
     if missing:
         raise ValueError(f"{folder} cannot be written before its cells are finished: {missing}")
-    [known] = [records[cell.key] for cell in cells if cell.definition.kind == "known"]
+    [known] = [records[cell.key] for cell in cells if cell.definition.rule is None]
     reference = Reference("known-task", (known,))
     adaptations = []
     for cell in cells:
-        if cell.definition.kind == "known":
+        if cell.definition.rule is None:
             continue
         result = records[cell.key].result
         figures = {
-            "inference": cell.options["inference"],
+            "inference": str(cell.definition.rule).lower(),
             "queries": result["queries"],
             "mean_return": np.mean(result["task_returns"], axis=0).tolist(),
             "limit": [float(reference.limits(k, EXACT)[0]) for k in result["queries"]],

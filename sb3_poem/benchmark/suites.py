@@ -133,7 +133,7 @@ class Cell:
     :param method: A name of :data:`METHODS`.
     :param seed: Of the training, and of what is random in the adaptation.
     :param snapshot: The share of the training after which the model is taken; None: all of it.
-    :param overrides: Options of the adapter that differ from the method's own, sorted by name.
+    :param overrides: Options of the rule that differ from the method's own, sorted by name.
     :param model: What the model is made of, see :meth:`ModelLibrary.origin`; None: not told.
     :param revision: See :data:`REVISION`.
     """
@@ -164,20 +164,14 @@ class Cell:
         """The model that is adapted."""
         return ModelKey(self.env_id, self.definition.variant, self.seed, self.training)
 
-    @property
-    def options(self) -> dict[str, Any]:
-        """Of the adapter."""
-        return {**self.definition.options, **dict(self.overrides)}
-
     def identity(self) -> dict[str, Any]:
         """All that can change the cell's figure, JSON-ready; so it names no suite."""
         method = self.definition
-        known = method.kind == "known"
+        known = method.rule is None
         return {
             "env_id": self.env_id,
             "variant": method.variant,
-            "kind": method.kind,
-            "options": self.options,
+            **method.recorded(dict(self.overrides)),
             "seed": self.seed,
             # What a model's policies could earn does not depend on who answers.
             "oracle": None if known else {"kind": self.oracle.kind, "value": self.oracle.value},
@@ -240,7 +234,7 @@ class Suite:
     :param snapshots: In how many equal parts the training is cut for measurements along it; 1
         measures its end only.
     :param budget: Unless told otherwise.
-    :param overrides: Options of adapters by kind of method, where the suite differs from their
+    :param overrides: Options of rules by the rule's name, where the suite differs from their
         defaults.
     """
 
@@ -310,7 +304,7 @@ class Suite:
         """
         cells = []
         for name in entry.methods:
-            overrides = self.overrides.get(METHODS[name].kind, ())
+            overrides = self.overrides.get(METHODS[name].rule or "", ())
             for oracle in entry.oracles:
                 moments: list[tuple[float | None, tuple[int, ...]]] = [(None, entry.record_at)]
                 if oracle in entry.curves and name not in WITHOUT_CURVE:
@@ -425,7 +419,7 @@ SUITES = {
             snapshots=3,
             budget=Budget(tasks=10, episodes=5),
             # The networks of SAC are as large here as elsewhere, and a point needs fewer steps.
-            overrides={"maml": (("gradient_steps", 20),)},
+            overrides={"MAMLReward": (("gradient_steps", 20),)},
         ),
     )
 }

@@ -24,6 +24,7 @@ from sb3_poem.adaptation import (
     Trajectory,
     evaluate_adaptation,
     evaluate_episodes,
+    named_rule,
 )
 from sb3_poem.adaptation.evaluation import evaluation_seed
 from sb3_poem.cli.arguments import DEFAULT_STORE
@@ -105,6 +106,7 @@ class Adaptation:
             for name in ("inference", "query_rule", "candidates", "n_candidates")
         }
         self.options = {name: value for name, value in chosen.items() if value is not None}
+        self.rule = named_rule(**self.options)
 
     def ask_oracle(self) -> int:
         """Let a program that knows the tasks answer, and say each measurement as it comes."""
@@ -129,12 +131,12 @@ class Adaptation:
                 subject.env,
                 subject.tasks,
                 factories[arguments.oracle],
+                rule=self.rule,
                 record_at=record_at,
                 n_episodes=arguments.episodes,
                 seed=self.seed,
                 progress_bar=True,
                 on_record=show,
-                **self.options,
             )
             known = self._known_task_return()
         except KeyboardInterrupt:
@@ -175,10 +177,10 @@ class Adaptation:
         adapter = PreferenceAdapter(
             subject.model,
             env,
+            rule=self.rule,
             oracle=oracle,
             n_queries=arguments.queries,
             seed=self.seed,
-            **self.options,
         )
         latents = [adapter.policy().latent]
         oracle.needs_frames = False

@@ -38,7 +38,7 @@ def run_page(arguments: argparse.Namespace) -> None:
     from sb3_poem.label.access import LOOPBACK, Access, is_loopback
     from sb3_poem.label.families import find_models
     from sb3_poem.label.render_queue import RenderQueue, process_pool
-    from sb3_poem.label.rendering import adapter_options
+    from sb3_poem.label.rendering import session_rule
     from sb3_poem.label.server import bind, link_host, make_app, make_server
     from sb3_poem.label.sessions import SessionManager
     from sb3_poem.label.store import Store
@@ -54,7 +54,7 @@ def run_page(arguments: argparse.Namespace) -> None:
     workers, packages = arguments.workers, arguments.gym_packages
     import_packages(packages)
     options = {"inference": arguments.inference, "mistake_rate": arguments.mistake_rate}
-    adapter_options(options)  # says now what is out of range
+    session_rule(options)  # says now what is out of range
     models = find_models(arguments.model, arguments.env, parse_env_kwargs(arguments.env_kwargs))
     listener = bind(arguments.host, arguments.port)
     port = listener.getsockname()[1]

@@ -54,7 +54,7 @@ def belief(adapter: Any, env_id: str) -> dict[str, Any]:
 def posterior(inference: Any) -> tuple[np.ndarray, np.ndarray]:
     """The latents (n, d) that are still possible, and weights (n,) summing to one.
 
-    :param inference: A ``LatentInference``.
+    :param inference: An ``Inference``.
     """
     if hasattr(inference, "particles"):
         return inference.particles, inference.weights

@@ -21,9 +21,9 @@ import numpy as np
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_poem.adaptation.adapter import PreferenceAdapter
-from sb3_poem.adaptation.noise import MistakeNoise
-from sb3_poem.adaptation.options import rollout_seed
+from sb3_poem.adaptation.named_rule import named_rule
 from sb3_poem.adaptation.preference import Preference
+from sb3_poem.adaptation.rule import Rule, rollout_seed
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
@@ -167,7 +167,7 @@ class Renderer:
                 latent[None, :],
                 None,
                 [rollout_seed(adapter.seed, RESULT_ROLLOUT)],
-                adapter.options.deterministic,
+                adapter.deterministic,
                 frames=every,
             )[0]
             frames = [*map(fit, clip.frames or ())]
@@ -193,13 +193,13 @@ class Renderer:
             return PreferenceAdapter(
                 self.model,
                 self.env,
+                rule=session_rule(request.options),
                 oracle=_Watches(self._film_every(request)),
                 seed=request.seed,
                 n_queries=n_queries,
-                **adapter_options(request.options),
             )
-        state = {**request.state, "options": {**request.state["options"], "n_queries": n_queries}}
-        data = {**state, "answers": list(request.answers), "pending": request.pending}
+        conversation = {"answers": list(request.answers), "pending": request.pending}
+        data = {**request.state, "n_queries": n_queries, **conversation}
         return PreferenceAdapter.from_dict(
             data, self.model, self.env, oracle=_Watches(self._film_every(request))
         )
@@ -219,14 +219,9 @@ def film_every(fps: float, wanted: int) -> int:
     return every * wanted if fps / (every * wanted) >= SMOOTH_FPS else every
 
 
-def adapter_options(options: dict[str, Any]) -> dict[str, Any]:
-    """Options of a session as the adapter's.
-
-    :param options: JSON-ready; ``mistake_rate`` stands for the noise model.
-    :return: Keyword arguments of ``PreferenceAdapter``.
-    """
-    others = dict(options)
-    return {"noise_model": MistakeNoise(others.pop("mistake_rate", 0.05)), **others}
+def session_rule(options: dict[str, Any]) -> Rule:
+    """The rule that a session's options name, see :func:`named_rule`; a person errs now and then."""
+    return named_rule(**{"mistake_rate": 0.05, **options})
 
 
 def make_turn(request: TurnRequest) -> Turn:

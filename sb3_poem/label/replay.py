@@ -8,14 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from sb3_poem.adaptation.adapter import PreferenceAdapter
-from sb3_poem.adaptation.inference import SIGNS
-from sb3_poem.adaptation.options import AdaptationOptions, inference_rng
-from sb3_poem.adaptation.preference import Preference
+from sb3_poem.adaptation.preference import SIGNS, Preference
+from sb3_poem.adaptation.rule import Setting, inference_rng
 from sb3_poem.common.rollouts import policy_actions
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.label.beliefs import belief
-from sb3_poem.label.rendering import adapter_options
+from sb3_poem.label.rendering import session_rule
 from sb3_poem.label.store import Session, Store
 
 # Latents of another model among which the one is sought that acts most like a recorded trajectory.
@@ -47,10 +45,9 @@ def replay(
         recorded (None where no latents had to be replaced).
     :raises ValueError: If the model does not fit the recorded trajectories.
     """
-    made: AdaptationOptions = PreferenceAdapter.make_options(
-        n_queries=1, **adapter_options(options or {})
-    )
-    inference = made.make_inference(model, inference_rng(seed))
+    rule = session_rule(options or {})
+    rule.check(model, Setting())
+    inference = rule.start(model, inference_rng(seed), Setting())
     translator = None if is_own else _Translator(model, np.random.default_rng([seed, 1]))
     latents, errors, foretold, decided = [inference.estimate()], [], 0, 0
     for item in store.adapter_answers(session.id, before=2**31):

@@ -81,8 +81,8 @@ class LabelWidget:
         self._thread = ThreadPoolExecutor(1)
         queue = RenderQueue(1, lambda: self._thread, make)
         info = ModelInfo("notebook", Path(), env_id)
-        options = {**adapter.options.to_dict(), "notebook": True}
-        n_queries = adapter.options.n_queries
+        options = {**adapter.rule.to_dict(), "notebook": True}
+        n_queries = adapter.n_queries
         sessions = SessionManager(
             self._store, queue, [info], options, n_queries, 1, load=lambda _: adapter.model
         )

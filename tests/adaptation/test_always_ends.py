@@ -1,6 +1,7 @@
 """Whatever the oracle says, every step is bounded and a usable policy comes out."""
 
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv
 from worlds import HORIZON, SpeedEnv, SpeedModel
 
+from sb3_poem import Bayes, Paper
 from sb3_poem.adaptation import (
     BoltzmannNoise,
     ExactNoise,
@@ -17,7 +19,7 @@ from sb3_poem.adaptation import (
     PreferenceAdapter,
 )
 from sb3_poem.adaptation.bayes import DECODER_MOVE_STEPS
-from sb3_poem.adaptation.options import AdaptationOptions
+from sb3_poem.adaptation.rule import Setting
 from sb3_poem.common.trajectory import Trajectory
 
 LEFT, RIGHT, EQUAL = Preference
@@ -35,11 +37,10 @@ class RandomModel(SpeedModel):
         self.scale = scale
         self.similarity_rows = self.decoder_steps = 0
 
-    def similarities(self, task_latents, policy_latents):
-        self.similarity_rows += len(task_latents) + len(policy_latents)
+    def similarities(self, task, policy_latents):
+        self.similarity_rows += len(task) + len(policy_latents)
         embeddings = [
-            np.tanh(z @ w)
-            for z, w in zip((task_latents, policy_latents), self.weights, strict=True)
+            np.tanh(z @ w) for z, w in zip((task, policy_latents), self.weights, strict=True)
         ]
         return self.scale * embeddings[0] @ embeddings[1].T
 
@@ -79,19 +80,14 @@ class Contradicts:
 
 rules = st.sampled_from(
     [
-        {"inference": "paper"},
-        {"inference": "paper", "epsilon": 0.0},
-        {"inference": "paper", "query_rule": "information-gain", "candidates": "aggregate"},
-        {"inference": "bayes"},
-        {"inference": "bayes", "likelihood": "similarity"},
-        {"inference": "bayes", "candidates": "aggregate", "query_rule": "worst-case"},
-        {
-            "inference": "bayes",
-            "candidates": "aggregate",
-            "likelihood": "similarity",
-            "decision": "posterior-mean",
-        },
-        {"inference": "bayes", "query_rule": "random", "decision": "most-likely"},
+        Paper(),
+        Paper(epsilon=0.0),
+        Paper(query_rule="information-gain", candidates="aggregate"),
+        Bayes(),
+        Bayes(likelihood="similarity"),
+        Bayes(candidates="aggregate", query_rule="worst-case"),
+        Bayes(candidates="aggregate", likelihood="similarity", decision="posterior-mean"),
+        Bayes(query_rule="random", decision="most-likely"),
     ]
 )
 
@@ -109,11 +105,12 @@ def test_any_answers_end_in_a_finite_latent_with_bounded_work(
     answers, rule, noise, seed, dim, scale
 ):
     model = RandomModel(seed, dim, scale)
-    options = AdaptationOptions(noise_model=noise, **rule)
-    inference = options.make_inference(model, np.random.default_rng(seed))
+    rule = rule.answered_by(SimpleNamespace(noise_model=noise))
+    inference = rule.start(model, np.random.default_rng(seed), Setting())
+    n_candidates = rule.n_candidates if isinstance(rule, Paper) else rule.n_particles
     for number, preference in enumerate(answers, 1):
         model.similarity_rows = model.decoder_steps = 0
-        left, right = inference.ask_latents()
+        left, right = inference.ask()
         assert not np.array_equal(left, right)
         shown = [Trajectory(np.ones((6, 2)), np.zeros((5, 1)), z) for z in (left, right)]
         inference.tell(preference, *shown)
@@ -122,7 +119,7 @@ def test_any_answers_end_in_a_finite_latent_with_bounded_work(
         assert np.all(np.isfinite(latent))
         # Bounded whatever the answers are, and in the number of answers at most linear.
         assert model.similarity_rows <= 40_000 + 200 * number
-        assert model.decoder_steps <= 2 * options.n_candidates * 5 + DECODER_MOVE_STEPS
+        assert model.decoder_steps <= 2 * n_candidates * 5 + DECODER_MOVE_STEPS
 
 
 @pytest.mark.parametrize(
@@ -133,14 +130,14 @@ def test_any_answers_end_in_a_finite_latent_with_bounded_work(
 @pytest.mark.parametrize(
     "rule",
     [
-        {"inference": "bayes"},
-        {"inference": "bayes", "likelihood": "similarity"},
-        {"inference": "paper"},
+        Bayes(),
+        Bayes(likelihood="similarity"),
+        Paper(),
     ],
 )
 def test_a_usable_policy_comes_out(oracle, rule):
     env = SpeedEnv()
-    adapter = PreferenceAdapter(SpeedModel(), env, seed=0, oracle=oracle, **rule)
+    adapter = PreferenceAdapter(SpeedModel(), env, seed=0, oracle=oracle, rule=rule)
     policy = adapter.adapt()
     assert adapter.done
     actions, _ = policy.predict(np.zeros((3, 2)))
@@ -157,9 +154,9 @@ def test_a_random_oracle_over_many_queries():
 @pytest.mark.parametrize(
     "rule",
     [
-        {"inference": "bayes"},
-        {"inference": "bayes", "likelihood": "similarity"},
-        {"inference": "paper", "epsilon": 0.0},
+        Bayes(),
+        Bayes(likelihood="similarity"),
+        Paper(epsilon=0.0),
     ],
     ids=["decoder", "similarity", "paper"],
 )
@@ -170,11 +167,11 @@ def test_ask_and_tell_take_less_than_50_ms(rule, preference):
     """
     model, best = RandomModel(0), np.inf
     for seed in range(5):
-        inference = AdaptationOptions(**rule).make_inference(model, np.random.default_rng(seed))
+        inference = rule.start(model, np.random.default_rng(seed), Setting())
         slowest = 0.0
         for _ in range(10):
             start = time.process_time()
-            left, right = inference.ask_latents()
+            left, right = inference.ask()
             asked = time.process_time()
             shown = [
                 Trajectory(np.ones((HORIZON + 1, 2)), np.zeros((HORIZON, 1)), z)

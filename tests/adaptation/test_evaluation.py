@@ -12,17 +12,19 @@ from scipy.stats import kendalltau, norm
 from stable_baselines3.common.vec_env import DummyVecEnv
 from worlds import HORIZON, SpeedEnv, SpeedModel, SpeedVecEnv
 
+from sb3_poem import Bayes, Paper
 from sb3_poem.adaptation import (
     MistakeOracle,
     Preference,
     ReturnOracle,
     adapt_tasks,
     evaluate_adaptation,
-    evaluate_latents,
+    evaluate_episodes,
     known_task_return,
     property_one,
 )
-from sb3_poem.adaptation.evaluation import evaluation_seed, preference_order, return_matrix
+from sb3_poem.adaptation.evaluation import evaluation_seed
+from sb3_poem.adaptation.known_task import preference_order, return_matrix
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.loading import load_model
@@ -40,11 +42,15 @@ def vec_env(n=10, **kwargs):
     [
         (lambda: property_one(np.zeros((2, 3)), np.zeros((3, 2))), "must have the same shape"),
         (
-            lambda: evaluate_latents(MODEL, vec_env(1), np.zeros((2, 5)), np.zeros((3, 1))),
+            lambda: (
+                evaluate_episodes(MODEL, vec_env(1), np.zeros((2, 5)), np.zeros((3, 1))).returns
+            ),
             "equally many rows",
         ),
         (
-            lambda: evaluate_latents(MODEL, vec_env(1), np.zeros((2, 5)), np.ones((2, 1)), 0),
+            lambda: (
+                evaluate_episodes(MODEL, vec_env(1), np.zeros((2, 5)), np.ones((2, 1)), 0).returns
+            ),
             "`n_episodes` must be",
         ),
         (lambda: known_task_return(MODEL, vec_env(1), GOALS, 0), "`n_latents` must be at least 1"),
@@ -108,16 +114,16 @@ def test_names_and_numbers_of_tasks_will_do():
     )
     assert known.tasks.shape == (30, 1)
     np.testing.assert_array_equal(known.tasks[:3], result.tasks)
-    returns = evaluate_latents(
+    returns = evaluate_episodes(
         "PointGoal", gym.make("poem/PointGoal-v0"), result.latents[:, 1], result.tasks, 1, 7
-    )
+    ).returns
     assert returns.shape == (3, 1)
 
 
 @pytest.mark.parametrize("copies", [1, 4, 40])
 def test_returns_are_the_true_ones(copies):
     latents = np.random.default_rng(0).standard_normal((6, 5))
-    returns = evaluate_latents(MODEL, vec_env(copies), latents, GOALS[:6], n_episodes=3)
+    returns = evaluate_episodes(MODEL, vec_env(copies), latents, GOALS[:6], n_episodes=3).returns
     assert returns.shape == (6, 3)
     expected = -200 * np.abs(MODEL.speed(latents) - GOALS[:6, 0])
     np.testing.assert_allclose(returns, np.tile(expected[:, None], 3), rtol=1e-5)
@@ -125,9 +131,9 @@ def test_returns_are_the_true_ones(copies):
 
 def test_early_ends_count_up_to_the_end():
     latents = np.array([[0.0] * 5, [2.0, 0, 0, 0, 0]])
-    returns = evaluate_latents(
+    returns = evaluate_episodes(
         MODEL, vec_env(3, end_at=1.5), latents, np.zeros((2, 1)), n_episodes=20
-    )
+    ).returns
     steps = returns / (-10 * MODEL.speed(latents))[:, None]
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-4)  # whole steps
     assert steps.min() < HORIZON <= steps.max() + 1e-6
@@ -223,7 +229,7 @@ def test_the_bayesian_rule_is_near_the_information_limit(likelihood):
         record_at=record_at,
         n_episodes=1,
         seed=1,
-        likelihood=likelihood,
+        rule=Bayes(likelihood=likelihood),
     )
     assert result.returns.shape == (30, 6, 1)
     for k in record_at:
@@ -254,7 +260,7 @@ def test_random_answers_find_nothing():
 
 def test_mistakes_cost_less_under_the_bayesian_rule_than_under_the_papers():
     returns = {}
-    for rule in ("bayes", "paper"):
+    for name, rule in {"bayes": Bayes(), "paper": Paper()}.items():
         result = evaluate_adaptation(
             MODEL,
             SpeedVecEnv(20),
@@ -262,9 +268,9 @@ def test_mistakes_cost_less_under_the_bayesian_rule_than_under_the_papers():
             partial(MistakeOracle, 0.1),
             record_at=(10,),
             seed=1,
-            inference=rule,
+            rule=rule,
         )
-        returns[rule] = result.after(10)
+        returns[name] = result.after(10)
     assert returns["bayes"] > returns["paper"]
     assert returns["bayes"] > -35
 
@@ -298,7 +304,7 @@ def test_each_measurement_is_told_as_it_comes_and_changes_nothing():
     assert measured.preferences == adapted.preferences
     for n, one in enumerate(told, 1):
         np.testing.assert_array_equal(one.returns, measured.returns[:, :n])
-        alone = evaluate_latents(
+        alone = evaluate_episodes(
             MODEL, vec_env(4), adapted.latents[:, n - 1], tasks, 2, evaluation_seed(0)
-        )
+        ).returns
         np.testing.assert_array_equal(one.returns[:, -1], alone)

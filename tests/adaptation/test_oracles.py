@@ -20,7 +20,7 @@ from sb3_poem.adaptation import (
     ReturnOracle,
 )
 from sb3_poem.adaptation.human import PROMPT
-from sb3_poem.adaptation.options import inference_rng
+from sb3_poem.adaptation.rule import inference_rng
 from sb3_poem.common.trajectory import Trajectory
 
 LEFT, RIGHT, EQUAL = Preference
@@ -170,7 +170,7 @@ def test_a_person_through_the_adapter(tmp_path):
     np.testing.assert_array_equal(again.left.observations, query.left.observations)
     adapter.adapt()
     assert [a.preference for a in adapter.answers] == [LEFT] * 3
-    assert adapter.options.noise_model == MistakeNoise(0.05)
+    assert adapter.rule.noise_model == MistakeNoise(0.05)
 
 
 def test_a_persons_terminal_and_frames_are_needed(tmp_path):

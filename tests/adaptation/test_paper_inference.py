@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from worlds import SpeedModel
 
-from sb3_poem.adaptation.inference import PaperInference, Snapshot
+from sb3_poem.adaptation.paper import Paper
 from sb3_poem.adaptation.preference import Preference
+from sb3_poem.adaptation.rule import Setting, Snapshot
 
 LEFT, RIGHT, EQUAL = Preference
 
@@ -19,7 +20,9 @@ def latent(first, dim=5):
 
 
 def make(epsilon=0.1, seed=0, **kwargs):
-    return PaperInference(SpeedModel(), epsilon=epsilon, rng=np.random.default_rng(seed), **kwargs)
+    return Paper(epsilon=epsilon, **kwargs).start(
+        SpeedModel(), np.random.default_rng(seed), Setting()
+    )
 
 
 def differences(inference, latents):
@@ -37,7 +40,7 @@ def test_candidates_satisfy_every_answer_within_the_tolerance(epsilon):
     inference = make(epsilon)
     inference.tell(LEFT, latent(0.5), latent(-0.5))
     inference.tell(RIGHT, latent(1.5), latent(0.2))
-    inference.ask_latents()
+    inference.ask()
     odds = 1.0 / (1.0 + np.exp(-differences(inference, inference.candidates)))
     assert inference.candidates.shape == (100, 5)
     assert np.all(odds >= 0.5 - epsilon - 1e-12)
@@ -56,7 +59,7 @@ def test_equal_excludes_nobody():
     grid = np.stack([latent(x) for x in np.linspace(-3, 3, 31)])
     assert np.all(inference.satisfied(grid) == 1)
     # but the most likely latent lies midway between the two
-    inference.ask_latents()
+    inference.ask()
     model = inference.model
     estimate = model.speed(inference.estimate())
     midway = 0.5 * (model.speed(latent(0.5)) + model.speed(latent(-0.5)))
@@ -66,9 +69,9 @@ def test_equal_excludes_nobody():
 
 def test_line_17_takes_the_candidate_of_highest_likelihood():
     inference = make()
-    inference.ask_latents()
+    inference.ask()
     inference.tell(LEFT, latent(0.5), latent(-0.5))
-    inference.ask_latents()
+    inference.ask()
     inference.tell(RIGHT, latent(1.5), latent(0.2))
     # Candidates are those drawn before the last answer; the likelihood counts it (lines 3 to 17 in
     # order).
@@ -79,13 +82,13 @@ def test_line_17_takes_the_candidate_of_highest_likelihood():
 
 
 def test_contradicting_answers_fall_back_in_the_defined_order():
-    inference = make(epsilon=0.0, max_draws=2000)
+    inference = make(epsilon=0.0)
     for _ in range(
         2
     ):  # nobody satisfies all three; whoever satisfies two satisfies the pair of equal answers
         inference.tell(LEFT, latent(0.5), latent(-0.5))
     inference.tell(RIGHT, latent(0.5), latent(-0.5))
-    inference.ask_latents()
+    inference.ask()
     satisfied = inference.satisfied(inference.candidates)
     assert inference.candidates.shape == (100, 5)
     assert np.all(satisfied == 2)
@@ -96,9 +99,9 @@ def test_contradicting_answers_fall_back_in_the_defined_order():
 
 def test_few_survivors_are_kept_and_filled_up():
     # The left policy is extreme: hardly any draw prefers it, but those that do come first.
-    inference = make(epsilon=0.0, max_draws=4000)
+    inference = make(epsilon=0.0)
     inference.tell(LEFT, latent(3.2), latent(2.4))
-    inference.ask_latents()
+    inference.ask()
     satisfied = inference.satisfied(inference.candidates)
     survivors = int(satisfied.sum())
     assert 0 < survivors < 100
@@ -108,7 +111,7 @@ def test_few_survivors_are_kept_and_filled_up():
 
 def test_the_query_is_eq_10s():
     inference = make()
-    left, right = inference.ask_latents()
+    left, right = inference.ask()
     model, z = inference.model, inference.candidates
     best = 101
     for i in range(100):
@@ -128,13 +131,13 @@ def test_the_query_is_eq_10s():
 def test_reproducible_and_restorable():
     first, second = make(seed=3), make(seed=3)
     for inference in (first, second):
-        inference.ask_latents()
+        inference.ask()
         inference.tell(LEFT, latent(0.5), latent(-0.5))
     third = make(seed=99)
     third.restore(Snapshot.from_dict(first.snapshot().to_dict()), first.answers)
     for inference in (second, third):
         np.testing.assert_array_equal(first.candidates, inference.candidates)
-    asked = [np.stack(inference.ask_latents()) for inference in (first, second, third)]
+    asked = [np.stack(inference.ask()) for inference in (first, second, third)]
     np.testing.assert_array_equal(asked[0], asked[1])
     np.testing.assert_array_equal(asked[0], asked[2])
 
@@ -144,7 +147,7 @@ def test_reproducible_and_restorable():
 def test_every_rule_asks_about_two_policies(rule, candidates):
     inference = make(query_rule=rule, candidates=candidates)
     for _ in range(3):
-        left, right = inference.ask_latents()
+        left, right = inference.ask()
         assert not np.array_equal(left, right)
         inference.tell(LEFT, left, right)
     assert inference.estimate().shape == (5,)

@@ -14,7 +14,7 @@ from worlds import Walk1D
 
 from poem_envs import ProcessFamilyVector
 from sb3_poem import POEMSAC, AdaptationEvalCallback
-from sb3_poem.adaptation import evaluate_adaptation, evaluate_latents, known_task_return
+from sb3_poem.adaptation import evaluate_adaptation, evaluate_episodes, known_task_return
 from sb3_poem.cli import main
 from sb3_poem.common.vec_env import make_task_vec_env
 
@@ -108,7 +108,7 @@ def test_a_family_without_successes_has_no_rates():
     assert result.successes is None
     assert result.success_rates is None
     assert "success_rate" not in result.to_dict()
-    assert evaluate_latents(model, model.env, np.zeros((2, 5)), tasks, 1).shape == (2, 1)
+    assert evaluate_episodes(model, model.env, np.zeros((2, 5)), tasks, 1).returns.shape == (2, 1)
 
 
 @pytest.mark.parametrize("name", ["test/WalkToSuccess-v0", "test/WalkOneByOne-v0"])

@@ -19,9 +19,10 @@ bound is tested with that in place of 1/2.
 import numpy as np
 import pytest
 
-from sb3_poem.adaptation import inference as inference_module
-from sb3_poem.adaptation.inference import PaperInference
+from sb3_poem.adaptation import paper as paper_module
+from sb3_poem.adaptation.paper import Paper
 from sb3_poem.adaptation.preference import Preference
+from sb3_poem.adaptation.rule import Setting
 
 RADIUS = 4.0
 N_CANDIDATES = 200
@@ -43,8 +44,8 @@ class SphereModel:
         direction = self.reward_embedding(latents)
         return RADIUS * direction / np.linalg.norm(direction, axis=1, keepdims=True)
 
-    def similarities(self, task_latents, policy_latents):
-        return self.reward_embedding(task_latents) @ self.policy_embedding(policy_latents).T
+    def similarities(self, task, policy_latents):
+        return self.reward_embedding(task) @ self.policy_embedding(policy_latents).T
 
 
 def slack(epsilon):
@@ -71,10 +72,10 @@ def run(epsilon, seed):
     model = SphereModel()
     rng = np.random.default_rng([seed, 1])
     truth, draws = rng.standard_normal((1, 3)), rng.standard_normal((30_000, 3))
-    inference = PaperInference(model, N_CANDIDATES, epsilon, rng=np.random.default_rng(seed))
+    inference = Paper(N_CANDIDATES, epsilon).start(model, np.random.default_rng(seed), Setting())
     masses, alive, distances = [1.0], True, []
     for _ in range(K):
-        left, right = inference.ask_latents()
+        left, right = inference.ask()
         difference = np.subtract(*model.similarities(truth, np.stack([left, right]))[0])
         # Assumption 2: it errs only where eq. 9 still holds for the truth. There it always errs.
         errs = abs(difference) <= slack(epsilon) * (1 - 1e-9)
@@ -126,13 +127,13 @@ def test_it_can_fail_with_the_sign_of_the_papers_proof(monkeypatch):
     """The appendix's inequality shrinks the half-spaces. Then the truth is thrown out, and its
     density is 0.
     """
-    widening = inference_module.tolerance
-    monkeypatch.setattr(inference_module, "tolerance", lambda epsilon: -widening(epsilon))
+    widening = paper_module.tolerance
+    monkeypatch.setattr(paper_module, "tolerance", lambda epsilon: -widening(epsilon))
     assert not all(run(0.2, seed)[1] for seed in range(3))
 
 
 def test_it_can_fail_without_the_tolerance(monkeypatch):
-    monkeypatch.setattr(inference_module, "tolerance", lambda epsilon: 0.0)
+    monkeypatch.setattr(paper_module, "tolerance", lambda epsilon: 0.0)
     assert not all(run(0.2, seed)[1] for seed in range(3))
 
 
@@ -144,9 +145,9 @@ def test_it_can_fail_with_random_questions():
     for seed in range(6):
         rng = np.random.default_rng(seed)
         truth = rng.standard_normal((1, 3))
-        inference = PaperInference(model, N_CANDIDATES, 0.0, query_rule="random", rng=rng)
+        inference = Paper(N_CANDIDATES, 0.0, query_rule="random").start(model, rng, Setting())
         for _ in range(K):
-            left, right = inference.ask_latents()
+            left, right = inference.ask()
             s = model.similarities(truth, np.stack([left, right]))[0]
             inference.tell(Preference.LEFT if s[0] > s[1] else Preference.RIGHT, left, right)
         masses.append(surviving_mass(model, inference, 0.0, draws))
@@ -161,10 +162,10 @@ def test_candidates_converge_to_the_truth():
     for seed in range(3):
         rng = np.random.default_rng(seed)
         truth = rng.standard_normal((1, 3))
-        inference = PaperInference(model, 100, 0.0, rng=rng)
+        inference = Paper(100, 0.0).start(model, rng, Setting())
         angles = []
         for _ in range(11):
-            left, right = inference.ask_latents()
+            left, right = inference.ask()
             cosine = (
                 model.policy_embedding(inference.candidates)
                 @ model.policy_embedding(truth)[0]

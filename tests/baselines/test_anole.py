@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from worlds import SpeedEnv, SpeedModel, SpeedVecEnv
 
 import sb3_poem
-from sb3_poem import PEARLSAC, ANOLEAdapter
+from sb3_poem import ANOLE, PEARLSAC, PreferenceAdapter
 from sb3_poem.adaptation import (
     MistakeOracle,
     Preference,
@@ -17,9 +17,8 @@ from sb3_poem.adaptation import (
     adapt_tasks,
     evaluate_adaptation,
 )
-from sb3_poem.adaptation.options import inference_rng
+from sb3_poem.adaptation.rule import Setting, inference_rng
 from sb3_poem.baselines import replay_fragments, rollout_fragments, training_rollouts
-from sb3_poem.baselines.anole import ANOLEOptions
 from sb3_poem.baselines.berlekamp import berlekamp_volumes, n_distinguishable, worst_case_volumes
 from sb3_poem.common.rollouts import rollout_latents
 
@@ -34,6 +33,16 @@ def library(n=60):
 
 
 LIBRARY = library()
+
+
+def begin(n_queries, seed=0, library=LIBRARY, **options):
+    """ANOLE's inference."""
+    rng = np.random.default_rng(seed)
+    return ANOLE(**options).start(MODEL, rng, Setting(n_queries, library))
+
+
+def anole(model, env, rule=None, **arguments):
+    return PreferenceAdapter(model, env, rule=rule or ANOLE(), **arguments)
 
 
 @pytest.mark.parametrize(("n_queries", "budget"), [(1, 0), (4, 0), (5, 1), (6, 2), (6, 6)])
@@ -79,18 +88,17 @@ def test_numbers_of_candidates():
     assert n_distinguishable(10, 2) == 1024 // 56
     assert n_distinguishable(3, 1) == 2  # the repetition code is perfect
     assert n_distinguishable(7, 1) == 16  # and so is Hamming's
-    assert ANOLEOptions().total_candidates == 100
-    assert ANOLEOptions().budget == 2
-    assert ANOLEOptions(n_queries=20).total_candidates == 2**20 // 6196
-    assert ANOLEOptions(strategy="greedy").total_candidates == 1024
-    assert ANOLEOptions(n_queries=15, mistake_rate=0.2).budget == 3
+    assert ANOLE().total_candidates(10) == 100
+    assert ANOLE().budget(10) == 2
+    assert ANOLE().total_candidates(20) == 2**20 // 6196
+    assert ANOLE(strategy="greedy").total_candidates(10) == 1024
+    assert ANOLE(mistake_rate=0.2).budget(15) == 3
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_greedy_takes_the_pair_of_an_exhaustive_search(seed):
     # Every pair is among the draws, so that the choice must be as good as the best of all.
-    options = ANOLEOptions(n_queries=4, strategy="greedy", n_pairs=2000)
-    inference = options.make_inference(MODEL, np.random.default_rng(seed), LIBRARY[:8])
+    inference = begin(4, seed, LIBRARY[:8], strategy="greedy", n_pairs=2000)
     for answer in (LEFT, RIGHT, LEFT):
         returns = MODEL.predicted_returns(inference.candidates[inference.alive], LIBRARY[:8])
         survivors = {
@@ -99,21 +107,20 @@ def test_greedy_takes_the_pair_of_an_exhaustive_search(seed):
             )
             for i, j in itertools.permutations(range(8), 2)
         }
-        i, j = inference.ask_library()
-        assert survivors[i, j] == min(survivors.values())
+        left, right = inference.ask()
+        asked = LIBRARY.index(left), LIBRARY.index(right)
+        assert survivors[asked] == min(survivors.values())
         before = inference.alive.sum()
-        inference.tell(answer, LIBRARY[i], LIBRARY[j])
+        inference.tell(answer, left, right)
         assert 1 <= inference.alive.sum() <= before
 
 
 def test_contradictions_are_counted_and_the_budget_grows():
-    inference = ANOLEOptions(n_queries=5, n_candidates=30).make_inference(
-        MODEL, np.random.default_rng(0), LIBRARY
-    )
+    inference = begin(5, n_candidates=30)
     assert inference.budget == 1
-    i, j = inference.ask_library()
+    left, right = inference.ask()
     for answer in (LEFT, RIGHT, LEFT, RIGHT, EQUAL):
-        inference.tell(answer, LIBRARY[i], LIBRARY[j])
+        inference.tell(answer, left, right)
     assert set(inference.contradictions) <= {0, 2}
     assert inference.contradictions.max() == 2
     inference.contradictions[:] = 3
@@ -122,9 +129,7 @@ def test_contradictions_are_counted_and_the_budget_grows():
 
 
 def test_greedy_keeps_candidates_when_none_agrees():
-    inference = ANOLEOptions(n_queries=3, strategy="greedy").make_inference(
-        MODEL, np.random.default_rng(0), LIBRARY
-    )
+    inference = begin(3, strategy="greedy")
     order = np.argsort([t.observations[1, 1] for t in LIBRARY])
     slow, fast = LIBRARY[order[0]], LIBRARY[order[-1]]
     inference.tell(LEFT, slow, fast)
@@ -142,8 +147,7 @@ def test_it_finds_the_speed(strategy):
         ReturnOracle,
         record_at=(0, 10),
         n_episodes=1,
-        adapter=ANOLEAdapter,
-        strategy=strategy,
+        rule=ANOLE(strategy=strategy),
         library=LIBRARY,
     )
     # Blind -150 at best; the candidates alone lie 2 apart for 100 of them.
@@ -160,8 +164,7 @@ def test_two_lies_in_ten_answers_are_borne():
             lambda env, task, seed: MistakeOracle(0.1, env, task, seed),
             record_at=(10,),
             n_episodes=1,
-            adapter=ANOLEAdapter,
-            strategy=strategy,
+            rule=ANOLE(strategy=strategy),
             library=LIBRARY,
         ).after(10)
         for strategy in ("berlekamp", "greedy")
@@ -178,12 +181,12 @@ def test_one_task_and_many_tasks_agree_and_the_state_resumes():
         ReturnOracle,
         n_queries=4,
         seed=7,
-        adapter=ANOLEAdapter,
+        rule=ANOLE(),
         library=LIBRARY,
     )
     env = DummyVecEnv([SpeedEnv])
     env.env_method("set_task", GOALS[20])
-    adapter = ANOLEAdapter(
+    adapter = anole(
         MODEL, env, n_queries=4, seed=8, library=LIBRARY, oracle=ReturnOracle(task=GOALS[20])
     )
     for _ in range(2):
@@ -191,7 +194,7 @@ def test_one_task_and_many_tasks_agree_and_the_state_resumes():
         adapter.tell(adapter.oracle(query.left, query.right))
         adapter.policy()
     adapter.ask()
-    resumed = ANOLEAdapter.from_json(
+    resumed = PreferenceAdapter.from_json(
         adapter.to_json(), MODEL, env, library=LIBRARY, oracle=ReturnOracle(env, GOALS[20])
     )
     for one in (adapter, resumed):
@@ -200,7 +203,7 @@ def test_one_task_and_many_tasks_agree_and_the_state_resumes():
 
 
 def test_undo():
-    adapter = ANOLEAdapter(MODEL, SpeedEnv(), n_queries=3, seed=0, library=LIBRARY)
+    adapter = anole(MODEL, SpeedEnv(), n_queries=3, seed=0, library=LIBRARY)
     before = adapter.policy().latent
     query = adapter.ask()
     adapter.tell("left")
@@ -240,38 +243,35 @@ def test_fragments_are_pieces_of_episodes(trained):
 
 def test_it_runs_on_a_trained_model_from_its_replay_buffer(trained):
     env = walks(1)
-    adapter = ANOLEAdapter(
-        trained, env, n_queries=3, n_pairs=20, fragment_length=4, seed=0, oracle=ReturnOracle()
-    )
+    rule = ANOLE(n_pairs=20, fragment_length=4)
+    adapter = PreferenceAdapter(trained, env, rule=rule, n_queries=3, seed=0, oracle=ReturnOracle())
     env.env_method("set_task", np.array([0.5]))
     env.reset()
     policy = adapter.adapt()
     assert policy.latent.shape == (5,)
-    again = ANOLEOptions(n_queries=3, n_pairs=20, fragment_length=4).make_inference(
-        trained, inference_rng(0)
-    )
+    again = rule.start(trained, inference_rng(0), Setting(3))
     np.testing.assert_array_equal(again.candidates, adapter.inference.candidates)
     assert len(training_rollouts(trained, walks(4), 6)) == 6
 
 
 def test_it_takes_ids_and_names():
     trained = small(PEARLSAC).learn(EPOCH)
-    policy = ANOLEAdapter(
-        trained, POINT_GOAL, n_queries=2, n_pairs=5, seed=0, oracle=ReturnOracle()
+    policy = PreferenceAdapter(
+        trained, POINT_GOAL, rule=ANOLE(n_pairs=5), n_queries=2, seed=0, oracle=ReturnOracle()
     ).adapt()
     assert policy.latent.shape == (5,)
     fragments = training_rollouts("PointGoal", POINT_GOAL, 4)
-    ANOLEAdapter(
+    anole(
         "PointGoal", POINT_GOAL, n_queries=2, seed=0, library=fragments, oracle=ReturnOracle()
     ).adapt()
     with pytest.raises(
         ValueError, match=r"pass library=sb3_poem.baselines.training_rollouts\(model, env, 200\)"
     ):
-        ANOLEAdapter("PointGoal", POINT_GOAL)
+        anole("PointGoal", POINT_GOAL)
 
 
 class Blind(SpeedModel):
-    predicted_returns = property()
+    predicted_returns = None
 
 
 @pytest.mark.parametrize(
@@ -288,23 +288,25 @@ class Blind(SpeedModel):
     ],
 )
 def test_bad_arguments(arguments, message):
+    of_adapter = {name: arguments[name] for name in ("n_queries", "library") if name in arguments}
+    of_rule = {name: value for name, value in arguments.items() if name not in of_adapter}
     with pytest.raises(ValueError, match=message):
-        ANOLEAdapter(MODEL, SpeedEnv(), **{"library": LIBRARY, **arguments})
+        anole(MODEL, SpeedEnv(), ANOLE(**of_rule), **{"library": LIBRARY, **of_adapter})
 
 
 def test_models_and_families_that_will_not_do(trained):
     with pytest.raises(
         ValueError, match="`model` needs a trained reward decoder, which this Blind"
     ):
-        ANOLEAdapter(Blind(), SpeedEnv(), library=LIBRARY)
+        anole(Blind(), SpeedEnv(), library=LIBRARY)
     untrained = small(PEARLSAC, walks(2), horizon=10, n_train_tasks=2, reward_coef=0.0)
     with pytest.raises(ValueError, match="`model` needs a trained reward decoder"):
-        ANOLEAdapter(untrained, walks(1), library=LIBRARY)
+        anole(untrained, walks(1), library=LIBRARY)
     with pytest.raises(ValueError, match="a family whose tasks share their dynamics"):
-        ANOLEAdapter(trained, walks(1, WindyWalk))
+        anole(trained, walks(1, WindyWalk))
     with pytest.raises(ValueError, match="does not belong to this environment"):
-        ANOLEAdapter(MODEL, walks(1, Walk), library=LIBRARY)
-    assert "ANOLEAdapter" in dir(sb3_poem)
+        anole(MODEL, walks(1, Walk), library=LIBRARY)
+    assert "ANOLE" in dir(sb3_poem)
 
 
 def test_fragments_of_rollouts_are_pieces_of_the_training_tasks_episodes():

@@ -8,6 +8,7 @@ from torch.func import grad
 
 from sb3_poem import PEARLSAC
 from sb3_poem.adaptation import Preference
+from sb3_poem.adaptation.rule import Answer
 from sb3_poem.baselines import replay_fragments
 from sb3_poem.baselines.maml import (
     PreferencePairs,
@@ -16,7 +17,7 @@ from sb3_poem.baselines.maml import (
     maml_loss,
     preference_loss,
 )
-from sb3_poem.baselines.maml_reward import JudgedPair, MetaReward, meta_train_reward
+from sb3_poem.baselines.meta_reward import MetaReward, meta_train_reward
 
 
 def tiny():
@@ -95,7 +96,7 @@ def judged(fragments, goal, n, seed):
             (-np.abs(t.reward_features[:, 0] - goal)).sum() * sign
             for t, sign in ((left, 1), (right, -1))
         )
-        answers.append(JudgedPair(Preference.LEFT if better > 0 else Preference.RIGHT, left, right))
+        answers.append(Answer(Preference.LEFT if better > 0 else Preference.RIGHT, left, right))
     return answers
 
 
@@ -128,7 +129,7 @@ def test_ten_answers_tell_the_meta_trained_reward_its_task(trained):
 def test_answers_about_episodes_that_ended_early(trained):
     meta = MetaReward(trained.policy, (8,))
     long, short = (replay_fragments(trained, 1, n, np.random.default_rng(0))[0] for n in (9, 4))
-    answers = [JudgedPair(Preference.LEFT, long, short), JudgedPair(Preference.EQUAL, short, short)]
+    answers = [Answer(Preference.LEFT, long, short), Answer(Preference.EQUAL, short, short)]
     adapted = meta.adapted(answers)
     # One step of gradient descent after the other, each pair by itself and nothing filled up.
     parameters = meta.parameters
@@ -172,7 +173,7 @@ def test_a_meta_reward_is_saved_and_read(tmp_path):
     loaded = MetaReward.load(tmp_path / "reward", model.policy)
     assert (loaded.net_arch, loaded.inner_learning_rate, loaded.inner_steps) == ((8, 4), 0.2, 2)
     left, right = replay_fragments(model, 2, 10, np.random.default_rng(0))
-    answers = [JudgedPair(Preference.LEFT, left, right)]
+    answers = [Answer(Preference.LEFT, left, right)]
     for judged in ([], answers):
         np.testing.assert_array_equal(
             loaded.rewards(loaded.adapted(judged), right), meta.rewards(meta.adapted(judged), right)

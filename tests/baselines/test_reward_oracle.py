@@ -7,8 +7,12 @@ from meta_toys import small, walks
 from stable_baselines3.common.vec_env import DummyVecEnv
 from worlds import SpeedEnv, SpeedModel
 
-from sb3_poem import PEARLSAC, POEMSAC, RewardOracleAdapter
+from sb3_poem import PEARLSAC, POEMSAC, PreferenceAdapter, RewardOracle
 from sb3_poem.adaptation import Preference, ReturnOracle, adapt_tasks
+
+
+def sighted(model, env, **arguments):
+    return PreferenceAdapter(model, env, rule=RewardOracle(), **arguments)
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +23,7 @@ def trained():
 def test_contexts_are_those_of_training(trained):
     # The rows that it makes of a trajectory equal those that training made of the same transitions.
     env = walks(1)
-    adapter = RewardOracleAdapter(trained, env, n_queries=1, seed=0)
+    adapter = sighted(trained, env, n_queries=1, seed=0)
     env.env_method("set_task", np.array([0.3]))
     query = adapter.ask()
     adapter.tell(Preference.EQUAL)
@@ -49,9 +53,9 @@ def test_contexts_are_those_of_training(trained):
 
 
 def test_before_any_rollout_it_is_the_prior(trained):
-    adapter = RewardOracleAdapter(trained, walks(1), seed=0)
+    adapter = sighted(trained, walks(1), seed=0)
     np.testing.assert_array_equal(adapter.policy().latent, np.zeros(5))
-    draws = np.concatenate([adapter.inference.ask_latents() for _ in range(2000)])
+    draws = np.concatenate([adapter.inference.ask() for _ in range(2000)])
     np.testing.assert_allclose(draws.mean(axis=0), 0, atol=0.1)
     np.testing.assert_allclose(draws.std(axis=0), 1, atol=0.1)
 
@@ -62,7 +66,7 @@ def test_answers_do_not_matter_and_many_tasks_are_as_one(trained):
     for answer in ("left", "right"):
         env = walks(1)
         env.env_method("set_task", task)
-        adapter = RewardOracleAdapter(trained, env, n_queries=3, seed=4)
+        adapter = sighted(trained, env, n_queries=3, seed=4)
         while not adapter.done:
             adapter.ask()
             adapter.tell(answer)
@@ -75,7 +79,7 @@ def test_answers_do_not_matter_and_many_tasks_are_as_one(trained):
         ReturnOracle,
         n_queries=3,
         seed=3,
-        adapter=RewardOracleAdapter,
+        rule=RewardOracle(),
     )
     np.testing.assert_allclose(many.latents[1, -1], latents[0], atol=1e-4)
 
@@ -83,12 +87,12 @@ def test_answers_do_not_matter_and_many_tasks_are_as_one(trained):
 def test_the_state_resumes_after_saving_the_model(trained, tmp_path):
     env = walks(1)
     env.env_method("set_task", np.array([0.5]))
-    adapter = RewardOracleAdapter(trained, env, n_queries=3, seed=0, oracle=ReturnOracle())
+    adapter = sighted(trained, env, n_queries=3, seed=0, oracle=ReturnOracle())
     adapter.ask()
     adapter.tell("left")
     trained.save(tmp_path / "model.zip")
     model = PEARLSAC.load(tmp_path / "model.zip", device="cpu")
-    resumed = RewardOracleAdapter.from_json(adapter.to_json(), model, env, oracle=ReturnOracle(env))
+    resumed = PreferenceAdapter.from_json(adapter.to_json(), model, env, oracle=ReturnOracle(env))
     np.testing.assert_allclose(resumed.adapt().latent, adapter.adapt().latent, atol=1e-5)
 
 
@@ -106,7 +110,7 @@ def test_the_posterior_is_that_of_all_rewarded_trajectories(trained, monkeypatch
     monkeypatch.setitem(trained.policy._modules, "encoder", RewardEncoder())
     env = walks(1)
     env.env_method("set_task", np.array([-0.5]))
-    adapter = RewardOracleAdapter(trained, env, n_queries=10, seed=1)
+    adapter = sighted(trained, env, n_queries=10, seed=1)
     centre, deviation = trained.context_reward_statistics
     rewards = []
     for k in range(1, 11):
@@ -129,21 +133,21 @@ def test_the_posterior_is_that_of_all_rewarded_trajectories(trained, monkeypatch
 def test_what_will_not_do(trained):
     untrained = small(PEARLSAC, walks(2), horizon=10, n_train_tasks=2)
     with pytest.raises(ValueError, match="train it for an epoch first"):
-        RewardOracleAdapter(untrained, walks(1))
+        sighted(untrained, walks(1))
     poem = small(POEMSAC, walks(2), horizon=10, n_train_tasks=2)
     with pytest.raises(ValueError, match="this POEMSAC's context also holds values"):
-        RewardOracleAdapter(poem, walks(1))
+        sighted(poem, walks(1))
     with pytest.raises(ValueError, match="needs a context encoder, which SpeedModel does not have"):
-        RewardOracleAdapter(SpeedModel(), SpeedEnv())
+        sighted(SpeedModel(), SpeedEnv())
     with pytest.raises(ValueError, match="`n_queries` must be at least 1"):
-        RewardOracleAdapter(trained, walks(1), n_queries=0)
+        sighted(trained, walks(1), n_queries=0)
     with pytest.raises(ValueError, match="`library` must be None"):
         adapt_tasks(
             trained,
             walks(1),
             np.zeros((1, 1)),
             ReturnOracle,
-            adapter=RewardOracleAdapter,
+            rule=RewardOracle(),
             library=[],
         )
 
@@ -153,4 +157,4 @@ def test_what_will_not_do(trained):
         shared_dynamics = property()
 
     with pytest.raises(ValueError, match="is no task family"):
-        RewardOracleAdapter(trained, DummyVecEnv([NoFamily]))
+        sighted(trained, DummyVecEnv([NoFamily]))

@@ -15,7 +15,7 @@ Returns = Callable[[Cell, int], np.ndarray]  # of a cell and a number of answers
 
 def finished(cell: Cell, returns: Returns, samples: int = 1000, **result: Any) -> Record:
     """A record of a cell."""
-    known = cell.definition.kind == "known"
+    known = cell.definition.rule is None
     queries = cell.budget.record_at
     content: dict[str, Any] = {
         "tasks": np.linspace(0.0, 1.0, cell.budget.tasks)[:, None].tolist(),

@@ -42,7 +42,7 @@ def matrix(cell: Cell) -> dict:
 def fill(path: Path, suite: str = "table3", seeds: int = 3, **arguments: object) -> Store:
     store = Store(path)
     for cell in SUITES[suite].cells([VEL], range(seeds), budget=FOUR, **arguments):
-        extra = matrix(cell) if cell.definition.kind == "known" else {}
+        extra = matrix(cell) if cell.definition.rule is None else {}
         store.add(finished(cell, ladder, **extra))
     return store
 
@@ -153,7 +153,7 @@ def test_the_table_of_what_ships(tmp_path: Path) -> None:
     facts = {"training_cpu_seconds": 1234.0}
     with Store(tmp_path / "store.sqlite") as store:
         for cell in SUITES["shipped"].cells([VEL], range(2), budget=FOUR):
-            known = cell.definition.kind == "known"
+            known = cell.definition.rule is None
             rates = [0.5] * 4 if known else [[0.25] * 7] * 4
             extra = {**facts, "task_success_rates": rates, **(matrix(cell) if known else {})}
             store.add(finished(cell, ladder, **extra))

@@ -68,10 +68,11 @@ def test_suites_hold_what_the_issue_asks_for() -> None:
             {"latent_dim": 10},
         )
     }
-    assert {
-        cell.options["inference"] for cell in ablation if cell.definition.kind == "preference"
-    } == {"paper", "bayes"}
-    assert {cell.options.get("query_rule") for cell in ablation} == {
+    assert {cell.definition.rule for cell in ablation if cell.definition.rule is not None} == {
+        "Paper",
+        "Bayes",
+    }
+    assert {cell.definition.options.get("query_rule") for cell in ablation} == {
         None,
         "worst-case",
         "information-gain",
@@ -82,11 +83,11 @@ def test_suites_hold_what_the_issue_asks_for() -> None:
     epsilon = SUITES["epsilon"].cells(
         ["poem/HalfCheetahVel-v0"], [0], ["poem-paper-epsilon-0", "poem-paper-epsilon-0.4"]
     )
-    assert {(cell.options["epsilon"], cell.oracle) for cell in epsilon} == {
+    assert {(cell.definition.options["epsilon"], cell.oracle) for cell in epsilon} == {
         (value, oracle) for value in (0.0, 0.4) for oracle in (EXACT, BOLTZMANN)
     }
     assert len([name for name in SUITES["epsilon"].methods if "epsilon" in name]) == 6
-    noise = {cell.oracle for cell in cells_of(SUITES["noise"]) if cell.definition.kind != "known"}
+    noise = {cell.oracle for cell in cells_of(SUITES["noise"]) if cell.definition.rule is not None}
     assert {(oracle.kind, oracle.value) for oracle in noise} == {
         ("boltzmann", None),
         ("mistake", 0.1),

@@ -21,7 +21,7 @@ from meta_toys import ARCH, POINT_GOAL, Walk, small
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from sb3_poem import PEARLSAC, POEMSAC, PreferenceAdapter, cli
+from sb3_poem import PEARLSAC, POEMSAC, Bayes, PreferenceAdapter, cli
 from sb3_poem.adaptation import AdaptedPolicy
 from sb3_poem.common.foreign import environment_of
 from sb3_poem.common.vec_env import make_task_vec_env
@@ -168,7 +168,7 @@ def small_zip(folder: Path, **attributes: Any) -> Path:
 
 def test_a_saved_adaptation_names_no_environment_to_make(trap: Path) -> None:
     model, env = small(POEMSAC), make_task_vec_env(POINT_GOAL, 1)
-    data = PreferenceAdapter(model, env, seed=0, n_candidates=10).to_dict()
+    data = PreferenceAdapter(model, env, seed=0, rule=Bayes(n_particles=10)).to_dict()
     data["model"]["env_id"] = "trap:Foo-v0"
     with refused("saved with a model for trap:Foo-v0, but this one is for poem/PointGoal-v0"):
         PreferenceAdapter.from_json(json.dumps(data), model, env)

@@ -17,7 +17,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sb3_poem.adaptation import PreferenceAdapter, ReturnOracle, evaluate_latents
+from sb3_poem import Bayes
+from sb3_poem.adaptation import PreferenceAdapter, ReturnOracle, evaluate_episodes
 from sb3_poem.adaptation.noise import MistakeNoise
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.common.vec_env import make_task_vec_env
@@ -188,7 +189,9 @@ def returns(info: ModelInfo, latents: np.ndarray, task: float) -> np.ndarray:
     """True returns of latents, the mean of the same ten episodes each."""
     env, model = make_task_vec_env(info.env_id, 10), load_shown_model(info)
     values = [
-        evaluate_latents(model, env, latent[None, :], np.array([[task]]), 10, seed=77).mean()
+        evaluate_episodes(
+            model, env, latent[None, :], np.array([[task]]), 10, seed=77
+        ).returns.mean()
         for latent in latents
     ]
     env.close()
@@ -198,7 +201,10 @@ def returns(info: ModelInfo, latents: np.ndarray, task: float) -> np.ndarray:
 def oracles_latents(info: ModelInfo, task: float, n_queries: int) -> np.ndarray:
     """Before any answer, and after those by ``ReturnOracle``."""
     oracle = ReturnOracle(gym.make(info.env_id), np.array([task]))
-    options: dict[str, Any] = {"n_queries": n_queries, "noise_model": MistakeNoise(0.05)}
+    options: dict[str, Any] = {
+        "n_queries": n_queries,
+        "rule": Bayes(noise_model=MistakeNoise(0.05)),
+    }
     model = load_shown_model(info)
     adapter = PreferenceAdapter(model, info.env_id, oracle=oracle, seed=SEED, **options)
     before = adapter.policy().latent

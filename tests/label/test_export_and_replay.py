@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from label_world import settled
 
-from sb3_poem import POEMSAC, cli
+from sb3_poem import POEMSAC, Bayes, cli
 from sb3_poem.adaptation import HumanOracle, PreferenceAdapter, ReturnOracle
 from sb3_poem.adaptation.policy import AdaptedPolicy
 from sb3_poem.common.trajectory import Trajectory
@@ -301,7 +301,9 @@ def test_the_widget_takes_an_environment_that_was_rendered_and_gives_it_back(qua
     except Exception as error:
         pytest.skip(f"this machine cannot render: {error}")
     model = POEMSAC.from_pretrained(pretrained_folder("HalfCheetahVel"), device="cpu")
-    widget = LabelWidget(PreferenceAdapter(model, env, seed=0, n_queries=2, n_candidates=10))
+    widget = LabelWidget(
+        PreferenceAdapter(model, env, seed=0, n_queries=2, rule=Bayes(n_particles=10))
+    )
     state: dict[str, Any] = {}
     for _ in range(600):
         state = json.loads(urllib.request.urlopen(widget.url + "/state").read())

@@ -16,6 +16,7 @@ import pytest
 from gymnasium.envs.registration import load_env_creator
 from label_world import make_sessions, settled
 
+from sb3_poem import Bayes
 from sb3_poem.adaptation.adapter import PreferenceAdapter
 from sb3_poem.adaptation.noise import MistakeNoise
 from sb3_poem.label.families import ModelInfo
@@ -65,7 +66,9 @@ def test_the_page_asks_what_an_adapter_asks(
 
     session = run_server(life)
     model = load_shown_model(point_goal)
-    adapter = PreferenceAdapter(model, "poem/PointGoal-v0", seed=5, noise_model=MistakeNoise(0.05))
+    adapter = PreferenceAdapter(
+        model, "poem/PointGoal-v0", seed=5, rule=Bayes(noise_model=MistakeNoise(0.05))
+    )
     for number, preference in enumerate(ANSWERS):
         query = adapter.ask()
         kept = contents(store, session, number)

@@ -19,7 +19,8 @@ from sb3_poem import (
     PEARLSAC,
     POEMSAC,
     AdaptationEvalCallback,
-    RewardOracleAdapter,
+    Paper,
+    RewardOracle,
     TrainingCheckpointCallback,
 )
 from sb3_poem.pearl_sac.callbacks import EpochCallback
@@ -233,8 +234,8 @@ def test_what_cannot_be_evaluated_or_saved_is_refused_before_training(tmp_path: 
     file.touch()
     for model, arguments, error, message in (
         (small(POEMSAC, walks(2), horizon=10), {}, ValueError, "must be registered with Gymnasium"),
-        (small(POEMSAC), {"adaptation_kwargs": {"inference": "bays"}}, ValueError, "inference"),
-        (small(POEMSAC), {"adaptation_kwargs": {"inferense": "bayes"}}, TypeError, "inferense"),
+        (small(POEMSAC), {"adaptation_kwargs": {"rule": "paper"}}, TypeError, r"rule=Paper\(\)"),
+        (small(POEMSAC), {"adaptation_kwargs": {"rules": Paper()}}, TypeError, "rules"),
         (small(POEMSAC), {"env_kwargs": {"step_lenght": 1.0}}, TypeError, "step_lenght"),
         (small(POEMSAC), {"best_model_save_path": file / "best"}, OSError, str(file)),
     ):
@@ -259,7 +260,7 @@ def test_a_baseline_evaluates_a_model_without_a_similarity() -> None:
         "n_tasks": 2,
         "n_episodes": 1,
         "record_at": (0, 1),
-        "adaptation_kwargs": {"adapter": RewardOracleAdapter},
+        "adaptation_kwargs": {"rule": RewardOracle()},
     }
     callback = AdaptationEvalCallback(every=1, **evaluation)
     small(PEARLSAC).learn(EPOCH, callback)

@@ -11,6 +11,7 @@ import torch as th
 from meta_toys import EPOCH, POINT_GOAL, small
 
 from sb3_poem import PEARLSAC, POEMSAC, PreferenceAdapter, ReturnOracle
+from sb3_poem.adaptation import named_rule
 from sb3_poem.pearl_sac import updater
 from sb3_poem.pearl_sac.sampler import MetaBatch
 
@@ -102,7 +103,7 @@ def test_adaptation_is_that_of_a_processor(algorithm: type[PEARLSAC], inference:
     for device in ("cuda", "cpu"):
         copy = algorithm.load(saved(model), device=device)
         adapter = PreferenceAdapter(
-            copy, POINT_GOAL, oracle=ReturnOracle(), n_queries=3, inference=inference, seed=0
+            copy, POINT_GOAL, oracle=ReturnOracle(), n_queries=3, rule=named_rule(inference), seed=0
         )
         latents.append(adapter.adapt().latent)
     np.testing.assert_allclose(*latents, atol=0.05)

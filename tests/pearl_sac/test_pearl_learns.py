@@ -5,7 +5,7 @@ import torch as th
 from meta_toys import LEARN, LEARN_STEPS, POINT_GOAL, point_goal_bounds
 
 from sb3_poem import PEARLSAC
-from sb3_poem.adaptation.evaluation import evaluate_latents
+from sb3_poem.adaptation.evaluation import evaluate_episodes
 from sb3_poem.common.vec_env import make_task_vec_env
 
 
@@ -16,13 +16,13 @@ def test_pearl_learns_point_goal() -> None:
     model = PEARLSAC("MlpPolicy", POINT_GOAL, **LEARN).learn(5 * LEARN_STEPS // 3)
     tasks, latents = model.train_tasks.tasks, model.task_latents
     env = make_task_vec_env(POINT_GOAL, len(tasks))
-    own = evaluate_latents(model, env, latents, tasks, n_episodes=2, seed=5).mean()
+    own = evaluate_episodes(model, env, latents, tasks, n_episodes=2, seed=5).returns.mean()
     blind, known = point_goal_bounds(tasks)
     assert own > blind + 0.2 * (known - blind)
     # and it is the latent that tells: with those of other tasks the policies go elsewhere
-    foreign = evaluate_latents(
+    foreign = evaluate_episodes(
         model, env, np.roll(latents, 7, axis=0), tasks, n_episodes=2, seed=5
-    ).mean()
+    ).returns.mean()
     assert foreign < blind
     # the decoder knows a reward to a tenth: rewards deviate by about 0.35, distances are about 1
     assert model.predicted_rewards_error < 0.2

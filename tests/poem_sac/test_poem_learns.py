@@ -9,12 +9,8 @@ import pytest
 from meta_toys import LEARN, LEARN_STEPS, POINT_GOAL, point_goal_bounds
 
 from sb3_poem import POEMSAC
-from sb3_poem.adaptation.evaluation import (
-    evaluate_latents,
-    known_task_return,
-    preference_order,
-    return_matrix,
-)
+from sb3_poem.adaptation.evaluation import evaluate_episodes
+from sb3_poem.adaptation.known_task import known_task_return, preference_order, return_matrix
 from sb3_poem.common.vec_env import TaskVecEnv, make_task_vec_env
 
 
@@ -37,9 +33,9 @@ def test_poem_learns_point_goal() -> None:
     """
     model = POEMSAC("MlpPolicy", POINT_GOAL, **LEARN).learn(LEARN_STEPS)
     env = make_task_vec_env(POINT_GOAL, 20)
-    own = evaluate_latents(
+    own = evaluate_episodes(
         model, env, model.task_latents, model.train_tasks.tasks, n_episodes=2, seed=5
-    ).mean()
+    ).returns.mean()
     blind, known = point_goal_bounds(model.train_tasks.tasks)
     assert own > blind + 0.35 * (known - blind)
     assert preference_accuracy(model, env) > 0.8

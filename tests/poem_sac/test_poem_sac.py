@@ -23,7 +23,7 @@ from meta_toys import (
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_poem import PEARLSAC, POEMSAC
-from sb3_poem.adaptation.bayes import BayesInference
+from sb3_poem.adaptation import Bayes
 from sb3_poem.common.buffers import Segment, TaskBatch
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.pearl_sac.collector import EpochCollector
@@ -188,7 +188,7 @@ def test_auto_relabels_where_it_can() -> None:
     assert not windy.epoch_context.returns.isfinite().all()
     # The decoder knows no rewards for what others' policies do, so adaptation goes by S.
     assert np.isnan(windy.predicted_rewards_error)
-    assert BayesInference(windy).likelihood == "similarity"
+    assert Bayes().likelihood_with(windy) == "similarity"
     assert small(POEMSAC, walks(4), horizon=10, preference_source="rollout").relabels is False
 
 

@@ -8,12 +8,12 @@ import torch as th
 from meta_toys import WindyWalk, small, walks
 from worlds import SpeedEnv, SpeedModel
 
-from sb3_poem import PEARLSAC, MAMLRewardAdapter
+from sb3_poem import PEARLSAC, MAMLReward, PreferenceAdapter
 from sb3_poem.adaptation import ReturnOracle, adapt_tasks
 from sb3_poem.baselines import MAMLRewardModel, MetaReward
 from sb3_poem.common.rollouts import rollout_latents
 
-FAST = {"gradient_steps": 5, "batch_size": 16}
+FAST = MAMLReward(gradient_steps=5, batch_size=16)
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def test_it_learns_a_reward_that_it_is_told(trained, model, monkeypatch):
     monkeypatch.setattr(
         MetaReward, "rewards", lambda self, parameters, trajectory: trajectory.observations[1:, 0]
     )
-    learning = {"gradient_steps": 80, "batch_size": 64, "learning_rate": 3e-3, "gamma": 0.9}
+    rule = MAMLReward(gradient_steps=80, batch_size=64, learning_rate=3e-3, gamma=0.9)
     adapted = adapt_tasks(
         model,
         walks(2),
@@ -42,8 +42,7 @@ def test_it_learns_a_reward_that_it_is_told(trained, model, monkeypatch):
         ReturnOracle,
         n_queries=4,
         record_at=(0, 4),
-        adapter=MAMLRewardAdapter,
-        **learning,
+        rule=rule,
     )
     before, after = (
         t.observations[-1, 0] for t in rollout_latents(model, walks(2), adapted.latents[0])
@@ -53,8 +52,8 @@ def test_it_learns_a_reward_that_it_is_told(trained, model, monkeypatch):
 
 
 def test_pairs_differ_and_the_budget_is_kept(model):
-    adapter = MAMLRewardAdapter(
-        model, walks(1), n_queries=2, seed=0, oracle=lambda left, right: "left", **FAST
+    adapter = PreferenceAdapter(
+        model, walks(1), n_queries=2, seed=0, oracle=lambda left, right: "left", rule=FAST
     )
     query = adapter.ask()
     assert np.abs(query.left.actions - query.right.actions).max() > 0.01
@@ -65,26 +64,26 @@ def test_pairs_differ_and_the_budget_is_kept(model):
 
 def test_the_state_resumes_and_the_generators_stay(model):
     env = walks(1)
-    adapter = MAMLRewardAdapter(
-        model, env, n_queries=3, seed=0, oracle=lambda left, right: "left", **FAST
+    adapter = PreferenceAdapter(
+        model, env, n_queries=3, seed=0, oracle=lambda left, right: "left", rule=FAST
     )
     adapter.ask()
     states = np.random.get_state()[1].copy(), th.random.get_rng_state()  # noqa: NPY002
     adapter.tell("left")
     np.testing.assert_array_equal(np.random.get_state()[1], states[0])  # noqa: NPY002
     assert th.equal(th.random.get_rng_state(), states[1])
-    resumed = MAMLRewardAdapter.from_json(
+    resumed = PreferenceAdapter.from_json(
         adapter.to_json(), model, env, oracle=lambda left, right: "left"
     )
     obs = np.random.default_rng(0).normal(size=(6, 2))
     first, second = (one.adapt().predict(obs)[0] for one in (adapter, resumed))
     np.testing.assert_allclose(first, second, atol=1e-5)
-    start = MAMLRewardAdapter(model, env, n_queries=3, seed=0, **FAST).policy().predict(obs)[0]
+    start = PreferenceAdapter(model, env, n_queries=3, seed=0, rule=FAST).policy().predict(obs)[0]
     assert np.abs(first - start).max() > 1e-3
 
 
 def test_a_pending_question_is_shown_again_by_a_model_that_was_made_anew(model, monkeypatch):
-    shown = MAMLRewardAdapter(model, walks(1), n_queries=3, seed=0, **FAST)
+    shown = PreferenceAdapter(model, walks(1), n_queries=3, seed=0, rule=FAST)
     shown.ask()
     shown.tell("left")
     query = shown.ask()
@@ -95,7 +94,7 @@ def test_a_pending_question_is_shown_again_by_a_model_that_was_made_anew(model, 
         "sb3_poem.adaptation.adapter.rollout_latents",
         lambda *a, frames, **k: rollout_latents(*a, **k),
     )
-    resumed = MAMLRewardAdapter.from_json(
+    resumed = PreferenceAdapter.from_json(
         shown.to_json(), MAMLRewardModel(model.reward, model), walks(1)
     )
     again = resumed.ask()
@@ -104,8 +103,11 @@ def test_a_pending_question_is_shown_again_by_a_model_that_was_made_anew(model, 
 
 
 def test_another_reward_does_not_go_on_where_this_one_stood(model):
-    begun = MAMLRewardAdapter(model, walks(1), n_queries=3, seed=0, **FAST)
-    assert repr(begun) == "MAMLRewardAdapter(MAMLRewardModel, 0 of 3 answers)"
+    begun = PreferenceAdapter(model, walks(1), n_queries=3, seed=0, rule=FAST)
+    assert (
+        repr(begun)
+        == "PreferenceAdapter(MAMLRewardModel, MAMLReward(gradient_steps=5, batch_size=16), 0 of 3 answers)"
+    )
     reward = copy.deepcopy(model.reward)
     other = MAMLRewardModel(reward, model)
     assert other.digest == model.digest
@@ -113,23 +115,21 @@ def test_another_reward_does_not_go_on_where_this_one_stood(model):
     with pytest.raises(
         ValueError, match="saved with a model of other weights than this MAMLRewardModel"
     ):
-        MAMLRewardAdapter.from_json(begun.to_json(), other, walks(1))
+        PreferenceAdapter.from_json(begun.to_json(), other, walks(1))
 
 
 def test_what_will_not_do(trained, model):
     with pytest.raises(
         ValueError, match="`model` must be a MAMLRewardModel, but is of type SpeedModel"
     ):
-        MAMLRewardAdapter(SpeedModel(), SpeedEnv())
+        PreferenceAdapter(SpeedModel(), SpeedEnv(), rule=FAST)
     with pytest.raises(ValueError, match="a family whose tasks share their dynamics"):
-        MAMLRewardAdapter(model, walks(1, WindyWalk))
+        PreferenceAdapter(model, walks(1, WindyWalk), rule=FAST)
     with pytest.raises(ValueError, match="`gradient_steps` must be at least 1, but is 0"):
-        MAMLRewardAdapter(model, walks(1), gradient_steps=0)
+        MAMLReward(gradient_steps=0)
     with pytest.raises(ValueError, match=r"`gamma` must lie in \[0, 1\], but is 1.5"):
-        MAMLRewardAdapter(model, walks(1), gamma=1.5)
+        MAMLReward(gamma=1.5)
     with pytest.raises(ValueError, match="`learning_rate` must be positive"):
-        MAMLRewardAdapter(model, walks(1), learning_rate=0.0)
+        MAMLReward(learning_rate=0.0)
     with pytest.raises(ValueError, match="`library` must be None"):
-        adapt_tasks(
-            model, walks(1), np.zeros((1, 1)), ReturnOracle, adapter=MAMLRewardAdapter, library=[]
-        )
+        adapt_tasks(model, walks(1), np.zeros((1, 1)), ReturnOracle, rule=FAST, library=[])

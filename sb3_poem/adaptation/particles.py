@@ -14,31 +14,22 @@ WIDENING = 1.3
 
 
 def systematic_resample(weights: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw n indices with the given weights by one uniform number, which keeps the counts within
-    one of n w_i.
-
-    :param weights: (m,) summing to one.
-    :param n: How many to draw.
-    :param rng: The generator.
-    :return: (n,) indices, ascending.
+    """Draw n indices, ascending, with the given weights by one uniform number, which keeps the
+    counts within one of n w_i.
     """
     positions = (rng.random() + np.arange(n)) / n
     cumulative = np.cumsum(weights)
-    return np.minimum(
-        np.searchsorted(cumulative / cumulative[-1], positions, side="right"), len(weights) - 1
-    )
+    found = np.searchsorted(cumulative / cumulative[-1], positions, side="right")
+    return np.minimum(found, len(weights) - 1)
 
 
 def fit_gaussian(particles: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A Gaussian over weighted particles.
+    """A Gaussian over weighted particles (n, d): mean (d,), and a lower-triangular factor (d, d) of
+    the covariance.
 
     With fewer effective particles than dimensions the sample covariance is singular, and moves
     would stay in its plane; it is shrunk towards its own diagonal by as much as particles are
     missing.
-
-    :param particles: (n, d).
-    :param weights: (n,) summing to one.
-    :return: Mean (d,), and a lower-triangular factor (d, d) of the covariance.
     """
     mean = weights @ particles
     centred = particles - mean
@@ -61,28 +52,24 @@ def kernel_neighbours(
     log_prior: Callable[[np.ndarray], np.ndarray] | None,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """A neighbour of each particle, without a look at the likelihood.
+    """A neighbour of each particle (n, d), without a look at the likelihood.
 
     The kernel shrinks towards the mean as much as it spreads, so that the particles' mean and
     covariance stay (Liu & West 2001). Where the prior has holes (between the modes of a mixture,
     off the surface on which its latents lie) there should be no particles however the likelihood
     looks: then a step is taken with the ratio of the prior's densities.
 
-    :param particles: (n, d).
     :param mean: (d,) of all particles.
     :param factor: (d, d) lower triangular factor of their covariance.
     :param width: Of the kernel, as a share of the particles' spread, in (0, 1).
     :param log_prior: Maps (m, d) to (m,), up to a constant; None where the prior has no holes.
-    :param rng: The generator.
-    :return: (n, d).
     """
     noise = rng.standard_normal(particles.shape) @ factor.T
     proposals = mean + np.sqrt(1.0 - width**2) * (particles - mean) + width * noise
     if log_prior is None:
         return proposals
-    accepted = np.log(1.0 - rng.random(len(particles))) < log_prior(proposals) - log_prior(
-        particles
-    )
+    ratio = log_prior(proposals) - log_prior(particles)
+    accepted = np.log(1.0 - rng.random(len(particles))) < ratio
     return np.where(accepted[:, None], proposals, particles)
 
 
@@ -96,7 +83,7 @@ def elliptical_slice_moves(
     tries: int,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One elliptical slice move (Murray, Adams & MacKay 2010) of every particle, in lockstep.
+    """One elliptical slice move (Murray, Adams & MacKay 2010) of every particle, all together.
 
     The ellipse belongs to a reference Gaussian that is fitted to the posterior, and the ratio of
     prior times likelihood to it is the slice's function (Nishihara, Murray & Adams 2014): so any
@@ -106,24 +93,20 @@ def elliptical_slice_moves(
     probable as its reverse.
 
     :param particles: (n, d).
-    :param log_likelihoods: (n,) at the particles.
+    :param log_likelihoods: (n,) at them.
     :param log_likelihood: Maps (m, d) to (m,).
     :param log_prior: Maps (m, d) to (m,), up to a constant.
     :param mean: (d,) of the reference.
     :param factor: (d, d) lower triangular factor of its covariance.
     :param tries: Bound on the evaluations per particle.
-    :param rng: The generator.
     :return: Moved particles (n, d), and their log-likelihoods (n,).
     """
     n, dim = particles.shape
     inverse = np.linalg.inv(factor)
 
     def log_ratio(latents: np.ndarray, likelihoods: np.ndarray) -> np.ndarray:
-        return (
-            likelihoods
-            + log_prior(latents)
-            + 0.5 * np.square((latents - mean) @ inverse.T).sum(axis=1)
-        )
+        reference = -0.5 * np.square((latents - mean) @ inverse.T).sum(axis=1)
+        return likelihoods + log_prior(latents) - reference
 
     particles, log_likelihoods = particles.copy(), log_likelihoods.copy()
     centred = particles - mean

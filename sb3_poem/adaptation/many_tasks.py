@@ -5,14 +5,24 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tqdm import tqdm
 
-from sb3_poem.adaptation.adapter import PreferenceAdapter
+from sb3_poem.adaptation.bayes import Bayes
 from sb3_poem.adaptation.environments import Env, model_and_env, warn_if_untrained
-from sb3_poem.adaptation.options import inference_rng, rollout_seed
+from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.preference import Preference, as_preference
+from sb3_poem.adaptation.rule import (
+    Rule,
+    Setting,
+    as_rule,
+    inference_rng,
+    latent_of,
+    rollout_seed,
+)
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
@@ -36,114 +46,91 @@ class TaskAdaptations:
     preferences: list[list[Preference]]
 
     def __repr__(self) -> str:
-        return f"TaskAdaptations({len(self.tasks)} tasks, after {', '.join(map(str, self.record_at))} answers)"
+        after = ", ".join(map(str, self.record_at))
+        return f"TaskAdaptations({len(self.tasks)} tasks, after {after} answers)"
 
 
 def adapt_tasks(
-    model: Any,
+    model: MetaModel | str | Path,
     env: Env,
     tasks: np.ndarray,
     oracle_factory: OracleFactory,
     *,
-    adapter: type[PreferenceAdapter] = PreferenceAdapter,
+    rule: Rule | None = None,
     n_queries: int = 10,
     record_at: Sequence[int] | None = None,
     seed: int = 0,
+    deterministic: bool = True,
     library: Sequence[Trajectory] | None = None,
     progress_bar: bool = False,
     on_record: Callable[[TaskAdaptations], None] | None = None,
-    **options: Any,
 ) -> TaskAdaptations:
-    """Adapt a model to each of many tasks, with all rollouts of a question in lockstep.
+    """Adapt a model to each of many tasks, with all rollouts of a question at once.
 
-    Task i is adapted as ``adapter(model, env, seed=seed + i, ...)`` would alone: with the same
-    candidates, questions and reset seeds. (Matrix products may round otherwise in a batch than
+    Task i is adapted as ``PreferenceAdapter(model, env, seed=seed + i, ...)`` would alone: with the
+    same candidates, questions and reset seeds. (Matrix products may round otherwise in a batch than
     alone, in the last bits; and with ``deterministic=False`` the actions' noise is drawn for all
     rollouts of a question together.) The tasks are set in ``env`` for the rollouts, and known to
-    the oracles; inference never sees them.
+    the oracles; a rule that infers from answers never sees them.
 
-    :param model: See :class:`PreferenceAdapter`.
-    :param env: See :class:`PreferenceAdapter`; a task family. Any number of copies will do; twice
-        the number of tasks is best, and an id makes 60.
+    Arguments that are not explained here are those of :class:`PreferenceAdapter`.
+
+    :param env: A task family. Any number of copies will do; twice the number of tasks is best, and
+        an id makes 60.
     :param tasks: (n_tasks, task_dim).
     :param oracle_factory: Called as ``oracle_factory(env=vec_env, task=task, seed=seed + i)``,
         gives task i's oracle. The oracles' classes will do, and ``functools.partial(MistakeOracle,
-        0.1)``.
-    :param adapter: The method: :class:`PreferenceAdapter`, or a baseline's adapter that ends in a
-        latent.
-    :param n_queries: Answers per task.
+        0.1)``. The first task's oracle says how all err.
     :param record_at: Numbers of answers at which to keep the estimate; None keeps 0, 1, ...,
         n_queries.
     :param seed: Task i takes seed + i.
-    :param library: See :class:`PreferenceAdapter`.
-    :param progress_bar: Whether to show one.
     :param on_record: Called with all that there is so far, each time that estimates are kept. It
         may use ``vec_env``.
-    :param options: Further options of the adapter; for :class:`PreferenceAdapter` ``inference``,
-        ``query_rule``, ``n_candidates``, ``epsilon``, ``candidates``, ``likelihood``, ``decision``,
-        ``noise_model``, ``deterministic``.
-    :return: The estimates.
     :raises ValueError: If an argument is out of its range, or the model belongs to another
         environment.
     :raises TypeError: If an argument is of another kind.
     """
-    from tqdm import tqdm
-
     model, vec_env = model_and_env(model, env)
     _check_factory(oracle_factory)
     tasks = np.asarray(tasks, dtype=np.float64)
     if tasks.ndim != 2 or len(tasks) < 1:
         raise ValueError(
-            f"`tasks` must have shape (n_tasks, task_dim) with at least one task, but has shape {tasks.shape}"
+            "`tasks` must have shape (n_tasks, task_dim) with at least one task, but has shape "
+            f"{tasks.shape}"
         )
     check_whole("seed", seed, 0)
-    kept = _check_record_at(record_at, n_queries)
-    oracles = [
-        oracle_factory(env=vec_env, task=task, seed=seed + i) for i, task in enumerate(tasks)
-    ]
-    settings = adapter.make_options(oracles[0], n_queries=n_queries, **options)
-    settings.check(model, vec_env, library)
+    kept, numbered = _check_record_at(record_at, n_queries), list(enumerate(tasks, seed))
+    oracles = [oracle_factory(env=vec_env, task=task, seed=number) for number, task in numbered]
+    rule = (Bayes() if rule is None else as_rule(rule)).answered_by(oracles[0])
+    rule.check(model, Setting(n_queries, library, vec_env))
     warn_if_untrained(model)
     inferences = [
-        settings.make_inference(model, inference_rng(seed + i), library) for i in range(len(tasks))
+        rule.start(model, inference_rng(number), Setting(n_queries, library, vec_env, task))
+        for number, task in numbered
     ]
-
-    for inference, task in zip(inferences, tasks, strict=True):
-        if hasattr(inference, "bind"):  # a method that is allowed to read rewards
-            inference.bind(vec_env, task)
 
     preferences: list[list[Preference]] = [[] for _ in tasks]
     latents = np.empty((len(tasks), len(kept), model.latent_dim))
     for query in tqdm(range(n_queries + 1), unit="query", disable=not progress_bar):
         if query in kept:
-            row = kept.index(query)
-            latents[:, row] = [inference.estimate() for inference in inferences]
+            rows = kept.index(query) + 1
+            latents[:, rows - 1] = [inference.estimate() for inference in inferences]
             if on_record is not None:
-                on_record(
-                    TaskAdaptations(
-                        tasks,
-                        kept[: row + 1],
-                        latents[:, : row + 1].copy(),
-                        list(map(list, preferences)),
-                    )
-                )
+                told = list(map(list, preferences))
+                on_record(TaskAdaptations(tasks, kept[:rows], latents[:, :rows].copy(), told))
         if query == n_queries or query >= kept[-1]:
             break
-        shown: list[Trajectory] = []
-        if inferences[0].library is None:
-            pairs = [inference.ask_latents() for inference in inferences]
-            seeds = [rollout_seed(seed + i, query) for i in range(len(tasks))]
+        asked = [item for inference in inferences for item in inference.ask()]
+        shown = [item for item in asked if isinstance(item, Trajectory)]
+        if not shown:
             shown = rollout_latents(
                 model,
                 vec_env,
-                np.concatenate(pairs),
+                np.stack([latent_of(item) for item in asked]),
                 np.repeat(tasks, 2, axis=0),
-                np.repeat(seeds, 2).tolist(),
-                settings.deterministic,
+                np.repeat([rollout_seed(number, query) for number, _ in numbered], 2).tolist(),
+                deterministic and not rule.explores,
             )
-        else:
-            for inference in inferences:
-                shown += [inference.library[index] for index in inference.ask_library()]
         for i, (inference, oracle) in enumerate(zip(inferences, oracles, strict=True)):
             left, right = shown[2 * i], shown[2 * i + 1]
             answer = as_preference(oracle(left, right))
@@ -157,9 +144,9 @@ def _check_factory(oracle_factory: OracleFactory) -> None:
         inspect.signature(oracle_factory).bind(env=None, task=None, seed=0)
     except (TypeError, ValueError) as error:
         raise TypeError(
-            "`oracle_factory` must be called as oracle_factory(env=..., task=..., seed=...) and return a "
-            "task's oracle, such as the class ReturnOracle or functools.partial(MistakeOracle, 0.1), but "
-            f"is {oracle_factory!r}: {error}"
+            "`oracle_factory` must be called as oracle_factory(env=..., task=..., seed=...) and "
+            "return a task's oracle, such as the class ReturnOracle or "
+            f"functools.partial(MistakeOracle, 0.1), but is {oracle_factory!r}: {error}"
         ) from error
 
 
@@ -171,7 +158,7 @@ def _check_record_at(record_at: Sequence[int] | None, n_queries: int) -> tuple[i
         check_whole("record_at", k, 0)
     kept = tuple(sorted({int(k) for k in record_at}))
     if not kept or kept[-1] > n_queries:
-        raise ValueError(
-            f"`record_at` must hold numbers from 0 to n_queries={n_queries}, but is {tuple(record_at)}"
-        )
+        given = tuple(record_at)
+        allowed = f"numbers from 0 to n_queries={n_queries}"
+        raise ValueError(f"`record_at` must hold {allowed}, but is {given}")
     return kept

@@ -1,0 +1,216 @@
+"""What a known task would give, and Property 1 on held-out tasks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sb3_poem.adaptation.environments import Env, model_and_env
+from sb3_poem.adaptation.evaluation import (
+    choose_test_tasks,
+    evaluate_episodes,
+    evaluation_seed,
+)
+from sb3_poem.adaptation.limits import information_limit
+from sb3_poem.adaptation.meta_model import HasSimilarity, MetaModel
+from sb3_poem.adaptation.noise import NoiseModel
+from sb3_poem.common.checks import check_whole
+from sb3_poem.common.family_view import FamilyView
+from sb3_poem.common.rollouts import rollout_outcomes
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
+
+# Latents to try for each task, where every one must be rolled out in every task, and where one
+# rollout serves all of them.
+LATENTS_WITH_OWN_DYNAMICS, LATENTS_WITH_SHARED_DYNAMICS = 30, 300
+
+
+@dataclass(frozen=True, eq=False)
+class KnownTaskReturn:
+    """What the model's repertoire holds for each task.
+
+    :param tasks: (n_tasks, task_dim).
+    :param returns: (n_tasks, n_episodes) of each task's best latent, on episodes that had no part
+        in choosing it.
+    :param latents: (n_tasks, latent_dim) those latents.
+    :param candidate_latents: (n_latents, latent_dim) all that were tried.
+    :param candidate_returns: (n_tasks, n_latents) their returns on every task (J).
+    :param successes: (n_tasks, n_episodes), of the episodes of ``returns``; None for a family that
+        does not say.
+    """
+
+    tasks: np.ndarray
+    returns: np.ndarray
+    latents: np.ndarray
+    candidate_latents: np.ndarray
+    candidate_returns: np.ndarray
+    successes: np.ndarray | None = None
+
+    def __repr__(self) -> str:
+        latents = f"the best of {len(self.candidate_latents)} latents"
+        found = f"mean return {self.mean_return:.1f} of {latents}"
+        return f"KnownTaskReturn({len(self.tasks)} tasks, {found})"
+
+    @property
+    def mean_return(self) -> float:
+        """Mean over tasks and episodes."""
+        return float(self.returns.mean())
+
+    @property
+    def success_rate(self) -> float | None:
+        """Share of successful episodes; None for a family that does not say."""
+        return None if self.successes is None else float(self.successes.mean())
+
+    def limit(self, k: int, noise_model: NoiseModel | None = None) -> float:
+        """The mean return that :func:`information_limit` gives for k answers within this
+        repertoire.
+
+        :param noise_model: How the oracle errs; None is an oracle that does not.
+        """
+        returns, ordered = self.candidate_returns, self.tasks.shape[1] == 1
+        if ordered:
+            returns = returns[np.argsort(self.tasks[:, 0])]
+        return information_limit(returns, k, noise_model=noise_model, ordered=ordered)
+
+
+def known_task_return(
+    model: MetaModel | str | Path,
+    env: Env,
+    tasks: np.ndarray | int | None = None,
+    n_latents: int | None = None,
+    n_episodes: int = 10,
+    seed: int = 0,
+    *,
+    source: str = "both",
+    selection_episodes: int = 1,
+    deterministic: bool = True,
+) -> KnownTaskReturn:
+    """The return if the task were known: for each task the best of many latents.
+
+    Beside the adapted return it tells which to work on: the repertoire of policies, or the
+    inference among them. Where tasks share their dynamics every latent is rolled out once, and its
+    trajectory relabelled for every task. The winners are then rolled out anew, so that the luck of
+    having been chosen does not count.
+
+    :param model: See :func:`adapt_tasks`.
+    :param env: See :func:`adapt_tasks`.
+    :param tasks: See :func:`evaluate_adaptation`.
+    :param n_latents: How many latents to try; None for 300, or for 30 where tasks do not share
+        their dynamics and every latent must be rolled out in every task.
+    :param n_episodes: Fresh episodes per winner.
+    :param seed: Of the draws and the episodes.
+    :param source: Where latents come from: "prior", "aggregate", or "both" in equal parts.
+    :param selection_episodes: Episodes per latent (and task, where dynamics differ) for choosing.
+    :param deterministic: Whether policies act by their mode.
+    :raises ValueError: If an argument is out of its range.
+    """
+    model, vec_env = model_and_env(model, env)
+    tasks = choose_test_tasks(model, vec_env, tasks, seed)
+    if n_latents is None:
+        shared = FamilyView(vec_env).shared_dynamics
+        n_latents = LATENTS_WITH_SHARED_DYNAMICS if shared else LATENTS_WITH_OWN_DYNAMICS
+    check_whole("n_latents", n_latents, 1)
+    candidates = _draw_latents(model, n_latents, source, np.random.default_rng([seed, 2]))
+    start = evaluation_seed(seed, 1)
+    returns = return_matrix(
+        model, vec_env, tasks, candidates, selection_episodes, start, deterministic
+    )
+    best, start = candidates[np.argmax(returns, axis=1)], evaluation_seed(seed)
+    fresh = evaluate_episodes(model, vec_env, best, tasks, n_episodes, start, deterministic)
+    return KnownTaskReturn(tasks, fresh.returns, best, candidates, returns, fresh.successes)
+
+
+def return_matrix(
+    model: MetaModel,
+    vec_env: VecEnv,
+    tasks: np.ndarray,
+    latents: np.ndarray,
+    n_episodes: int = 1,
+    seed: int = 0,
+    deterministic: bool = True,
+) -> np.ndarray:
+    """J[i, j], (n_tasks, n_latents), the mean true return on task i of the policy of latent j.
+
+    :param vec_env: Of the task family. If its tasks share their dynamics each latent is rolled out
+        once for all tasks, else once for each.
+    :param tasks: (n_tasks, task_dim).
+    :param latents: (n_latents, latent_dim).
+    :param n_episodes: Episodes to average over.
+    :param seed: Where the reset seeds start.
+    :param deterministic: Whether policies act by their mode.
+    :raises ValueError: If shapes do not fit or an episode is not finite.
+    """
+    tasks, latents = np.asarray(tasks, dtype=np.float64), np.asarray(latents, dtype=np.float64)
+    family, shape = FamilyView(vec_env), (len(tasks), len(latents))
+    if not family.shared_dynamics:
+        every, rows = np.tile(latents, (shape[0], 1)), np.repeat(tasks, shape[1], axis=0)
+        how = n_episodes, seed, deterministic
+        return (
+            evaluate_episodes(model, vec_env, every, rows, *how).returns.mean(axis=1).reshape(shape)
+        )
+    # The task in effect does not matter, and it must be one that every copy accepts.
+    some_task = np.repeat(tasks[:1], n_episodes * shape[1], axis=0)
+    every = np.tile(latents, (n_episodes, 1))
+    outcomes = rollout_outcomes(model, vec_env, every, some_task, seed, deterministic)
+    features = [outcome.reward_features[None] for outcome in outcomes]
+    totals = [family.compute_rewards(tasks[:, None], each).sum(axis=1) for each in features]
+    return np.stack(totals, axis=1).reshape(shape[0], n_episodes, shape[1]).mean(axis=1)
+
+
+def property_one(similarities: np.ndarray, returns: np.ndarray) -> tuple[float, float]:
+    """How well S orders policies as true returns do (Property 1).
+
+    :param similarities: (n_tasks, n_policies) S(z_i, z_j).
+    :param returns: (n_tasks, n_policies) J[i, j].
+    :return: Preference accuracy, the share of pairs of policies with different returns that S puts
+        in the right order (a tie of S counts one half); and Kendall's tau-b, averaged over tasks.
+        NaN if no task tells any two policies apart.
+    :raises ValueError: If the shapes differ.
+    """
+    similarities = np.asarray(similarities, dtype=np.float64)
+    returns = np.asarray(returns, dtype=np.float64)
+    if similarities.shape != returns.shape or similarities.ndim != 2:
+        raise ValueError(
+            "`similarities` and `returns` must have the same shape (n_tasks, n_policies), but have "
+            f"{similarities.shape} and {returns.shape}"
+        )
+    first, second = np.triu_indices(returns.shape[1], 1)
+    order = np.sign(returns[:, first] - returns[:, second])
+    guess = np.sign(similarities[:, first] - similarities[:, second])
+    decided = np.count_nonzero(order)
+    if not decided:
+        return float("nan"), float("nan")
+    agreement = order * guess
+    accuracy = float((0.5 * (1.0 + agreement))[order != 0].mean())
+    norms = np.sqrt(np.abs(order).sum(axis=1) * np.abs(guess).sum(axis=1))
+    told = np.abs(order).sum(axis=1) > 0
+    tau = np.divide(agreement.sum(axis=1), norms, out=np.zeros(len(norms)), where=norms > 0)
+    return accuracy, float(tau[told].mean())
+
+
+def preference_order(model: HasSimilarity, known: KnownTaskReturn) -> tuple[float, float]:
+    """Property 1 on held-out tasks. A held-out task's latent is the best of the candidates for it;
+    S between those latents is compared with the returns of their policies on those tasks.
+
+    :return: Preference accuracy and Kendall's tau, see :func:`property_one`.
+    """
+    best = np.argmax(known.candidate_returns, axis=1)
+    policies = np.unique(best)
+    similarities = model.similarities(known.latents, known.candidate_latents[policies])
+    return property_one(similarities, known.candidate_returns[:, policies])
+
+
+def _draw_latents(model: MetaModel, n: int, source: str, rng: np.random.Generator) -> np.ndarray:
+    if source in ("prior", "aggregate"):
+        return model.sample_latents(n, rng, source=source)
+    if source != "both":
+        raise ValueError(f'`source` must be "prior", "aggregate" or "both", but is {source!r}')
+    half = n // 2
+    prior = model.sample_latents(n - half, rng, source="prior")
+    if not half:
+        return prior
+    return np.concatenate([prior, model.sample_latents(half, rng, source="aggregate")])

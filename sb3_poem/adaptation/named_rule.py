@@ -1,0 +1,36 @@
+"""Rules by their short form: words, as a command line and the sessions of the page have them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sb3_poem.adaptation.bayes import Bayes
+from sb3_poem.adaptation.noise import MistakeNoise
+from sb3_poem.adaptation.paper import Paper
+from sb3_poem.adaptation.rule import Rule, check_choice
+
+
+def named_rule(
+    inference: str = "bayes",
+    n_candidates: int | None = None,
+    mistake_rate: float | None = None,
+    **options: Any,
+) -> Rule:
+    """The rule that these words mean.
+
+    :param inference: "bayes" or "paper".
+    :param n_candidates: Of Algorithm 2, or particles; None takes the rule's own number.
+    :param mistake_rate: How often who answers errs, which Algorithm 2 takes no notice of.
+    :param options: Others of the rule.
+    :raises ValueError: If one is out of its range.
+    """
+    check_choice("inference", inference, ("bayes", "paper"))
+    if inference == "paper":
+        if n_candidates is not None:
+            options["n_candidates"] = n_candidates
+        return Paper(**options)
+    if n_candidates is not None:
+        options["n_particles"] = n_candidates
+    if mistake_rate is not None:
+        options["noise_model"] = MistakeNoise(mistake_rate)
+    return Bayes(**options)

@@ -1,0 +1,186 @@
+"""The paper's own rule, Algorithm 2 of Xu & Zhu (2025)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sb3_poem.adaptation.meta_model import HasSimilarity, MetaModel
+from sb3_poem.adaptation.preference import SIGNS, Preference, preference_log_likelihood
+from sb3_poem.adaptation.priors import SOURCES, make_prior
+from sb3_poem.adaptation.queries import (
+    QUERY_RULES,
+    check_epsilon,
+    information_gains,
+    pair_at,
+    pair_differences,
+    random_pair,
+    tolerance,
+    worst_case_pair,
+)
+from sb3_poem.adaptation.rule import (
+    Answer,
+    Inference,
+    Rule,
+    Setting,
+    Shown,
+    check_choice,
+    latent_of,
+)
+from sb3_poem.common.checks import check_whole
+
+# Bound on the draws for a question.
+MAX_DRAWS = 16384
+
+
+@dataclass(frozen=True, repr=False)
+class Paper(Rule):
+    """Algorithm 2 of Xu & Zhu (2025): candidates that satisfy every answer within the tolerance of
+    eq. 9, the pair of eq. 10, and the candidate of highest Bradley-Terry likelihood (line 17).
+
+    The paper's loop draws until N_z candidates are found, which need not happen: contradicting
+    answers leave no such latent, and the accepted share halves with every answer. Here the draws
+    are bounded; what is missing is filled up by the draws that satisfy most answers, and among
+    those by the highest likelihood. EQUAL excludes nobody.
+
+    :param n_candidates: N_z, at least 2.
+    :param epsilon: Tolerated error of eq. 9, in [0, 0.5).
+    :param candidates: Where they come from: "prior" (the paper's N(0, I)) or "aggregate" (the
+        training tasks' posteriors).
+    :param query_rule: "worst-case" (the paper's), "information-gain" or "random".
+    :raises ValueError: If an option is out of its range.
+    """
+
+    n_candidates: int = 100
+    epsilon: float = 0.1
+    candidates: str = "prior"
+    query_rule: str = "worst-case"
+
+    refuses_library = "Algorithm 2 compares its own candidates; Bayes() asks about a library"
+
+    def __post_init__(self) -> None:
+        check_whole("n_candidates", self.n_candidates, 2)  # a question compares two
+        check_epsilon(self.epsilon)
+        check_choice("candidates", self.candidates, SOURCES)
+        check_choice("query_rule", self.query_rule, QUERY_RULES)
+
+    def check(self, model: MetaModel, setting: Setting) -> None:
+        """See :class:`Rule`: Algorithm 2 needs S."""
+        super().check(model, setting)
+        if not isinstance(model, HasSimilarity):
+            name = type(model).__name__
+            raise ValueError(f"rule=Paper() needs a model with a similarity S; {name} has none")
+
+    def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> PaperInference:
+        """See :class:`Rule`."""
+        return PaperInference(self, model, rng)
+
+
+class PaperInference(Inference):
+    """See :class:`Paper`."""
+
+    state = ("candidates", "fresh")
+
+    def __init__(self, rule: Paper, model: Any, rng: np.random.Generator) -> None:
+        super().__init__(rng)
+        self.rule, self.model = rule, model
+        self.prior = make_prior(model, rule.candidates, rng)
+        self.candidates = self.prior.sample(rule.n_candidates, rng)
+        self.fresh = np.array([True])
+
+    def ask(self) -> tuple[Shown, Shown]:
+        """See :class:`Inference`. Draws the candidate set anew, as lines 3 to 9 do."""
+        if not self.fresh:
+            self.candidates = self._draw_candidates()
+            self.fresh = np.array([True])
+        if self.rule.query_rule == "random":
+            first, second = random_pair(len(self.candidates), self.rng)
+        else:
+            similarities = self.model.similarities(self.candidates, self.candidates)
+            if self.rule.query_rule == "worst-case":
+                first, second = worst_case_pair(similarities, self.rule.epsilon)
+            else:
+                first, second = self._most_informative(similarities)
+        return self.candidates[first].copy(), self.candidates[second].copy()
+
+    def tell(self, preference: Preference, left: Shown, right: Shown) -> None:
+        """See :class:`Inference`."""
+        self.answers.append(Answer(preference, left, right))
+        self.fresh = np.array([False])
+
+    def estimate(self) -> np.ndarray:
+        """See :class:`Inference`. Line 17: of the candidates that were drawn for the last question
+        the one under which the answers, the last one included, are most likely; before any answer
+        the one nearest to their centre.
+        """
+        if not self.answers:
+            distances = np.linalg.norm(self.candidates - self.candidates.mean(axis=0), axis=1)
+            return self.candidates[np.argmin(distances)].copy()
+        differences = self._differences(self.candidates)
+        return self.candidates[np.argmax(self._log_likelihoods(differences))].copy()
+
+    def satisfied(self, latents: np.ndarray) -> np.ndarray:
+        """(m,) how many answers each latent (m, d) satisfies within the tolerance (eq. 9)."""
+        if not self.answers:
+            return np.zeros(len(latents), dtype=np.int64)
+        return self._satisfied(self._differences(latents))
+
+    def _most_informative(self, similarities: np.ndarray) -> tuple[int, int]:
+        probabilities = np.exp(log_sigmoid(pair_differences(similarities)))  # eq. 7
+        n = len(self.candidates)
+        gains = information_gains(probabilities, np.full(n, 1.0 / n))
+        return pair_at(int(np.argmax(gains)), n)
+
+    def _differences(self, latents: np.ndarray) -> np.ndarray:
+        """(m, k) S(z, z_left) - S(z, z_right) of every answered question."""
+        shown = [item for answer in self.answers for item in (answer.left, answer.right)]
+        similarities = self.model.similarities(latents, np.stack([latent_of(z) for z in shown]))
+        return similarities[:, 0::2] - similarities[:, 1::2]
+
+    def _satisfied(self, differences: np.ndarray) -> np.ndarray:
+        slack = tolerance(self.rule.epsilon)
+        signs = np.array([SIGNS[answer.preference] for answer in self.answers])
+        return np.count_nonzero(differences * signs >= -slack, axis=1)
+
+    def _log_likelihoods(self, differences: np.ndarray) -> np.ndarray:
+        told = [answer.preference for answer in self.answers]
+        return preference_log_likelihood(log_sigmoid(differences), log_sigmoid(-differences), told)
+
+    def _draw_candidates(self) -> np.ndarray:
+        """Lines 3 to 9, bounded. The last question's candidates take part in the fall-back alone:
+        line 3 starts afresh.
+        """
+        rest = [(self.candidates, self._differences(self.candidates))]
+        found: list[np.ndarray] = []
+        max_draws = max(MAX_DRAWS, self.rule.n_candidates)
+        n_found, drawn, batch = 0, 0, max(1024, self.rule.n_candidates)
+        while n_found < self.rule.n_candidates and drawn < max_draws:
+            latents = self.prior.sample(min(batch, max_draws - drawn), self.rng)
+            drawn += len(latents)
+            batch *= 2
+            differences = self._differences(latents)
+            accepted = self._satisfied(differences) == len(self.answers)
+            found.append(latents[accepted])
+            rest.append((latents[~accepted], differences[~accepted]))
+            n_found += int(np.count_nonzero(accepted))
+        if n_found < self.rule.n_candidates:
+            latents, differences = (np.concatenate(parts) for parts in zip(*rest, strict=True))
+            found.append(latents[self._best(differences, self.rule.n_candidates - n_found)])
+        return np.concatenate(found)[: self.rule.n_candidates]
+
+    def _best(self, differences: np.ndarray, n: int) -> np.ndarray:
+        """Rows of the n latents that satisfy most answers, and among equals are the likeliest; best
+        first.
+        """
+        satisfied = self._satisfied(differences)
+        worst = len(satisfied) - n
+        contenders = np.flatnonzero(satisfied >= np.partition(satisfied, worst)[worst])
+        likelihoods = self._log_likelihoods(differences[contenders])
+        return contenders[np.lexsort((-likelihoods, -satisfied[contenders]))[:n]]
+
+
+def log_sigmoid(x: np.ndarray) -> np.ndarray:
+    """log(1 / (1 + exp(-x))) without overflow."""
+    return np.minimum(x, 0.0) - np.log1p(np.exp(-np.abs(x)))

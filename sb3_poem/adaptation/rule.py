@@ -1,0 +1,250 @@
+"""What a rule of inference is: options that start an inference, which asks and is told."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, TypeVar
+
+import numpy as np
+
+from sb3_poem.adaptation.environments import check_model_fits
+from sb3_poem.adaptation.meta_model import MetaModel
+from sb3_poem.adaptation.preference import Preference
+from sb3_poem.adaptation.state import generator_from_state
+from sb3_poem.common.trajectory import Trajectory, decode_array, encode_array
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
+
+# What a question compares: trajectories, or the latents of policies to roll out.
+Shown: TypeAlias = Trajectory | np.ndarray
+SelfRule = TypeVar("SelfRule", bound="Rule")
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """One answered question: the answer, and what stood left and right."""
+
+    preference: Preference
+    left: Shown
+    right: Shown
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """An inference between two answers: its generator's state, and all else that changes."""
+
+    random_state: dict[str, Any]
+    arrays: dict[str, np.ndarray]
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready."""
+        arrays = {name: encode_array(array) for name, array in self.arrays.items()}
+        return {"random_state": self.random_state, "arrays": arrays}
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Snapshot:
+        """Read what :meth:`to_dict` wrote.
+
+        :raises ValueError: If it is incomplete or broken.
+        """
+        try:
+            arrays = {str(name): decode_array(array) for name, array in data["arrays"].items()}
+            return cls(dict(data["random_state"]), arrays)
+        except (KeyError, AttributeError, TypeError) as error:
+            raise ValueError(f"not a stored posterior: {error!r}") from error
+
+
+class Inference(ABC):
+    """One task's inference under a rule: ``ask`` says what to compare, ``tell`` takes the answer,
+    ``estimate`` gives the latent to act on.
+
+    :param rng: The only source of randomness.
+    """
+
+    #: Names of the attributes, arrays, that change while answers come in, beside the answers and
+    #: the generator.
+    state: ClassVar[tuple[str, ...]] = ()
+    #: Trajectories to ask about; None where questions are new rollouts.
+    library: list[Trajectory] | None = None
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng = rng
+        self.answers: list[Answer] = []
+
+    @abstractmethod
+    def ask(self) -> tuple[Shown, Shown]:
+        """What to compare next: two latents (d,) to roll out, or two trajectories to show."""
+
+    def same_latents(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The latents of a question from a file; others where a latent means something to one model
+        object alone.
+        """
+        return left, right
+
+    @abstractmethod
+    def tell(self, preference: Preference, left: Shown, right: Shown) -> None:
+        """Take an answer about two trajectories, or their latents where the rule needs no more."""
+
+    @abstractmethod
+    def estimate(self) -> np.ndarray:
+        """(d,) the latent to act on, given the answers so far."""
+
+    def snapshot(self) -> Snapshot:
+        """A copy of the posterior and the random state, as they are now."""
+        arrays = {name: np.array(getattr(self, name)) for name in self.state}
+        return Snapshot(dict(self.rng.bit_generator.state), arrays)
+
+    def restore(self, snapshot: Snapshot, answers: list[Answer]) -> None:
+        """Go back, or on, to a snapshot and the answers up to then.
+
+        :raises ValueError: If the snapshot belongs to another kind of inference.
+        """
+        missing = [name for name in self.state if name not in snapshot.arrays]
+        if missing:
+            raise ValueError(f"not a snapshot of {type(self).__name__}: {missing[0]} is missing")
+        for name in self.state:
+            setattr(self, name, snapshot.arrays[name].copy())
+        self.rng = generator_from_state(snapshot.random_state)
+        self.answers = list(answers)
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """What an adaptation is given beside model and rule.
+
+    :param n_queries: How many answers there will be.
+    :param library: Trajectories to ask about instead of new rollouts.
+    :param env: Where rollouts are made; None where none are.
+    :param task: (task_dim,) for a rule that may read rewards: by which; None takes the one in
+        effect in ``env``. A rule that infers from answers does not look at it.
+    """
+
+    n_queries: int = 10
+    library: Sequence[Trajectory] | None = None
+    env: VecEnv | None = None
+    task: np.ndarray | None = None
+
+
+@dataclass(frozen=True, repr=False)
+class Rule(ABC):
+    """How to ask and how to infer: a rule's own options and nothing else.
+
+    A rule of your own is a frozen dataclass that subclasses this, says in ``__post_init__`` which
+    values its options may have, and starts an :class:`Inference`.
+    """
+
+    #: Whether questions show policies with their exploration noise, whatever the adapter says.
+    explores: ClassVar[bool] = False
+    #: Why the rule takes no library; None if it takes one.
+    refuses_library: ClassVar[str | None] = None
+
+    _known: ClassVar[dict[str, type[Rule]]] = {}
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        Rule._known[cls.__name__] = cls
+
+    def __repr__(self) -> str:
+        chosen = ((f.name, getattr(self, f.name), f.default) for f in fields(self))
+        options = ", ".join(f"{name}={value!r}" for name, value, usual in chosen if value != usual)
+        return f"{type(self).__name__}({options})"
+
+    def check(self, model: MetaModel, setting: Setting) -> None:
+        """Refuse what the rule cannot run with, before anything starts.
+
+        :raises ValueError: If something does not fit.
+        """
+        if setting.env is not None:
+            check_model_fits(model, setting.env)
+        if setting.library is not None and self.refuses_library:
+            raise ValueError(f"`library` must be None: {self.refuses_library}")
+        if setting.library is not None and len(setting.library) < 2:
+            n = len(setting.library)
+            raise ValueError(f"`library` must hold at least 2 trajectories, but holds {n}")
+
+    @abstractmethod
+    def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> Inference:
+        """Begin with a task, with what :meth:`check` has accepted."""
+
+    def answered_by(self: SelfRule, oracle: Any) -> SelfRule:
+        """The rule for the answers of this oracle: itself, where it makes no difference."""
+        return self
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready."""
+        options = {f.name: getattr(self, f.name) for f in fields(self)}
+        for name, value in options.items():  # JSON does not know NumPy's numbers
+            options[name] = value.item() if isinstance(value, np.generic) else value
+        return {"name": type(self).__name__, "module": type(self).__module__, "options": options}
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Rule:
+        """Read what :meth:`to_dict` of any rule wrote.
+
+        :raises ValueError: If there is no rule of this name, or an option is out of its range.
+        """
+        name, module = data["name"], data["module"]
+        if name not in cls._known:
+            raise ValueError(
+                f"the rule is {name!r}, which this program does not know: import it first, by "
+                f"`from {module} import {name}`"
+            )
+        return cls._known[name]._of_options(data["options"])
+
+    @classmethod
+    def _of_options(cls: type[SelfRule], options: dict[str, Any]) -> SelfRule:
+        return cls(**options)
+
+
+def as_rule(rule: Any) -> Rule:
+    """A rule as it is.
+
+    :raises TypeError: If it is none; the message says what to write.
+    """
+    if isinstance(rule, Rule):
+        return rule
+    if isinstance(rule, type):
+        name = rule.__name__
+        raise TypeError(f"`rule` is the class {name}, but must be an object: {name}()")
+    known = {name.lower(): name for name in Rule._known}
+    meant = f"; write rule={known[rule.lower()]}()" if str(rule).lower() in known else ""
+    objects = "Bayes(), Paper(n_candidates=50) or ANOLE()"
+    raise TypeError(f"`rule` must be an object as {objects}, but is {rule!r}{meant}")
+
+
+def check_choice(name: str, value: Any, allowed: Sequence[str | None]) -> None:
+    """Refuse an option's value that is none of those allowed.
+
+    :raises ValueError: Names the option, the value and what it may be.
+    """
+    if value not in allowed:
+        raise ValueError(f"`{name}` must be one of {tuple(allowed)}, but is {value!r}")
+
+
+def latent_of(shown: Shown) -> np.ndarray:
+    """(d,) the latent behind what was shown."""
+    return shown.latent if isinstance(shown, Trajectory) else np.asarray(shown, dtype=np.float64)
+
+
+def trajectories_of(name: str, left: Shown, right: Shown) -> list[Trajectory]:
+    """Both, as trajectories, which a rule of that name needs.
+
+    :raises ValueError: If one is a latent alone.
+    """
+    if not (isinstance(left, Trajectory) and isinstance(right, Trajectory)):
+        shown = "the two trajectories that were shown, not their latents alone"
+        raise ValueError(f"{name} needs {shown}")
+    return [left, right]
+
+
+def inference_rng(seed: int) -> np.random.Generator:
+    """The generator of an adaptation's inference, from the adaptation's seed."""
+    return np.random.default_rng([seed, 0])
+
+
+def rollout_seed(seed: int, query: int) -> int:
+    """The reset seed of both rollouts of a question, from 0, of an adaptation with this seed."""
+    return int(np.random.SeedSequence([seed, 1, query]).generate_state(1)[0] >> 1)

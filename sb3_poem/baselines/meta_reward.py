@@ -1,0 +1,238 @@
+"""A meta-trained reward, which a few answers adapt to a task (Hejna & Sadigh 2023)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from safetensors import SafetensorError
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as tensors_to_bytes
+
+from sb3_poem.adaptation.preference import SIGNS
+from sb3_poem.adaptation.rule import Answer, trajectories_of
+from sb3_poem.adaptation.state import read_json, write_json_atomically
+from sb3_poem.baselines.fragments import default_fragment_length, replay_fragments
+from sb3_poem.baselines.maml import (
+    Parameters,
+    PreferencePairs,
+    RewardNetwork,
+    adapt_parameters,
+    maml_loss,
+)
+from sb3_poem.baselines.transitions import transition_rows
+from sb3_poem.common.checks import check_whole
+from sb3_poem.common.digest import digest_of
+from sb3_poem.common.files import write_atomically
+from sb3_poem.common.trajectory import Trajectory
+from sb3_poem.pearl_sac import PEARLSAC
+from sb3_poem.pearl_sac.policies import LatentPolicy
+
+FORMAT = "sb3_poem meta reward 1"
+WEIGHTS, CONFIG = "reward.safetensors", "reward.json"
+
+
+class MetaReward:
+    """A reward network from which a few preferences lead to a task's reward.
+
+    :param policy: Whose standardisation of observations is used.
+    :param net_arch: Hidden layers of the network.
+    :param inner_learning_rate: Step size of MAML's inner loop.
+    :param inner_steps: Gradient steps of the inner loop.
+    :param seed: Of the initial parameters.
+    """
+
+    def __init__(
+        self,
+        policy: LatentPolicy,
+        net_arch: Sequence[int] = (64, 64),
+        inner_learning_rate: float = 0.1,
+        inner_steps: int = 5,
+        seed: int = 0,
+    ) -> None:
+        if not inner_learning_rate > 0:
+            rate = inner_learning_rate
+            raise ValueError(f"`inner_learning_rate` must be positive, but is {rate}")
+        check_whole("inner_steps", inner_steps, 1)
+        self.policy = policy
+        self.inner_learning_rate, self.inner_steps = inner_learning_rate, inner_steps
+        self.net_arch = tuple(int(width) for width in net_arch)
+        in_dim = 2 * spaces.flatdim(policy.observation_space) + spaces.flatdim(policy.action_space)
+        with th.random.fork_rng():
+            th.manual_seed(seed)
+            self.network = RewardNetwork(in_dim, net_arch).to(policy.device)
+        self.parameters: Parameters = {
+            name: value.detach().clone() for name, value in self.network.named_parameters()
+        }
+
+    @property
+    def digest(self) -> str:
+        """Of its numbers, the standardisation's included."""
+        return digest_of({**self.parameters, **_standardisation(self.policy)})
+
+    def save(self, folder: str | Path) -> None:
+        """Write the parameters as safetensors and the settings as JSON, into a folder that is made
+        if missing.
+
+        :raises OSError: If it cannot be written.
+        """
+        own = {f"network.{name}": value.detach() for name, value in self.parameters.items()}
+        tensors = {**own, **_standardisation(self.policy)}
+        config = {
+            "format": FORMAT,
+            "net_arch": list(self.net_arch),
+            "inner_learning_rate": self.inner_learning_rate,
+            "inner_steps": self.inner_steps,
+        }
+        content = {name: value.cpu().contiguous() for name, value in tensors.items()}
+        write_atomically(Path(folder) / WEIGHTS, tensors_to_bytes(content))
+        write_json_atomically(Path(folder) / CONFIG, config)
+
+    @classmethod
+    def load(cls, folder: str | Path, policy: LatentPolicy) -> MetaReward:
+        """Read what :meth:`save` wrote.
+
+        :param policy: The one with which it was meta-trained.
+        :raises FileNotFoundError: If the folder does not hold one.
+        :raises ValueError: If a file is broken or of another version, or the policy is another one.
+        """
+        weights, settings = Path(folder) / WEIGHTS, Path(folder) / CONFIG
+        if not settings.is_file():
+            raise FileNotFoundError(f"{folder} holds no meta-trained reward: it has no {CONFIG}")
+        config = read_json(settings)
+        if config.get("format") != FORMAT:
+            expected = f"expected format {FORMAT!r}"
+            raise ValueError(f"{settings} is not of this version of sb3_poem ({expected})")
+        try:
+            tensors = load_tensors(weights.read_bytes())
+        except SafetensorError as error:
+            raise ValueError(f"{weights} is truncated, or no safetensors file: {error}") from error
+        for name, value in _standardisation(policy).items():
+            kept = tensors.get(name)
+            if kept is None or kept.shape != value.shape or not th.equal(kept, value.cpu()):
+                raise ValueError(
+                    "`policy` is not the one with which the reward in "
+                    f"{folder} was meta-trained: its {name} differs; load the same model again"
+                )
+        meta = cls(policy, config["net_arch"], config["inner_learning_rate"], config["inner_steps"])
+        shapes = {f"network.{name}": value.shape for name, value in meta.parameters.items()}
+        if shapes != {name: t.shape for name, t in tensors.items() if name.startswith("network.")}:
+            raise ValueError(f"{weights} does not hold the network that {CONFIG} describes")
+        for name in meta.parameters:
+            meta.parameters[name] = tensors[f"network.{name}"].to(policy.device)
+        return meta
+
+    def transitions(self, trajectory: Trajectory) -> th.Tensor:
+        """(T, in_dim + 1) standardised (s, a, s') of a trajectory, and 1."""
+        return transition_rows(self.policy, trajectory, 1.0)
+
+    def adapted(self, answers: Sequence[Answer]) -> Parameters:
+        """The network's parameters after some answers, about trajectories of any length."""
+        parameters = self.parameters
+        if not answers:
+            return parameters
+        shown = [trajectories_of("MAML-reward", item.left, item.right) for item in answers]
+        longest = max(len(trajectory) for pair in shown for trajectory in pair)
+        left, right = (
+            th.stack([_filled(self.transitions(trajectory), longest) for trajectory in side])
+            for side in zip(*shown, strict=True)
+        )
+        labels = [0.5 + 0.5 * SIGNS[answer.preference] for answer in answers]
+        pairs = PreferencePairs(left, right, th.tensor(labels, device=left.device))
+        rate, steps = self.inner_learning_rate, self.inner_steps
+        adapted = adapt_parameters(self.network, parameters, pairs, rate, steps)
+        return {name: value.detach() for name, value in adapted.items()}
+
+    def rewards(self, parameters: Parameters, trajectory: Trajectory) -> np.ndarray:
+        """(T,) predicted rewards with what :meth:`adapted` gave, in the network's own unit."""
+        inputs = (self.transitions(trajectory),)
+        with th.no_grad():
+            predicted = th.func.functional_call(self.network, parameters, inputs)
+        return predicted.double().cpu().numpy()
+
+
+def meta_train_reward(
+    model: PEARLSAC,
+    n_iterations: int = 500,
+    n_fragments: int = 500,
+    fragment_length: int | None = None,
+    tasks_per_batch: int = 16,
+    n_support: int = 10,
+    n_query: int = 10,
+    learning_rate: float = 1e-3,
+    seed: int = 0,
+    **arguments: Any,
+) -> MetaReward:
+    """Meta-train a reward on the preferences of a model's training tasks about fragments from its
+    replay buffer.
+
+    Every training task judges fragments of all of them, so the family must share dynamics.
+
+    :param model: A trained model with its environment and its replay buffer.
+    :param n_iterations: Steps of the outer loop.
+    :param n_fragments: Fragments that pairs are drawn from.
+    :param fragment_length: Steps of a fragment; None takes 50, or an episode that is shorter.
+    :param tasks_per_batch: Tasks in an outer step (all, if there are fewer).
+    :param n_support: Pairs that a task adapts to.
+    :param n_query: Pairs that it is judged by.
+    :param learning_rate: Of Adam in the outer loop.
+    :param seed: Of everything.
+    :param arguments: Of :class:`MetaReward`.
+    :raises ValueError: If the family does not share dynamics, or the replay buffer is empty.
+    """
+    if not model.family.shared_dynamics:
+        raise ValueError(
+            "`model` must be of a family whose tasks share their dynamics, but those of "
+            f"{model.family.env_id} do not: MAML-reward lets every training task judge all tasks' "
+            "fragments"
+        )
+    if not model.replay_buffer.counts.any():
+        empty = "has an empty replay buffer (a loaded model has none)"
+        raise ValueError(f"`model` {empty}: call load_replay_buffer")
+    check_whole("n_iterations", n_iterations, 1)
+    check_whole("n_support", n_support, 1)
+    check_whole("n_query", n_query, 1)
+    rng = np.random.default_rng([seed, 5])
+    meta = MetaReward(model.policy, seed=seed, **arguments)
+    length = default_fragment_length(model.horizon) if fragment_length is None else fragment_length
+    fragments = replay_fragments(model, n_fragments, length, rng)
+    inputs = th.stack([meta.transitions(fragment) for fragment in fragments])
+    features = np.stack([np.asarray(fragment.reward_features) for fragment in fragments])
+    tasks = model.train_tasks.tasks[:, None, None, :]
+    returns = model.family.compute_rewards(tasks, features[None]).sum(axis=2)
+    parameters = {name: value.requires_grad_() for name, value in meta.parameters.items()}
+    optimizer = th.optim.Adam(parameters.values(), lr=learning_rate)
+    n_tasks = min(tasks_per_batch, len(returns))
+    for _ in range(n_iterations):
+        judges = rng.choice(len(returns), size=n_tasks, replace=False)
+        support, query = (_judged(inputs, returns, judges, n, rng) for n in (n_support, n_query))
+        optimizer.zero_grad()
+        rate, steps = meta.inner_learning_rate, meta.inner_steps
+        maml_loss(meta.network, parameters, support, query, rate, steps).backward()
+        optimizer.step()
+    meta.parameters = {name: value.detach() for name, value in parameters.items()}
+    return meta
+
+
+def _judged(
+    inputs: th.Tensor, returns: np.ndarray, tasks: np.ndarray, n: int, rng: np.random.Generator
+) -> PreferencePairs:
+    """n pairs for each of some tasks, by their returns (all tasks, fragments)."""
+    left, right = rng.integers(len(inputs), size=(2, len(tasks), n))
+    rows = tasks[:, None]
+    label = 0.5 + 0.5 * np.sign(returns[rows, left] - returns[rows, right])
+    labels = th.as_tensor(label, dtype=inputs.dtype, device=inputs.device)
+    return PreferencePairs(inputs[left], inputs[right], labels)
+
+
+def _standardisation(policy: LatentPolicy) -> dict[str, th.Tensor]:
+    """How observations are standardised, without which the parameters mean nothing."""
+    return {"obs_mean": policy.obs_norm.mean, "obs_std": policy.obs_norm.std}
+
+
+def _filled(rows: th.Tensor, length: int) -> th.Tensor:
+    return th.cat([rows, rows.new_zeros(length - len(rows), rows.shape[1])])
