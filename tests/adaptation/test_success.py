@@ -4,8 +4,6 @@ benchmark's table.
 
 import functools
 import json
-import sys
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -18,7 +16,6 @@ from sb3_poem.adaptation import evaluate_adaptation, evaluate_episodes, known_ta
 from sb3_poem.cli import main
 from sb3_poem.common.vec_env import make_task_vec_env
 
-sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 SMALL = {"net_arch": {"pi": [16], "qf": [16], "encoder": [16], "decoder": [16], "embedding": [8]}}
 
 
@@ -150,20 +147,3 @@ def test_the_command_line_reports_them(env_id, tmp_path, capsys):
     assert np.mean(data["task_success_rates"], axis=0) == pytest.approx(data["success_rate"])
     assert 0.0 <= data["known_task_success_rate"] <= 1.0
     assert "success rate" in capsys.readouterr().out
-
-
-def test_the_benchmarks_table_has_them():
-    import adaptation
-
-    result = {
-        "inference": "bayes",
-        "candidates": "prior",
-        "success_rate": [0.0, 0.25, 1.0],
-        "known_task_success_rate": 0.5,
-    }
-    run = {"training": {"seed": 0}, "adaptations": [result]}
-    assert (
-        adaptation.success_table([run])[-1] == "| 0 | bayes | prior | 0.00 | 0.25 | 1.00 | 0.50 |"
-    )
-    del result["success_rate"]
-    assert adaptation.success_table([run]) == []
