@@ -1,0 +1,66 @@
+"""The documentation site: `make docs` builds it."""
+
+import inspect
+import re
+import sys
+from pathlib import Path
+
+TOP = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(TOP / "tests"))  # toy families that pages use
+
+import gymnasium as gym  # noqa: E402
+
+import sb3_poem  # noqa: E402
+
+project = "sb3_poem"
+author = "the sb3_poem contributors"
+copyright = author
+version = release = sb3_poem.__version__
+
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.viewcode",
+]
+exclude_patterns = ["_build", "environments/_*"]
+nitpicky = False
+
+html_theme = "furo"
+html_title = "sb3_poem"
+html_static_path = ["_static"]
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented"
+
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 3
+# Tutorials run while the site is built; what they print and draw is what the page shows.
+nb_execution_mode = "cache"
+nb_execution_timeout = 300
+nb_execution_raise_on_error = True
+nb_execution_excludepatterns = []
+suppress_warnings = ["mystnb.unknown_mime_type"]
+
+
+def environment_pages(_app: object) -> None:
+    """A page a family, made from the docstring of its environment's class."""
+    folder = TOP / "docs/environments"
+    for spec in sorted(gym.registry.values(), key=lambda spec: spec.id):
+        if spec.namespace != "poem":
+            continue
+        cls = gym.envs.registration.load_env_creator(spec.entry_point)
+        text = re.sub(r":\w+:`~?[\w.]*?\.?(\w+)`", r"`\1`", inspect.getdoc(cls) or "")
+        picture = f"../_static/environments/{spec.name}.webp"
+        shown = f"![{spec.name}]({picture})\n\n" if (folder / picture).exists() else ""
+        facts = f"`gymnasium.make({spec.id!r})`, {spec.max_episode_steps} steps an episode.\n\n"
+        page = folder / f"{spec.name}.md"
+        content = f"# {spec.name}\n\n{facts}{shown}{text}\n"
+        if not page.exists() or page.read_text() != content:
+            page.write_text(content)
+
+
+def setup(app: object) -> None:
+    """Sphinx calls this."""
+    app.connect("builder-inited", environment_pages)
