@@ -1,0 +1,59 @@
+"""Makes the pictures of README and of the families' pages anew: ``python docs/pictures.py``.
+
+They are films of the models that ship, so they change with them. Needs off-screen rendering.
+"""
+
+import tempfile
+from pathlib import Path
+
+import gymnasium as gym
+import imageio.v3 as iio
+import numpy as np
+from PIL import Image
+
+import sb3_poem
+from sb3_poem import cli
+from sb3_poem.adaptation import AdaptedPolicy
+from sb3_poem.resources import shipped_folder
+
+STATIC = Path(__file__).with_name("_static")
+
+
+def before_and_after(model: str, path: Path, task: str, width: int = 640, every: int = 3) -> None:
+    """A robot before and after ten answers, side by side, as an animated WebP."""
+    with tempfile.TemporaryDirectory() as folder:
+        film = Path(folder, "film.mp4")
+        cli.main(["record-video", "--model", model, "--task", *task.split(), "--out", str(film)])
+        frames = iio.imread(film)[::every]
+    height = round(width * frames.shape[1] / frames.shape[2])
+    images = [Image.fromarray(frame).resize((width, height)) for frame in frames]
+    first, *others = images
+    first.save(path, save_all=True, append_images=others, duration=50 * every, loop=0, quality=60)
+
+
+def still(env_id: str, path: Path, size: int = 360, steps: int = 60) -> None:
+    """A family's robot at work: adapted if a model ships, moving at random otherwise."""
+    env = gym.make(env_id, render_mode="rgb_array", width=size, height=size)
+    obs, _ = env.reset(seed=2)
+    env.action_space.seed(2)
+    act = adapted(env) if (shipped_folder("pretrained") / env.spec.name).exists() else None
+    obs, _ = env.reset()
+    for _ in range(min(steps, env.spec.max_episode_steps - 1)):
+        obs, *_ = env.step(env.action_space.sample() if act is None else act.predict(obs)[0])
+    Image.fromarray(env.render()).save(path, quality=80)
+    env.close()
+
+
+def adapted(env: gym.Env) -> AdaptedPolicy:
+    """The policy of the family's model after ten answers."""
+    oracle = sb3_poem.ReturnOracle()
+    return sb3_poem.PreferenceAdapter(env.spec.name, env, oracle=oracle, seed=2).adapt()
+
+
+if __name__ == "__main__":
+    before_and_after("AntGoal", STATIC / "before-and-after.webp", task="-2.1 -2")
+    families = STATIC / "environments"
+    families.mkdir(exist_ok=True)
+    for spec in list(gym.registry.values()):
+        if spec.namespace == "poem":
+            still(spec.id, families / f"{spec.name}.webp")
