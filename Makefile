@@ -3,7 +3,7 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help run label test test-all lint format bench bench-gpu venv rendering browser wheel clean
+.PHONY: help run label docs test test-all lint format bench bench-gpu venv rendering browser wheel clean
 
 PYTHON ?= python3
 VENV := .venv
@@ -16,6 +16,7 @@ THREADS := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 help:
 	@echo "make run       meta-train a model, adapt it from ten preferences, show the result (files in $(OUT)/)"
 	@echo "make label     the page on which a person answers, on this machine"
+	@echo "make docs      the documentation, in docs/_build/html/"
 	@echo "make test      the default test suite"
 	@echo "make test-all  the default suite and the slow tests"
 	@echo "make lint      ruff, mypy and import-linter"
@@ -31,6 +32,12 @@ run: $(STAMP) rendering
 
 label: $(STAMP) rendering
 	$(BIN)/python -m sb3_poem.cli label
+
+# Tutorials are executed, which takes minutes; DOCS_ARGS="-D nb_execution_mode=off" leaves that out.
+docs: $(STAMP) rendering
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[docs]'
+	$(THREADS) $(BIN)/python -m sphinx -W --keep-going -q -b html $(DOCS_ARGS) docs docs/_build/html
+	@echo "Open docs/_build/html/index.html"
 
 test: $(STAMP) rendering browser
 	$(THREADS) $(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
