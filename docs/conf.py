@@ -61,6 +61,17 @@ def environment_pages(_app: object) -> None:
             page.write_text(content)
 
 
+def files_beside_docs(app: object, name: str, content: list[str]) -> None:
+    """Markdown files outside of docs/ are downloads: MyST would look for them among the pages."""
+
+    def link(match: re.Match[str]) -> str:
+        outside = not (app.srcdir / name / ".." / match[1]).resolve().is_relative_to(app.srcdir)
+        return f"](path:{match[1]})" if outside else match[0]
+
+    content[0] = re.sub(r"\]\(((?:\.\./)+[^)#\s]+\.md)\)", link, content[0])
+
+
 def setup(app: object) -> None:
     """Sphinx calls this."""
     app.connect("builder-inited", environment_pages)
+    app.connect("source-read", files_beside_docs)
