@@ -61,12 +61,14 @@ def environment_pages(_app: object) -> None:
             page.write_text(content)
 
 
-def files_beside_docs(app: object, name: str, content: list[str]) -> None:
+def files_beside_docs(_app: object, name: str, content: list[str]) -> None:
     """Markdown files outside of docs/ are downloads: MyST would look for them among the pages."""
 
+    folder = TOP / "docs"
+
     def link(match: re.Match[str]) -> str:
-        outside = not (app.srcdir / name / ".." / match[1]).resolve().is_relative_to(app.srcdir)
-        return f"](path:{match[1]})" if outside else match[0]
+        inside = ((folder / name).parent / match[1]).resolve().is_relative_to(folder)
+        return match[0] if inside else f"](path:{match[1]})"
 
     content[0] = re.sub(r"\]\(((?:\.\./)+[^)#\s]+\.md)\)", link, content[0])
 
