@@ -20,7 +20,14 @@ from sb3_poem.cli import experiment
 from sb3_poem.resources import config_file, shipped_folder
 
 TOP = Path(__file__).parents[1]
-PAGES = ("README.md", *(f"docs/{page.name}" for page in sorted((TOP / "docs").glob("*.md"))))
+PAGES = (
+    "README.md",
+    *(
+        str(page.relative_to(TOP))
+        for pattern in ("*.md", "[!_]*/*.md")
+        for page in sorted((TOP / "docs").glob(pattern))
+    ),
+)
 LEARN = PEARLSAC.learn
 
 TINY = "--env-kwargs width:48 height:48"
@@ -125,7 +132,13 @@ def test_every_kind_of_command_is_shown() -> None:
     assert {"train", "enjoy", "adapt", "label", "benchmark", "record-video", "models"} <= shown
 
 
-LINKED = ("README.md", "docs/*.md", "pretrained/*/README.md", "benchmarks/results/**/*.md")
+LINKED = (
+    "README.md",
+    "docs/*.md",
+    "docs/[!_]*/*.md",
+    "pretrained/*/README.md",
+    "benchmarks/results/**/*.md",
+)
 
 
 def test_every_relative_link_leads_somewhere() -> None:
