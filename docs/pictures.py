@@ -8,7 +8,6 @@ from pathlib import Path
 
 import gymnasium as gym
 import imageio.v3 as iio
-import numpy as np
 from PIL import Image
 
 import sb3_poem

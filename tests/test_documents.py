@@ -2,6 +2,7 @@
 
 import io
 import re
+import runpy
 import shlex
 import shutil
 from collections.abc import Iterator
@@ -163,3 +164,14 @@ def test_results_are_small_and_listed() -> None:
     for file in files:
         manifest = (file.parent / "manifest.md").read_text()
         assert file.name == "manifest.md" or f"({file.name})" in manifest, file.relative_to(TOP)
+
+
+def test_figures_come_from_records() -> None:
+    for page, content in runpy.run_path(str(TOP / "docs/tables.py"))["WRITTEN"].items():
+        assert page.read_text() == content(), f"{page.name} is not what docs/tables.py writes"
+
+
+def test_readme_is_two_screens() -> None:
+    lines = (TOP / "README.md").read_text().splitlines()
+    assert len(lines) <= 130
+    assert max(map(len, lines)) <= 120
