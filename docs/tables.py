@@ -87,7 +87,7 @@ def family_section(family: str) -> str:
         ks = [
             k
             for k in (0, 1, 2, 5, 10)
-            if all(k in one["queries"] for one in sum(found.values(), []))
+            if all(k in one["queries"] for ones in found.values() for one in ones)
         ]
         lines.append(f"| rule | {' | '.join(f'{k} answers' for k in ks)} | task known | seeds |")
         lines.append("|---|" + "---|" * (len(ks) + 2))
@@ -134,7 +134,7 @@ def readme() -> str:
     text = (TOP / "README.md").read_text()
     return re.sub(
         r"(<!-- results:.*?-->\n).*?(<!-- end -->)",
-        rf"\g<1>\n{summary()}\n\n\g<2>",
+        rf"\g<1>{summary()}\n\g<2>",
         text,
         flags=re.DOTALL,
     )
