@@ -30,6 +30,7 @@ from sb3_poem.common.buffers import ContextStore, TaskReplayBuffer
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.files import write_atomically
 from sb3_poem.common.foreign import check_env_id
+from sb3_poem.pearl_sac.model_card import model_card
 from sb3_poem.pearl_sac.policies import DEFAULT_NET_ARCH
 from sb3_poem.pearl_sac.train_tasks import TrainTasks
 from sb3_poem.resources import find_folder, pretrained_names
@@ -227,7 +228,7 @@ def save_pretrained(model: Any, folder: str | Path, card: dict[str, Any] | None 
     contents = {  # all made before the first is written
         WEIGHTS: tensors_to_bytes(tensors),
         CONFIG: (config_text(config) + "\n").encode(),
-        CARD: _card_text(config).encode(),
+        CARD: model_card(config).encode(),
     }
     for name, content in contents.items():
         write_atomically(Path(folder) / name, content)
@@ -294,27 +295,6 @@ def _to_json(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     raise TypeError(f"{value!r} of type {type(value).__name__} cannot be written as JSON")
-
-
-def _card_text(config: dict[str, Any]) -> str:
-    card, algorithm = config["card"], config["algorithm"]
-    steps, updates = config["num_timesteps"], config["n_updates"]
-    text = f"""# {algorithm} on `{config["env_id"]}`
-
-Trained with sb3_poem for {steps:,} environment steps and {updates:,} gradient steps.
-
-```python
-model = sb3_poem.{algorithm}.from_pretrained(<this folder>)
-```
-
-"""
-    known = [key for key in ("command", "seed", "commit", "machine") if key in card]
-    text += "".join(f"- {key}: `{card[key]}`\n" for key in known)
-    if "note" in card:
-        text += f"- {card['note']}\n"
-    if "results" in card:
-        text += f"\nResults:\n\n```json\n{config_text(card['results'])}\n```\n"
-    return text
 
 
 def read_config(folder: str | Path) -> dict[str, Any]:

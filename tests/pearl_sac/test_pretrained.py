@@ -25,7 +25,17 @@ CARD = {
     "commit": "abc123",
     "machine": "2 cores",
     "note": "Stopped by hand.",
-    "results": {"mean_return": np.float64(-12.5), "per_task": np.arange(3.0)},
+    "results": {
+        "adaptation to 30 unseen tasks": [
+            {
+                "inference": "bayes",
+                "candidates": "prior",
+                "queries": np.arange(3),
+                "mean_return": [np.float64(-30.0), -20.0, -12.5],
+                "known_task_return": -11.0,
+            }
+        ]
+    },
 }
 
 
@@ -129,19 +139,20 @@ def test_the_card_says_where_the_model_comes_from(trained: PEARLSAC, folder: Pat
     text = (folder / "README.md").read_text()
     name = type(trained).__name__
     for part in (
-        name,
-        POINT_GOAL,
-        "600 environment steps",
-        "10 gradient steps",
+        f"# {name} on `{POINT_GOAL}`",
+        "| environment steps | 600 |",
+        "| gradient steps | 10 |",
+        "| machine | 2 cores |",
         CARD["command"],
-        "abc123",
-        "2 cores",
-        CARD["note"],
-        "-12.5",
+        "`note` in `config.json`",
+        "| `Bayes()` | prior | -30.0 | -20.0 | -12.5 | -11.0 |",
     ):
         assert str(part) in text, part
     config = json.loads((folder / "config.json").read_text())
-    assert config["card"]["results"] == {"mean_return": -12.5, "per_task": [0.0, 1.0, 2.0]}
+    (results,) = config["card"]["results"]["adaptation to 30 unseen tasks"]
+    assert results["queries"] == [0, 1, 2]
+    assert config["card"]["note"] == CARD["note"]
+    assert config["card"]["commit"] == "abc123"
     assert config["card"]["seed"] == 3
     assert config["algorithm"] == name
 
