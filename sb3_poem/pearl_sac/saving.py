@@ -225,10 +225,11 @@ def save_pretrained(model: Any, folder: str | Path, card: dict[str, Any] | None 
         torch.optim's, which JSON could not name
     """
     config, tensors = model_contents(model, card)
+    text = config_text(config)
     contents = {  # all made before the first is written
         WEIGHTS: tensors_to_bytes(tensors),
-        CONFIG: (config_text(config) + "\n").encode(),
-        CARD: model_card(config).encode(),
+        CONFIG: (text + "\n").encode(),
+        CARD: model_card(json.loads(text)).encode(),
     }
     for name, content in contents.items():
         write_atomically(Path(folder) / name, content)
