@@ -402,6 +402,6 @@ def test_a_missing_gpu_is_told() -> None:
 
 
 def test_the_documents_name_what_only_sac_takes() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "algorithms.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "algorithms" / "index.md").read_text()
     table = page.partition("## What SAC takes and these do not")[2]
     assert {name for name in UNSUPPORTED if f"`{name}`" in table} == UNSUPPORTED.keys()
