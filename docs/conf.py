@@ -20,15 +20,15 @@ version = release = sb3_poem.__version__
 extensions = [
     "myst_nb",
     "sphinx.ext.autodoc",
-    "sphinx.ext.mathjax",
+    "sphinx-mathjax-offline",
     "sphinx.ext.viewcode",
 ]
 exclude_patterns = ["_build", "environments/_*"]
-nitpicky = False
 
 html_theme = "furo"
 html_title = "sb3_poem"
 html_static_path = ["_static"]
+html_css_files = ["site.css"]
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
@@ -40,8 +40,8 @@ myst_heading_anchors = 3
 nb_execution_mode = "cache"
 nb_execution_timeout = 300
 nb_execution_raise_on_error = True
-nb_execution_excludepatterns = []
-suppress_warnings = ["mystnb.unknown_mime_type"]
+# Where they are not executed, no kernel says which language they are in.
+suppress_warnings = ["myst-nb.lexer"]
 
 
 def environment_pages(_app: object) -> None:

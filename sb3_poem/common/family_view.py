@@ -38,7 +38,7 @@ def no_family(env: str) -> str:
     return (
         f"env {env} is no task family: an environment whose reward depends on a hidden task. "
         "Subclass poem_envs.TaskFamily, or make one of a goal-conditioned environment by "
-        "poem_envs.GoalFamily; docs/families.md has both as complete programs, and "
+        "poem_envs.GoalFamily; docs/guides/families.md has both as complete programs, and "
         "poem_envs.testing.check_task_family says what is missing"
     )
 
