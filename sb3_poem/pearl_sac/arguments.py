@@ -4,10 +4,11 @@ what to do instead.
 
 import difflib
 import inspect
+import re
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from itertools import takewhile
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
@@ -15,6 +16,7 @@ import torch as th
 from sb3_poem.common.checks import check_number, check_number_or_auto, check_whole
 from sb3_poem.common.precision import hidden_dtype
 
+T = TypeVar("T")
 BY_NAME = inspect.Parameter.KEYWORD_ONLY
 
 #: The least of arguments that are whole numbers
@@ -120,15 +122,20 @@ def check_arguments(given: Mapping[str, Any], algorithm: type) -> None:
         warnings.warn(what, stacklevel=3)
 
 
-def with_arguments_of(base: type, without: str) -> Callable[[Any], Any]:
-    """Of a constructor that passes ``*args`` and ``**kwargs`` on to its base class's: its signature
-    has the arguments of both.
+def with_arguments_of(base: type, without: str) -> Callable[[type[T]], type[T]]:
+    """Of a class whose constructor passes ``*args`` and ``**kwargs`` on to its base class's: its
+    signature and its docstring have the arguments of both.
 
     :param without: An argument of the base class's that it does not take
     """
 
-    def decorate(constructor: Any) -> Any:
-        theirs, ours = (inspect.signature(one).parameters for one in (base, constructor))
+    def described(cls: type) -> dict[str, str]:
+        found = re.findall(r"(    :param (\w+):.*\n(?:        .*\n)*)", cls.__doc__ or "")
+        return {name: words for words, name in found}
+
+    def decorate(cls: type[T]) -> type[T]:
+        constructor: Any = cls.__init__
+        theirs, ours = (inspect.signature(one.__init__).parameters for one in (base, cls))
         own = {name: one for name, one in ours.items() if one.kind is one.KEYWORD_ONLY}
         by_place = {"self", *takewhile(lambda name: name not in own, theirs)}
         merged = [
@@ -137,6 +144,10 @@ def with_arguments_of(base: type, without: str) -> Callable[[Any], Any]:
             if name != without
         ]
         constructor.__signature__ = inspect.Signature(sorted(merged, key=lambda one: one.kind))
-        return constructor
+        text, documented = cls.__doc__ or "", {*described(cls), without}
+        inherited = [words for name, words in described(base).items() if name not in documented]
+        start = text.index("    :param ")
+        cls.__doc__ = text[:start] + "".join(inherited) + text[start:]
+        return cls
 
     return decorate

@@ -66,9 +66,13 @@ class PEARLSAC(SAC):
     :param buffer_size: Transitions kept for each training task
     :param learning_starts: Environment steps with uniformly random actions before learning
     :param batch_size: Transitions of each task in a gradient step
+    :param tau: Share of the networks that their targets take over in a gradient step
+    :param gamma: Discount factor
     :param gradient_steps: Gradient steps after each epoch's collection; -1: as many as environment
         steps
     :param ent_coef: Entropy coefficient; "auto" learns it, "auto_0.1" from 0.1 on
+    :param target_update_interval: Gradient steps between two updates of the targets
+    :param target_entropy: Which "auto" coefficients aim at; "auto" is minus the action's dimension
     :param n_train_tasks: Training tasks, drawn once from the family with the model's seed; None:
         120, or all of a smaller finite family
     :param meta_batch_size: Tasks in a gradient step (all, if there are fewer)
@@ -106,8 +110,13 @@ class PEARLSAC(SAC):
         the actor, the decoder, the embeddings and the entropy coefficient (as in TD3)
     :param horizon: Steps of an episode; None takes the environment's time limit
     :param precision: "auto" (bfloat16 where the processor has it), "bf16", or "fp32"
+    :param stats_window_size: Episodes that the logged means of rollouts are taken over
+    :param tensorboard_log: Folder of TensorBoard's logs; None writes none
+    :param policy_kwargs: Arguments of the policy: ``net_arch``, ``activation_fn``, ``layer_norm``,
+        ``n_critics``, ``optimizer_class``, ``optimizer_kwargs``
     :param verbose: 0 no output, 1 how long an epoch is and a table after each, 2 debug
     :param seed: Seed of everything: tasks, networks, sampling, environments
+    :param device: PyTorch device; "auto" takes a CUDA device where there is one
     :raises ValueError: for an environment that is no task family, and for arguments outside their
         range
     :raises TypeError: for arguments that it does not have; of those of SB3's SAC, the message says

@@ -21,6 +21,7 @@ from sb3_poem.poem_sac.policies import MlpPolicy, POEMPolicy
 from sb3_poem.poem_sac.sampler import GroupSampler
 
 
+@with_arguments_of(PEARLSAC, without="context_relabel_fraction")
 class POEMSAC(PEARLSAC):
     """Preference-order-preserving embedding on soft actor-critic (POEM, Xu & Zhu, ICML 2025),
     Algorithm 1.
@@ -35,8 +36,8 @@ class POEMSAC(PEARLSAC):
     and the actor, while contexts and preference labels are the last epoch's only; the critics' loss
     trains the encoder too, as in PEARL.
 
-    All arguments of :class:`PEARLSAC` but ``context_relabel_fraction`` (contexts are of the task's
-    own policy, eq. 8), with other defaults of the losses' weights, and:
+    It takes all arguments of :class:`PEARLSAC` but ``context_relabel_fraction`` (contexts are of the
+    task's own policy, eq. 8), with other defaults of the losses' weights.
 
     :param preference_coef: Weight of the preference loss
     :param similarity: "two-encoder": <f_r(z_i), f_pi(z_j)>; "inner": <z_i, z_j>, the ablation of
@@ -54,7 +55,6 @@ class POEMSAC(PEARLSAC):
     objective_class: ClassVar[type[Objective]] = POEMObjective
     policy: POEMPolicy
 
-    @with_arguments_of(PEARLSAC, without="context_relabel_fraction")
     def __init__(
         self,
         policy: str | type[POEMPolicy],

@@ -73,6 +73,15 @@ def test_tasks_come_from_the_family_and_the_seed(algorithm: type[PEARLSAC]) -> N
     )
 
 
+@pytest.mark.parametrize("algorithm", [PEARLSAC, POEMSAC])
+def test_help_explains_every_argument(algorithm: type[PEARLSAC]) -> None:
+    for name in inspect.signature(algorithm).parameters.keys() - {
+        "_init_setup_model",
+        "unsupported",
+    }:
+        assert (algorithm.__doc__ or "").count(f":param {name}:") == 1, name
+
+
 def test_the_signature_of_poem_has_the_arguments_of_pearl() -> None:
     of_pearl, of_poem = (inspect.signature(kind).parameters for kind in (PEARLSAC, POEMSAC))
     assert of_pearl.keys() - of_poem.keys() == {"context_relabel_fraction"}
