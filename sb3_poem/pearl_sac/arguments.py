@@ -134,8 +134,9 @@ def with_arguments_of(base: type, without: str) -> Callable[[type[T]], type[T]]:
         return {name: words for words, name in found}
 
     def decorate(cls: type[T]) -> type[T]:
-        constructor: Any = cls.__init__
-        theirs, ours = (inspect.signature(one.__init__).parameters for one in (base, cls))
+        constructor: Any = vars(cls)["__init__"]
+        theirs = inspect.signature(vars(base)["__init__"]).parameters
+        ours = inspect.signature(constructor).parameters
         own = {name: one for name, one in ours.items() if one.kind is one.KEYWORD_ONLY}
         by_place = {"self", *takewhile(lambda name: name not in own, theirs)}
         merged = [
