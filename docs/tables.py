@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_poem.benchmark.paper import TABLE_3
+from sb3_poem.benchmark.tables import TABLE_3
 
 TOP = Path(__file__).resolve().parents[1]
 RESULTS = TOP / "benchmarks/results"

@@ -21,5 +21,5 @@ from sb3_poem.adaptation.paper import Paper
 from sb3_poem.adaptation.policy import AdaptedPolicy
 from sb3_poem.adaptation.preference import Preference, Query
 from sb3_poem.adaptation.rate_distortion import answer_capacity, rate_distortion_limit
-from sb3_poem.adaptation.rule import Inference, Rule, Setting
+from sb3_poem.adaptation.rule import Answer, Inference, Rule, Setting
 from sb3_poem.common.trajectory import Trajectory

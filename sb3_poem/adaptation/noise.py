@@ -110,8 +110,8 @@ class MistakeNoise(_Serialisable):
 class BoltzmannNoise(_Serialisable):
     """LEFT with probability 1 / (1 + exp(-beta (R_left - R_right))) (C.6 of Xu & Zhu 2025).
 
-    :param beta: Inverse temperature, one over the unit of returns; None is the paper's 1 /
-        (|R_left| + |R_right|).
+    :param beta: Inverse temperature, one over the unit of returns; None is the paper's
+        ``1 / (|R_left| + |R_right|)``.
     """
 
     beta: float | None = None

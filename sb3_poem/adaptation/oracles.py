@@ -114,7 +114,7 @@ class BoltzmannOracle(TaskOracle):
     With the paper's beta the exponent's magnitude is at most 1, so an answer is right at most 73 %
     of the time, and ten answers carry less than two bits.
 
-    :param beta: Inverse temperature; None is the paper's 1 / (|R_left| + |R_right|).
+    :param beta: Inverse temperature; None is the paper's ``1 / (|R_left| + |R_right|)``.
     :param seed: Seeds the answers; for the others see :class:`TaskOracle`.
     :raises ValueError: If beta is not positive.
     """
