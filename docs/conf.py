@@ -47,11 +47,12 @@ suppress_warnings = ["myst-nb.lexer"]
 def environment_pages(_app: object) -> None:
     """A page a family, made from the docstring of its environment's class."""
     folder = TOP / "docs/environments"
-    for spec in sorted(gym.registry.values(), key=lambda spec: spec.id):
-        if spec.namespace != "poem":
-            continue
+    specs = [spec for spec in gym.registry.values() if spec.namespace == "poem"]
+    link = {spec.name: f"[{spec.name}]({spec.name}.md)" for spec in specs}
+    for spec in specs:
         cls = gym.envs.registration.load_env_creator(spec.entry_point)
         text = re.sub(r":\w+:`~?[\w.]*?\.?(\w+)`", r"`\1`", inspect.getdoc(cls) or "")
+        text = re.sub(r"`(\w+)Env`", lambda found: link.get(found[1], found[0]), text)
         picture = f"../_static/environments/{spec.name}.webp"
         shown = f"![{spec.name}]({picture})\n\n" if (folder / picture).exists() else ""
         facts = f"`gymnasium.make({spec.id!r})`, {spec.max_episode_steps} steps an episode.\n\n"
