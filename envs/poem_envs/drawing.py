@@ -1,5 +1,4 @@
-"""A few antialiased shapes on a numpy image, and a window to show it: enough to render a toy
-without a graphics library.
+"""A few antialiased shapes on a numpy image, and a window to show it, without a graphics library.
 """
 
 from __future__ import annotations
@@ -12,8 +11,7 @@ Colour = tuple[int, int, int]
 class Canvas:
     """A white image onto which shapes are painted in plane coordinates (x right, y up).
 
-    :param width: of the image, pixels
-    :param height: of the image, pixels
+    :param width: of the image, pixels, as ``height``
     :param centre: the point of the plane in the middle of the image
     :param extent: length of the plane that the shorter side of the image shows
     """
@@ -56,11 +54,7 @@ def _span(inside: np.ndarray) -> slice:
 
 
 class ImageWindow:
-    """A window that shows images, through GLFW and OpenGL, which MuJoCo's package brings along.
-
-    :param width: pixels
-    :param height: pixels
-    """
+    """A window that shows images, through GLFW and OpenGL, which MuJoCo's package brings along."""
 
     def __init__(self, width: int, height: int, title: str) -> None:
         import glfw

@@ -126,9 +126,7 @@ class HalfCheetahVelEnv(_HalfCheetahVel, MujocoTaskEnv):
 
 
 class HalfCheetahVelVectorEnv(_HalfCheetahVel, MujocoTaskVectorEnv):
-    """The vectorised :class:`HalfCheetahVelEnv`: same arguments, and those of a vectorised MuJoCo
-    family.
-    """
+    """The vectorised :class:`HalfCheetahVelEnv`."""
 
 
 class HalfCheetahFwdBackEnv(_HalfCheetahFwdBack, MujocoTaskEnv):

@@ -27,9 +27,8 @@ def _offscreen_backend() -> str | None:
 
 def choose_headless_backend() -> None:
     """On a Linux machine without a display, let MuJoCo render through EGL or OSMesa, unless the
-    user chose already. To be called before MuJoCo is imported.
-
-    Left to itself, Gymnasium's renderer tries a window first, and goes on as if it had got one.
+    user chose already: Gymnasium's renderer would try a window first, and go on as if it had got
+    one. To be called before MuJoCo is imported.
 
     :raises RuntimeError: if there is neither
     """
@@ -47,9 +46,7 @@ def choose_headless_backend() -> None:
 
 
 def release_graphics() -> None:
-    """Let go of the EGL context that this thread rendered with last: it can be used in one thread
-    at a time.
-    """
+    """Let go of the EGL context that this thread rendered with last, for use in another thread."""
     egl = sys.modules.get("mujoco.egl")
     if egl is None or egl.EGL_DISPLAY is None:
         return

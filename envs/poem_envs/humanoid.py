@@ -78,8 +78,8 @@ class _HumanoidDir2D(DirectionFamily):
         return np.concatenate([super()._observations(), self._derived], axis=1)
 
     def _derive(self, copies: np.ndarray, controls: np.ndarray) -> None:
-        """Compute what the observation and the reward take from the simulator, at the current
-        states of some copies, given by number, under the actions applied, ``(len(copies), nu)``.
+        """Compute what observation and reward take from the simulator, at the current states of
+        some copies under the actions applied, ``(len(copies), nu)``.
         """
         model = self.model
         if self._forward_data is None:
@@ -182,6 +182,4 @@ class HumanoidDir2DEnv(_HumanoidDir2D, MujocoTaskEnv):
 
 
 class HumanoidDir2DVectorEnv(_HumanoidDir2D, MujocoTaskVectorEnv):
-    """The vectorised :class:`HumanoidDir2DEnv`: same arguments, and those of a vectorised MuJoCo
-    family.
-    """
+    """The vectorised :class:`HumanoidDir2DEnv`."""

@@ -11,11 +11,8 @@ from poem_envs.mujoco_rendering import arrow
 
 
 class LeggedFamily(MujocoFamily):
-    """A robot whose episode ends when its torso leaves a range of heights.
-
-    :param ctrl_cost_weight: weight of the action cost, the last reward feature
-    :param terminate_when_unhealthy: whether it ends then
-    :param healthy_z_range: lowest and highest z-coordinate of the torso, m
+    """A robot whose episode ends when its torso leaves a range of heights; the last reward feature
+    is the action cost.
     """
 
     hidden_qpos = 2
@@ -50,11 +47,8 @@ class LeggedFamily(MujocoFamily):
 
 
 class DirectionFamily(LeggedFamily):
-    """A legged robot that is to run in a direction, whichever directions there are. The reward
-    features are the velocity in x and y, and the square of the action.
-
-    :param forward_reward_weight: of the speed in the direction, an angle in radians
-    :param healthy_reward: of every step
+    """A legged robot that is to run in a direction, an angle in radians. The reward features are
+    the velocity in x and y, and the square of the action.
     """
 
     def __init__(

@@ -21,12 +21,7 @@ COARSE = (12, 6, 1)
 
 
 class _Renderer:
-    """What the renderers below have in common.
-
-    :param model: the model that the states are of; its settings of rendering are changed
-    :param width: of the image, pixels
-    :param height: of the image, pixels
-    """
+    """What the renderers below have in common; the model's settings of rendering are changed."""
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
         self._model, self._data = model, mujoco.MjData(model)
@@ -45,12 +40,8 @@ class _Renderer:
         _open_renderers.add(self)
 
     def render(self, state: np.ndarray, render_mode: str, markers: list[dict[str, Any]]) -> Any:
-        """Render one state.
-
-        :param state: time, positions and velocities, ``(1 + nq + nv,)``
-        :param render_mode: one of Gymnasium's MuJoCo render modes
-        :param markers: shapes to add, as ``MujocoRenderer``'s ``add_marker`` takes them
-        :return: what Gymnasium returns in that mode
+        """Render a state, ``(1 + nq + nv,)``, in one of Gymnasium's modes, with markers as
+        ``MujocoRenderer``'s ``add_marker`` takes them.
         """
         raise NotImplementedError
 
@@ -60,7 +51,7 @@ class _Renderer:
 
 
 class StateRenderer(_Renderer):
-    """Renders states of one model as Gymnasium does, whoever simulated them.
+    """Renders states as Gymnasium does, whoever simulated them.
 
     :param view: further arguments of Gymnasium's ``MujocoRenderer``; without a camera, one follows
         the robot's root
@@ -93,13 +84,9 @@ class StateRenderer(_Renderer):
 
 
 class FastRenderer(_Renderer):
-    """Renders RGB images without shadows, reflections or haze, and with coarse shapes. On a machine
-    without a graphics card an image takes a small part of what Gymnasium's takes. Arguments are
-    those of :class:`StateRenderer`.
-
-    A graphics context belongs to the thread that rendered first; render from no other.
-
-    :raises ValueError: if the model has no camera of that name
+    """Renders RGB images without shadows, reflections or haze, and with coarse shapes, which takes
+    a small part of the time on a machine without a graphics card. A graphics context belongs to the
+    thread that rendered first; render from no other.
     """
 
     def __init__(
@@ -200,11 +187,8 @@ def _close_open_renderers() -> None:
 
 
 def renders_fast(render_quality: str, render_mode: str | None) -> bool:
-    """Whether images come from a :class:`FastRenderer`.
-
-    :param render_quality: "full" or "fast", as users give it
-    :raises ValueError: if the quality is another, or "fast" is asked of a mode that has no images
-        in colour
+    """Whether images come from a :class:`FastRenderer`; refuses unknown qualities, and "fast" in a
+    mode without images in colour.
     """
     if render_quality not in RENDER_QUALITIES:
         raise ValueError(
@@ -225,9 +209,7 @@ def fit_buffer(model: mujoco.MjModel, width: int, height: int) -> None:
 
 
 def _make_context(width: int, height: int) -> Any:
-    """A graphics context off screen. ``mujoco.GLContext`` itself is fixed when MuJoCo is imported,
-    which was long ago.
-    """
+    """A graphics context off screen; ``mujoco.GLContext`` is fixed when MuJoCo is imported."""
     choose_headless_backend()
     backend, module = os.environ.get("MUJOCO_GL", "").lower(), mujoco
     if backend in ("egl", "osmesa"):
@@ -236,8 +218,8 @@ def _make_context(width: int, height: int) -> Any:
 
 
 def renderer_inside(env: Any) -> Any:
-    """The ``MujocoRenderer`` of a bare environment that renders by itself; None where there is
-    none. Mazes of gymnasium-robotics keep the robot's environment one deeper.
+    """The ``MujocoRenderer`` of a bare environment, if it has one; mazes of gymnasium-robotics keep
+    the robot's environment one deeper.
     """
     for holder in (env, getattr(env, "ant_env", None), getattr(env, "point_env", None)):
         renderer = getattr(holder, "mujoco_renderer", None)
@@ -275,11 +257,7 @@ def close_viewers(env: Any) -> None:
 
 
 def arrow(start: np.ndarray, direction: tuple[float, float], length: float) -> dict[str, Any]:
-    """A horizontal arrow, as a marker.
-
-    :param start: where it begins, ``(3,)``
-    :param direction: a unit vector in the plane
-    """
+    """A horizontal arrow from a point ``(3,)`` in a direction (a unit vector), as a marker."""
     x, y = direction
     return {
         "type": mujoco.mjtGeom.mjGEOM_ARROW,

@@ -140,8 +140,6 @@ class PointGoalEnv(_PointGoal, BatchTaskFamily):
 
 
 class PointGoalVectorEnv(_PointGoal, TaskFamilyVector):
-    """The vectorised :class:`PointGoalEnv`: same arguments, and those of
-    :class:`~poem_envs.vector.TaskFamilyVector`.
-    """
+    """The vectorised :class:`PointGoalEnv`."""
 
     metadata = {**PointGoalEnv.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012

@@ -30,9 +30,7 @@ from poem_envs.vector import TaskFamilyVector, checked_nthread
 
 
 class EpisodeStart(NamedTuple):
-    """What a copy, by its number within its group, needs to begin an episode as a single
-    environment would.
-    """
+    """What a copy, by its number within its group, needs to begin an episode."""
 
     copy: int
     rng: np.random.Generator
@@ -44,8 +42,6 @@ class EpisodeStart(NamedTuple):
 class CopyGroup:
     """Copies of a task family that one process steps in turn.
 
-    :param make: makes one
-    :param n: how many
     :param first: the number of the first one among the copies of all groups, for messages
     :param attributes: to set on each
     """
@@ -75,8 +71,7 @@ class CopyGroup:
     def begin(
         self, starts: Sequence[EpisodeStart]
     ) -> tuple[list[np.ndarray], list[np.random.Generator]]:
-        """Begin episodes in some copies; returns their observations, and their generators after all
-        draws.
+        """Begin episodes in some copies: their observations, and their generators after all draws.
         """
         observations = []
         for start in starts:
@@ -89,8 +84,8 @@ class CopyGroup:
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-        """Step every copy, ``(copies, action_dim)``; returns observations, reward features, early
-        ends, and further infos, a row for each copy.
+        """Step every copy, ``(copies, action_dim)``: observations, reward features, early ends, and
+        further infos, a row for each copy.
         """
         results, infos = [], []
         for copy, (env, action) in enumerate(zip(self.envs, actions, strict=True)):
@@ -122,17 +117,15 @@ class CopyGroup:
 
 
 class WorkerError(Exception):
-    """The traceback of an error in a worker process, as text; the cause of the error that is raised
-    for it.
-    """
+    """An error's traceback in a worker process, as text; the cause of the error raised for it."""
 
     def __str__(self) -> str:
         return "\n" + str(self.args[0])
 
 
 class RemoteGroup:
-    """A :class:`CopyGroup`, with the same arguments, in a process of its own: calls are sent, and
-    their results received later. The first result is that of making it.
+    """A :class:`CopyGroup` in a process of its own: calls are sent, and their results received
+    later. The first result is that of making it.
     """
 
     def __init__(self, *arguments: Any) -> None:
@@ -157,10 +150,7 @@ class RemoteGroup:
             raise self._gone() from None
 
     def receive(self) -> Any:
-        """The result of the oldest call that is under way.
-
-        :raises RuntimeError: if the call failed, or the worker is gone
-        """
+        """The result of the oldest call that is under way."""
         try:
             succeeded, result = pickle.loads(self._connection.recv_bytes())
         except (EOFError, ConnectionResetError):
@@ -197,13 +187,10 @@ class ProcessFamilyVector(TaskFamilyVector):
         gym.register("my/Walk-v0", Walk1D, vector_entry_point=vector, max_episode_steps=50)
 
     :param family: a :class:`~poem_envs.TaskFamily` class, or a function that makes such an
-        environment
+        environment; ``family_kwargs`` are its arguments
     :param nthread: number of processes; None for as many as this process may use cores
-    :param max_episode_steps: episodes are truncated after so many steps; None for as many as a
-        :class:`GoalFamily`'s environment has, or never
-    :param render_mode: as the family has them; ``"human"`` for one copy only
-    :param family_kwargs: further arguments of the family
-    :raises TypeError: if what ``family`` makes is no task family
+    :param max_episode_steps: None for as many as a :class:`GoalFamily`'s environment has, or no
+        limit
     """
 
     def __init__(

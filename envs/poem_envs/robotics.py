@@ -42,8 +42,7 @@ class FetchReachEnv(_RoboticsFamily):
     within 0.05.
 
     ## Episode End
-    There is no early end. `gymnasium.make` truncates episodes after 50 steps, as gymnasium-robotics
-    does.
+    There is no early end. `gymnasium.make` truncates episodes after 50 steps.
 
     ## Arguments
     `reward_type` (`"dense"` or `"sparse"`), `render_mode`, `render_task`, and those of
@@ -123,13 +122,10 @@ class AntMazeEnv(_RoboticsFamily):
     0.45.
 
     ## Episode End
-    There is no early end. `gymnasium.make` truncates episodes after 700 steps, as
-    gymnasium-robotics does.
+    There is no early end. `gymnasium.make` truncates episodes after 700 steps.
 
     ## Arguments
-    `reward_type` (`"dense"` or `"sparse"`), `render_mode`, `render_task`, and those of
-    `AntMaze_UMaze-v5`.
-
+    As :class:`FetchReachEnv`; further ones are those of `AntMaze_UMaze-v5`.
     ## Version History
     * v0: Initial version
     """

@@ -1,6 +1,4 @@
-"""Does an environment keep the contract of a task family? A check of our families and of yours,
-like SB3's ``check_env``.
-"""
+"""Does an environment keep the contract of a task family? A check like SB3's ``check_env``."""
 
 from __future__ import annotations
 
@@ -28,18 +26,15 @@ def check_task_family(
     render: bool = True,
     **env_kwargs: Any,
 ) -> None:
-    """Check that an environment keeps the contract of a task family, so that training, relabelling
-    and adaptation are right.
-
-    It checks the spaces, the drawing of tasks, seeds, when a task takes effect, that the task is
-    hidden, that relabelling is exact, the potential and the symmetries (of a family that has them),
-    the vectorised version (of a registered id that has one), rendering and closing, in this order.
+    """Check that an environment keeps the contract of a task family: the spaces, the drawing of
+    tasks, seeds, when a task takes effect, that the task is hidden, that relabelling is exact, the
+    potential and the symmetries (of a family that has them), the vectorised version (of a
+    registered id that has one), rendering and closing, in this order.
 
     :param env: The id of a registered environment, or a class or function that makes one
     :param n_steps: How many steps of an episode to compare; the episode may be shorter
     :param seed: Of the episodes, tasks and actions
     :param render: Whether to check rendering, which needs OpenGL for MuJoCo environments
-    :param env_kwargs: Arguments of the environment
     :raises AssertionError: At the first violation; the message says what to change
     """
     if isinstance(env, str):
@@ -118,9 +113,7 @@ class Case:
         each_step: Callable[[], Any] = lambda: None,
         seed: int | None = None,
     ) -> Episode:
-        """An episode, whose arrays are kept as they came: one that the environment reuses is caught
-        by the comparison.
-        """
+        """An episode, whose arrays are kept as they came, so that one that is reused is caught."""
         options = None if task is None else {"task": task}
         observation, _ = env.reset(seed=self.seed if seed is None else seed, options=options)
         observations, rewards, features = [observation], [], []
@@ -187,9 +180,7 @@ def check_sampling(case: Case) -> None:
 
 
 def check_seeds(case: Case) -> None:
-    """A seed determines the task and the episode, in this environment as in another, whatever was
-    done before.
-    """
+    """A seed determines the task and the episode, whatever was done before."""
     env, other = case.make(), case.make()
     first, task = case.play(env), env.task
     case.play(other, actions=case.actions[::-1], seed=case.seed + 1)
@@ -301,9 +292,7 @@ def check_potential(case: Case) -> None:
 
 
 def check_symmetries(case: Case) -> None:
-    """Symmetries fit the spaces. Whether the dynamics have them cannot be seen from outside:
-    compare steps from a state and from its mirror image in a test of your own.
-    """
+    """Symmetries fit the spaces. Whether the dynamics have them is for a test of your own."""
     env = case.player
     given: dict[str, spaces.Box] = {
         "observations": env.observation_space,
@@ -329,9 +318,7 @@ def check_symmetries(case: Case) -> None:
 
 
 def check_vector_parity(case: Case, env_id: str, env_kwargs: dict[str, Any]) -> None:
-    """The vectorised version equals single environments bit for bit, over ends of episodes and a
-    change of tasks.
-    """
+    """The vectorised version equals single environments bit for bit, over ends and other tasks."""
     n, horizon = 3, max(2, case.n_steps // 2)
     arguments = {**env_kwargs, "max_episode_steps": horizon}
     vector_env = gym.make_vec(env_id, n, vectorization_mode="vector_entry_point", **arguments)

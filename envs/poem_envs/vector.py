@@ -34,10 +34,7 @@ NO_RENDER_MODE = "without a render_mode; pass one to the constructor, say 'rgb_a
 
 
 class BatchFamily(TaskDefinition):
-    """The dynamics of ``n`` independent copies of an environment, as a mixin for the two classes
-    below.
-
-    A family writes this once, and combines it twice::
+    """The dynamics of ``n`` independent copies of an environment, written once and combined twice::
 
         class _Walk1D(BatchFamily): ...  # the methods below, and those of TaskDefinition
         class Walk1DEnv(_Walk1D, BatchTaskFamily): ...  # one copy, a Gymnasium environment
@@ -61,11 +58,8 @@ class BatchFamily(TaskDefinition):
 
     @abstractmethod
     def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Step all copies.
-
-        :param actions: ``(n, action_dim)`` float64, valid
-        :return: new arrays: reward features ``(n, reward_feature_dim)``, and whether each episode
-            ended early ``(n,)``
+        """Step all copies by valid actions ``(n, action_dim)`` float64; return new arrays of reward
+        features ``(n, reward_feature_dim)`` and of early ends ``(n,)``.
         """
 
     def _step_infos(self) -> dict[str, np.ndarray]:
@@ -85,11 +79,7 @@ class BatchFamily(TaskDefinition):
 
 
 class BatchTaskFamily(BatchFamily, TaskFamily):
-    """A single environment: a batch of one copy.
-
-    :param observation_space: of one copy, as is ``action_space``
-    :param kwargs: those of :class:`~poem_envs.TaskFamily`
-    """
+    """A single environment: a batch of one copy."""
 
     def __init__(
         self, *, observation_space: spaces.Box, action_space: spaces.Box, **kwargs: Any
@@ -111,9 +101,7 @@ class BatchTaskFamily(BatchFamily, TaskFamily):
         return {key: values[0] for key, values in self._step_infos().items()}
 
     def render(self) -> Any:
-        """Render the current state as ``render_mode`` says: an image ``(height, width, 3)`` for
-        ``"rgb_array"``.
-        """
+        """Render the current state as ``render_mode`` says."""
         if self.render_mode is None:
             gym.logger.warn(f"render() was called {NO_RENDER_MODE}")
             return None
@@ -141,20 +129,17 @@ def checked_nthread(nthread: int | None) -> int:
 class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """A vectorised task family, each copy with a task of its own.
 
-    - A copy whose episode ends is reset in the same step (``AutoresetMode.SAME_STEP``).
-      ``infos["final_obs"]`` then holds ``(num_envs, obs_dim)``: the observation that each copy's
-      step led to, which differs from the returned one for copies that were reset
-      (``infos["_final_obs"]``, a mask). The key is there only if some copy was reset.
-    - ``infos["reward_features"]``, ``(num_envs, reward_feature_dim)``, is always that of the step
-      just taken, as are ``"success"`` and ``"is_success"``, ``(num_envs,)``, of a family that has
-      them.
+    - A copy whose episode ends is reset in the same step (``AutoresetMode.SAME_STEP``). Then
+      ``infos["final_obs"]`` holds ``(num_envs, obs_dim)`` that each copy's step led to, and
+      ``infos["_final_obs"]`` which copies were reset.
+    - ``infos["reward_features"]``, ``(num_envs, reward_feature_dim)``, and a family's ``"success"``
+      and ``"is_success"``, ``(num_envs,)``, are always those of the step just taken.
     - ``reset(seed=s)`` seeds copy ``i`` with ``s + i``; results equal those of single environments
       bit for bit.
 
     Its arguments are those of :class:`BatchTaskFamily`, and
 
     :param max_episode_steps: episodes are truncated after so many steps; None for never
-    :param render_mode: ``"rgb_array"`` and the like; ``"human"`` for one copy only
     """
 
     metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
@@ -213,11 +198,10 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
     def set_tasks(
         self, tasks: npt.ArrayLike, copies: Sequence[int] | np.ndarray | None = None
     ) -> None:
-        """Choose the tasks of the episodes that begin from each copy's next reset on.
+        """Choose the tasks of the episodes that begin from each copy's next reset on; errors as of
+        :meth:`TaskFamily.set_task`.
 
         :param tasks: ``(num_envs, task_dim)``, or one row for each of ``copies``
-        :param copies: numbers of the copies to set; None for all
-        :raises ValueError: as :meth:`TaskFamily.set_task`
         """
         index = np.arange(self.num_envs) if copies is None else np.asarray(copies, dtype=np.intp)
         shape = (len(index), *self.task_space.shape)
@@ -225,9 +209,8 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         self._task_chosen[index] = True
 
     def keep_tasks(self) -> None:
-        """Keep every copy's task through its next reset, also if that has a seed, which would draw
-        another: the task that was chosen for it, or else the one in effect. Before the first reset
-        there is none in effect.
+        """Keep every copy's task, the one chosen last or else the one in effect, through its next
+        reset, also if that has a seed, which would draw another.
         """
         self._tasks_kept[:] = self._tasks is not None
 
@@ -246,7 +229,6 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         :param seed: ``s`` seeds copy ``i`` with ``s + i``; or one seed (or None) for each copy. It
             draws other tasks, except for copies whose task was chosen
         :param options: ``{"tasks": tasks}`` is short for :meth:`set_tasks` just before
-        :return: the observations ``(num_envs, obs_dim)`` and an empty info
         """
         options = check_options(options, self._reset_options)
         seeds = self._seed_of_each_copy(seed)
@@ -275,11 +257,8 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
     def step(
         self, actions: npt.ArrayLike
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Step every copy; errors as of :meth:`TaskFamily.step`, and they name the copy.
-
-        :param actions: ``(num_envs, action_dim)``
-        :return: observations ``(num_envs, obs_dim)``, rewards, terminations, truncations
-            ``(num_envs,)`` and infos
+        """Step every copy by actions ``(num_envs, action_dim)``; errors as of
+        :meth:`TaskFamily.step`, and they name the copy.
         """
         if self._tasks is None:
             raise ResetNeeded("step() was called before the first reset()")
@@ -305,17 +284,11 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         return observations, rewards, terminations, truncations, infos
 
     def get_physics_state(self, copy: int) -> np.ndarray:
-        """The simulator's state of one copy, by number, ``(state_dim,)``, which a single
-        environment's ``set_physics_state`` takes.
-        """
+        """The simulator's state of one copy, ``(state_dim,)``, as of a single environment."""
         return self._physics_state(copy)
 
     def set_physics_state(self, copy: int, state: npt.ArrayLike) -> None:
-        """Put one copy into a state of :meth:`get_physics_state`. Its task and the number of its
-        step stay.
-
-        :raises ValueError: if the state has another shape or is not finite
-        """
+        """Put one copy into a state of :meth:`get_physics_state`; task and time stay."""
         self._set_physics_state(copy, checked_state(state, self._physics_state(copy).shape))
 
     def render(self) -> tuple[Any, ...] | None:
@@ -381,7 +354,6 @@ def set_task(env: Any, task: npt.ArrayLike) -> None:
     :param task: ``(task_dim,)``; of a vectorised environment for all copies, or
         ``(num_envs, task_dim)``, one for each
     :raises TypeError: if ``env`` is none of these, or no task family
-    :raises ValueError: if there are not as many tasks as copies, and as :meth:`TaskFamily.set_task`
     """
     if isinstance(env, gym.Env) and env.has_wrapper_attr("set_task"):
         env.get_wrapper_attr("set_task")(task)

@@ -1,8 +1,6 @@
-"""The process in which a part of a :class:`~poem_envs.process_vector.ProcessFamilyVector`'s copies
-live.
+"""The process of a :class:`~poem_envs.process_vector.RemoteGroup`.
 
-Started as ``python -m poem_envs.worker <file descriptor>``; it ends when the other end of the
-connection is closed.
+Started as ``python -m poem_envs.worker <file descriptor>``; it ends when the connection is closed.
 """
 
 from __future__ import annotations
@@ -20,9 +18,7 @@ from poem_envs.process_vector import CopyGroup
 
 
 def serve(connection: Connection) -> None:
-    """Answer calls of a group's methods, the first of which makes the group, until the connection
-    is closed.
-    """
+    """Answer calls of a group's methods, the first of which makes the group."""
     group: CopyGroup | None = None
     while True:
         try:

@@ -15,14 +15,11 @@ BLOCK_ROWS = 2000
 def decoded_sums(
     mlp: MLP, transitions: th.Tensor, lengths: Sequence[int], embeddings: th.Tensor, dtype: th.dtype
 ) -> th.Tensor:
-    """The decoder's outputs, summed over each trajectory, under each embedding: (m, trajectories).
+    """The decoder's outputs, summed over each trajectory, under each embedding (m, latent_dim): (m,
+    trajectories), without gradients. The first layer sees the transitions once.
 
-    The first layer sees the transitions once, not once for each embedding. No gradients.
-
-    :param mlp: A decoder's perceptron, whose input is a transition followed by an embedding
     :param transitions: (steps of all trajectories, transition_dim), one trajectory after the other
     :param lengths: Steps of each trajectory
-    :param embeddings: (m, latent_dim)
     :param dtype: Arithmetic of the hidden layers
     """
     sums = transitions.new_empty(len(embeddings), len(lengths))

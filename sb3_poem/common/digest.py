@@ -7,9 +7,7 @@ import torch as th
 
 
 def digest_of(tensors: Mapping[str, th.Tensor]) -> str:
-    """Hexadecimal; the same for equal numbers under equal names, on whatever device and of whatever
-    type.
-    """
+    """Hexadecimal; the same for equal numbers under equal names, of whatever device and type."""
     digest = hashlib.sha256()
     for name in sorted(tensors):
         value = tensors[name].detach().cpu().double()  # holds other types' numbers exactly

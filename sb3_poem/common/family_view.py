@@ -44,10 +44,8 @@ def no_family(env: str) -> str:
 
 
 class FamilyView:
-    """What a vectorised environment, whose copies are :class:`poem_envs.TaskFamily` environments,
-    is as a task family: the one way to ask it.
-
-    :raises ValueError: if it is of no task family
+    """A vectorised environment of :class:`poem_envs.TaskFamily` environments as a task family: the
+    one way to ask it.
     """
 
     #: Steps of an episode, of a family that training can use (:meth:`for_training`)
@@ -80,15 +78,11 @@ class FamilyView:
 
     @classmethod
     def for_training(cls, env: VecEnv, horizon: int | None = None) -> FamilyView:
-        """The same of what can be trained on: spaces fit, no wrapper changes it, an episode's
-        length is known.
+        """The same of what can be trained on: spaces fit, an episode's length is known, no wrapper
+        changes what is seen, done or paid: those of Gymnasium and SB3 are refused by name, others
+        by the first experience, see :meth:`check_experience`.
 
-        Wrappers that change what is seen, done or paid are refused: those of Gymnasium and SB3 by
-        name, others by the first experience, see :meth:`check_experience`.
-
-        :param horizon: Steps of an episode; None reads the time limit of the environment's
-            registration
-        :raises ValueError: if not
+        :param horizon: Steps of an episode; None reads the time limit of the registration
         """
         family = cls(env)
         family._unknown_wrappers = ", ".join(family.unknown_wrappers())
@@ -128,10 +122,7 @@ class FamilyView:
         return {name: value for name, value in own.items() if name not in DRAWING_ARGUMENTS}
 
     def unknown_wrappers(self) -> list[str]:
-        """The names of those wrappers of which it is not known whether they change the family.
-
-        :raises WrapperError: if there are such as do
-        """
+        """The names of wrappers that may change the family; refuses those that are known to."""
         env, names = self.env, self._wrapper_names()
         changing = [name for name in names if name in CHANGING]
         changing += [kind.__name__ for kind in CHANGING_KINDS if any(env.env_is_wrapped(kind))]
@@ -162,12 +153,11 @@ class FamilyView:
         return list(dict.fromkeys(names))
 
     def check_experience(self, tasks: np.ndarray, seed: int, segment: Segment) -> None:
-        """Whether rewards are :meth:`compute_rewards`'s, and unknown wrappers leave the family as
-        it is. The first call looks, and the others take its word.
+        """Refuse rewards that are not :meth:`compute_rewards`'s, and unknown wrappers that change
+        the family; the first call looks, and the others take its word.
 
         :param tasks: (copies, task_dim), those of the segment
         :param seed: Of the reset that it began with
-        :raises ValueError: if not
         """
         if self._experience_is_right:
             return
@@ -244,8 +234,8 @@ class FamilyView:
         return self._call("sample_tasks", n, rng)
 
     def test_tasks(self, n: int, seed: int) -> np.ndarray:
-        """(n, task_dim) tasks that no seed gives a model to train on. Those of a finite family are
-        repeated in turn: each is one adaptation more.
+        """(n, task_dim) tasks that no seed gives a model to train on; those of a finite family are
+        repeated in turn.
         """
         rng = np.random.default_rng([TEST_TASK_STREAM, seed])
         if self.all_tasks is None:
@@ -270,16 +260,12 @@ class FamilyView:
             env.env_method("set_task", task, indices=[index])
 
     def seed_episodes(self, seeds: Sequence[int]) -> None:
-        """Seed every copy's next episode without touching its task.
+        """Seed every copy's next episode, one seed a copy, without touching its task, the one that
+        was chosen for the next reset if there is one.
 
-        A task family that was never given a task draws one whenever it is reset with a seed; a
-        reset without a seed keeps the task. So a family's generators are replaced, and its next
-        reset needs no seed: the episode is the same as after a seeded reset, and the task stays.
-        Copies that have no generators to replace (``TaskVecEnv``) are told to keep their tasks. A
-        task that was chosen for the next reset is the one that stays, and seeds that are pending
-        are used up first.
-
-        :param seeds: One a copy
+        A family that was never given a task draws one whenever it is reset with a seed. So its
+        generators are replaced, and its next reset needs no seed; copies that have none to replace
+        (``TaskVecEnv``) are told to keep their tasks. Seeds that are pending are used up first.
         """
         env: Any = self.env
         if any(seed is not None for seed in env.unwrapped._seeds):
@@ -295,9 +281,7 @@ class FamilyView:
         seed_copies(env, seeds)
 
     def reset(self, tasks: np.ndarray, seed: int) -> np.ndarray:
-        """Start an episode of ``tasks[i]`` in each copy i, reproducibly; returns observations
-        (num_envs, obs_dim).
-        """
+        """Start an episode of ``tasks[i]`` in each copy i, reproducibly: (num_envs, obs_dim)."""
         self.set_tasks(tasks)
         self.env.seed(seed)
         obs = self.env.reset()
@@ -322,9 +306,7 @@ class FamilyView:
 
 
 def reward_features(env: VecEnv, infos: Sequence[dict[str, Any]]) -> np.ndarray | None:
-    """(num_envs, feat_dim) of the last step, as one array where the environment has it so; None
-    where it gives none.
-    """
+    """(num_envs, feat_dim) of the last step; None where the environment gives none."""
     fast: np.ndarray | None = getattr(env, "last_reward_features", None)
     if fast is not None:
         return fast
@@ -334,8 +316,7 @@ def reward_features(env: VecEnv, infos: Sequence[dict[str, Any]]) -> np.ndarray 
 
 
 def seed_copies(vec_env: VecEnv, seeds: Sequence[int]) -> None:
-    """Seed every copy's next reset by itself. ``VecEnv.seed(s)`` can only give copy i the seed s +
-    i, and two rollouts that are compared should start alike.
+    """Seed every copy's next reset by itself, where ``VecEnv.seed(s)`` gives copy i the seed s + i.
     """
     base = vec_env.unwrapped
     base.seed(seeds[0])

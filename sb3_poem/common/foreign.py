@@ -28,11 +28,7 @@ TIMES_DEFAULT, LONGEST = 100, 64
 
 
 def check_env_id(env_id: Any, source: str) -> None:
-    """Refuse what is not a registered environment's plain id, which imports no module.
-
-    :param env_id: From a file; None where a model has none
-    :param source: Of the file, for the message
-    """
+    """Refuse a file's id that is not a plain one, by which no module is imported; None is none."""
     if env_id is not None and not (isinstance(env_id, str) and PLAIN_ID.fullmatch(env_id)):
         raise ValueError(
             f"{source}: env_id is {_short(env_id)}, but an id that comes from a file must be a "
@@ -48,13 +44,10 @@ def environment_of(
     given_id: str | None = None,
     given_kwargs: Mapping[str, Any] | None = None,
 ) -> tuple[str, dict[str, Any]]:
-    """The environment for a model, id and arguments for ``gym.make``: the one that its file names,
-    unless the user names another.
+    """Id and arguments for ``gym.make`` of a model's environment: those that its file names, which
+    are checked, unless the user gives others, which are taken as they are.
 
     :param source: The model's name, for the message
-    :param env_id: From its file, as ``env_kwargs``
-    :param given_id: From the user; taken as it is
-    :param given_kwargs: From the user, in place of the file's; taken as they are
     :raises ValueError: if nobody names an environment, or the file's id or arguments are refused
     :raises gymnasium.error.Error: if the file's environment is not registered
     """
@@ -80,9 +73,7 @@ def environment_of(
 
 
 def _defaults(entry_point: str | Callable[..., Any] | None) -> dict[str, Any]:
-    """Arguments that an environment's class names, and the bases to which it passes on others, with
-    their defaults. Those without a default are left out: the class gives them itself.
-    """
+    """Arguments with defaults of an environment's class and of the bases to which it passes on."""
     creator: Any = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
     kinds = creator.__mro__ if isinstance(creator, type) else ()
     makers = [vars(kind)["__init__"] for kind in kinds if "__init__" in vars(kind)] or [creator]

@@ -25,8 +25,7 @@ LOG_DENSITY_CONSTANT = 0.5 * math.log(2.0 * math.pi) + 2.0 * math.log(2.0)
 
 
 class Normalised(nn.Module):
-    """An activation of values that are normalised over their layer (Ba, Kiros & Hinton, 2016),
-    without gain and bias.
+    """An activation of layer-normalised values (Ba, Kiros & Hinton, 2016), without gain and bias.
     """
 
     def __init__(self, activation: nn.Module) -> None:
@@ -105,10 +104,8 @@ class MLP(nn.Module):
         self.low_precision: LowPrecisionMLP | None = None
 
     def forward(self, *parts: th.Tensor, frozen: bool = False) -> th.Tensor:
-        """Map (..., in_dim), in one or more parts, to (..., out_dim), float32.
-
-        :param parts: Input, split along its last dimension
-        :param frozen: Do not build a graph to the parameters; gradients still reach the input
+        """Map (..., in_dim), in one or more parts, to (..., out_dim), float32; if ``frozen``
+        without a graph to the parameters, while gradients still reach the input.
         """
         return self.evaluate(self.inputs(*parts), frozen)
 
@@ -163,12 +160,8 @@ class _GaussianProduct(th.autograd.Function):
 
 
 class ContextEncoder(nn.Module):
-    """Probabilistic, permutation-invariant task encoder q_phi(z | c).
-
-    Each transition of the context gives one Gaussian factor; their normalised product is the
-    posterior, as in Rakelly et al. (2019), which section 5.3 of Xu & Zhu (2025) takes over.
-
-    :param in_dim: Width of one context transition
+    """Probabilistic, permutation-invariant task encoder q_phi(z | c): the normalised product of a
+    Gaussian factor of each transition (Rakelly et al. 2019; section 5.3 of Xu & Zhu 2025).
     """
 
     def __init__(self, in_dim: int, latent_dim: int, net_arch: Sequence[int]) -> None:
@@ -176,16 +169,13 @@ class ContextEncoder(nn.Module):
         self.mlp = MLP(in_dim, 2 * latent_dim, net_arch)
 
     def forward(self, context: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Mean and variance of every task's posterior, each (tasks, latent_dim), from (tasks,
-        transitions, in_dim).
+        """(tasks, transitions, in_dim) -> each posterior's mean and variance, (tasks, latent_dim).
         """
         return _GaussianProduct.apply(self.mlp(context))
 
 
 class _SquashedGaussian(th.autograd.Function):
-    """Actions and their log-probability from means and log standard deviations, (..., 2 *
-    action_dim), and noise.
-    """
+    """Actions and their log-probability from means and log deviations, (..., 2 action_dim)."""
 
     @staticmethod
     def forward(ctx: Any, raw: th.Tensor, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
@@ -214,10 +204,7 @@ class _SquashedGaussian(th.autograd.Function):
 
 
 class LatentActor(nn.Module):
-    """Squashed Gaussian policy pi_theta(a | s, z_pi).
-
-    :param architecture: Further arguments of :class:`MLP`
-    """
+    """Squashed Gaussian policy pi_theta(a | s, z_pi)."""
 
     def __init__(
         self, obs_dim: int, latent_dim: int, action_dim: int, *architecture: Any, **more: Any
@@ -247,9 +234,7 @@ class LatentActor(nn.Module):
 
 
 class LatentCritic(nn.Module):
-    """Action values Q(s, a, z) of several critics at once; the arguments after the widths are those
-    of :class:`MLP`.
-    """
+    """Action values Q(s, a, z) of several critics at once."""
 
     def __init__(
         self,
@@ -268,20 +253,14 @@ class LatentCritic(nn.Module):
     def forward(
         self, obs: th.Tensor, actions: th.Tensor, latents: th.Tensor, frozen: bool = False
     ) -> th.Tensor:
-        """Values of (..., obs_dim), (..., action_dim), (..., latent_dim) -> (n_critics, ...).
-
-        :param frozen: Do not build a graph to the parameters; gradients still reach the inputs
-        """
+        """Values of (..., obs_dim), (..., action_dim), (..., latent_dim) -> (n_critics, ...)."""
         members: list[MLP] = list(self.members)  # type: ignore[arg-type]
         x = members[0].inputs(obs, actions, latents)
         return th.stack([member.evaluate(x, frozen) for member in members]).squeeze(-1)
 
 
 class RewardDecoder(nn.Module):
-    """Reward model r_theta_r(s, a, s', z_r), in standardised units of reward.
-
-    :param architecture: Further arguments of :class:`MLP`
-    """
+    """Reward model r_theta_r(s, a, s', z_r), in standardised units of reward."""
 
     def __init__(
         self, obs_dim: int, action_dim: int, latent_dim: int, *architecture: Any, **more: Any

@@ -30,26 +30,21 @@ def rollout_latents(
     """Roll out one episode of pi(. | f_pi(z)) for every latent z, as many at a time as the
     environment has copies; in the order of the latents.
 
-    Every rollout resets its copy with a seed of its own, so a rollout of policies that act by their
-    mode depends on its latent, its task and its seed, and not on which copy ran it or on how many
-    copies there are. Two rollouts with equal seeds start alike (common random numbers). Action
-    noise (``deterministic=False``) is drawn for all copies of a wave together: it depends on the
-    wave's first seed, on the copy and on their number, too. A copy's first episode alone is kept.
-    Nothing is restored afterwards: the environment keeps the tasks and the state that it ended in.
+    Every rollout resets its copy with a seed of its own: of policies that act by their mode it
+    depends on its latent, task and seed alone, not on the copy or on how many there are, and two
+    with equal seeds start alike (common random numbers). Action noise is drawn for a wave of copies
+    together. A copy's first episode alone is kept; the environment keeps the tasks and the state
+    that it ended in.
 
     :param model: Anything with SB3's ``predict(obs, state=latents, deterministic=...)``.
-    :param vec_env: Any SB3 vector environment.
     :param latents: (n, latent_dim), any n.
-    :param tasks: (n, task_dim) to set before each rollout; None keeps the environment's own tasks
-        as they are.
+    :param tasks: (n, task_dim) to set before each rollout; None keeps the environment's own tasks.
     :param seed: One seed a rollout, or one integer s: then rollout i takes s + i.
     :param deterministic: Whether the policies act by their mode.
     :param frames: Whether to render every step, or n to render every n-th; the environment needs
         ``render_mode="rgb_array"``.
-    :param max_steps: Where an episode is cut if the environment does not end it; None takes
-        ``model.horizon``.
-    :raises ValueError: On wrong shapes, and if an observation or an action is not finite; the
-        episode is named.
+    :param max_steps: Where an episode is cut; None takes ``model.horizon``.
+    :raises ValueError: On wrong shapes, and if an observation or an action is not finite.
     """
     how = (seed, deterministic, frames, max_steps)
     episodes = _episodes(model, vec_env, latents, tasks, *how, keep=True)
@@ -76,10 +71,8 @@ def rollout_outcomes(
     *,
     max_steps: int | None = None,
 ) -> list[Outcome]:
-    """As :func:`rollout_latents`, but keep each episode's outcome only: for evaluation, where
-    observations would take hundreds of megabytes (Humanoid).
-
-    :raises ValueError: As there, and if the environment gives no reward features.
+    """As :func:`rollout_latents`, but keep each episode's outcome only, for evaluation:
+    observations may take hundreds of megabytes. Refuses an environment without reward features.
     """
     outcomes, how = [], (seed, deterministic, False, max_steps)
     for episode in _episodes(model, vec_env, latents, tasks, *how, keep=False):
@@ -92,9 +85,7 @@ def rollout_outcomes(
 def policy_actions(
     model: Any, observations: np.ndarray, latents: np.ndarray, deterministic: bool
 ) -> np.ndarray:
-    """The actions (n, act_dim) of pi(. | f_pi(z)), one latent (n, latent_dim) an observation (n,
-    obs_dim).
-    """
+    """Actions (n, act_dim) of pi(. | f_pi(z)) for observations (n, obs_dim), a latent each."""
     actions, _ = model.predict(observations, state=latents, deterministic=deterministic)
     return actions
 
@@ -167,9 +158,7 @@ def _episodes(
 
 @contextlib.contextmanager
 def _seeded_noise(seed: int, deterministic: bool) -> Iterator[None]:
-    """SB3's policies draw action noise from torch's global generator: seed it for the rollout, and
-    hand it back as it was.
-    """
+    """Seed torch's global generator, of SB3's action noise, and hand it back as it was."""
     if deterministic:
         yield
         return

@@ -1,6 +1,4 @@
-"""SB3's face of a vectorised task family: all copies step in one call, infos are as with
-``DummyVecEnv`` and ``Monitor``.
-"""
+"""SB3's face of a vectorised task family: infos are as with ``DummyVecEnv`` and ``Monitor``."""
 
 from __future__ import annotations
 
@@ -39,21 +37,17 @@ READ_INFOS = {"reward_features", "final_obs", "_final_obs"}
 
 class TaskVecEnv(VecEnv):
     """Vectorised environment for task families that have a vectorised version
-    (``vector_entry_point``).
+    (``vector_entry_point``), in place of ``DummyVecEnv`` where a class can be given:
+    ``make_vec_env(id, n, vec_env_cls=TaskVecEnv)``, rl_zoo3.
 
-    It takes the place of ``DummyVecEnv`` where a class can be given: ``make_vec_env(id, n,
-    vec_env_cls=TaskVecEnv)``, rl_zoo3. It steps all copies at once, and gives the same
-    observations, rewards and infos. ``infos[i]`` holds ``"reward_features"``, and as ``Monitor``
-    and ``DummyVecEnv`` have them ``"TimeLimit.truncated"``, ``"terminal_observation"`` and
-    ``"episode"``. ``get_attr`` and ``env_method`` see each copy as a single
-    :class:`poem_envs.TaskFamily`. What else the family's infos hold, such as ``"is_success"``, is
-    there too.
+    It steps all copies at once, and gives the same observations, rewards and infos, those of
+    ``Monitor`` and ``DummyVecEnv`` included, and ``"reward_features"``. ``get_attr`` and
+    ``env_method`` see each copy as a single :class:`poem_envs.TaskFamily`.
 
     :param env_fns: One function a copy that returns an environment. Only the first is called: all
         copies are made alike, from its registration and arguments. If its ``Monitor`` has a file,
         the episodes of all copies are written to that file.
-    :param nthread: Threads (or processes, as the family has it) to step with; None for the family's
-        default (all cores).
+    :param nthread: Threads (or processes, as the family has it) to step with; None for all cores
     :raises ValueError: If the environment is no task family, has no vectorised version, was not
         made by ``gym.make``, was given a task already, or is inside a wrapper other than
         ``TimeLimit``, ``OrderEnforcing``, ``PassiveEnvChecker`` and ``Monitor``.
@@ -200,9 +194,7 @@ class TaskVecEnv(VecEnv):
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None
     ) -> list[bool]:
-        """Whether the copies do what a wrapper does: those that the first environment was inside,
-        and ``Monitor`` always.
-        """
+        """Whether the copies do what a wrapper does: the first environment's, and ``Monitor``."""
         kinds: tuple[type, ...] = (Monitor, *self._wrapper_types)
         wrapped = any(issubclass(kind, wrapper_class) for kind in kinds)
         return [wrapped for _ in self._get_indices(indices)]
@@ -221,11 +213,7 @@ class TaskVecEnv(VecEnv):
 
 
 def as_task_vec_env(vector_env: gym.vector.VectorEnv) -> VecEnv:
-    """Gymnasium's vectorised environment of a task family, as ``gym.make_vec`` makes it, as one of
-    SB3.
-
-    :raises ValueError: If it is of no task family, or in a wrapper, or in Gymnasium's processes
-    """
+    """Gymnasium's vectorised environment of a task family, from ``gym.make_vec``, as one of SB3."""
     if isinstance(vector_env, TaskFamilyVector):
         return TaskVecEnv.from_vector_env(vector_env)
     if isinstance(vector_env, gym.vector.SyncVectorEnv):
@@ -259,11 +247,7 @@ def make_task_vec_env(
 
 
 def make_shown_env(env_id: str, render_mode: str | None, **env_kwargs: Any) -> gym.Env:
-    """A single environment, to be looked at.
-
-    :param render_mode: None draws nothing
-    :raises ValueError: If it cannot be drawn so
-    """
+    """A single environment, to be looked at; refused if it cannot be drawn so."""
     env = gym.make(env_id, render_mode=render_mode, **env_kwargs)
     if render_mode is not None and render_mode not in env.metadata.get("render_modes", ()):
         raise ValueError(f"{env_id} cannot be shown: it has no render mode {render_mode!r}")

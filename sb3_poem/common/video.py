@@ -18,12 +18,7 @@ def _even(frame: Frame) -> Frame:
 
 
 def write_video(frames: Sequence[Frame], path: str | Path, fps: float = 20.0) -> Path:
-    """Write frames as MP4 (H.264) or GIF, by the file's suffix; missing folders are made.
-
-    :param frames: (height, width, 3) uint8 each, all of one size
-    :return: the path
-    :raises ValueError: no frames, frames of other shapes, or another suffix
-    """
+    """Write frames, (height, width, 3) uint8 of one size, as MP4 (H.264) or GIF, by the suffix."""
     import imageio.v2 as imageio
 
     path = Path(path)
@@ -80,11 +75,8 @@ def side_by_side(
     captions: tuple[str, str] | None = None,
     gap: int = GAP,
 ) -> list[Frame]:
-    """Two clips beside each other, under a line of text each if there are captions; the shorter one
-    holds its last frame.
-
-    :param gap: White columns between them
-    :raises ValueError: a clip is empty, or their heights differ
+    """Two clips beside each other, with ``gap`` white columns between them, under a line of text
+    each if there are captions; the shorter one holds its last frame.
     """
     if len(left) == 0 or len(right) == 0:
         raise ValueError(f"both clips need frames, got {len(left)} and {len(right)}")
