@@ -1,5 +1,4 @@
-"""A few antialiased shapes on a numpy image, and a window to show it, without a graphics library.
-"""
+"""A few antialiased shapes on a numpy image, and a window to show it."""
 
 from __future__ import annotations
 

@@ -71,8 +71,7 @@ class CopyGroup:
     def begin(
         self, starts: Sequence[EpisodeStart]
     ) -> tuple[list[np.ndarray], list[np.random.Generator]]:
-        """Begin episodes in some copies: their observations, and their generators after all draws.
-        """
+        """Begin episodes in some copies: observations, and generators after all draws."""
         observations = []
         for start in starts:
             env = self.envs[start.copy]

@@ -316,8 +316,7 @@ def reward_features(env: VecEnv, infos: Sequence[dict[str, Any]]) -> np.ndarray 
 
 
 def seed_copies(vec_env: VecEnv, seeds: Sequence[int]) -> None:
-    """Seed every copy's next reset by itself, where ``VecEnv.seed(s)`` gives copy i the seed s + i.
-    """
+    """Seed every copy's next reset by itself: ``VecEnv.seed(s)`` gives copy i the seed s + i."""
     base = vec_env.unwrapped
     base.seed(seeds[0])
     # SB3's own list of "seeds to be used in the next call to env.reset()"

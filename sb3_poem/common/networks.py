@@ -25,8 +25,7 @@ LOG_DENSITY_CONSTANT = 0.5 * math.log(2.0 * math.pi) + 2.0 * math.log(2.0)
 
 
 class Normalised(nn.Module):
-    """An activation of layer-normalised values (Ba, Kiros & Hinton, 2016), without gain and bias.
-    """
+    """An activation of layer-normalised values (Ba, Kiros & Hinton, 2016), without gain or bias."""
 
     def __init__(self, activation: nn.Module) -> None:
         super().__init__()
@@ -169,8 +168,7 @@ class ContextEncoder(nn.Module):
         self.mlp = MLP(in_dim, 2 * latent_dim, net_arch)
 
     def forward(self, context: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """(tasks, transitions, in_dim) -> each posterior's mean and variance, (tasks, latent_dim).
-        """
+        """(tasks, transitions, in_dim) -> posteriors' means and variances, (tasks, latent_dim)."""
         return _GaussianProduct.apply(self.mlp(context))
 
 

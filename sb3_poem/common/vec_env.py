@@ -226,11 +226,7 @@ def as_task_vec_env(vector_env: gym.vector.VectorEnv) -> VecEnv:
 
 
 def make_task_vec_env(
-    env_id: str,
-    n_envs: int,
-    max_sequential: int = 8,
-    nthread: int | None = None,
-    **env_kwargs: Any,
+    env_id: str, n_envs: int, max_sequential: int = 8, nthread: int | None = None, **env_kwargs: Any
 ) -> VecEnv:
     """Copies of a registered family: a :class:`TaskVecEnv`, or a ``DummyVecEnv`` of a family
     without a vectorised version.

@@ -1,6 +1,4 @@
-"""Arguments of the algorithms: their ranges, and what SB3's SAC takes and these do not: why, and
-what to do instead.
-"""
+"""Arguments: their ranges, and why SAC's others are not taken, with what to do instead."""
 
 import difflib
 import inspect
@@ -92,10 +90,7 @@ def refuse_unknown(names: Iterable[str], algorithm: type) -> None:
 
 
 def check_arguments(given: Mapping[str, Any], algorithm: type) -> None:
-    """:param given: PEARLSAC's arguments by name
-    :raises ValueError: at the first outside its range
-    :raises TypeError: for arguments of the policy that only SAC's takes
-    """
+    """Refuse the first of PEARLSAC's arguments, by name, that is outside its range."""
     policy_kwargs, scale, device = given["policy_kwargs"], given["reward_scale"], given["device"]
     if not isinstance(policy_kwargs, dict | None):
         needed = "a dictionary of the policy's arguments"

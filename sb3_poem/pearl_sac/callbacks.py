@@ -14,7 +14,6 @@ class EpochCallback(BaseCallback):
     collection of the next.
 
     :param every: Epochs between two calls; the end of training is always one
-    :raises ValueError: if that is below 1
     """
 
     model: PEARLSAC

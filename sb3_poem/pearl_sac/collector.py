@@ -17,12 +17,9 @@ from sb3_poem.pearl_sac.train_tasks import TrainTasks
 
 @dataclass
 class EpochCollector:
-    """Rolls training tasks out and fills their replay buffers. Fields that are not described are
-    PEARLSAC's.
-
-    :param explores: Whether actions are uniformly random at present
-    :param episode_count: Episodes begun so far; for messages
-    :param on_step: See :func:`collect_segment`
+    """Rolls training tasks out and fills their replay buffers. ``explores`` tells whether actions
+    are uniformly random at present, ``episode_count`` the episodes begun so far, for messages;
+    other fields are PEARLSAC's.
     """
 
     family: FamilyView
@@ -37,26 +34,22 @@ class EpochCollector:
     on_step: OnStep
 
     def collect(self) -> list[Segment] | None:
-        """One epoch: ``trajectories_per_task`` horizons of every task, one segment for each wave of
-        copies; None if ``on_step`` ended the collection.
+        """One epoch: ``trajectories_per_task`` horizons of every task, a segment for each wave of
+        copies; None if ``on_step`` ended it.
         """
         waves = []
         wanted = np.repeat(np.arange(len(self.train_tasks)), self.trajectories_per_task)
         for wave in in_waves(wanted, self.family.num_envs):
-            segment = self.roll_out(
-                wave, self.train_tasks.draw_latents(wave, self.generators.numpy)
-            )
+            latents = self.train_tasks.draw_latents(wave, self.generators.numpy)
+            segment = self.roll_out(wave, latents)
             if segment is None:
                 return None
             waves.append(segment)
         return waves
 
     def roll_out(self, task_ids: np.ndarray, latents: np.ndarray) -> Segment | None:
-        """One horizon of each copy under a latent of its own, which goes to the buffer as well;
-        None if ``on_step`` ended the collection.
-
-        :param task_ids: (copies,)
-        :param latents: (copies, latent_dim)
+        """One horizon of each copy on a task (copies,) under a latent (copies, latent_dim), which
+        goes to the buffer as well; None if ``on_step`` ended it.
         """
         space = self.policy.action_space
         shape = (len(latents), int(space.shape[0]))
@@ -90,9 +83,7 @@ class EpochCollector:
 
 
 def in_waves(rows: np.ndarray, n_envs: int) -> np.ndarray:
-    """Rows in order, (waves, n_envs, ...): the last wave is filled up from the start, as its copies
-    are stepped anyway.
-    """
+    """Rows in order, (waves, n_envs, ...): the last wave is filled up from the start."""
     count = -(-len(rows) // n_envs) * n_envs
     return rows[np.arange(count) % len(rows)].reshape(-1, n_envs, *rows.shape[1:])
 

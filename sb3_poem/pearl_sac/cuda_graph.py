@@ -14,14 +14,12 @@ Step = Callable[[MetaBatch], dict[str, th.Tensor]]
 
 
 class GraphedStep:
-    """Runs a step, and from the fourth on replays it: thousands of small kernels then cost one
-    launch.
+    """Runs a step, which maps a meta-batch to scalar metrics without waiting for the device, and
+    from the fourth on replays it: thousands of small kernels then cost one launch.
 
     Everything that the step reads and does not change must stay where it is between calls, but for
     the meta-batch, which is copied to where the graph reads it. Its optimisers must be
     :func:`prepared <prepare_optimizers>`.
-
-    :param step: Maps a meta-batch to metrics, all scalars, without waiting for the device
     """
 
     def __init__(self, step: Step) -> None:
@@ -60,8 +58,7 @@ class GraphedStep:
 
 def prepare_optimizers(optimizers: list[th.optim.Optimizer], device: th.device) -> None:
     """Keep the state of optimisers where their parameters are, and tell them whether a graph may
-    capture them: on a processor, where a model that was trained on a GPU may go on, they refuse
-    that.
+    capture them, which they refuse on a processor.
     """
     for optimizer in optimizers:
         for group in optimizer.param_groups:

@@ -23,9 +23,6 @@ def vectorise(
     each trajectory of an epoch, up to one per task or :data:`DEFAULT_TRAIN_TASKS`, whichever is
     more; of a family without a vectorised version, as many as :func:`make_task_vec_env` steps in
     turn.
-
-    :raises TypeError: if it is no environment
-    :raises ValueError: if it is Gymnasium's vectorised environment of no task family
     """
     if isinstance(env, gym.vector.VectorEnv):
         return as_task_vec_env(env)

@@ -13,9 +13,7 @@ Metrics = dict[str, th.Tensor]
 
 
 class TaskEmbeddings(NamedTuple):
-    """Latents z of the tasks of a meta-batch, and what actor and decoder see of them; each (tasks,
-    latent_dim).
-    """
+    """Latents of a meta-batch, and what actor and decoder see of them; each (tasks, latent_dim)."""
 
     latents: th.Tensor
     policy: th.Tensor
@@ -34,11 +32,9 @@ def kl_to_prior(mean: th.Tensor, variance: th.Tensor) -> th.Tensor:
 
 @dataclass
 class Objective:
-    """PEARL's losses. Transitions that its methods take are standardised already, their actions
-    lie in [-1, 1]. Fields that are not described are PEARLSAC's.
-
-    :param reward_scale: Factor on the rewards that the critics learn
-    :param reward_variance: By which the decoder's squared error is divided
+    """PEARL's losses, of transitions that are standardised already. ``reward_scale`` is the factor
+    on the critics' rewards, ``reward_variance`` divides the decoder's squared error; other fields
+    are PEARLSAC's.
     """
 
     actor_trains_encoder: ClassVar[bool] = False
@@ -55,10 +51,8 @@ class Objective:
     def loss(
         self, batch: MetaBatch, alpha: th.Tensor, whole: bool = True
     ) -> tuple[th.Tensor, Metrics]:
-        """Sum of the losses of a meta-batch, and what to log of them (Algorithm 1, lines 7 to 14).
-
-        :param alpha: Entropy coefficient
-        :param whole: False leaves out all but critics and encoder
+        """Sum of the losses, and what to log of them (Algorithm 1, lines 7 to 14). Unless
+        ``whole``, those of critics and encoder alone; ``alpha`` is the entropy coefficient.
         """
         latents, kl = self.encode(batch)
         embeddings = self.embed(latents)
@@ -70,21 +64,14 @@ class Objective:
         actor_loss, log_prob = self.actor_loss(batch, transitions, embeddings, alpha)
         decoder_loss = self.decoder_loss(batch, transitions, embeddings)
         embedding_loss, embedding_metrics = self.embedding_loss(batch, embeddings)
-        loss = (
-            critic_loss
-            + self.policy_coef * actor_loss
-            + self.reward_coef * decoder_loss
-            + self.kl_coef * kl
-            + embedding_loss
-        )
+        loss = critic_loss + self.policy_coef * actor_loss + self.reward_coef * decoder_loss
+        loss = loss + self.kl_coef * kl + embedding_loss
         metrics |= {"actor_loss": actor_loss, "decoder_loss": decoder_loss}
         metrics |= {"entropy": -log_prob, "ent_coef": alpha}
         return loss, metrics | embedding_metrics
 
     def encode(self, batch: MetaBatch) -> tuple[th.Tensor, th.Tensor]:
-        """Latents (tasks, latent_dim) by reparameterisation, and the mean KL of their posteriors to
-        N(0, I).
-        """
+        """Latents (tasks, latent_dim) by reparameterisation, and their posteriors' mean KL."""
         mean, variance = self.policy.encoder(batch.context)
         latents = mean + variance.sqrt() * batch.latent_noise
         return latents, kl_to_prior(mean, variance).mean()
@@ -92,24 +79,19 @@ class Objective:
     def embed(self, latents: th.Tensor) -> TaskEmbeddings:
         """What actor and decoder see of latents (tasks, latent_dim)."""
         policy, seen = self.policy, latents if self.actor_trains_encoder else latents.detach()
-        return TaskEmbeddings(
-            latents, policy.policy_embedding(seen), policy.reward_embedding(latents)
-        )
+        embeddings = policy.policy_embedding(seen), policy.reward_embedding(latents)
+        return TaskEmbeddings(latents, *embeddings)
 
     def standardised(self, batch: TaskBatch) -> TaskBatch:
         """The same with standardised observations."""
-        standardise = self.policy.standardise
-        return batch._replace(
-            observations=standardise(batch.observations),
-            next_observations=standardise(batch.next_observations),
-        )
+        seen = map(self.policy.standardise, (batch.observations, batch.next_observations))
+        observations, next_observations = seen
+        return batch._replace(observations=observations, next_observations=next_observations)
 
     def critic_loss(
         self, batch: MetaBatch, transitions: TaskBatch, embeddings: TaskEmbeddings, alpha: th.Tensor
     ) -> th.Tensor:
-        """Half the squared soft Bellman error, summed over the critics; it trains the encoder too,
-        as in PEARL.
-        """
+        """Half the squared soft Bellman error of all critics; it trains the encoder too."""
         policy, n = self.policy, transitions.rewards.shape[1]
         z = rows(embeddings.latents, n)
         if batch.bootstraps is None:
@@ -142,9 +124,8 @@ class Objective:
     def decoder_loss(
         self, batch: MetaBatch, transitions: TaskBatch, embeddings: TaskEmbeddings
     ) -> th.Tensor:
-        """Squared error of the decoder, relative to ``reward_variance`` (eq. 4): on contexts or,
-        where batches are relabelled, on these: they hold other tasks' policies too, as adaptation
-        asks the decoder about.
+        """Squared error of the decoder over ``reward_variance`` (eq. 4): on contexts or, where they
+        are relabelled, on batches, which hold other tasks' policies too, as adaptation asks about.
         """
         inputs = transitions.observations, transitions.actions, transitions.next_observations
         rewards = transitions.rewards

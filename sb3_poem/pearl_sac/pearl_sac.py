@@ -294,7 +294,6 @@ class PEARLSAC(SAC):
         """A new model with the hyperparameters that ship for an environment (``zoo_configs/``), as
         ``sb3-poem train`` makes it. :meth:`learn` then knows for how many steps.
 
-        :param env_id: A registered id that has an entry
         :param arguments: What shall differ: arguments of the constructor, ``n_envs`` (copies of the
             environment) and ``n_timesteps``. With ``env``, another family is trained by this entry
         :raises ValueError: if there is no entry; the message lists those that there are
@@ -329,18 +328,12 @@ class PEARLSAC(SAC):
         """Train, in whole epochs, until at least ``total_timesteps`` environment steps are done.
 
         :param total_timesteps: None takes those of the entry that :meth:`from_zoo` read
-        :param callback: As SB3's
         :param log_interval: Epochs between two dumps of the log; None never dumps
         :param tb_log_name: None is the algorithm's name
-        :raises ValueError: if the number of steps is not known
         """
-        total_timesteps, callback = self._setup_learn(
-            self._checked_steps(total_timesteps, callback),
-            callback,
-            reset_num_timesteps,
-            tb_log_name or self.algorithm,
-            progress_bar,
-        )
+        steps = self._checked_steps(total_timesteps, callback)
+        how = (callback, reset_num_timesteps, tb_log_name or self.algorithm, progress_bar)
+        total_timesteps, callback = self._setup_learn(steps, *how)
         callback.on_training_start(locals(), globals())
         while self.num_timesteps < total_timesteps:
             # between two epochs: evaluations and checkpoints belong here
@@ -406,11 +399,7 @@ class PEARLSAC(SAC):
 
     def measure_returns(self, epoch: Segment, collector: EpochCollector) -> np.ndarray | None:
         """J[i, j]: the return of task j's policy on task i, (n_train_tasks, n_train_tasks); NaN
-        where unknown.
-
-        :param epoch: Rollouts of the tasks under their own policies
-        :param collector: For further rollouts
-        :return: None if a callback ended these
+        where unknown, None if a callback ended the ``collector``'s further rollouts.
         """
         n_tasks = len(self.train_tasks)
         own = (epoch.rewards * epoch.first_episode).sum(axis=1).reshape(n_tasks, -1).mean(axis=1)
@@ -478,9 +467,7 @@ class PEARLSAC(SAC):
 
     @th.no_grad()
     def _refresh_posteriors(self) -> None:
-        """Posterior of every training task from its latest context: next epoch's latents, and the
-        aggregate.
-        """
+        """Every training task's posterior from its latest context, for the next epoch's latents."""
         self.policy.set_training_mode(False)
         transitions, generator = self._known_context.transitions, self.generators.torch
         picks = th.randperm(transitions.shape[1], generator=generator, device=self.device)
@@ -490,8 +477,7 @@ class PEARLSAC(SAC):
     @th.no_grad()
     def _measure_decoder(self) -> None:
         """Residual deviation of the decoder, per step, on transitions of all training policies, in
-        units of reward. Where tasks do not share their dynamics it stays unknown: the decoder has
-        seen no rewards for what others' policies do.
+        units of reward; unknown where tasks do not share their dynamics.
         """
         if not self.family.shared_dynamics:
             return
@@ -597,10 +583,7 @@ class PEARLSAC(SAC):
 
     @property
     def family(self) -> FamilyView:
-        """The environment as a task family.
-
-        :raises ValueError: if the model was loaded without an environment
-        """
+        """The environment as a task family; refused if the model was loaded without one."""
         if self._family is None:
             if self.env is None:
                 raise ValueError(
@@ -639,8 +622,6 @@ class PEARLSAC(SAC):
     def set_env(self, env: GivenEnv, force_reset: bool = True) -> None:
         """Change the environment, to one of the same family with any number of copies; a registered
         id gets as many as the model has.
-
-        :raises ValueError: if the environment is of another family; the model then keeps its own
         """
         given = vectorise(env, self.n_envs)
         if given is None:
@@ -682,9 +663,8 @@ class PEARLSAC(SAC):
         self, latents: np.ndarray, trajectories: Iterable[Trajectory], max_steps: int | None = None
     ) -> np.ndarray:
         """Returns that the reward decoder predicts for trajectories, if each latent were the
-        task's: (m, number of trajectories).
+        task's: (m, latent_dim) -> (m, number of trajectories).
 
-        :param latents: (m, latent_dim)
         :param max_steps: Of a longer trajectory only so many steps are decoded, evenly spaced, and
             the sum is scaled up; None decodes all
         """
@@ -744,10 +724,8 @@ class PEARLSAC(SAC):
         return model
 
     def save_checkpoint(self, path: str | pathlib.Path) -> None:
-        """Write everything to one file, from which :meth:`load_checkpoint` continues bit for bit.
-        Between two epochs only.
-
-        :raises OSError: if it cannot be written; a previous checkpoint stays whole
+        """Write everything to one file, between two epochs only, from which :meth:`load_checkpoint`
+        continues bit for bit. Where it fails, a previous checkpoint stays whole.
         """
         archive = io.BytesIO()
         self.save(archive)
@@ -762,11 +740,10 @@ class PEARLSAC(SAC):
         device: th.device | str = "auto",
     ) -> SelfPEARLSAC:
         """Read what :meth:`save_checkpoint` or :class:`TrainingCheckpointCallback` wrote;
-        :meth:`resume` then continues the run.
+        :meth:`resume` then continues the run, in an environment with as many copies.
 
-        :param env: An environment like the run's own: the same family and number of copies
-        :raises ValueError: if the file is truncated or holds another algorithm's run, or env is of
-            another family
+        :raises ValueError: if the file is truncated or of another algorithm, or env of another
+            family
         """
         state = saving.read_checkpoint(path, cls.__name__)
         model = cls.load(io.BytesIO(state["model"].numpy().tobytes()), env, device)
@@ -779,9 +756,7 @@ class PEARLSAC(SAC):
     def save_pretrained(
         self, folder: str | pathlib.Path, card: dict[str, Any] | None = None
     ) -> None:
-        """Write safetensors, JSON and a model card; see
-        :func:`sb3_poem.pearl_sac.saving.save_pretrained`.
-        """
+        """Write safetensors, JSON and a model card; see :func:`.saving.save_pretrained`."""
         saving.save_pretrained(self, folder, card)
 
     @classmethod
@@ -793,7 +768,6 @@ class PEARLSAC(SAC):
     ) -> SelfPEARLSAC:
         """Read what :meth:`save_pretrained` wrote, or a shipped model by its name.
 
-        :param env: An environment of the model's family, if it shall be trained on
         :raises FileNotFoundError: if the folder does not hold a model
         :raises ValueError: if a file is truncated or foreign, the model is of another algorithm, or
             env of another family

@@ -1,6 +1,4 @@
-"""Policy of PEARLSAC: an actor, critics, a context encoder and a reward decoder that share one
-latent.
-"""
+"""Policy of PEARLSAC: an actor, critics, a context encoder and a reward decoder of one latent."""
 
 import warnings
 from collections.abc import Callable, Iterable, Sequence
@@ -138,9 +136,8 @@ class LatentPolicy(SACPolicy):
         return self.obs_norm(obs)
 
     def update_statistics(self, segments: Sequence[Segment]) -> None:
-        """Standardise by the mean and deviation of all observations so far: a robot that has
-        learned to run is far from what the first epoch's random actions showed. Rewards keep the
-        first epoch's, in whose units the critics learn.
+        """Standardise observations by all so far: a robot that has learned to run is far from what
+        the first epoch showed. Rewards keep the first epoch's, in whose units the critics learn.
         """
         obs = np.concatenate([segment.observations for segment in segments])
         self.obs_norm.update(obs.reshape(-1, obs.shape[-1]))
@@ -149,11 +146,9 @@ class LatentPolicy(SACPolicy):
             self.reward_norm.update(rewards.reshape(-1, 1))
 
     def action_values(self, obs: th.Tensor, actions: th.Tensor, latents: np.ndarray) -> th.Tensor:
-        """Q(s, a) of the more doubtful critic, (copies, steps).
-
-        :param obs: (copies, steps, obs_dim), standardised
-        :param actions: (copies, steps, action_dim) in [-1, 1]
-        :param latents: (copies, latent_dim)
+        """Q(s, a) of the more doubtful critic, (copies, steps), of standardised observations
+        (copies, steps, obs_dim), actions (copies, steps, action_dim) in [-1, 1], latents (copies,
+        latent_dim).
         """
         z = th.as_tensor(latents, dtype=th.float32, device=self.device)
         values = [
@@ -170,10 +165,7 @@ class LatentPolicy(SACPolicy):
         max_steps: int | None,
         dtype: th.dtype,
     ) -> np.ndarray:
-        """See :meth:`PEARLSAC.predicted_returns`.
-
-        :param dtype: Of the hidden layers' arithmetic
-        """
+        """See :meth:`PEARLSAC.predicted_returns`; ``dtype`` is the hidden layers' arithmetic."""
 
         def tensor(values: np.ndarray) -> th.Tensor:
             return th.as_tensor(values, dtype=th.float32, device=self.device)
@@ -206,8 +198,8 @@ class LatentPolicy(SACPolicy):
     def decode_rewards(
         self, obs: th.Tensor, actions: th.Tensor, next_obs: th.Tensor, reward_embedding: th.Tensor
     ) -> th.Tensor:
-        """Predicted rewards (...) in the environment's units, of standardised observations (...,
-        obs_dim), actions (..., action_dim) in [-1, 1] and embeddings (..., latent_dim).
+        """Predicted rewards (...) in the environment's units, of standardised observations and
+        actions in [-1, 1].
         """
         return self.reward_norm.inverse(self.decoder(obs, actions, next_obs, reward_embedding))
 
@@ -215,8 +207,7 @@ class LatentPolicy(SACPolicy):
         self, latents: np.ndarray
     ) -> Callable[[np.ndarray, th.Tensor | None], np.ndarray]:
         """How to act under latents (n, latent_dim): a function of observations (n, obs_dim) and
-        standard normal noise (n, action_dim), None for the mean action, that gives actions in [-1,
-        1]. What depends on the latents alone is computed once.
+        standard normal noise (n, action_dim), None for the mean, to actions in [-1, 1].
         """
         device = self.device
         with th.no_grad():
@@ -302,13 +293,8 @@ class LatentPolicy(SACPolicy):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         names = [
             *("observation_space", "action_space", "net_arch", "activation_fn", "layer_norm"),
-            *(
-                "latent_dim",
-                "context_has_value",
-                "n_critics",
-                "optimizer_class",
-                "optimizer_kwargs",
-            ),
+            *("latent_dim", "context_has_value", "n_critics"),
+            *("optimizer_class", "optimizer_kwargs"),
         ]
         return {"lr_schedule": self._dummy_schedule} | {name: getattr(self, name) for name in names}
 

@@ -22,36 +22,25 @@ FOREIGN_SOURCES = 2
 
 
 class Bootstraps(NamedTuple):
-    """What the critics' targets are made of where they look some steps ahead.
+    """What critics' targets that look some steps ahead are made of, (tasks, batch, ...)."""
 
-    rewards (tasks, batch), their discounted sum until then; observations (tasks, batch, obs_dim)
-    after it; discounts (tasks, batch) of the value there, 0 where the episode terminated.
-    """
-
-    rewards: th.Tensor
-    observations: th.Tensor
-    discounts: th.Tensor
+    rewards: th.Tensor  # their discounted sum until then
+    observations: th.Tensor  # after it
+    discounts: th.Tensor  # of the value there, 0 where the episode terminated
 
 
 class MetaBatch(NamedTuple):
-    """What one gradient step sees of a meta-batch of tasks.
+    """What one gradient step sees of a meta-batch of tasks."""
 
-    task_ids (tasks,), transitions: a :class:`TaskBatch` (tasks, batch, ...), context (tasks,
-    context_size, context_dim), context_rewards (tasks, context_size), returns (tasks, tasks): J[i,
-    j], NaN where unknown; standard normal draws for the latents (tasks, latent_dim), the actions
-    and the next actions (tasks, batch, action_dim); bootstraps, None where targets look one step
-    ahead, which ``transitions`` tell.
-    """
-
-    task_ids: th.Tensor
-    transitions: TaskBatch
-    context: th.Tensor
-    context_rewards: th.Tensor
-    returns: th.Tensor
-    latent_noise: th.Tensor
-    action_noise: th.Tensor
+    task_ids: th.Tensor  # (tasks,)
+    transitions: TaskBatch  # (tasks, batch, ...)
+    context: th.Tensor  # (tasks, context_size, context_dim)
+    context_rewards: th.Tensor  # (tasks, context_size)
+    returns: th.Tensor  # (tasks, tasks): J[i, j], NaN where unknown
+    latent_noise: th.Tensor  # (tasks, latent_dim)
+    action_noise: th.Tensor  # (tasks, batch, action_dim)
     next_action_noise: th.Tensor
-    bootstraps: Bootstraps | None = None
+    bootstraps: Bootstraps | None = None  # None where targets look one step ahead
 
 
 def mapped(function: Callable[[th.Tensor], th.Tensor], batch: Any) -> Any:
@@ -63,8 +52,8 @@ def mapped(function: Callable[[th.Tensor], th.Tensor], batch: Any) -> Any:
 
 @dataclass
 class MetaBatchSampler:
-    """Draws meta-batches from replay buffers and contexts, several at once: indices, relabelled
-    rewards and noise then cost as many operations as for one. Its fields are those of PEARLSAC.
+    """Draws meta-batches from replay buffers and contexts, several at once, which costs as many
+    operations as one. Its fields are those of PEARLSAC.
     """
 
     family: FamilyView
@@ -88,9 +77,7 @@ class MetaBatchSampler:
         return self.replay_buffer.device
 
     def blocks(self, n: int, batch_size: int) -> Iterator[list[MetaBatch]]:
-        """``n`` meta-batches of ``batch_size`` transitions a task, in blocks that are drawn at
-        once.
-        """
+        """``n`` meta-batches of ``batch_size`` transitions a task, in blocks drawn at once."""
         step_bytes = self.meta_batch_size * batch_size * 4 * sum(self.replay_buffer.widths)
         at_once = max(1, BYTES_AT_ONCE.get(self.device.type, BYTES_AT_ONCE["cpu"]) // step_bytes)
         for start in range(0, n, at_once):
@@ -118,9 +105,7 @@ class MetaBatchSampler:
         return [batch._replace(returns=batch.returns[:, batch.task_ids]) for batch in batches]
 
     def choose_tasks(self) -> np.ndarray:
-        """Indices of a meta-batch, without repetition: a task twice would be a pair without a
-        difference.
-        """
+        """Indices of a meta-batch, each once: a task twice is a pair without a difference."""
         n_tasks = len(self.train_tasks)
         size = min(self.meta_batch_size, n_tasks)
         return self.generators.numpy.choice(n_tasks, size=size, replace=False)
@@ -128,9 +113,9 @@ class MetaBatchSampler:
     def _transitions(
         self, task_ids: th.Tensor, chosen: np.ndarray, batch_size: int
     ) -> tuple[TaskBatch, Bootstraps | None]:
-        """``batch_size`` transitions for each task, ``relabel_fraction`` of them other tasks' with
-        the task's own rewards and ``mirror_fraction`` seen in a symmetry; and what the critics'
-        targets are made of, if that is more than these.
+        """``batch_size`` transitions a task, ``relabel_fraction`` of them other tasks' with the
+        task's own rewards and ``mirror_fraction`` seen in a symmetry; and what targets need beyond
+        these.
         """
         generator, buffer = self.generators.torch, self.replay_buffer
         sources = task_ids[:, None].expand(-1, batch_size)
@@ -167,7 +152,7 @@ class MetaBatchSampler:
 
     def _draw_mirror(self, shape: th.Size) -> Callable[[TaskBatch], TaskBatch]:
         """A function that sees ``mirror_fraction`` of transitions (tasks, batch) in a symmetry,
-        each always in the same; their rewards stay as they were.
+        each always in the same, but for their rewards.
         """
         generator, device, symmetries = self.generators.torch, self.device, self.family.symmetries
         which = th.randint(1, len(symmetries) + 1, shape, generator=generator, device=device)
@@ -233,7 +218,7 @@ class MetaBatchSampler:
 
     def _context_sources(self, task_ids: th.Tensor) -> th.Tensor:
         """Whose transitions a context holds, (tasks, context_size): the task's own, or for
-        ``context_relabel_fraction`` of the contexts a mixture of those of two random tasks.
+        ``context_relabel_fraction`` of the contexts a mixture of two random tasks'.
         """
         generator, device, n = self.generators.torch, self.device, len(task_ids)
         n_tasks, picked = len(self.train_tasks), (n, self.context_size)

@@ -17,9 +17,7 @@ def default_train_tasks(all_tasks: np.ndarray | None) -> int:
 
 @dataclass(eq=False)
 class TrainTasks:
-    """Training tasks (n, task_dim) with the posterior of each one's latent, a Gaussian: means and
-    variances, (n, latent_dim).
-    """
+    """Training tasks (n, task_dim) with Gaussian posteriors of their latents, (n, latent_dim)."""
 
     tasks: np.ndarray
     latent_means: np.ndarray
@@ -35,11 +33,7 @@ class TrainTasks:
     def draw(
         cls, family: FamilyView, n: int | None, latent_dim: int, rng: np.random.Generator
     ) -> "TrainTasks":
-        """Draw tasks from a family.
-
-        :param n: How many; None takes :func:`default_train_tasks`
-        :raises ValueError: if a finite family has fewer
-        """
+        """Draw tasks from a family; of None, :func:`default_train_tasks`."""
         count = default_train_tasks(family.all_tasks) if n is None else n
         most = np.inf if family.all_tasks is None else len(family.all_tasks)
         if count > most:
@@ -65,9 +59,7 @@ class TrainTasks:
         """Draw latents (n, latent_dim).
 
         :param source: "prior": N(0, I). "aggregate": the training tasks' posteriors, and what lies
-            between a task and its nearest neighbours, so that tasks between the training tasks are
-            covered but untrained regions are not
-        :raises ValueError: for another source
+            between a task and its nearest neighbours
         """
         means = self.latent_means
         if source == "prior":

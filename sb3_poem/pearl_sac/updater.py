@@ -16,11 +16,8 @@ from sb3_poem.pearl_sac.sampler import MetaBatch
 
 @dataclass
 class EntropyCoefficient:
-    """SAC's entropy coefficient, learned or fixed.
-
-    :param tensor: The coefficient; its logarithm, (1,), where it is learned
-    :param optimizer: Of the logarithm; None where the coefficient is fixed
-    :param target: The entropy that it is to bring about
+    """SAC's entropy coefficient: fixed or, with an optimizer, learned, and then its logarithm,
+    (1,).
     """
 
     tensor: th.Tensor
@@ -38,9 +35,7 @@ class EntropyCoefficient:
         return self.tensor if self.optimizer is None else self.tensor.detach().exp().squeeze()
 
     def update(self, entropy: th.Tensor) -> None:
-        """Learn from the entropy of a meta-batch: a step along the gradient of log * (entropy -
-        target).
-        """
+        """A step along the gradient of log * (entropy - target), of a meta-batch's entropy."""
         if self.optimizer is not None:
             gradient = (entropy.detach() - self.target).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
             self.tensor.grad = gradient.view_as(self.tensor)
@@ -49,11 +44,8 @@ class EntropyCoefficient:
 
 @dataclass
 class Updater:
-    """Changes the networks, one meta-batch at a time. Use it as a context, in which hidden layers
-    compute in ``hidden_dtype``. Fields that are not described are PEARLSAC's.
-
-    :param objective: What is minimised
-    :param n_updates: Steps that the networks have had
+    """Changes the networks, one meta-batch at a time; a context, in which hidden layers compute in
+    ``hidden_dtype``. Fields but the objective are PEARLSAC's.
     """
 
     policy: LatentPolicy
@@ -87,10 +79,7 @@ class Updater:
 
     def step(self, batch: MetaBatch) -> Metrics:
         """One step on a meta-batch: of everything or, in between, of critics and encoder. Returns
-        what to log.
-
-        :raises ValueError: on a processor, if loss or gradient is not finite; see
-            :meth:`check_finite`
+        what to log; refuses what is not finite, on a processor (see :meth:`check_finite`).
         """
         metrics = self._steps[self.n_updates % self.policy_delay == 0](batch)
         self.n_updates += 1
@@ -104,10 +93,9 @@ class Updater:
             self.entropy_coefficient.update(metrics["entropy"])
         if self.n_updates % self.target_update_interval == 0:
             targets, critics = self.policy.critic_target, self.policy.critic
+            pair = tuple(targets.parameters()), tuple(critics.parameters())
             with th.no_grad():
-                th._foreach_lerp_(
-                    tuple(targets.parameters()), tuple(critics.parameters()), self.tau
-                )
+                th._foreach_lerp_(*pair, self.tau)
         return {name: value.detach() for name, value in metrics.items()}
 
     def _descend(self, loss: th.Tensor) -> th.Tensor:
@@ -128,9 +116,8 @@ class Updater:
         return norm
 
     def check_finite(self, gradient_norms: list[th.Tensor], first: int) -> None:
-        """:param gradient_norms: Of successive steps
-        :param first: The number of the first of them
-        :raises ValueError: if one is not finite
+        """Refuse gradient norms of successive steps, of which ``first`` is the number of the first,
+        that are not finite.
         """
         finite = th.isfinite(th.stack(gradient_norms))
         if not finite.all():
