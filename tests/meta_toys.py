@@ -206,7 +206,7 @@ LEARN: dict[str, Any] = {
     "seed": 1,
     "device": "cpu",
 }
-LEARN_STEPS = 12 * 20 * POINT_GOAL_STEPS
+LEARN_EPOCH = 20 * POINT_GOAL_STEPS
 
 
 class Interrupt(BaseCallback):

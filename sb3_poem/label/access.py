@@ -1,6 +1,4 @@
-"""Who gets in, and with how much: host names, passwords, cross-site requests, sizes, what a browser
-may do with a page, how long the server waits for a client, and who goes when there are too many.
-"""
+"""Who gets in, and with how much: names, passwords, cross-site requests, sizes, waiting, crowds."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""What the system believes, as a picture and a sentence for people: the posterior over latents,
-seen as tasks.
-"""
+"""What the system believes, as a picture and a sentence: the posterior over latents, as tasks."""
 
 from __future__ import annotations
 
@@ -52,10 +50,7 @@ def belief(adapter: Any, env_id: str) -> dict[str, Any]:
 
 
 def posterior(inference: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The latents (n, d) that are still possible, and weights (n,) summing to one.
-
-    :param inference: An ``Inference``.
-    """
+    """The latents (n, d) that are still possible, and weights (n,) summing to one."""
     if hasattr(inference, "particles"):
         return inference.particles, inference.weights
     candidates = inference.candidates
@@ -65,15 +60,7 @@ def posterior(inference: Any) -> tuple[np.ndarray, np.ndarray]:
 def sentence(
     picture: str, points: np.ndarray, weights: np.ndarray, estimate: np.ndarray, unit: str
 ) -> str:
-    """The posterior in words, for those who cannot see the picture, and those who would rather
-    read.
-
-    :param picture: How it is drawn.
-    :param points: (n, 1 or 2).
-    :param weights: (n,) summing to one.
-    :param estimate: (1 or 2,).
-    :param unit: Of the numbers.
-    """
+    """The posterior in words: points (n, 1 or 2), weights (n,), the estimate's point."""
     if picture == "speed":
         low, high = weighted_quantiles(points[:, 0], weights, ((1 - SHARE) / 2, (1 + SHARE) / 2))
         return f"It believes that you want between {max(low, 0.0):.1f} and {high:.1f} {unit}."
@@ -94,12 +81,7 @@ def sentence(
 def weighted_quantiles(
     values: np.ndarray, weights: np.ndarray, shares: tuple[float, ...]
 ) -> list[float]:
-    """The smallest value of a weighted sample below or at which lies each share.
-
-    :param values: (n,).
-    :param weights: (n,) summing to one.
-    :param shares: Each in [0, 1].
-    """
+    """The smallest value (n,) of a sample, weighted (n,), at or below which each share lies."""
     order = np.argsort(values)
     cumulative = np.cumsum(weights[order])
     places = np.searchsorted(cumulative, np.asarray(shares) * cumulative[-1])
@@ -123,9 +105,7 @@ def _direction_sentence(points: np.ndarray, weights: np.ndarray) -> str:
 
 
 def _points_of(model: Any, latents: np.ndarray, train_points: np.ndarray) -> np.ndarray:
-    """(m, 1 or 2) the tasks of latents (m, d): the mean of the nearest training tasks', the nearer
-    the heavier.
-    """
+    """(m, 1 or 2) tasks of latents (m, d): the mean of the nearest training tasks', weighted."""
     means, variances = model.train_tasks.latent_means, model.train_tasks.latent_variances
     spread = means.var(axis=0)
     # What training has left unused says nothing of the task; there the prior's spread would drown
@@ -139,9 +119,7 @@ def _points_of(model: Any, latents: np.ndarray, train_points: np.ndarray) -> np.
 
 
 def _projection(model: Any, latents: np.ndarray) -> tuple[np.ndarray, float]:
-    """(m, 2) latents on the plane in which the training tasks' latents differ most, and half the
-    picture's width.
-    """
+    """(m, 2) latents on the plane in which the training tasks' differ most, and half its width."""
     means = model.train_tasks.latent_means
     centre = means.mean(axis=0)
     axes = np.linalg.svd(means - centre, full_matrices=False)[2][:2]

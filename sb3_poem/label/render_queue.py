@@ -1,6 +1,4 @@
-"""The queue of turns to render: a few workers, what somebody waits for first, what may be wanted
-next in the time that is left.
-"""
+"""The queue of turns to render: what somebody waits for first, then what may be wanted next."""
 
 from __future__ import annotations
 
@@ -45,11 +43,7 @@ class Priority(IntEnum):
 
 @dataclass(eq=False)
 class Job:
-    """A turn that is being made, or will be.
-
-    :param priority: May change while it waits.
-    :param done: Its turn, when it is there.
-    """
+    """A turn that is being made, or will be; its priority may change while it waits."""
 
     request: TurnRequest
     priority: Priority
@@ -60,12 +54,8 @@ class Job:
 
 
 class RenderQueue:
-    """Makes turns on an executor, in the order of their priority. All methods belong to one event
-    loop.
-
-    :param n_workers: How many turns are made at a time.
-    :param make_executor: Makes the executor; None takes processes.
-    :param make: What a worker does.
+    """Makes turns on an executor (None: processes), in the order of their priority. All methods
+    belong to one event loop.
     """
 
     def __init__(
@@ -168,10 +158,8 @@ class RenderQueue:
 def process_pool(
     n_workers: int, models: Sequence[ModelInfo] = (), packages: Sequence[str] = ()
 ) -> ProcessPoolExecutor:
-    """Worker processes that end with this one, even if it is killed.
-
-    :param models: They load these at once.
-    :param packages: Modules that register environments; they import these first.
+    """Worker processes, which end with this one even if it is killed; first they import
+    ``packages``, which register environments, and load ``models``.
     """
     return ProcessPoolExecutor(
         n_workers,

@@ -1,8 +1,6 @@
 """One turn of a conversation, as a pure function: the state before, and the answer, give the state
 after and its video, which is small, quick to encode, and to the frame seekable in every browser.
-
-Nothing is remembered between turns but models and environments, so any process may compute any turn
-of any session, ahead of time or again; the same input always gives the same turn, bit for bit.
+Any process may compute any turn of any session, ahead of time or again, bit for bit.
 """
 
 from __future__ import annotations
@@ -12,7 +10,7 @@ import os
 import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -37,14 +35,10 @@ from sb3_poem.poem_sac import POEMSAC
 
 # The result's rollout starts as no question's does.
 RESULT_ROLLOUT = 1_000_000
-# The hidden task of the environment, of which the person knows nothing, comes from a stream of its
-# own.
+# Of the hidden task of the environment, of which the person knows nothing.
 TASK_STREAM = 0x1ABE1
-# Frames per second that a film should not fall below.
-SMOOTH_FPS = 8.0
-# Frames per second of a film otherwise; where a family is drawn more often, some steps are left
-# out.
-FILM_FPS = 20.0
+# Frames per second of a film: at least, and where a family is drawn more often, about.
+SMOOTH_FPS, FILM_FPS = 8.0, 20.0
 #: Models that a process keeps.
 MAX_RENDERERS = 4
 #: What an adapter's dictionary holds of its conversation; the rest is the ``state`` of a turn.
@@ -71,16 +65,13 @@ class RenderCancelledError(Exception):
 class TurnRequest:
     """What a turn is made from.
 
-    :param seed: Of the adaptation.
-    :param options: Of the adapter.
     :param kind: "question" or "result".
     :param video: The file to write.
     :param state: The state of the turn before; None at the start.
     :param answers: The answers before that turn: ``preference``, ``left``, ``right``.
     :param pending: That turn's question: ``left``, ``right``.
     :param preference: The answer to it; None at the start.
-    :param film_every: How many steps lie between two frames of the video, if it moves smoothly
-        enough then.
+    :param film_every: Steps between two frames of the video, if it moves smoothly enough then.
     """
 
     model: ModelInfo
@@ -96,7 +87,7 @@ class TurnRequest:
 
     @property
     def marker(self) -> Path:
-        """A file that whoever asks may keep while the turn is wanted: its end is the work's."""
+        """A file that may be kept while the turn is wanted: its end is the work's."""
         return self.video.with_suffix(".wanted")
 
 
@@ -109,8 +100,6 @@ class Turn:
     :param left: The question's left trajectory; None in a result.
     :param belief: As :func:`sb3_poem.label.beliefs.belief` gives it.
     :param latent: (d,) of the policy that would be taken now.
-    :param fps: Of the video.
-    :param frames: Of the video.
     """
 
     state: dict[str, Any] | None
@@ -123,16 +112,12 @@ class Turn:
 
 
 class _Watches:
-    """Stands for the person where the adapter asks who answers: somebody who needs to see.
-
-    :param film_every: See :class:`TurnRequest`.
-    """
+    """Stands for the person where the adapter asks who answers: somebody who needs to see."""
 
     def __init__(self, film_every: int) -> None:
         self.needs_frames = film_every
 
     def __call__(self, left: Trajectory, right: Trajectory) -> Preference:
-        """Answers come through ``tell()``, when they come."""
         raise RuntimeError("a person answers on the page; adapt() cannot ask")
 
 
@@ -152,82 +137,62 @@ class Renderer:
 
     def turn(self, request: TurnRequest) -> Turn:
         """Make a turn, and write its video."""
-        adapter = self.adapter(request)
+        every = film_every(self.fps, request.film_every)
+        adapter = self._adapter(request, every)
         if request.preference is not None:
             adapter.tell(request.preference)
         believed, latent = belief(adapter, self.env_id), adapter.policy().latent
-        every = self._film_every(request)
         if request.kind == "question":
             query = adapter.ask()
             frames = pair(query.left.frames or (), query.right.frames or ())
         else:
-            clip = rollout_latents(
-                self.model,
-                self.env,
-                latent[None, :],
-                None,
-                [rollout_seed(adapter.seed, RESULT_ROLLOUT)],
-                adapter.deterministic,
-                frames=every,
-            )[0]
+            seeds = [rollout_seed(adapter.seed, RESULT_ROLLOUT)]
+            about = (self.model, self.env, latent[None], None, seeds, adapter.deterministic)
+            (clip,) = rollout_latents(*about, frames=every)
             frames = [*map(fit, clip.frames or ())]
         fps = self.fps / every
         write_clip(frames, request.video, fps)
         data = adapter.to_dict()
-        pending = data["pending"] or {"left": None, "right": None}
+        sides = data["pending"] or {"left": None, "right": None}
         state = {name: value for name, value in data.items() if name not in CONVERSATION}
-        return Turn(
-            state, pending["left"], pending["right"], believed, latent.tolist(), fps, len(frames)
-        )
+        latents = (believed, latent.tolist())
+        return Turn(state, sides["left"], sides["right"], *latents, fps, len(frames))
 
     def warm_up(self) -> None:
         """Do once what only the first time is slow: the first image, the first action."""
         latent = np.zeros((1, self.model.latent_dim))
         rollout_latents(self.model, self.env, latent, None, [0], frames=True, max_steps=2)
 
-    def adapter(self, request: TurnRequest) -> PreferenceAdapter:
+    def _adapter(self, request: TurnRequest, every: int) -> PreferenceAdapter:
         """The adapter as it was before the answer."""
+        model, env, oracle = self.model, self.env, _Watches(every)
         # The session counts the questions; the adapter must only be ready for one more.
-        n_queries = len(request.answers) + 2
+        more: dict[str, Any] = {"n_queries": len(request.answers) + 2}
         if request.state is None:
-            return PreferenceAdapter(
-                self.model,
-                self.env,
-                rule=session_rule(request.options),
-                oracle=_Watches(self._film_every(request)),
-                seed=request.seed,
-                n_queries=n_queries,
-            )
-        conversation = {"answers": list(request.answers), "pending": request.pending}
-        data = {**request.state, "n_queries": n_queries, **conversation}
-        return PreferenceAdapter.from_dict(
-            data, self.model, self.env, oracle=_Watches(self._film_every(request))
-        )
-
-    def _film_every(self, request: TurnRequest) -> int:
-        return film_every(self.fps, request.film_every)
+            more |= {"rule": session_rule(request.options), "seed": request.seed}
+            return PreferenceAdapter(model, env, oracle=oracle, **more)
+        more |= {"answers": list(request.answers), "pending": request.pending}
+        return PreferenceAdapter.from_dict({**request.state, **more}, model, env, oracle=oracle)
 
 
 def film_every(fps: float, wanted: int) -> int:
     """How many steps lie between two frames of a film.
 
     :param fps: Steps per second.
-    :param wanted: How many times fewer frames than usual there should be; not where it would move
-        in jerks then.
+    :param wanted: How many times fewer frames there should be, unless it would move in jerks then.
     """
     every = max(1, int(fps / FILM_FPS))  # what moves faster than films do is not filmed whole
     return every * wanted if fps / (every * wanted) >= SMOOTH_FPS else every
 
 
 def session_rule(options: dict[str, Any]) -> Rule:
-    """The rule that a session's options name, see :func:`named_rule`; a person errs now and then."""
+    """The rule that a session's options name; a person errs now and then."""
     return named_rule(**{"mistake_rate": 0.05, **options})
 
 
 def make_turn(request: TurnRequest) -> Turn:
-    """Make a turn in this process, which keeps models and environments that it has used.
-
-    :raises RenderCancelledError: If there was a marker, and it is taken away.
+    """Make a turn in this process, which keeps models and environments that it has used; raises
+    :class:`RenderCancelledError` if there was a marker, and it is taken away.
     """
     renderer = renderer_of(request.model)
     renderer.env.env_method("render_while", request.marker if request.marker.exists() else None)
@@ -239,29 +204,21 @@ def make_turn(request: TurnRequest) -> Turn:
 @lru_cache(maxsize=MAX_RENDERERS)
 def renderer_of(info: ModelInfo) -> Renderer:
     """Load a model and make its environment."""
-    env = DummyVecEnv(
-        [lambda: CancellableRendering(make_env(info.env_id, **dict(info.env_kwargs)))]
-    )
+    make = partial(make_env, info.env_id, **dict(info.env_kwargs))
+    env = DummyVecEnv([lambda: CancellableRendering(make())])
     return Renderer(load_shown_model(info), env, info.env_id)
 
 
 class CancellableRendering(gym.Wrapper):
-    """Rendering is what takes long in a turn, so there it is looked whether the turn is still
-    wanted.
-    """
+    """Rendering is what takes long in a turn: there it is seen whether the turn is still wanted."""
 
     _marker: Path | None = None
 
     def render_while(self, marker: Path | None) -> None:
-        """From now on.
-
-        :param marker: A file without which rendering raises :class:`RenderCancelledError`; None
-            renders always.
-        """
+        """A file without which rendering raises RenderCancelledError; None renders always."""
         self._marker = marker
 
     def render(self) -> Any:
-        """See :class:`gymnasium.Env`."""
         if self._marker is not None and not self._marker.exists():
             raise RenderCancelledError
         return super().render()
@@ -274,10 +231,7 @@ def load_shown_model(info: ModelInfo) -> Any:
 
 
 def make_env(env_id: str, **env_kwargs: Any) -> gym.Env:
-    """An environment that renders, small and fast where it can.
-
-    :raises ValueError: If it cannot render RGB images.
-    """
+    """An environment that renders, small and fast where it can."""
     small = {"width": WIDTH, "height": HEIGHT}
     for extra in ({**small, "render_quality": "fast"}, small):
         with contextlib.suppress(TypeError):  # it does not take these
@@ -286,11 +240,8 @@ def make_env(env_id: str, **env_kwargs: Any) -> gym.Env:
 
 
 def write_clip(frames: Sequence[np.ndarray], path: Path, fps: float) -> None:
-    """Write frames as MP4 (H.264), completely or not at all.
-
-    :param frames: (height, width, 3) uint8 each, of one size.
-    :param path: A file that ends in ``.mp4``, in a folder that exists.
-    :raises StorageError: If it cannot be written.
+    """Write frames, (height, width, 3) uint8 of one size, as MP4 (H.264), completely or not at all;
+    raises :class:`StorageError` if it cannot.
     """
     from imageio_ffmpeg import get_ffmpeg_exe
 
@@ -321,12 +272,7 @@ def pair(left: Sequence[np.ndarray], right: Sequence[np.ndarray]) -> list[np.nda
 
 
 def fit(frame: np.ndarray) -> np.ndarray:
-    """A frame in the page's size, whole, with bars of its corner's colour where its shape is
-    another.
-
-    :param frame: (height, width, 3) uint8.
-    :return: (:data:`HEIGHT`, :data:`WIDTH`, 3) uint8.
-    """
+    """A frame in the page's size, whole, with bars of its corner's colour beside another shape."""
     if frame.shape[:2] == (HEIGHT, WIDTH):
         return frame
     from PIL import Image, ImageOps

@@ -28,17 +28,13 @@ def replay(
     seed: int = 0,
     is_own: bool = True,
 ) -> dict[str, Any]:
-    """Feed a session's answers to a model.
-
-    Before each answer the model foretells it: the side of larger predicted return for the policy
-    that it would take so far.
+    """Feed a session's answers to a model. Before each answer the model foretells it: the side of
+    larger predicted return for the policy that it would take so far.
 
     :param model: A model whose observations and actions are those of the recorded trajectories.
     :param options: Of the adaptation, as a session's; ``mistake_rate`` stands for the noise model.
-    :param seed: Of the inference.
     :param is_own: Whether the session was recorded with this very model. If not, the latents that
-        were shown are not this model's: in their place come those of its own latents that act most
-        alike.
+        were shown are replaced by those of its own latents that act most alike.
     :return: JSON-ready: ``session``, ``foretold`` of ``decided`` answers (those that are not
         "equal"), ``latents`` after 0, 1, ... answers, ``sentence`` (the belief in words) and
         ``action_error``, the root mean squared difference of the actions of such latents from those

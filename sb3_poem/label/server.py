@@ -1,6 +1,4 @@
-"""The web server: the start page, the page of a conversation, the few requests that it makes, and
-running it all, until it is stopped or in a thread beside a notebook.
-"""
+"""The web server: the pages, the few requests that they make, and running it all."""
 
 from __future__ import annotations
 
@@ -60,10 +58,8 @@ SessionEndpoint = Callable[[Request, Session], Awaitable[Response]]
 
 
 def make_app(sessions: SessionManager, access: Access | None = None) -> Starlette:
-    """The ASGI application.
-
-    :param sessions: Those that it serves; their queue is closed with it.
-    :param access: Who gets in; None lets in who reaches the server by a name of this machine.
+    """The ASGI application; with it the sessions' queue is closed. Without ``access`` it lets in
+    who reaches the server by a name of this machine.
     """
     return _Pages(sessions).application(access or Access())
 
@@ -115,9 +111,7 @@ class _Pages:
         return Route(f"/s/{{token}}{path}", find_session, methods=[method])
 
     def action(self, path: str, change: Callable[..., object], **fields: type) -> Route:
-        """Of requests whose fields change the session in the store; the answer is what is shown
-        next.
-        """
+        """Of requests whose fields change the session; the answer is what is shown next."""
 
         async def act(request: Request, session: Session) -> Response:
             data = await _fields(request, **fields)
@@ -225,10 +219,7 @@ async def _error_response(request: Request, error: Exception) -> Response:
 
 
 def make_server(app: Starlette, host: str, port: int, deadline: float = DEADLINE) -> uvicorn.Server:
-    """A server, not yet running.
-
-    :param deadline: Seconds that a client has for a request.
-    """
+    """A server, not yet running; ``deadline`` is how many seconds a client has for a request."""
     config = uvicorn.Config(
         app,
         host=host,
@@ -246,10 +237,8 @@ def make_server(app: Starlette, host: str, port: int, deadline: float = DEADLINE
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """Take a port before anything else is started; who comes meanwhile waits, and is not turned
-    away.
+    """Take a port (0: a free one) before anything else is started; who comes meanwhile waits.
 
-    :param port: 0 takes a free one.
     :raises ValueError: If there is no such port.
     :raises OSError: If it is taken, or the address is not this machine's.
     """
@@ -266,8 +255,8 @@ def bind(host: str, port: int) -> socket.socket:
 
 
 def link_host(listener: socket.socket, host: str) -> str:
-    """The host of a link to a server: the address that was asked for; for one that stands for all
-    of this machine's, such as ``0.0.0.0``, one at which the machine is reached.
+    """The host of a link to a server: the one asked for; for one that stands for all of this
+    machine's, such as ``0.0.0.0``, one at which the machine is reached.
     """
     if not ipaddress.ip_address(listener.getsockname()[0]).is_unspecified:
         return host.strip("[]")
@@ -279,12 +268,7 @@ def link_host(listener: socket.socket, host: str) -> str:
 
 
 class BackgroundServer:
-    """A server on loopback in a thread of its own.
-
-    :param port: 0 takes a free one.
-    :param deadline: Seconds that a client has for a request.
-    :raises RuntimeError: If it does not start.
-    """
+    """A server on loopback in a thread of its own; see :func:`make_server`."""
 
     def __init__(self, app: Starlette, port: int = 0, deadline: float = DEADLINE) -> None:
         self._listener = bind("127.0.0.1", port)

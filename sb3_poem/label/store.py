@@ -1,6 +1,4 @@
-"""Where sessions, questions and answers are kept: SQLite, so that a kill at any moment loses
-nothing that was answered.
-"""
+"""Where sessions, questions and answers are kept: a kill at any moment loses no answer."""
 
 from __future__ import annotations
 
@@ -73,9 +71,7 @@ CREATE UNIQUE INDEX one_answer ON answers(session, number) WHERE undone IS NULL;
 
 
 class RefusedError(ValueError):
-    """What was asked for does not fit the session as it now is: an answer out of order, say.
-    Nothing was changed.
-    """
+    """What was asked for does not fit the session as it now is; nothing was changed."""
 
 
 @dataclass(frozen=True)
@@ -98,13 +94,10 @@ class Session:
 class Store:
     """The store. One connection, used by one thread at a time; several processes may open the same
     file. Sessions, turns and answers are named by their numbers, and a turn's place by the number
-    of answers before it.
+    of answers before it. :class:`~sb3_poem.label.rendering.StorageError` says that the disk is full
+    or broken.
 
-    Each method raises :class:`~sb3_poem.label.rendering.StorageError` if the disk is full or
-    broken.
-
-    :param folder: Where; it is made if missing, for its owner alone. ``answers.sqlite`` is the
-        store, ``videos/`` holds the videos.
+    :param folder: It is made if missing, for its owner alone: ``answers.sqlite`` and ``videos/``
     :raises ValueError: If the store is of another version.
     """
 
@@ -139,24 +132,12 @@ class Store:
         step: int = 10,
         source: str = "page",
     ) -> tuple[Session, str]:
-        """Begin a conversation; see :class:`Session`.
-
-        :return: The session, and the token of its link, of which only a hash is kept.
-        """
-        token = secrets.token_urlsafe(32)
+        """Begin a conversation; returns the token of its link too, of which only a hash is kept."""
+        token, about = secrets.token_urlsafe(32), {"model": model, "env_id": env_id, "seed": seed}
+        about |= {"options": json.dumps(options), "step": step, "target": step}
+        about |= {"source": source, "created": time.time(), "token_hash": _hash(token)}
         with self._transaction():
-            number = self._insert(
-                "sessions",
-                token_hash=_hash(token),
-                source=source,
-                model=model,
-                env_id=env_id,
-                seed=seed,
-                options=json.dumps(options),
-                step=step,
-                target=step,
-                created=time.time(),
-            )
+            number = self._insert("sessions", **about)
         return self.session(number), token
 
     def find(self, token: str) -> Session | None:
@@ -165,10 +146,7 @@ class Store:
         return None if row is None else _session(row)
 
     def session(self, number: int) -> Session:
-        """A session.
-
-        :raises KeyError: If there is none.
-        """
+        """A session; KeyError if there is none."""
         row = self._one("SELECT * FROM sessions WHERE id = ?", number)
         if row is None:
             raise KeyError(f"there is no session {number}")
@@ -185,10 +163,7 @@ class Store:
         )
 
     def turn(self, session: int, kind: str, number: int) -> sqlite3.Row | None:
-        """The row of a turn that counts, if there is one, without what is large.
-
-        :param kind: "question" or "result".
-        """
+        """The row of a "question" or "result" that counts, if any, without what is large."""
         return self._one(
             "SELECT id, session, kind, number, belief, latent, video, fps, frames, created, shown, "
             "verdict FROM turns WHERE session = ? AND kind = ? AND number = ? AND dropped IS NULL",
@@ -200,8 +175,8 @@ class Store:
         return self._one("SELECT * FROM turns WHERE id = ?", turn)
 
     def adapter_answers(self, session: int, before: int) -> list[dict[str, Any]]:
-        """The first so many answers with their trajectories, as an adapter's dictionary holds them:
-        ``preference``, ``left`` and ``right`` of each.
+        """The first so many answers, as an adapter's dictionary holds them: ``preference``,
+        ``left`` and ``right`` of each.
         """
         query = """SELECT answers.preference, turns.left_trajectory, turns.right_trajectory
             FROM answers JOIN turns ON turns.id = answers.question
@@ -240,8 +215,7 @@ class Store:
 
         :param last_answer: The last of the answers before it; None at the start.
         :param video: Its file's name within ``videos/``.
-        :param created: When it was made, seconds since 1970; None is now.
-        :param shown: When it was shown; None is not yet.
+        :param created: Seconds since 1970, as ``shown``; None is now.
         :return: The turn's number; None if it was not kept.
         """
         with self._transaction() as execute:
@@ -277,17 +251,13 @@ class Store:
     def mark_shown(self, turn: int) -> None:
         """Note that a turn has been shown, the first time."""
         with self._transaction() as execute:
-            execute(
-                "UPDATE turns SET shown = ? WHERE id = ? AND shown IS NULL", (time.time(), turn)
-            )
+            now = (time.time(), turn)
+            execute("UPDATE turns SET shown = ? WHERE id = ? AND shown IS NULL", now)
 
     def add_answer(self, session: int, question: int, preference: str) -> int:
-        """Keep an answer. Once this returns, it is on the disk. The same answer again is no second
-        one.
+        """Keep an answer, "left", "right" or "equal", to a question's turn: once this returns, it
+        is on the disk. The same answer again is no second one.
 
-        :param question: The question's turn.
-        :param preference: "left", "right" or "equal".
-        :return: The answer's number.
         :raises RefusedError: If it is no answer, or that question is not the one that waits.
         """
         if preference not in PREFERENCES:
@@ -307,22 +277,18 @@ class Store:
             about = self.session(session)
             if about.stopped or len(answers) >= about.target:
                 raise RefusedError("the questions are over for now; the result is shown")
+            about_answer = {"question": question, "preference": preference}
+            now = time.time()
             return self._insert(
-                "answers",
-                session=session,
-                question=question,
-                number=len(answers),
-                preference=preference,
-                created=time.time(),
+                "answers", session=session, number=len(answers), created=now, **about_answer
             )
 
     def undo(self, session: int, answered: int) -> None:
         """Take the last answer back; or, after an early stop, go back to the question that waited.
 
-        :param answered: How many answers there were where the undo was asked for; so that a
-            repeated one takes back no more.
-        :raises RefusedError: If there is nothing to take back, or the conversation is somewhere
-            else by now.
+        :param answered: How many answers there were where it was asked for: a repeated undo takes
+            back no more
+        :raises RefusedError: If there is nothing to take back, or the conversation has moved on.
         """
         with self._transaction() as execute:
             answers = self.answers(session)
@@ -347,11 +313,9 @@ class Store:
             execute("UPDATE sessions SET stopped = 1 WHERE id = ?", (session,))
 
     def judge(self, session: int, result: int, verdict: str) -> None:
-        """Keep what the person says of a result; "not quite" asks for more questions. The same
-        verdict again changes nothing.
+        """Keep what the person says of a result's turn; "not quite" asks for more questions. The
+        same verdict again changes nothing.
 
-        :param result: The result's turn.
-        :param verdict: "yes" or "not quite".
         :raises RefusedError: If it is no verdict, or that result is not the one that is shown.
         """
         if verdict not in VERDICTS:
@@ -375,19 +339,14 @@ class Store:
                 )
 
     def set_wish(self, session: int, wish: str) -> None:
-        """Keep what the person wants, in their own words.
-
-        :raises RefusedError: If it is too long.
-        """
+        """Keep what the person wants, in their own words; a wish that is too long is refused."""
         if len(wish) > MAX_WISH:
             raise RefusedError(f"what you wish for may be {MAX_WISH} characters long at most")
         with self._transaction() as execute:
             execute("UPDATE sessions SET wish = ? WHERE id = ?", (wish, session))
 
     def records(self) -> list[sqlite3.Row]:
-        """All answers of all sessions with their questions, those that were taken back too, in the
-        order of time.
-        """
+        """All answers with their questions, those taken back too, in the order of time."""
         return self._all(
             """SELECT sessions.id AS session, sessions.source, sessions.model, sessions.env_id,
                 sessions.seed, sessions.options, sessions.wish, answers.number, answers.preference,
@@ -403,11 +362,7 @@ class Store:
         )
 
     def remove_orphans(self) -> int:
-        """Delete videos that no turn names: rendered ahead for an answer that was not given, or cut
-        short by a kill.
-
-        :return: How many.
-        """
+        """Delete videos that no turn names, as of answers that were not given; returns how many."""
         kept = {row["video"] for row in self._all("SELECT video FROM turns")}
         files = [file for file in self.videos.iterdir() if file.is_file()]
         orphans = [file for file in files if file.name not in kept]
@@ -479,11 +434,8 @@ class StoreRecorder:
     """Keeps what a ``HumanOracle`` is told at a terminal, in the same store as the page's answers:
     ``HumanOracle(record=StoreRecorder(...))``.
 
-    :param model: The model's name.
-    :param seed: Of the adaptation.
-    :param options: Of the adaptation, JSON-ready.
+    :param options: Of the adaptation, JSON-ready, as ``seed``
     :param n_queries: How many answers there will be at most.
-    :param wish: What the person wants, in their own words.
     :param resume: Whether to go on with the last terminal session that has answers and agrees in
         all of this, if there is one. The adapter must be told first what :meth:`kept` gives.
     """

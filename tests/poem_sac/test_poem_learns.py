@@ -6,12 +6,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from meta_toys import LEARN, LEARN_STEPS, POINT_GOAL, point_goal_bounds
+from meta_toys import LEARN, LEARN_EPOCH, POINT_GOAL, point_goal_bounds
 
 from sb3_poem import POEMSAC
 from sb3_poem.adaptation.evaluation import evaluate_episodes
 from sb3_poem.adaptation.known_task import known_task_return, preference_order, return_matrix
 from sb3_poem.common.vec_env import TaskVecEnv, make_task_vec_env
+
+QUICK = {**LEARN, "kl_coef": 0.02, "tau": 0.1}
+STEPS = 8 * LEARN_EPOCH
 
 
 def preference_accuracy(model: POEMSAC, env: TaskVecEnv) -> float:
@@ -28,10 +31,8 @@ def preference_accuracy(model: POEMSAC, env: TaskVecEnv) -> float:
 
 
 def test_poem_learns_point_goal() -> None:
-    """Thresholds against figures measured with several seeds and numerics: 0.84 to 0.95, and 36 to
-    78 % of the way.
-    """
-    model = POEMSAC("MlpPolicy", POINT_GOAL, **LEARN).learn(LEARN_STEPS)
+    """A third of the way from the best that a policy can do blindly to the best that there is."""
+    model = POEMSAC("MlpPolicy", POINT_GOAL, **QUICK).learn(STEPS)
     env = make_task_vec_env(POINT_GOAL, 20)
     own = evaluate_episodes(
         model, env, model.task_latents, model.train_tasks.tasks, n_episodes=2, seed=5
@@ -53,5 +54,5 @@ def test_preferences_are_ordered_by_the_preference_loss_alone() -> None:
     """Without its loss, the embeddings order at random: actor, critics and decoder do not do it for
     them.
     """
-    model = POEMSAC("MlpPolicy", POINT_GOAL, **LEARN, preference_coef=0.0).learn(LEARN_STEPS)
+    model = POEMSAC("MlpPolicy", POINT_GOAL, **QUICK, preference_coef=0.0).learn(STEPS)
     assert preference_accuracy(model, make_task_vec_env(POINT_GOAL, 20)) < 0.7
