@@ -22,11 +22,7 @@ MODULES = {"enjoy": "show", "record-video": "show"}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run ``sb3-poem``.
-
-    :param argv: the arguments (default: those of this process)
-    :return: the exit status
-    """
+    """Run ``sb3-poem`` with these arguments or the process's own; returns the exit status."""
     if sys.stdin is None:  # it was closed, and its end is all that there is to read
         sys.stdin = open(os.devnull)  # noqa: SIM115
     parser = build_parser()

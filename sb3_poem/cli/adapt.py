@@ -45,12 +45,7 @@ DEFAULT_TASKS = 30
 
 
 def run_adapt(arguments: argparse.Namespace) -> int:
-    """Run the command, and return the exit status.
-
-    :raises ValueError: if they do not fit the model or the environment
-    :raises OSError: if the model cannot be read, or a file not be written
-    :raises EOFError: if a person should answer and standard input is closed
-    """
+    """Run the command, and return the exit status."""
     check_output("--json", arguments.json, (".json",))
     check_output("--plot", arguments.plot, (".png", ".pdf", ".svg"))
     check_output("--video", arguments.video, (".mp4", ".gif"))
@@ -101,10 +96,8 @@ class Adaptation:
         self.arguments = arguments
         self.subject = subject
         self.seed = subject.seed
-        chosen = {
-            name: getattr(arguments, name)
-            for name in ("inference", "query_rule", "candidates", "n_candidates")
-        }
+        names = ("inference", "query_rule", "candidates", "n_candidates")
+        chosen = {name: getattr(arguments, name) for name in names}
         self.options = {name: value for name, value in chosen.items() if value is not None}
         self.rule = named_rule(**self.options)
 
@@ -126,18 +119,10 @@ class Adaptation:
 
         known = None
         try:
-            evaluate_adaptation(
-                subject.model,
-                subject.env,
-                subject.tasks,
-                factories[arguments.oracle],
-                rule=self.rule,
-                record_at=record_at,
-                n_episodes=arguments.episodes,
-                seed=self.seed,
-                progress_bar=True,
-                on_record=show,
-            )
+            about = (subject.model, subject.env, subject.tasks, factories[arguments.oracle])
+            how: dict[str, Any] = {"n_episodes": arguments.episodes, "seed": self.seed}
+            how |= {"rule": self.rule, "record_at": record_at, "progress_bar": True}
+            evaluate_adaptation(*about, on_record=show, **how)
             known = self._known_task_return()
         except KeyboardInterrupt:
             if not measured:
@@ -160,13 +145,8 @@ class Adaptation:
         """
         arguments, subject = self.arguments, self.subject
         folder = arguments.store or DEFAULT_STORE
-        about = (
-            Path(arguments.model).name,
-            subject.env_id,
-            self.seed,
-            self.options,
-            arguments.queries,
-        )
+        name, n_queries = Path(arguments.model).name, arguments.queries
+        about = (name, subject.env_id, self.seed, self.options, n_queries)
         recorder = StoreRecorder(Store(folder), *about, resume=arguments.resume)
         if arguments.resume:
             nothing = "There is nothing to go on with; beginning"
@@ -174,14 +154,8 @@ class Adaptation:
             say(f"{found} session {recorder.session.id} of {folder}")
         oracle = HumanOracle(record=recorder)
         env = subject.make_env("rgb_array", show_task=False)
-        adapter = PreferenceAdapter(
-            subject.model,
-            env,
-            rule=self.rule,
-            oracle=oracle,
-            n_queries=arguments.queries,
-            seed=self.seed,
-        )
+        how: dict[str, Any] = {"oracle": oracle, "n_queries": n_queries, "seed": self.seed}
+        adapter = PreferenceAdapter(subject.model, env, rule=self.rule, **how)
         latents = [adapter.policy().latent]
         oracle.needs_frames = False
         for kept in recorder.kept():
@@ -258,14 +232,8 @@ class Adaptation:
         subject = self.subject
         tasks = np.repeat(subject.tasks, len(latents), axis=0)
         with subject.console.status("Measuring the returns"):
-            outcomes = evaluate_episodes(
-                subject.model,
-                subject.env,
-                latents,
-                tasks,
-                self.arguments.episodes,
-                evaluation_seed(self.seed),
-            )
+            about = (subject.model, subject.env, latents, tasks, self.arguments.episodes)
+            outcomes = evaluate_episodes(*about, evaluation_seed(self.seed))
         successes = None if outcomes.successes is None else outcomes.successes[None]
         answers = [answer.preference for answer in adapter.answers]
         records = tuple(range(len(latents)))
@@ -300,9 +268,7 @@ class Adaptation:
         report.write(subject.console, arguments.json, arguments.plot)
 
     def _film(self, latents: np.ndarray, answers: Sequence[int]) -> None:
-        """Film the policies after the fewest and the most answers; ``latents`` is (n_records,
-        latent_dim).
-        """
+        """Film the policies (n_records, latent_dim) after the fewest and the most answers."""
         captions = [f"after {n} answer{'s' * (n != 1)}" for n in (answers[0], answers[-1])]
         task_matters = self.arguments.oracle != "human" or self.arguments.task is not None
         self.subject.film([latents[0], latents[-1]], captions, self.arguments.video, task_matters)

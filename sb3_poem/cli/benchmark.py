@@ -19,13 +19,7 @@ from sb3_poem.cli.packages import import_packages
 
 
 def run_benchmark(arguments: argparse.Namespace) -> int:
-    """Run the command.
-
-    :param arguments: as ``sb3_poem.cli`` parsed them
-    :return: the exit status: 1 if a cell failed
-    :raises ValueError: if they name what does not exist or cannot be run
-    :raises ImportError: if an optional package is missing; the message says how to install it
-    """
+    """Run the command, and return the exit status: 1 if a cell failed."""
     try:
         return _run(arguments) if arguments.part == "run" else _report(arguments)
     except ModuleNotFoundError as error:

@@ -36,8 +36,8 @@ CHECKPOINT = "checkpoint.zip"
 
 
 class TrainingInterrupted(KeyboardInterrupt):
-    """Training was interrupted, and what it had learned is saved. The message says how far it came,
-    and ``resumable`` whether ``--resume`` finds a checkpoint of this run.
+    """Training was interrupted, and what it had learned is saved. ``resumable`` is whether
+    ``--resume`` finds a checkpoint of this run.
     """
 
     def __init__(self, message: str, resumable: bool) -> None:
@@ -47,9 +47,7 @@ class TrainingInterrupted(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def stopping_between_epochs(checkpoint: TrainingCheckpointCallback) -> Iterator[None]:
-    """Let the first Ctrl-C (or ``SIGTERM``) end training after the epoch at hand, and the second at
-    once.
-    """
+    """Let the first Ctrl-C (or SIGTERM) end training after this epoch, the second at once."""
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def restore() -> None:
@@ -75,11 +73,7 @@ def make_experiment(
     args: Any, algo: str, env_id: str, log_folder: str, *rest: Any, **kwargs: Any
 ) -> ExperimentManager:
     """The experiment that fits the algorithm; takes what rl_zoo3's ``train`` gives to its
-    ``ExperimentManager``.
-
-    :raises ValueError: if one of our algorithms is given an environment that is no task family, or
-        for a number of steps or a file of hyperparameters that cannot be
-    :raises OSError: if a folder that a flag names cannot be written
+    ``ExperimentManager``, and refuses steps, files and folders that cannot be.
     """
     # -1 is rl_zoo3's default, and takes the entry's
     if args.n_timesteps < 1 and args.n_timesteps != -1:
@@ -94,9 +88,7 @@ def make_experiment(
 
 
 def is_task_family(env_id: str) -> bool | None:
-    """Whether an environment is a task family; None if its entry point is a function, which does
-    not tell.
-    """
+    """Whether an environment is a task family; None if a function makes it."""
     creator: Any = gym.spec(env_id).entry_point
     if isinstance(creator, str):
         creator = load_env_creator(creator)
@@ -104,9 +96,7 @@ def is_task_family(env_id: str) -> bool | None:
 
 
 class FamilyExperiment(ExperimentManager):
-    """Steps all copies of a task family at once, whatever the algorithm, unless ``--vec-env
-    subproc`` asks otherwise.
-    """
+    """Steps all copies of a task family at once, unless ``--vec-env subproc`` asks otherwise."""
 
     def __init__(self, args: Any, algo: str, env_id: str, *rest: Any, **kwargs: Any) -> None:
         super().__init__(args, algo, env_id, *rest, **kwargs)
@@ -117,11 +107,8 @@ class FamilyExperiment(ExperimentManager):
 
 class PoemExperiment(FamilyExperiment):
     """A meta-training run: with our hyperparameter files, evaluated by adaptation to held-out
-    tasks, and resumable.
-
-    ``--eval-freq`` and ``--eval-episodes`` set up an :class:`AdaptationEvalCallback`.
-    ``checkpoint.zip``, from which ``--resume`` continues bit for bit, is written as often as it
-    costs little, or with the models of ``--save-freq``.
+    tasks, and resumable from ``checkpoint.zip``, which is written as often as it costs little, or
+    with the models of ``--save-freq``.
     """
 
     def __init__(self, args: Any, algo: str, env_id: str, *rest: Any, **kwargs: Any) -> None:
@@ -213,11 +200,8 @@ class PoemExperiment(FamilyExperiment):
 
     def save_trained_model(self, model: Any) -> None:
         super().save_trained_model(model)
-        done, total, saved = (
-            model.num_timesteps,
-            model._total_timesteps,
-            self.checkpoint.saved_steps,
-        )
+        done, total = model.num_timesteps, model._total_timesteps
+        saved = self.checkpoint.saved_steps
         if done < total and self.is_interrupted:
             kept = ", before the first checkpoint" if saved is None else f", saved at {saved:,}"
             message = f"Interrupted at {done:,} of {total:,} steps{kept * (saved != done)}"
@@ -242,10 +226,8 @@ class PoemExperiment(FamilyExperiment):
             optuna.create_study = create_study
 
     def objective(self, trial: optuna.Trial) -> float:
-        """What ``-optimize`` maximises: the return on held-out tasks after the most answers.
-
-        :raises optuna.TrialPruned: if the trial is not worth finishing, or its hyperparameters made
-            it fail
+        """What ``-optimize`` maximises: the return on held-out tasks after the most answers. Trials
+        that are not worth finishing, or fail by their hyperparameters, are pruned.
         """
         sample, entry = HYPERPARAMS_SAMPLER[self.algo], {"entry": self._hyperparams}
         sampled = self._preprocess_schedules(sample(trial, self.n_actions, self.n_envs, entry))
@@ -283,9 +265,7 @@ def _epochs(model: PEARLSAC, steps: int) -> int:
 
 
 class TrialAdaptationCallback(AdaptationEvalCallback):
-    """Reports each evaluation to Optuna, and ends the training of a trial that is not worth
-    finishing.
-    """
+    """Reports each evaluation to Optuna, and ends trials that are not worth finishing."""
 
     def __init__(self, trial: optuna.Trial, **kwargs: Any) -> None:
         super().__init__(**kwargs)

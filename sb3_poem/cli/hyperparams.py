@@ -21,12 +21,8 @@ FLAG_OF_KEY = {
 
 
 def check_entry(entry: Mapping[str, Any], algorithm: str, source: str) -> None:
-    """Compare an entry of hyperparameters with what rl_zoo3 and the algorithm take.
-
-    :param algorithm: its name on the command line
-    :param source: where the entry was read, for the message
-    :raises ValueError: at the first key that neither takes, with what resembles it; if a number is
-        none, or was read as text, as YAML reads 1e-3 (but 1.0e-3 as a number)
+    """Refuse keys of an entry (of what ``source`` names) that neither rl_zoo3 nor the algorithm
+    takes, and numbers that are none, or were read as text, as YAML reads 1e-3 (but not 1.0e-3).
     """
     parameters = inspect.signature(ALGORITHMS[algorithm]).parameters
     known = {name for name in parameters if not name.startswith("_")} - {"unsupported"} | ZOO_KEYS
@@ -37,11 +33,8 @@ def check_entry(entry: Mapping[str, Any], algorithm: str, source: str) -> None:
             raise ValueError(f"{key!r} in {source} is not for {algorithm}: {UNSUPPORTED[key]}")
         if key not in known:
             close = difflib.get_close_matches(key, known - set(FLAG_OF_KEY), n=3)
-            alike = (
-                f"did you mean {' or '.join(map(repr, close))}?"
-                if close
-                else "nor anything like it."
-            )
+            names = " or ".join(map(repr, close))
+            alike = f"did you mean {names}?" if close else "nor anything like it."
             raise ValueError(
                 f"Unknown key {key!r} in {source}: {algorithm} has no such hyperparameter, {alike}"
             )

@@ -1,6 +1,4 @@
-"""What ``sb3-poem train -optimize`` searches, in the form of rl_zoo3's samplers: a range around
-each value of an entry.
-"""
+"""What ``sb3-poem train -optimize`` searches: a range around each value of an entry."""
 
 import inspect
 import math
@@ -28,8 +26,7 @@ LINEAR = "lin_learning_rate"
 def entry_params(algorithm: str, entry: dict[str, Any]) -> dict[str, Any]:
     """The trial that is an entry itself, by the names of Optuna's parameters, without what cannot
     be searched around it: 0, and as many gradient steps as are taken in the environment (-1).
-
-    :param entry: hyperparameters, learning rates as schedules
+    Learning rates are schedules.
     """
     parameters = inspect.signature(ALGORITHMS[algorithm]).parameters
     values = {name: parameter.default for name, parameter in parameters.items()} | entry

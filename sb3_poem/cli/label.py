@@ -60,15 +60,9 @@ def run_page(arguments: argparse.Namespace) -> None:
     port = listener.getsockname()[1]
     store = Store(arguments.store)
     store.remove_orphans()
-    sessions = SessionManager(
-        store,
-        RenderQueue(workers, lambda: process_pool(workers, models, packages)),
-        models,
-        options,
-        arguments.queries,
-        arguments.max_sessions,
-        arguments.seed,
-    )
+    queue = RenderQueue(workers, lambda: process_pool(workers, models, packages))
+    limits = (arguments.queries, arguments.max_sessions, arguments.seed)
+    sessions = SessionManager(store, queue, models, options, *limits)
     hosts = LOOPBACK | {name.lower() for name in (arguments.host, *arguments.allow_host)}
     app = make_app(sessions, Access(user, password, token, hosts))
     name = link_host(listener, arguments.host)
@@ -90,11 +84,7 @@ def run_page(arguments: argparse.Namespace) -> None:
 
 
 def read_password(auth: str | None, file: Path | None) -> tuple[str | None, str | None]:
-    """Read ``USER:PASSWORD`` from the flag, else from the file, else from the environment.
-
-    :raises ValueError: If it has another form, or the password is short
-    :raises OSError: If there is no such file
-    """
+    """Read ``USER:PASSWORD`` from the flag, else from the file, else from the environment."""
     source = "--auth"
     if file is not None:
         source, auth = f"--auth-file {file}", file.read_text(encoding="utf-8").rstrip("\r\n")
@@ -165,18 +155,14 @@ def run_replay(arguments: argparse.Namespace) -> None:
             "no session could be replayed: name the model that they were recorded with by --model"
         )
     if arguments.json is not None:
-        write_json_atomically(
-            arguments.json, {"model": given, "options": options, "sessions": results}
-        )
+        content = {"model": given, "options": options, "sessions": results}
+        write_json_atomically(arguments.json, content)
         say(f"Wrote {arguments.json}")
     store.close()
 
 
 def _open_store(folder: Path) -> Any:
-    """The store that was named.
-
-    :raises ValueError: If there is none
-    """
+    """The store that was named, if there is one."""
     from sb3_poem.label.store import Store
 
     if not (folder / "answers.sqlite").is_file():

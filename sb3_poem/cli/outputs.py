@@ -7,11 +7,7 @@ from pathlib import Path
 
 
 def check_writable(folder: str | Path) -> None:
-    """Make a folder and a file in it, so that a run does not find out at its end that it cannot
-    save.
-
-    :raises OSError: if that fails; the message names the folder
-    """
+    """Make a folder and a file in it: a run should not find out at its end that it cannot save."""
     try:
         os.makedirs(folder, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -22,11 +18,7 @@ def check_writable(folder: str | Path) -> None:
 
 
 def check_output(flag: str, path: Path | None, suffixes: Sequence[str]) -> None:
-    """Check a file that a flag named, if it did.
-
-    :raises ValueError: if its name has none of these suffixes
-    :raises OSError: if its folder cannot be written
-    """
+    """Refuse a file that a flag named, if it did, for its suffix or for where it lies."""
     if path is None:
         return
     if path.suffix not in suffixes:

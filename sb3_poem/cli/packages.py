@@ -7,10 +7,7 @@ from collections.abc import Sequence
 
 
 def import_packages(names: Sequence[str]) -> None:
-    """Import modules, which may lie in the working folder.
-
-    :raises ValueError: if there is no such module
-    """
+    """Import modules, which may lie in the working folder."""
     folder = os.getcwd()
     if names and folder not in sys.path:
         # last, so that no file there takes the place of an installed package

@@ -13,13 +13,9 @@ from sb3_poem.cli.experiment import CHECKPOINT
 
 
 def resumed(arguments: Sequence[str]) -> list[str] | None:
-    """Replace ``--resume`` by what it means: ``-i CHECKPOINT`` of the last run of the same
-    algorithm, environment and seed, or nothing, and a word about it, where no such run has left a
-    checkpoint.
-
-    :param arguments: those of ``train``, ``--algo`` among them
-    :return: arguments for rl_zoo3; None if that run has finished already
-    :raises ValueError: if ``-i`` is given too
+    """Replace ``--resume`` in the arguments of ``train`` by what it means: ``-i CHECKPOINT`` of the
+    last run of the same algorithm, environment and seed, or nothing, and a word about it, where
+    none has left a checkpoint. None if that run has finished already.
     """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--algo")
@@ -58,11 +54,8 @@ def resume_command(arguments: Sequence[str]) -> str:
 
 
 def is_complete(model: Path) -> bool:
-    """Whether a training made all its steps. rl_zoo3 saves a model too when an interrupt from the
-    keyboard stops it.
-
-    :param model: the file that it saved last, or would have
-    :raises ValueError: if the file is no model
+    """Whether a training made all its steps, by the file of its model, which rl_zoo3 writes when an
+    interrupt stops it, too.
     """
     if not model.exists():
         return False
@@ -77,9 +70,8 @@ def is_complete(model: Path) -> bool:
 
 
 def last_run(folder: Path, env_name: str, seed: int) -> Path | None:
-    """The newest run that can be continued, or is done.
+    """The newest run in an algorithm's folder that can be continued, or is done.
 
-    :param folder: of the algorithm's runs
     :param env_name: environment id with - in place of /
     :param seed: as given to the run; negative: any
     """

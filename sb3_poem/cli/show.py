@@ -4,6 +4,7 @@ import argparse
 import shlex
 from math import ceil
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -16,11 +17,7 @@ from sb3_poem.cli.subject import COPIES_FOR_ONE_TASK, Subject, describe_task, sa
 
 
 def run_enjoy(arguments: argparse.Namespace) -> None:
-    """Show a policy in a window.
-
-    :raises OSError: if there is no display, or no model
-    :raises ValueError: if the arguments do not fit
-    """
+    """Show a policy in a window."""
     if not has_display() and not arguments.no_render:
         film = shlex.join(["sb3-poem", "record-video", *arguments.given[1:], "--out", "policy.mp4"])
         raise OSError(f"there is no display to draw on: film it by `{film}`, or add --no-render")
@@ -42,11 +39,7 @@ def run_enjoy(arguments: argparse.Namespace) -> None:
 
 
 def run_record_video(arguments: argparse.Namespace) -> None:
-    """Film a policy, or one before and after adaptation side by side.
-
-    :raises OSError: if there is no model, or the file cannot be written
-    :raises ValueError: if the arguments do not fit
-    """
+    """Film a policy, or one before and after adaptation side by side."""
     check_output("--out", arguments.out, (".mp4", ".gif"))
     shown = Shown(arguments)
     shown.subject.film(shown.latents, shown.captions, arguments.out, shown.has_task)
@@ -54,10 +47,8 @@ def run_record_video(arguments: argparse.Namespace) -> None:
 
 
 class Shown:
-    """The policies to show, and the task on which; both are printed.
-
-    ``latents`` holds one of (latent_dim,), or two, before and after adaptation, with their
-    ``captions``. ``has_task`` is whether the task says anything of the policy.
+    """The policies to show, ``latents`` (latent_dim,), one or two with ``captions``, and the task;
+    both are printed. ``has_task`` is whether the task says anything of the policy.
     """
 
     def __init__(self, arguments: argparse.Namespace) -> None:
@@ -88,14 +79,10 @@ class Shown:
     def _adapt(self, arguments: argparse.Namespace) -> None:
         subject = self.subject
         with subject.console.status(f"Asking {arguments.queries} questions"):
-            measured = evaluate_adaptation(
-                subject.model,
-                subject.env,
-                subject.tasks,
-                record_at=(0, arguments.queries),
-                n_episodes=arguments.episodes,
-                seed=subject.seed,
-            )
+            record_at, n_episodes = (0, arguments.queries), arguments.episodes
+            about = (subject.model, subject.env, subject.tasks)
+            how: dict[str, Any] = {"n_episodes": n_episodes, "seed": subject.seed}
+            measured = evaluate_adaptation(*about, record_at=record_at, **how)
         self.latents = list(measured.latents[0])
         self.captions = [f"after {n} answer{'s' * (n != 1)}" for n in measured.record_at]
         earned = zip(measured.mean_returns, self.captions, strict=True)

@@ -63,9 +63,6 @@ class Subject:
 
     :param console: Where to say what takes its time
     :param n_tasks: How many tasks are drawn, unless ``--task`` names the only one
-    :param copies: How many of the environment step at once
-    :raises ValueError: if the arguments do not fit the model or the environment
-    :raises OSError: if the model cannot be read
     """
 
     def __init__(
@@ -107,21 +104,12 @@ class Subject:
 
     def known_task_return(self, n_episodes: int) -> KnownTaskReturn:
         """The best of the model's policies for each task, measured on so many episodes."""
-        return known_task_return(
-            self.model,
-            self.env,
-            self.tasks,
-            n_episodes=n_episodes,
-            seed=self.seed,
-            selection_episodes=min(n_episodes, SELECTION_EPISODES),
-        )
+        how: dict[str, Any] = {"selection_episodes": min(n_episodes, SELECTION_EPISODES)}
+        about = (self.model, self.env, self.tasks)
+        return known_task_return(*about, n_episodes=n_episodes, seed=self.seed, **how)
 
     def make_env(self, render_mode: str | None, show_task: bool) -> DummyVecEnv:
-        """A single environment with the first task, which is drawn too if it is shown.
-
-        :param render_mode: ``"rgb_array"``, ``"human"`` or None
-        :raises ValueError: if the environment cannot render so
-        """
+        """A single environment with the first task, which is drawn too if it is shown."""
         options = {**self.env_kwargs, "render_task": True} if show_task else self.env_kwargs
         env = DummyVecEnv([partial(make_shown_env, self.env_id, render_mode, **options)])
         FamilyView(env).set_tasks(self.tasks[:1])
@@ -130,9 +118,7 @@ class Subject:
     def roll_out(
         self, env: DummyVecEnv, latent: np.ndarray, episode: int = 0, frames: bool = False
     ) -> Trajectory:
-        """An episode of a policy (latent_dim,) on the first task, in what :meth:`make_env` made;
-        equal numbers start alike.
-        """
+        """An episode of a policy (latent_dim,) on the first task; equal numbers start alike."""
         seed, latents, tasks = evaluation_seed(self.seed) + episode, latent[None], self.tasks[:1]
         return rollout_latents(self.model, env, latents, tasks, [seed], frames=frames)[0]
 
@@ -144,11 +130,8 @@ class Subject:
     def film(
         self, latents: Sequence[np.ndarray], captions: Sequence[str], path: Path, show_task: bool
     ) -> None:
-        """Film one policy on the first task, or two side by side from the same start.
-
-        :param latents: One or two, (latent_dim,) each
-        :param captions: What is written above each of two
-        :param show_task: Whether the task is drawn, and what was earned on it is written
+        """Film one policy (latent_dim,) on the first task, or two side by side, with captions, from
+        the same start; ``show_task`` draws the task, and writes what was earned on it.
         """
         env = self.make_env("rgb_array", show_task)
         with self.console.status("Filming"):

@@ -44,9 +44,7 @@ def register_algorithms() -> None:
 
 
 class CheckedPairs(StoreDict):
-    """rl_zoo3's ``KEY:VALUE`` arguments, whose values are Python, with an error that names what is
-    none.
-    """
+    """rl_zoo3's ``KEY:VALUE`` arguments, with an error that names what is no Python."""
 
     def __call__(
         self, parser: Any, namespace: Any, values: Any, option_string: str | None = None
@@ -63,11 +61,8 @@ class CheckedPairs(StoreDict):
 
 
 def check_arguments(command: str, arguments: Sequence[str]) -> None:
-    """Refuse what rl_zoo3 would stumble over, and import what ``--gym-packages`` names.
-
-    :param command: ``"train"`` or ``"enjoy"``
-    :raises ValueError: if a value is no Python, or a module, the environment, the device or the
-        model does not exist
+    """Refuse what rl_zoo3's "train" or "enjoy" would stumble over, and import what
+    ``--gym-packages`` names.
     """
     parser = argparse.ArgumentParser(f"sb3-poem {command}", add_help=False, allow_abbrev=False)
     for flags in (("-params", "--hyperparams"), ("--env-kwargs",), ("--eval-env-kwargs",)):
@@ -95,12 +90,8 @@ def check_arguments(command: str, arguments: Sequence[str]) -> None:
 
 
 def run_zoo(command: str, arguments: Sequence[str]) -> None:
-    """Run rl_zoo3's program with our algorithms registered; ``logs`` is the default folder.
-    Training evaluates by adaptation, which takes a while, and so less often and on fewer episodes
-    than rl_zoo3's default.
-
-    :param command: ``"train"`` or ``"enjoy"``
-    :param arguments: its own arguments, as its ``--help`` lists them
+    """Run rl_zoo3's "train" or "enjoy" with our algorithms registered. Training evaluates by
+    adaptation, which takes a while, and so less often than by rl_zoo3's default.
     """
     register_algorithms()
     trains, asks_help = command == "train", bool({"-h", "--help"} & set(arguments))
