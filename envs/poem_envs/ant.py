@@ -225,9 +225,6 @@ class AntVelEnv(_AntVel, MujocoTaskEnv):
     Further arguments (`xml_file="ant.xml"`, `frame_skip=5`, `render_mode`, cameras, size of images)
     are those of :class:`~poem_envs.mujoco_family.MujocoFamily`. `render_task=True` shows the hidden
     task: an arrow, half a metre long for each m/s.
-
-    ## Version History
-    * v0: Initial version
     """
 
 
@@ -267,9 +264,6 @@ class AntFwdBackEnv(_AntFwdBack, MujocoTaskEnv):
 
     The others are those of :class:`AntVelEnv`, but for `forward_reward_offset`.
     `render_task=True` shows the hidden task: an arrow.
-
-    ## Version History
-    * v0: Initial version
     """
 
 
@@ -291,9 +285,6 @@ class AntDir2DEnv(_AntDir2D, MujocoTaskEnv):
 
     ## Rewards, Arguments
     As :class:`AntFwdBackEnv`.
-
-    ## Version History
-    * v0: Initial version
     """
 
 
@@ -340,9 +331,6 @@ class AntGoalEnv(_AntGoal, MujocoTaskEnv):
 
     `healthy_z_range`, `reset_noise_scale` and further arguments are those of :class:`AntVelEnv`.
     `render_task=True` shows the hidden task: a pole at the goal.
-
-    ## Version History
-    * v0: Initial version
     """
 
 

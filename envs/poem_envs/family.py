@@ -24,12 +24,7 @@ BOUNDS_TOLERANCE = 1e-6
 
 
 class SignedPermutation(NamedTuple):
-    """A reordering with changes of sign: entry i of the result is ``signs[i]`` times entry
-    ``order[i]``.
-
-    :param order: ``(n,)`` indices, each once
-    :param signs: ``(n,)`` of 1 and -1
-    """
+    """A reordering with changes of sign: entry i is ``signs[i]`` (1, -1) times ``order[i]``'s."""
 
     order: tuple[int, ...]
     signs: tuple[int, ...]
@@ -49,8 +44,7 @@ class Symmetry(NamedTuple):
 
     If an action takes the environment from one observation to the next, with some reward features,
     then the mirrored action takes it from the one's mirror image to the other's, with the mirrored
-    features. Nothing is said of rewards: those of what is mirrored are computed from its features,
-    for any task.
+    features; rewards are computed from these, for any task.
     """
 
     observations: SignedPermutation
@@ -63,8 +57,7 @@ class Symmetry(NamedTuple):
 
 
 class TaskDefinition(ABC):
-    """The tasks of a family and their rewards: what its single and its vectorised environment have
-    in common.
+    """The tasks of a family and their rewards, of its single and its vectorised environment.
 
     A subclass sets the attributes below and defines :meth:`_reward`; unless its tasks are uniform
     on ``task_space`` or finitely many (``all_tasks``), it defines :meth:`_draw_tasks` too.
@@ -87,12 +80,9 @@ class TaskDefinition(ABC):
     split: str = "train"
 
     def sample_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Draw tasks from the family's own distribution.
+        """Draw ``(n, task_dim)`` float64 tasks from the family's own distribution with a generator
+        (not the environment's own); of a finite family without replacement.
 
-        :param n: how many, at least 1; of a finite family, at most all of them, which are drawn
-            without replacement
-        :param rng: the generator to draw from; the environment's own one is left alone
-        :return: ``(n, task_dim)`` float64
         :raises ValueError: if ``n`` is below 1 or above the number of tasks of a finite family
         """
         if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1:
@@ -108,16 +98,11 @@ class TaskDefinition(ABC):
         return np.asarray(rng.permutation(self.all_tasks)[:n], dtype=np.float64)
 
     def compute_rewards(self, tasks: npt.ArrayLike, features: npt.ArrayLike) -> np.ndarray:
-        """The rewards that steps with the given features earn in the given tasks.
+        """The rewards ``(...)`` float64 that steps with features ``(..., reward_feature_dim)``, as
+        in ``info["reward_features"]``, earn in tasks ``(..., task_dim)``, broadcast.
 
         A pure function: ``step`` returns exactly this for its own task and features, so that a
-        trajectory logged in one task can be relabelled for any other. Leading dimensions broadcast
-        against each other.
-
-        :param tasks: ``(..., task_dim)``
-        :param features: ``(..., reward_feature_dim)``, as in ``info["reward_features"]``
-        :return: ``(...)`` float64
-        :raises ValueError: if a last dimension is not the expected one
+        trajectory logged in one task can be relabelled for any other.
         """
         tasks = np.asarray(tasks, dtype=np.float64)
         features = np.asarray(features, dtype=np.float64)
@@ -139,13 +124,10 @@ class TaskDefinition(ABC):
         return type(self)._potential is not TaskDefinition._potential
 
     def compute_potential(self, tasks: npt.ArrayLike, observations: npt.ArrayLike) -> np.ndarray:
-        """The reward per step of staying where observations show the robot, roughly; by it training
-        can be shaped (Ng, Harada & Russell, ICML 1999), which changes how fast policies are
-        learned, not which ones are best.
+        """The reward per step ``(...)`` of staying where observations ``(..., obs_dim)`` show the
+        robot, roughly, in tasks ``(..., task_dim)``; by it training can be shaped (Ng, Harada &
+        Russell, ICML 1999), which changes how fast policies are learned, not which are best.
 
-        :param tasks: ``(..., task_dim)``
-        :param observations: ``(..., obs_dim)``; leading dimensions broadcast
-        :return: ``(...)``
         :raises NotImplementedError: if the family defines none (:attr:`has_potential`)
         """
         return self._potential(np.asarray(tasks), np.asarray(observations))
@@ -158,9 +140,7 @@ class TaskDefinition(ABC):
 
     @abstractmethod
     def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
-        """The reward function. Only elementwise operations, so that one step and a batch give the
-        same bits.
-        """
+        """Elementwise operations alone, so that one step and a batch give the same bits."""
 
     def _draw_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draw from an infinite family: uniformly on ``task_space`` unless overridden."""
@@ -213,8 +193,8 @@ class TaskDefinition(ABC):
 
 
 class _NothingToRender:
-    """The ``metadata`` of families that cannot be rendered. Their classes have none: SB3 asks every
-    environment for RGB images first, and ``gym.make``, which looks at the class, would warn.
+    """The ``metadata`` of families that cannot be rendered: their classes have none, since SB3 asks
+    every environment for RGB images, and ``gym.make``, which looks at the class, would warn.
     """
 
     def __get__(self, instance: object, owner: type) -> dict[str, Any]:
@@ -322,9 +302,6 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray], metaclass=_Fam
     :param render_mode: one of ``metadata["render_modes"]``, or None
     :param render_task: whether rendering shows the hidden task, for a developer who debugs
     :param split: one of :attr:`splits`, to draw tasks from
-    :raises ValueError: if there is no such split or render mode, or no display for
-        ``render_mode="human"``
-    :raises TypeError: if a method or an attribute is missing; the message says which
     """
 
     metadata: dict[str, Any] = _NothingToRender()  # type: ignore[assignment]
@@ -352,22 +329,17 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray], metaclass=_Fam
         return None if self._task is None else self._task.copy()
 
     def set_task(self, task: npt.ArrayLike) -> None:
-        """Choose the task, ``(task_dim,)``, of the episodes that begin from the next reset on.
-
-        :raises ValueError: if it has another shape, is not finite, or lies outside ``task_space``
-            (or the finite family)
-        """
+        """Choose the task, ``(task_dim,)``, of :attr:`task_space`, from the next reset on."""
         self._next_task = self._checked_tasks(task, self.task_space.shape, "task")
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin an episode.
+        """Begin an episode; returns the observation and an empty info.
 
         :param seed: makes this and the following episodes reproducible; draws another task, unless
             one was chosen
         :param options: ``{"task": task}`` is short for :meth:`set_task` just before
-        :return: the observation and an empty info
         """
         options = check_options(options, self._reset_options)
         if "task" in options:
@@ -385,13 +357,10 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray], metaclass=_Fam
         return observation, {}
 
     def step(self, action: npt.ArrayLike) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Take one step.
+        """Take one step: observation, reward, terminated, truncated (always False, time limits are
+        a wrapper's), info.
 
-        :param action: inside ``action_space``; a tiny excess (1e-6) is clipped
-        :return: observation, reward, terminated, truncated (always False, time limits are a
-            wrapper's), info
-        :raises ValueError: if the action has another shape, is not finite or lies outside
-            ``action_space``
+        :param action: inside ``action_space``, or refused; a tiny excess (1e-6) is clipped
         :raises gymnasium.error.ResetNeeded: before the first reset
         """
         if self._task is None:
@@ -415,26 +384,18 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray], metaclass=_Fam
 
     @abstractmethod
     def _simulate(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
-        """Apply a valid action; return new arrays of observation and reward features, and whether
-        the episode ended early.
-        """
+        """Apply a valid action; new arrays of observation and features, and whether it ended."""
 
     def _step_info(self) -> dict[str, Any]:
         """Further entries of the info of the step just taken, say ``{"success": True}``."""
         return {}
 
     def get_physics_state(self) -> np.ndarray:
-        """The simulator's state, ``(state_dim,)``: enough to render this moment, or to go on from
-        it, of families that have one.
-        """
+        """The simulator's state, ``(state_dim,)``, from which it can go on."""
         return self._physics_state(0)
 
     def set_physics_state(self, state: npt.ArrayLike) -> None:
-        """Put the simulator into a state of :meth:`get_physics_state`, say to render a recorded
-        trajectory. The task stays.
-
-        :raises ValueError: if it has another shape or is not finite
-        """
+        """Put the simulator into a state of :meth:`get_physics_state`; the task stays."""
         self._set_physics_state(0, checked_state(state, self._physics_state(0).shape))
 
     def _describe_episode(self, copy: int = 0) -> str:
@@ -450,10 +411,8 @@ def task_stream(rng: np.random.Generator) -> np.random.Generator:
 
 
 def check_render_mode(render_mode: str | None, metadata: dict[str, Any]) -> None:
-    """Refuse a mode in which an environment cannot render.
+    """Refuse a mode in which an environment of this metadata cannot render.
 
-    :param metadata: the environment's own
-    :raises ValueError: if it can render, but not so, or not on this machine
     :raises TypeError: if it cannot render at all; upon that SB3's ``make_vec_env``, which always
         asks, makes it without
     """
@@ -473,11 +432,7 @@ def check_render_mode(render_mode: str | None, metadata: dict[str, Any]) -> None
 
 
 def check_options(options: dict[str, Any] | None, known: frozenset[str]) -> dict[str, Any]:
-    """The options of a reset.
-
-    :param known: the keys that mean something
-    :raises ValueError: if there are others, which it names
-    """
+    """The options of a reset; refuses keys that are not known."""
     unknown = set(options or {}) - known
     if unknown:
         raise ValueError(
@@ -490,13 +445,7 @@ def check_options(options: dict[str, Any] | None, known: frozenset[str]) -> dict
 def checked_actions(
     actions: npt.ArrayLike, space: spaces.Box, num_envs: int | None = None
 ) -> np.ndarray:
-    """Actions as a new float64 array inside the bounds.
-
-    :param actions: ``space.shape``, or ``(num_envs, *space.shape)``
-    :param space: of one action
-    :param num_envs: number of environment copies; None for a single environment
-    :raises ValueError: if they have another shape, or one is not finite or too large
-    """
+    """Actions as a new float64 array inside the bounds; a ValueError says which are wrong."""
     array = _numbers(
         actions, space.shape if num_envs is None else (num_envs, *space.shape), "action"
     )
@@ -515,10 +464,7 @@ def checked_actions(
 
 
 def checked_state(state: npt.ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
-    """A simulator's state as a new array.
-
-    :raises ValueError: if it has another shape or is not finite
-    """
+    """A simulator's state as a new array; refuses other shapes, and what is not finite."""
     array = np.array(state, dtype=np.float64)
     if array.shape != shape or not np.isfinite(array).all():
         raise ValueError(

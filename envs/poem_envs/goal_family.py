@@ -57,13 +57,10 @@ class GoalFamily(TaskFamily):
     :param goal_low: lower bounds of the goals, ``(goal_dim,)``; None takes those of
         ``desired_goal``
     :param goal_high: upper bounds
-    :param render_mode: as the environment has them
     :param render_task: whether rendering shows the goal. If not, MuJoCo sites that mark it are made
-        invisible, and whatever else the environment draws for its goal is drawn at the achieved
-        goal
+        invisible, and whatever else is drawn for it is drawn at the achieved goal
     :param env_kwargs: further arguments of the environment
-    :raises ValueError: if the environment is not goal-conditioned, or wrapped; the message says
-        what is missing
+    :raises ValueError: if the environment is not goal-conditioned, or wrapped
     """
 
     metadata = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012 (Gymnasium declares it so)
@@ -147,19 +144,13 @@ class GoalFamily(TaskFamily):
             registered.max_episode_steps = self.max_episode_steps
 
     def step(self, action: npt.ArrayLike) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """See :class:`TaskFamily`; a family that was not made by ``gym.make`` keeps its time limit
-        itself.
-        """
+        """See :class:`TaskFamily`; not made by ``gym.make``, it keeps its time limit itself."""
         observation, reward, terminated, _, info = super().step(action)
         truncated = self._spec is None and self._elapsed_steps >= (self.max_episode_steps or np.inf)
         return observation, reward, terminated, truncated, info
 
     def _check_reward(self) -> bool:
-        """Whether ``compute_reward`` takes many goals at once; if not, it is called for one after
-        another.
-
-        :raises ValueError: if it cannot be called, or the environment cannot be given a goal
-        """
+        """Whether ``compute_reward``, which it tries, takes many goals at once."""
         goals = self._goals_of_resets(self.env, range(2))
         try:
             one_by_one = [self._own_reward(goals[i : i + 1], goals[:1]) for i in range(2)]
@@ -286,9 +277,7 @@ class GoalFamily(TaskFamily):
 
 @contextlib.contextmanager
 def unchanged_physics(env: gym.Env) -> Iterator[None]:
-    """Put a MuJoCo environment back into its present state afterwards: some let a rendering change
-    the solver's warm start.
-    """
+    """Put a MuJoCo environment back afterwards: some let a rendering change the warm start."""
     model, data = getattr(env, "model", None), getattr(env, "data", None)
     if model is None or data is None:
         yield

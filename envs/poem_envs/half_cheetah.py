@@ -119,9 +119,6 @@ class HalfCheetahVelEnv(_HalfCheetahVel, MujocoTaskEnv):
     Further arguments (`xml_file="half_cheetah.xml"`, `frame_skip=5`, `render_mode`, cameras, size
     of images) are those of :class:`~poem_envs.mujoco_family.MujocoFamily`. `render_task=True` shows
     the hidden task: an arrow, half a metre long for each m/s.
-
-    ## Version History
-    * v0: Initial version
     """
 
 
@@ -145,9 +142,6 @@ class HalfCheetahFwdBackEnv(_HalfCheetahFwdBack, MujocoTaskEnv):
     $w_{forward} \cdot direction \cdot v_x - w_{ctrl} \|action\|_2^2$, where $v_x$ is the change of
     the x-coordinate over the step, divided by its duration `dt` = 0.05 s. The reward features are
     $(v_x, \|action\|_2^2)$.
-
-    ## Version History
-    * v0: Initial version
     """
 
 

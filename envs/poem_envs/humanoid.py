@@ -78,9 +78,7 @@ class _HumanoidDir2D(DirectionFamily):
         return np.concatenate([super()._observations(), self._derived], axis=1)
 
     def _derive(self, copies: np.ndarray, controls: np.ndarray) -> None:
-        """Compute what observation and reward take from the simulator, at the current states of
-        some copies under the actions applied, ``(len(copies), nu)``.
-        """
+        """Compute what observation and reward take from the simulator, for some copies."""
         model = self.model
         if self._forward_data is None:
             self._forward_data = mujoco.MjData(model)
@@ -175,9 +173,6 @@ class HumanoidDir2DEnv(_HumanoidDir2D, MujocoTaskEnv):
     Further arguments (`xml_file="humanoid.xml"`, `frame_skip=5`, `render_mode`, cameras, size of
     images) are those of :class:`~poem_envs.mujoco_family.MujocoFamily`. `render_task=True` shows
     the hidden task: an arrow.
-
-    ## Version History
-    * v0: Initial version
     """
 
 

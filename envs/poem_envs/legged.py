@@ -11,9 +11,7 @@ from poem_envs.mujoco_rendering import arrow
 
 
 class LeggedFamily(MujocoFamily):
-    """A robot whose episode ends when its torso leaves a range of heights; the last reward feature
-    is the action cost.
-    """
+    """A robot that ends its episode outside a range of heights; the last feature is the cost."""
 
     hidden_qpos = 2
     reward_feature_dim = 3
@@ -47,9 +45,7 @@ class LeggedFamily(MujocoFamily):
 
 
 class DirectionFamily(LeggedFamily):
-    """A legged robot that is to run in a direction, an angle in radians. The reward features are
-    the velocity in x and y, and the square of the action.
-    """
+    """A robot that is to run in a direction; features are v_x, v_y and the action's square."""
 
     def __init__(
         self, *, forward_reward_weight: float = 1.0, healthy_reward: float = 1.0, **kwargs: Any

@@ -40,9 +40,7 @@ class _Renderer:
         _open_renderers.add(self)
 
     def render(self, state: np.ndarray, render_mode: str, markers: list[dict[str, Any]]) -> Any:
-        """Render a state, ``(1 + nq + nv,)``, in one of Gymnasium's modes, with markers as
-        ``MujocoRenderer``'s ``add_marker`` takes them.
-        """
+        """Render a state ``(1 + nq + nv,)`` with markers as ``add_marker`` takes them."""
         raise NotImplementedError
 
     def close(self) -> None:
@@ -187,9 +185,7 @@ def _close_open_renderers() -> None:
 
 
 def renders_fast(render_quality: str, render_mode: str | None) -> bool:
-    """Whether images come from a :class:`FastRenderer`; refuses unknown qualities, and "fast" in a
-    mode without images in colour.
-    """
+    """Whether images come from a :class:`FastRenderer`; refuses what is unknown or does not fit."""
     if render_quality not in RENDER_QUALITIES:
         raise ValueError(
             f"render_quality must be one of {RENDER_QUALITIES}, got {render_quality!r}"
@@ -218,9 +214,7 @@ def _make_context(width: int, height: int) -> Any:
 
 
 def renderer_inside(env: Any) -> Any:
-    """The ``MujocoRenderer`` of a bare environment, if it has one; mazes of gymnasium-robotics keep
-    the robot's environment one deeper.
-    """
+    """The ``MujocoRenderer`` of a bare environment, which mazes keep one deeper, if it has one."""
     for holder in (env, getattr(env, "ant_env", None), getattr(env, "point_env", None)):
         renderer = getattr(holder, "mujoco_renderer", None)
         if renderer is not None:

@@ -131,9 +131,6 @@ class PointGoalEnv(_PointGoal, BatchTaskFamily):
     | `width`, `height`   | **int**   | `480`   | Size of the rendered image, pixels           |
     | `render_mode`       | **str**   | `None`  | `"rgb_array"` or `"human"`                   |
     | `render_task`       | **bool**  | `False` | Whether rendering shows the goal             |
-
-    ## Version History
-    * v0: Initial version
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 10}  # noqa: RUF012

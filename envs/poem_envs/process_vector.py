@@ -83,9 +83,7 @@ class CopyGroup:
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-        """Step every copy, ``(copies, action_dim)``: observations, reward features, early ends, and
-        further infos, a row for each copy.
-        """
+        """Step every copy: observations, reward features, early ends and further infos."""
         results, infos = [], []
         for copy, (env, action) in enumerate(zip(self.envs, actions, strict=True)):
             env._elapsed_steps += 1
@@ -123,9 +121,7 @@ class WorkerError(Exception):
 
 
 class RemoteGroup:
-    """A :class:`CopyGroup` in a process of its own: calls are sent, and their results received
-    later. The first result is that of making it.
-    """
+    """A :class:`CopyGroup` in a process: calls are sent, results received, first of making it."""
 
     def __init__(self, *arguments: Any) -> None:
         self._connection, theirs = Pipe()

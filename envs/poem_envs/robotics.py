@@ -47,9 +47,6 @@ class FetchReachEnv(_RoboticsFamily):
     ## Arguments
     `reward_type` (`"dense"` or `"sparse"`), `render_mode`, `render_task`, and those of
     `FetchReach-v4`, such as `width`.
-
-    ## Version History
-    * v0: Initial version
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -84,9 +81,6 @@ class FetchPushEnv(_RoboticsFamily):
     `reward_type="dense"`: minus the distance of the box to the goal; `"sparse"`: 0 within 0.05 of
     it, else -1. The reward features are the box's position, and `success` of the info is whether it
     is within 0.05.
-
-    ## Version History
-    * v0: Initial version
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -126,8 +120,6 @@ class AntMazeEnv(_RoboticsFamily):
 
     ## Arguments
     As :class:`FetchReachEnv`; further ones are those of `AntMaze_UMaze-v5`.
-    ## Version History
-    * v0: Initial version
     """
 
     def __init__(self, **kwargs: Any) -> None:

@@ -36,9 +36,7 @@ CHECKPOINT = "checkpoint.zip"
 
 
 class TrainingInterrupted(KeyboardInterrupt):
-    """Training was interrupted, and what it had learned is saved. ``resumable`` is whether
-    ``--resume`` finds a checkpoint of this run.
-    """
+    """Training was interrupted, and what it had learned is saved, ``resumable`` by ``--resume``."""
 
     def __init__(self, message: str, resumable: bool) -> None:
         super().__init__(message)
@@ -72,9 +70,7 @@ def stopping_between_epochs(checkpoint: TrainingCheckpointCallback) -> Iterator[
 def make_experiment(
     args: Any, algo: str, env_id: str, log_folder: str, *rest: Any, **kwargs: Any
 ) -> ExperimentManager:
-    """The experiment that fits the algorithm; takes what rl_zoo3's ``train`` gives to its
-    ``ExperimentManager``, and refuses steps, files and folders that cannot be.
-    """
+    """What rl_zoo3's ``train`` takes for its ``ExperimentManager``, once arguments are checked."""
     # -1 is rl_zoo3's default, and takes the entry's
     if args.n_timesteps < 1 and args.n_timesteps != -1:
         raise ValueError(f"-n/--n-timesteps must be at least 1, got {args.n_timesteps}")

@@ -1,6 +1,4 @@
-"""``sb3-poem label``: the page on which people answer, the data set of their answers, and what
-others make of these.
-"""
+"""``sb3-poem label``: the page on which people answer, the data set, and what others make of it."""
 
 import argparse
 import os

@@ -42,9 +42,7 @@ class Report:
         )
 
     def table(self) -> Table:
-        """Return, its standard error over tasks, the limit and, where a family has it, the success
-        rate after each answer.
-        """
+        """Return, its standard error over tasks, limit and success rate after each answer."""
         known, limits = self.known, self.limits
         rates = self.evaluation.success_rates
         look: dict[str, Any] = {"caption_justify": "left", "min_width": TABLE_WIDTH}
@@ -76,9 +74,7 @@ class Report:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-ready: every task's return after every answer, the limit, the known-task return, and
-        how it came about.
-        """
+        """JSON-ready: every task's return after every answer, limits, and how it came about."""
         return {
             "command": " ".join(sys.orig_argv),
             "versions": versions(),
@@ -99,9 +95,7 @@ class Report:
         }
 
     def write(self, console: Console, json_file: Path | None, plot_file: Path | None) -> None:
-        """Print the table, and write what was asked for: :meth:`to_dict`, and a plot of the return
-        against the number of answers.
-        """
+        """Print the table, and write what was asked for: :meth:`to_dict`, and a plot."""
         console.print(self.table())
         if json_file is not None:
             write_json_atomically(json_file, self.to_dict())

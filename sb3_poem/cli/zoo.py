@@ -61,9 +61,7 @@ class CheckedPairs(StoreDict):
 
 
 def check_arguments(command: str, arguments: Sequence[str]) -> None:
-    """Refuse what rl_zoo3's "train" or "enjoy" would stumble over, and import what
-    ``--gym-packages`` names.
-    """
+    """Refuse what rl_zoo3's "train" or "enjoy" would stumble over; import ``--gym-packages``."""
     parser = argparse.ArgumentParser(f"sb3-poem {command}", add_help=False, allow_abbrev=False)
     for flags in (("-params", "--hyperparams"), ("--env-kwargs",), ("--eval-env-kwargs",)):
         parser.add_argument(*flags, nargs="+", action=CheckedPairs)
@@ -90,9 +88,7 @@ def check_arguments(command: str, arguments: Sequence[str]) -> None:
 
 
 def run_zoo(command: str, arguments: Sequence[str]) -> None:
-    """Run rl_zoo3's "train" or "enjoy" with our algorithms registered. Training evaluates by
-    adaptation, which takes a while, and so less often than by rl_zoo3's default.
-    """
+    """Run rl_zoo3's "train" or "enjoy" with our algorithms registered and defaults of our own."""
     register_algorithms()
     trains, asks_help = command == "train", bool({"-h", "--help"} & set(arguments))
     if not trains and not has_display() and not asks_help and "--no-render" not in arguments:

@@ -122,9 +122,7 @@ class TaskReplayBuffer(ReplayBuffer):
         self._note_counts()
 
     def draw_slots(self, source_tasks: th.Tensor, generator: th.Generator) -> th.Tensor:
-        """Draw one stored transition for each entry of (tasks, batch) indices of tasks, uniformly
-        from its task's own: its slot, for :meth:`at`.
-        """
+        """Draw a slot for each of (tasks, batch) indices of tasks, uniformly from its own."""
         uniform = th.rand(source_tasks.shape, generator=generator, device=self.device)
         return (uniform * self._counts_on_device[source_tasks]).long()
 
@@ -133,9 +131,7 @@ class TaskReplayBuffer(ReplayBuffer):
         return self.at(source_tasks, self.draw_slots(source_tasks, generator))
 
     def at(self, tasks: th.Tensor, slots: th.Tensor) -> TaskBatch:
-        """The transitions in slots (...), below their tasks' ``counts``, of tasks (...). The next
-        slot, round the ring, holds the next step, but where an episode or its recording ended.
-        """
+        """The transitions in slots (...) of tasks (...); next steps follow, round the ring."""
         return self._gather(tasks * self.rows.shape[1] + slots)
 
     def transitions(self, task: int) -> TaskBatch:
@@ -180,9 +176,7 @@ class TaskReplayBuffer(ReplayBuffer):
         return sum(self.widths[:3])
 
     def _pack(self, segment: Segment, steps: int) -> tuple[th.Tensor, np.ndarray, np.ndarray]:
-        """Rows (copies, steps, words) without marks; which are ends, and which of these terminated,
-        (copies, steps).
-        """
+        """Rows (copies, steps, words) without marks; which are ends, and which terminated."""
         obs = segment.observations[:, -steps:].astype(np.float32, copy=False)
         next_obs = segment.next_observations[:, -steps:].astype(np.float32, copy=False)
         terminated = segment.terminated[:, -steps:] > 0
@@ -258,9 +252,7 @@ class TaskReplayBuffer(ReplayBuffer):
 
 @dataclass
 class ContextStore:
-    """What the last epoch collected: the encoder's contexts and the preference labels. Replaced
-    every epoch.
-    """
+    """What the last epoch collected: the encoder's contexts and the preference labels."""
 
     #: (tasks, steps, context_dim) standardised (s, a, s', r[, Q])
     transitions: th.Tensor

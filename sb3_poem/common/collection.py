@@ -39,18 +39,14 @@ def collect_segment(
     on_step: OnStep,
 ) -> Segment | None:
     """Run every copy for one horizon on its task; an episode that ends early is followed by another
-    of the same task.
+    of the same task. Refuses NaN, infinity, and what :meth:`FamilyView.check_experience` does.
 
     :param act: Maps observations (copies, obs_dim) to actions in the environment's units and in
         [-1, 1]
-    :param task_ids: (copies,) index of each copy's task
-    :param tasks: (copies, task_dim)
+    :param task_ids: (copies,) index of each copy's task, whose ``tasks`` are (copies, task_dim)
     :param latents: (copies, latent_dim), noted in the segment
-    :param seed: Of the copies' resets
     :param episode_counts: (copies,) episodes begun so far, counted on here; for messages
     :param on_step: Given the local variables of a step; False ends the collection, without result
-    :raises ValueError: if the environment returns NaN or infinity, or what
-        :meth:`FamilyView.check_experience` refuses
     """
     obs = family.reset(tasks, seed)
     check_finite("observations", obs, task_ids, episode_counts, 0)

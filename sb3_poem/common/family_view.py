@@ -44,9 +44,7 @@ def no_family(env: str) -> str:
 
 
 class FamilyView:
-    """A vectorised environment of :class:`poem_envs.TaskFamily` environments as a task family: the
-    one way to ask it.
-    """
+    """A vectorised :class:`poem_envs.TaskFamily`, whatever its class: the one way to ask it."""
 
     #: Steps of an episode, of a family that training can use (:meth:`for_training`)
     horizon: int
@@ -234,9 +232,7 @@ class FamilyView:
         return self._call("sample_tasks", n, rng)
 
     def test_tasks(self, n: int, seed: int) -> np.ndarray:
-        """(n, task_dim) tasks that no seed gives a model to train on; those of a finite family are
-        repeated in turn.
-        """
+        """(n, task_dim) no training draws; those of a finite family are repeated in turn."""
         rng = np.random.default_rng([TEST_TASK_STREAM, seed])
         if self.all_tasks is None:
             return self.sample_tasks(n, rng)

@@ -11,11 +11,9 @@ from typing import BinaryIO
 def write_atomically(
     path: str | Path, content: bytes | memoryview | Callable[[BinaryIO], object]
 ) -> None:
-    """Write a file completely or not at all: a crash, a kill or a full disk leaves the previous
-    file whole.
+    """Write a file, and missing folders, completely or not at all: a crash, a kill or a full disk
+    leaves the previous file whole. ``content`` may be a function that writes to an open file.
 
-    :param path: Missing folders are made
-    :param content: What, or a function that writes it to an open file
     :raises OSError: if the folder cannot be written or the disk is full; names the path
     """
     path = Path(path)

@@ -103,9 +103,7 @@ class MLP(nn.Module):
         self.low_precision: LowPrecisionMLP | None = None
 
     def forward(self, *parts: th.Tensor, frozen: bool = False) -> th.Tensor:
-        """Map (..., in_dim), in one or more parts, to (..., out_dim), float32; if ``frozen``
-        without a graph to the parameters, while gradients still reach the input.
-        """
+        """Map parts of (..., in_dim) to (..., out_dim), float32; ``frozen`` trains no parameter."""
         return self.evaluate(self.inputs(*parts), frozen)
 
     def inputs(self, *parts: th.Tensor) -> th.Tensor:
@@ -131,9 +129,7 @@ def _linear(x: th.Tensor, layer: nn.Module, frozen: bool) -> th.Tensor:
 
 
 class _GaussianProduct(th.autograd.Function):
-    """Mean and variance, (..., d), of the normalised product of Gaussian factors, (..., factors, 2
-    d): their means, then what softplus makes their variances.
-    """
+    """Mean and variance, (..., d), of the product of Gaussian factors, (..., factors, 2 d)."""
 
     @staticmethod
     def forward(ctx: Any, raw: th.Tensor) -> tuple[th.Tensor, th.Tensor]:

@@ -17,11 +17,7 @@ def cpu_has_bfloat16() -> bool:
 
 
 def hidden_dtype(precision: str, device_type: str) -> th.dtype:
-    """Type of the hidden layers' arithmetic.
-
-    :param precision: One of :data:`PRECISIONS`
-    :param device_type: "cpu" or "cuda"
-    """
+    """Type of the hidden layers' arithmetic on a device, "cpu" or "cuda"."""
     if precision not in PRECISIONS:
         known = ", ".join(map(repr, PRECISIONS))
         raise ValueError(f"precision must be one of {known}, got {precision!r}")
@@ -36,12 +32,7 @@ class MixedPrecision:
     weights that stay float32.
 
     Within the context, copies of the layers compute; :meth:`refresh` brings them up to date, and
-    :meth:`collect_gradients` takes their gradients back to the float32 weights, each for all layers
-    at once.
-
-    :param module: Module that holds the perceptrons; those with another activation than ReLU stay
-        float32
-    :param dtype: Arithmetic of their hidden layers; float32 changes nothing
+    :meth:`collect_gradients` takes their gradients back. Float32 changes nothing.
     """
 
     def __init__(self, module: nn.Module, dtype: th.dtype) -> None:

@@ -7,11 +7,7 @@ import torch as th
 
 
 class Generators:
-    """One NumPy and one torch generator from one seed; pickles with its exact state.
-
-    :param seed: Seed; None draws one from the operating system
-    :param device: Device of the torch generator
-    """
+    """One NumPy and one torch generator from one seed; pickles with its exact state."""
 
     def __init__(self, seed: int | None, device: th.device | str = "cpu") -> None:
         numpy_seed, torch_seed = np.random.SeedSequence(seed).spawn(2)
@@ -47,9 +43,7 @@ class Generators:
         return th.Generator(device).manual_seed(int(self.numpy.integers(2**63 - 1)))
 
     def to(self, device: th.device | str) -> "Generators":
-        """Move the torch generator to another kind of device; its stream is then a new one, seeded
-        by the old.
-        """
+        """Move the torch generator to another kind of device, its stream seeded by the old."""
         device = th.device(device)
         if device.type != self.torch.device.type:
             self.torch = self._seeded(device)

@@ -71,9 +71,7 @@ def rollout_outcomes(
     *,
     max_steps: int | None = None,
 ) -> list[Outcome]:
-    """As :func:`rollout_latents`, but keep each episode's outcome only, for evaluation:
-    observations may take hundreds of megabytes. Refuses an environment without reward features.
-    """
+    """As :func:`rollout_latents`, but outcomes only: observations may take up all memory."""
     outcomes, how = [], (seed, deterministic, False, max_steps)
     for episode in _episodes(model, vec_env, latents, tasks, *how, keep=False):
         if episode.reward_features is None:

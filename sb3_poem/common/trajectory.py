@@ -14,12 +14,7 @@ STORED = ("observations", "actions", "latent", "reward_features")
 
 
 def encode_array(array: np.ndarray) -> dict[str, Any]:
-    """Write an array as JSON-ready data, bit for bit, for :func:`decode_array`.
-
-    Decimal text would be larger and slower, and people do not read trajectories; so the array's own
-    ``.npy`` bytes are compressed and written in base 64. The shape stands beside them for the
-    reader's benefit.
-    """
+    """An array as JSON-ready data, bit for bit: compressed ``.npy`` bytes in base 64."""
     buffer = io.BytesIO()
     np.save(buffer, np.ascontiguousarray(array), allow_pickle=False)
     return {
@@ -29,10 +24,7 @@ def encode_array(array: np.ndarray) -> dict[str, Any]:
 
 
 def decode_array(data: dict[str, Any]) -> np.ndarray:
-    """Read what :func:`encode_array` wrote.
-
-    :raises ValueError: If the data is not such a dictionary.
-    """
+    """Read what :func:`encode_array` wrote; ValueError if it is none such."""
     try:
         content = zlib.decompress(base64.b64decode(data["npy"], validate=True))
         return np.load(io.BytesIO(content), allow_pickle=False)
@@ -42,8 +34,7 @@ def decode_array(data: dict[str, Any]) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """One episode of a latent-conditioned policy. It holds no rewards on purpose: adaptation must
-    not see them.
+    """One episode of a latent-conditioned policy, without rewards: adaptation must not see them.
 
     :param observations: (T + 1, obs_dim); the last is the observation after the last action.
     :param actions: (T, act_dim).
@@ -52,7 +43,6 @@ class Trajectory:
         rewards; None where the environment gives none.
     :param frames: RGB images (height, width, 3) uint8, one a step, and one more where the episode
         was cut, when rendering was asked for; else None.
-    :raises ValueError: If the shapes do not fit together, or T = 0.
     """
 
     observations: np.ndarray
@@ -88,9 +78,7 @@ class Trajectory:
         return len(self.actions)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-ready data for :meth:`from_dict`. Frames stay out: they are large, and the rollout's
-        seed gives them again.
-        """
+        """JSON-ready data for :meth:`from_dict`, without frames, which the rollout's seed gives."""
         arrays = {name: getattr(self, name) for name in STORED}
         return {name: None if a is None else encode_array(a) for name, a in arrays.items()}
 

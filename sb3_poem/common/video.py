@@ -75,9 +75,7 @@ def side_by_side(
     captions: tuple[str, str] | None = None,
     gap: int = GAP,
 ) -> list[Frame]:
-    """Two clips beside each other, with ``gap`` white columns between them, under a line of text
-    each if there are captions; the shorter one holds its last frame.
-    """
+    """Two clips beside each other, under captions if any; the shorter one holds its last frame."""
     if len(left) == 0 or len(right) == 0:
         raise ValueError(f"both clips need frames, got {len(left)} and {len(right)}")
     heights = left[0].shape[0], right[0].shape[0]

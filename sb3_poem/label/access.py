@@ -79,9 +79,7 @@ def is_loopback(host: str) -> bool:
 
 
 class AccessMiddleware:
-    """ASGI middleware in front of everything. A request's body is read here, of one that is too
-    large no more than the limit.
-    """
+    """ASGI middleware in front of everything, which reads bodies up to a limit."""
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self.app = app
@@ -319,9 +317,7 @@ class Connection(H11Protocol):
 
 
 def network_of(host: str) -> str:
-    """What counts as one address: an IPv4 address, and of IPv6 the network of 64 bits that one
-    household is given.
-    """
+    """What counts as one address: one of IPv4, and of IPv6 a household's network of 64 bits."""
     try:
         address = ipaddress.ip_address(host)
     except ValueError:

@@ -1,6 +1,4 @@
-"""Which trained models a person may choose from, what their task families are called on the page,
-and how tasks are drawn.
-"""
+"""Models that a person may choose from, their families in words, and how tasks are drawn."""
 
 from __future__ import annotations
 

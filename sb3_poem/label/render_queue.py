@@ -54,9 +54,7 @@ class Job:
 
 
 class RenderQueue:
-    """Makes turns on an executor (None: processes), in the order of their priority. All methods
-    belong to one event loop.
-    """
+    """Makes turns on an executor (None: processes), by priority; belongs to one event loop."""
 
     def __init__(
         self,
@@ -158,9 +156,7 @@ class RenderQueue:
 def process_pool(
     n_workers: int, models: Sequence[ModelInfo] = (), packages: Sequence[str] = ()
 ) -> ProcessPoolExecutor:
-    """Worker processes, which end with this one even if it is killed; first they import
-    ``packages``, which register environments, and load ``models``.
-    """
+    """Worker processes, which end with this one, import ``packages``, and load ``models``."""
     return ProcessPoolExecutor(
         n_workers,
         mp_context=multiprocessing.get_context("spawn"),

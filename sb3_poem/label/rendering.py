@@ -191,9 +191,7 @@ def session_rule(options: dict[str, Any]) -> Rule:
 
 
 def make_turn(request: TurnRequest) -> Turn:
-    """Make a turn in this process, which keeps models and environments that it has used; raises
-    :class:`RenderCancelledError` if there was a marker, and it is taken away.
-    """
+    """Make a turn, by models and environments that the process keeps, while it is wanted."""
     renderer = renderer_of(request.model)
     renderer.env.env_method("render_while", request.marker if request.marker.exists() else None)
     family = FamilyView(renderer.env)
@@ -240,9 +238,7 @@ def make_env(env_id: str, **env_kwargs: Any) -> gym.Env:
 
 
 def write_clip(frames: Sequence[np.ndarray], path: Path, fps: float) -> None:
-    """Write frames, (height, width, 3) uint8 of one size, as MP4 (H.264), completely or not at all;
-    raises :class:`StorageError` if it cannot.
-    """
+    """Write frames, (height, width, 3) uint8, as MP4 (H.264), completely or not at all."""
     from imageio_ffmpeg import get_ffmpeg_exe
 
     height, width = frames[0].shape[:2]

@@ -58,9 +58,7 @@ SessionEndpoint = Callable[[Request, Session], Awaitable[Response]]
 
 
 def make_app(sessions: SessionManager, access: Access | None = None) -> Starlette:
-    """The ASGI application; with it the sessions' queue is closed. Without ``access`` it lets in
-    who reaches the server by a name of this machine.
-    """
+    """The ASGI application, which closes the sessions' queue; by default for this machine alone."""
     return _Pages(sessions).application(access or Access())
 
 
@@ -255,9 +253,7 @@ def bind(host: str, port: int) -> socket.socket:
 
 
 def link_host(listener: socket.socket, host: str) -> str:
-    """The host of a link to a server: the one asked for; for one that stands for all of this
-    machine's, such as ``0.0.0.0``, one at which the machine is reached.
-    """
+    """The host of a link to a server: one of all addresses that ``0.0.0.0`` stands for."""
     if not ipaddress.ip_address(listener.getsockname()[0]).is_unspecified:
         return host.strip("[]")
     for family in (listener.family, socket.AF_INET):  # an IPv6 socket takes IPv4 too

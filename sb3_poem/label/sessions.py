@@ -1,6 +1,4 @@
-"""The sessions of a server: which question is next, what is rendered ahead, and what a page needs
-to know of it all.
-"""
+"""The sessions of a server: which question is next, what is rendered ahead, what the page shows."""
 
 from __future__ import annotations
 
@@ -184,9 +182,7 @@ class SessionManager:
         return TurnRequest(*about, **before, preference=key.preference, film_every=film_every)
 
     def _look(self, number: int) -> tuple[Session, int, str, Any, Any]:
-        """The session as it is now, its answers, the kind of turn that should be shown, that turn,
-        and where it is missing the question before it.
-        """
+        """The session, its answers, the turn that is due and its kind, else the question before."""
         session, answered = self.store.session(number), len(self.store.answers(number))
         kind = "result" if session.stopped or answered >= session.target else "question"
         turn = self.store.turn(number, kind, answered)
@@ -228,9 +224,7 @@ class SessionManager:
         active.task = asyncio.get_running_loop().create_task(turn)
 
     async def _make_turn(self, session: Session, answered: int, kind: str) -> None:
-        """Have the turn made that the page waits for, or take the one that was rendered ahead, and
-        keep it.
-        """
+        """Have the turn made that the page waits for, or take the one rendered ahead; keep it."""
         active = self._active[session.id]
         try:
             answers = await asyncio.to_thread(self.store.answers, session.id)
@@ -275,9 +269,7 @@ class SessionManager:
             active.jobs[key] = self.queue.submit(request, priority)
 
     def _keep_only(self, active: _Active, question: int | None, due: _Key | None = None) -> None:
-        """Drop jobs that follow from other questions, or, once the answer is known, from other
-        answers.
-        """
+        """Drop jobs that follow from other questions or, once it is known, from other answers."""
         for key in list(active.jobs):
             if key.question != question or due not in (None, key):
                 self.queue.cancel(active.jobs.pop(key))

@@ -175,9 +175,7 @@ class Store:
         return self._one("SELECT * FROM turns WHERE id = ?", turn)
 
     def adapter_answers(self, session: int, before: int) -> list[dict[str, Any]]:
-        """The first so many answers, as an adapter's dictionary holds them: ``preference``,
-        ``left`` and ``right`` of each.
-        """
+        """The first so many answers: ``preference``, ``left`` and ``right`` of each."""
         query = """SELECT answers.preference, turns.left_trajectory, turns.right_trajectory
             FROM answers JOIN turns ON turns.id = answers.question
             WHERE answers.session = ? AND answers.undone IS NULL AND answers.number < ?
@@ -188,9 +186,7 @@ class Store:
         ]
 
     def adapter_data(self, turn: int) -> dict[str, Any]:
-        """What the adapter's dictionary held when a turn was made: ``answers``, ``pending``, and
-        the rest as ``state``.
-        """
+        """The adapter's dictionary of a turn: ``answers``, ``pending``, the rest as ``state``."""
         row: Any = self.whole_turn(turn)
         pair = {side: json.loads(row[f"{side}_trajectory"] or "null") for side in ("left", "right")}
         return {

@@ -76,9 +76,7 @@ def refuse_unsupported(names: Iterable[str], algorithm: str) -> None:
 
 
 def refuse_unknown(names: Iterable[str], algorithm: type) -> None:
-    """:param names: Of arguments that the algorithm's constructor does not have
-    :raises TypeError: at the first; as :func:`refuse_unsupported`, or with a name like it
-    """
+    """Refuse a name that the constructor does not have, and say which it may have meant."""
     refuse_unsupported(names, algorithm.__name__)
     for name in names:
         if name in POLICY_ARGUMENTS:

@@ -34,9 +34,7 @@ class EpochCollector:
     on_step: OnStep
 
     def collect(self) -> list[Segment] | None:
-        """One epoch: ``trajectories_per_task`` horizons of every task, a segment for each wave of
-        copies; None if ``on_step`` ended it.
-        """
+        """An epoch: a segment for each wave of copies; None if ``on_step`` ended it."""
         waves = []
         wanted = np.repeat(np.arange(len(self.train_tasks)), self.trajectories_per_task)
         for wave in in_waves(wanted, self.family.num_envs):
@@ -48,9 +46,7 @@ class EpochCollector:
         return waves
 
     def roll_out(self, task_ids: np.ndarray, latents: np.ndarray) -> Segment | None:
-        """One horizon of each copy on a task (copies,) under a latent (copies, latent_dim), which
-        goes to the buffer as well; None if ``on_step`` ended it.
-        """
+        """A horizon of each copy, which goes to the buffer too; None if ``on_step`` ended it."""
         space = self.policy.action_space
         shape = (len(latents), int(space.shape[0]))
         policy_action, noises = self.policy.acting_on(latents), self.action_noises(shape)

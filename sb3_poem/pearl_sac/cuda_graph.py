@@ -57,9 +57,7 @@ class GraphedStep:
 
 
 def prepare_optimizers(optimizers: list[th.optim.Optimizer], device: th.device) -> None:
-    """Keep the state of optimisers where their parameters are, and tell them whether a graph may
-    capture them, which they refuse on a processor.
-    """
+    """Keep optimisers' state where parameters are; only on a GPU may a graph capture them."""
     for optimizer in optimizers:
         for group in optimizer.param_groups:
             if "capturable" in group:

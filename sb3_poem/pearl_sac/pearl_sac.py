@@ -375,9 +375,7 @@ class PEARLSAC(SAC):
         return total
 
     def _collect_epoch(self, callback: BaseCallback) -> int | None:
-        """Roll out every training task under a latent of its own, and replace the contexts by what
-        was seen: environment steps, or None if a callback ended it.
-        """
+        """Roll out every task, and make the contexts: environment steps, None if it was ended."""
         started, steps_before = time.perf_counter(), self.num_timesteps
         collector = self.make_collector(callback)
         waves = collector.collect()
@@ -439,9 +437,7 @@ class PEARLSAC(SAC):
         )
 
     def train(self, gradient_steps: int, batch_size: int = 128) -> None:
-        """Gradient steps on meta-batches (Algorithm 1, lines 4 to 15), then a refresh of every
-        training task's posterior.
-        """
+        """Gradient steps on meta-batches (Algorithm 1, lines 4 to 15); then new posteriors."""
         self.policy.set_training_mode(True)
         optimizers = [self.policy.optimizer, *self.entropy_coefficient.optimizers]
         self._update_learning_rate(optimizers)
@@ -476,9 +472,7 @@ class PEARLSAC(SAC):
 
     @th.no_grad()
     def _measure_decoder(self) -> None:
-        """Residual deviation of the decoder, per step, on transitions of all training policies, in
-        units of reward; unknown where tasks do not share their dynamics.
-        """
+        """The decoder's residual deviation, per step, in units of reward, where dynamics agree."""
         if not self.family.shared_dynamics:
             return
         tasks, policy, device = self.train_tasks.tasks, self.policy, self.device

@@ -198,9 +198,7 @@ class LatentPolicy(SACPolicy):
     def decode_rewards(
         self, obs: th.Tensor, actions: th.Tensor, next_obs: th.Tensor, reward_embedding: th.Tensor
     ) -> th.Tensor:
-        """Predicted rewards (...) in the environment's units, of standardised observations and
-        actions in [-1, 1].
-        """
+        """Predicted rewards (...) in the environment's units, of what is standardised."""
         return self.reward_norm.inverse(self.decoder(obs, actions, next_obs, reward_embedding))
 
     def acting_on(

@@ -52,9 +52,7 @@ def mapped(function: Callable[[th.Tensor], th.Tensor], batch: Any) -> Any:
 
 @dataclass
 class MetaBatchSampler:
-    """Draws meta-batches from replay buffers and contexts, several at once, which costs as many
-    operations as one. Its fields are those of PEARLSAC.
-    """
+    """Draws meta-batches, several at once, which costs as much as one; fields are PEARLSAC's."""
 
     family: FamilyView
     train_tasks: TrainTasks
@@ -151,9 +149,7 @@ class MetaBatchSampler:
         return transitions, Bootstraps(rewards, last.next_observations, discounts)
 
     def _draw_mirror(self, shape: th.Size) -> Callable[[TaskBatch], TaskBatch]:
-        """A function that sees ``mirror_fraction`` of transitions (tasks, batch) in a symmetry,
-        each always in the same, but for their rewards.
-        """
+        """A function that sees ``mirror_fraction`` of transitions (tasks, batch) in a symmetry."""
         generator, device, symmetries = self.generators.torch, self.device, self.family.symmetries
         which = th.randint(1, len(symmetries) + 1, shape, generator=generator, device=device)
         # 0 is no symmetry
@@ -217,9 +213,7 @@ class MetaBatchSampler:
         return context, own
 
     def _context_sources(self, task_ids: th.Tensor) -> th.Tensor:
-        """Whose transitions a context holds, (tasks, context_size): the task's own, or for
-        ``context_relabel_fraction`` of the contexts a mixture of two random tasks'.
-        """
+        """Whose transitions contexts hold, (tasks, context_size): some mix two random tasks'."""
         generator, device, n = self.generators.torch, self.device, len(task_ids)
         n_tasks, picked = len(self.train_tasks), (n, self.context_size)
         pool = th.randint(n_tasks, (n, FOREIGN_SOURCES), generator=generator, device=device)

@@ -16,9 +16,7 @@ from sb3_poem.pearl_sac.sampler import MetaBatch
 
 @dataclass
 class EntropyCoefficient:
-    """SAC's entropy coefficient: fixed or, with an optimizer, learned, and then its logarithm,
-    (1,).
-    """
+    """SAC's entropy coefficient: fixed, or learned by an optimizer as its logarithm, (1,)."""
 
     tensor: th.Tensor
     optimizer: th.optim.Optimizer | None
@@ -44,9 +42,7 @@ class EntropyCoefficient:
 
 @dataclass
 class Updater:
-    """Changes the networks, one meta-batch at a time; a context, in which hidden layers compute in
-    ``hidden_dtype``. Fields but the objective are PEARLSAC's.
-    """
+    """Changes the networks; a context, in which hidden layers compute in ``hidden_dtype``."""
 
     policy: LatentPolicy
     objective: Objective
@@ -78,9 +74,7 @@ class Updater:
         self._precision.__exit__(*exception)
 
     def step(self, batch: MetaBatch) -> Metrics:
-        """One step on a meta-batch: of everything or, in between, of critics and encoder. Returns
-        what to log; refuses what is not finite, on a processor (see :meth:`check_finite`).
-        """
+        """A step of everything or, in between, of critics and encoder. Returns what to log."""
         metrics = self._steps[self.n_updates % self.policy_delay == 0](batch)
         self.n_updates += 1
         return metrics
@@ -116,9 +110,7 @@ class Updater:
         return norm
 
     def check_finite(self, gradient_norms: list[th.Tensor], first: int) -> None:
-        """Refuse gradient norms of successive steps, of which ``first`` is the number of the first,
-        that are not finite.
-        """
+        """Refuse norms of successive steps, the first of this number, that are not finite."""
         finite = th.isfinite(th.stack(gradient_norms))
         if not finite.all():
             raise ValueError(

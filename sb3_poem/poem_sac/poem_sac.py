@@ -36,8 +36,8 @@ class POEMSAC(PEARLSAC):
     and the actor, while contexts and preference labels are the last epoch's only; the critics' loss
     trains the encoder too, as in PEARL.
 
-    It takes all arguments of :class:`PEARLSAC` but ``context_relabel_fraction`` (contexts are of the
-    task's own policy, eq. 8), with other defaults of the losses' weights.
+    Of the arguments of :class:`PEARLSAC` it lacks ``context_relabel_fraction`` (contexts are of the
+    task's own policy, eq. 8), and defaults of the losses' weights are others.
 
     :param preference_coef: Weight of the preference loss
     :param similarity: "two-encoder": <f_r(z_i), f_pi(z_j)>; "inner": <z_i, z_j>, the ablation of
@@ -135,9 +135,7 @@ class POEMSAC(PEARLSAC):
         return np.array_split(tasks, max(1, len(tasks) // self.preference_group_size))
 
     def measure_returns(self, epoch: Segment, collector: EpochCollector) -> np.ndarray | None:
-        """J[i, j] by relabelling or, within random groups of tasks, by running their policies on
-        each other's; see :meth:`PEARLSAC.measure_returns`.
-        """
+        """J[i, j] by relabelling or, within random groups of tasks, by running the policies."""
         family, tasks, n_tasks = self.family, self.train_tasks.tasks, len(self.train_tasks)
         if self.relabels:
             steps = (epoch.features, epoch.first_episode)

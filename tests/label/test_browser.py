@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import re
 import shutil
@@ -16,6 +17,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from label_world import make_sessions
 
 from sb3_poem import Bayes
 from sb3_poem.adaptation import PreferenceAdapter, ReturnOracle, evaluate_episodes
@@ -24,6 +26,7 @@ from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.label.families import ModelInfo, find_models
 from sb3_poem.label.rendering import load_shown_model
+from sb3_poem.label.server import bind, make_app, make_server
 from sb3_poem.label.store import Store
 
 playwright_api = pytest.importorskip(
@@ -72,6 +75,29 @@ class Server:
             self.kill()
 
 
+class ForkedServer:
+    """The same in a fork of this process, which need not import everything anew."""
+
+    def __init__(self, store: Path, info: ModelInfo) -> None:
+        self.store, self.info = store, info
+        self.listener = bind("127.0.0.1", 0)
+        self.port = self.listener.getsockname()[1]
+        self.url = f"http://127.0.0.1:{self.port}"
+        self.start()
+
+    def start(self) -> None:
+        self.process = multiprocessing.get_context("fork").Process(target=self.serve, daemon=True)
+        self.process.start()
+
+    def serve(self) -> None:
+        app = make_app(make_sessions(Store(self.store), self.info, n_queries=5))
+        make_server(app, "127.0.0.1", self.port).run(sockets=[self.listener])
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.join()
+
+
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     with playwright_api.sync_playwright() as playwright:
@@ -118,7 +144,9 @@ def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
 class Person:
     """Answers by the true return of what was shown, as an oracle that knows the task."""
 
-    def __init__(self, server: Server, page: Any, info: ModelInfo, task: float) -> None:
+    def __init__(
+        self, server: Server | ForkedServer, page: Any, info: ModelInfo, task: float
+    ) -> None:
         self.page = page
         self.token = page.url.rpartition("/s/")[2]
         self.task = np.array([task])
@@ -177,7 +205,11 @@ class Person:
 
 
 def begin(
-    open_page: Callable[..., Any], server: Server, info: ModelInfo, task: float, **options: Any
+    open_page: Callable[..., Any],
+    server: Server | ForkedServer,
+    info: ModelInfo,
+    task: float,
+    **options: Any,
 ) -> Person:
     page = open_page(server.url, **options)
     page.click(f"button[value={info.name}]")
@@ -374,8 +406,9 @@ def test_a_phone(open_page: Callable[..., Any], server: Server, point_goal: Mode
 
 
 def test_the_server_is_killed_in_the_middle(
-    open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
+    open_page: Callable[..., Any], point_goal: ModelInfo, tmp_path: Path
 ) -> None:
+    server = ForkedServer(tmp_path, point_goal)
     person = begin(open_page, server, point_goal, 2.5)
     page = person.page
     person.answer(1)
@@ -391,6 +424,7 @@ def test_the_server_is_killed_in_the_middle(
     page.wait_for_function("() => view.answered === 1 && !busy")
     person.answer(2)
     assert len(person.stored()) == 3
+    server.kill()
 
 
 @pytest.mark.slow
