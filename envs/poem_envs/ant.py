@@ -14,9 +14,8 @@ from poem_envs.mujoco_rendering import arrow, pole
 
 
 def _symmetries(hidden_qpos: int) -> tuple[Symmetry, ...]:
-    """The model's own: left is like right, and the front like the back.
-
-    :param hidden_qpos: how many of the torso's x and y the observation leaves out
+    """The model's own: left is like right, and the front like the back; the observation leaves out
+    so many of the torso's x and y.
     """
     # The hinges are hip_1, ankle_1, ..., ankle_4; legs 1 to 4 stand at (+, +), (-, +), (-, -) and
     # (+, -) of x and y. A reflection turns the hips the other way; a half turn finds the axes of

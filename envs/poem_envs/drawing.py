@@ -8,11 +8,8 @@ Colour = tuple[int, int, int]
 
 
 class Canvas:
-    """A white image onto which shapes are painted in plane coordinates (x right, y up).
-
-    :param width: of the image, pixels, as ``height``
-    :param centre: the point of the plane in the middle of the image
-    :param extent: length of the plane that the shorter side of the image shows
+    """A white image, ``width`` by ``height`` pixels, onto which shapes are painted in coordinates
+    of a plane (x right, y up), of which its shorter side shows ``extent`` around ``centre``.
     """
 
     def __init__(self, width: int, height: int, centre: tuple[float, float], extent: float) -> None:

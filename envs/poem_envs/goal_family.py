@@ -300,11 +300,7 @@ def hide_goal_sites(env: gym.Env) -> None:
 
 
 def check_goal_env(env: gym.Env) -> None:
-    """Refuse what is no goal-conditioned environment.
-
-    :raises ValueError: if its spaces are others, or ``compute_reward`` is missing; the message says
-        what is needed
-    """
+    """Refuse what is no goal-conditioned environment, and say what is needed."""
     bare, space = env.unwrapped, env.observation_space
     parts = space.spaces if isinstance(space, spaces.Dict) else {}
     if not set(GOAL_KEYS) <= set(parts):

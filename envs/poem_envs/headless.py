@@ -26,11 +26,9 @@ def _offscreen_backend() -> str | None:
 
 
 def choose_headless_backend() -> None:
-    """On a Linux machine without a display, let MuJoCo render through EGL or OSMesa, unless the
-    user chose already: Gymnasium's renderer would try a window first, and go on as if it had got
-    one. To be called before MuJoCo is imported.
-
-    :raises RuntimeError: if there is neither
+    """On a Linux machine without a display, let MuJoCo, before its import, render through EGL or
+    OSMesa, unless the user chose already: Gymnasium would try a window. Refuses if there is
+    neither.
     """
     if has_display() or "MUJOCO_GL" in os.environ:
         return

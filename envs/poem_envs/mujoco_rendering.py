@@ -49,10 +49,8 @@ class _Renderer:
 
 
 class StateRenderer(_Renderer):
-    """Renders states as Gymnasium does, whoever simulated them.
-
-    :param view: further arguments of Gymnasium's ``MujocoRenderer``; without a camera, one follows
-        the robot's root
+    """Renders states as Gymnasium's ``MujocoRenderer`` does, whoever simulated them; without a
+    camera, one follows the robot's root.
     """
 
     def __init__(self, model: mujoco.MjModel, *, width: int, height: int, **view: Any) -> None:
@@ -82,9 +80,8 @@ class StateRenderer(_Renderer):
 
 
 class FastRenderer(_Renderer):
-    """Renders RGB images without shadows, reflections or haze, and with coarse shapes, which takes
-    a small part of the time on a machine without a graphics card. A graphics context belongs to the
-    thread that rendered first; render from no other.
+    """Renders RGB images without shadows, reflections, haze or details, fast without a graphics
+    card. A graphics context belongs to the thread that rendered first; render from no other.
     """
 
     def __init__(

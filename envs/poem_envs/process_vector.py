@@ -40,11 +40,7 @@ class EpisodeStart(NamedTuple):
 
 
 class CopyGroup:
-    """Copies of a task family that one process steps in turn.
-
-    :param first: the number of the first one among the copies of all groups, for messages
-    :param attributes: to set on each
-    """
+    """Copies of a task family that one process steps in turn, numbered from ``first``."""
 
     def __init__(
         self, make: Callable[[], TaskFamily], n: int, first: int, attributes: dict[str, Any]

@@ -1,7 +1,5 @@
 """Families that simulate many copies at once: write the dynamics of a batch, get a single and a
-vectorised environment.
-
-Both run the same code, the single one as a batch of one, so their results agree bit for bit.
+vectorised environment, whose results agree bit for bit.
 """
 
 from __future__ import annotations

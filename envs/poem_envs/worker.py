@@ -1,7 +1,4 @@
-"""The process of a :class:`~poem_envs.process_vector.RemoteGroup`.
-
-Started as ``python -m poem_envs.worker <file descriptor>``; it ends when the connection is closed.
-"""
+"""The process of a ``RemoteGroup``: ``python -m poem_envs.worker <file descriptor>``."""
 
 from __future__ import annotations
 

@@ -194,10 +194,8 @@ class Adaptation:
     def _conclude(
         self, adapter: PreferenceAdapter, recorder: StoreRecorder, latents: np.ndarray, stopped: str
     ) -> int:
-        """Write what was asked for, say what is believed, and how to go on.
-
-        :param latents: (n_answers + 1, latent_dim), before and after each answer
-        :param stopped: Why it ended before all questions were answered, if it did
+        """Write what was asked for, say what is believed by the latents (n_answers + 1,
+        latent_dim), and how to go on; ``stopped`` is why it ended early, if it did.
         """
         arguments, subject = self.arguments, self.subject
         interrupted = stopped == "Interrupted"

@@ -20,11 +20,7 @@ examples:
 
 
 def add_benchmark(commands: Any, count: Count) -> None:
-    """Add the command and its two parts.
-
-    :param commands: What ``add_subparsers`` gave
-    :param count: gives the type of a whole number of at least so much
-    """
+    """Add the command; ``count`` gives the type of a whole number of at least so much."""
     parser = commands.add_parser(
         "benchmark",
         help="run the paper's comparisons and ablations, and report them",

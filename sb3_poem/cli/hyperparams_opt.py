@@ -24,9 +24,8 @@ LINEAR = "lin_learning_rate"
 
 
 def entry_params(algorithm: str, entry: dict[str, Any]) -> dict[str, Any]:
-    """The trial that is an entry itself, by the names of Optuna's parameters, without what cannot
-    be searched around it: 0, and as many gradient steps as are taken in the environment (-1).
-    Learning rates are schedules.
+    """The trial that is an entry itself, by Optuna's names and with schedules of learning rates,
+    without what cannot be searched around it: 0, and gradient steps of -1.
     """
     parameters = inspect.signature(ALGORITHMS[algorithm]).parameters
     values = {name: parameter.default for name, parameter in parameters.items()} | entry

@@ -18,12 +18,7 @@ AUTH_VARIABLE = "SB3_POEM_AUTH"
 
 
 def run_label(arguments: argparse.Namespace) -> None:
-    """Run the command.
-
-    :param arguments: As ``sb3_poem.cli`` parsed them
-    :raises ValueError: If they do not fit
-    :raises OSError: If a file or a port cannot be had
-    """
+    """Run the command."""
     commands = {"export": run_export, "replay": run_replay, None: run_page}
     commands[arguments.label_command](arguments)
 

@@ -21,12 +21,8 @@ TABLE_WIDTH = 76
 
 @dataclass(frozen=True)
 class Report:
-    """The outcome of adapting a model.
-
-    :param title: of the table and the plot
-    :param settings: JSON-ready: the model, the environment, who answered and how it was asked
-    :param evaluation: returns after numbers of answers
-    :param known: returns if the tasks were known; None if that was not measured
+    """The outcome of adapting a model; ``settings`` are JSON-ready, without ``known`` it was left
+    unfinished.
     """
 
     title: str

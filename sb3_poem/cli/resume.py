@@ -70,10 +70,8 @@ def is_complete(model: Path) -> bool:
 
 
 def last_run(folder: Path, env_name: str, seed: int) -> Path | None:
-    """The newest run in an algorithm's folder that can be continued, or is done.
-
-    :param env_name: environment id with - in place of /
-    :param seed: as given to the run; negative: any
+    """The newest run in an algorithm's folder that can be continued, or is done, of an environment
+    (with - in place of /), and unless it is negative of a seed.
     """
 
     def number(run: Path) -> int:

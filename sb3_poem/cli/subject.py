@@ -59,10 +59,8 @@ def say(text: str) -> None:
 
 
 class Subject:
-    """A model, an environment with many copies (``env``), and test tasks.
-
-    :param console: Where to say what takes its time
-    :param n_tasks: How many tasks are drawn, unless ``--task`` names the only one
+    """A model, an environment with many copies (``env``), and test tasks: ``n_tasks``, unless
+    ``--task`` names the only one.
     """
 
     def __init__(

@@ -42,17 +42,13 @@ class TaskBatch(NamedTuple):
 
 
 class TaskReplayBuffer(ReplayBuffer):
-    """Replay buffer with a ring of transitions for every training task.
+    """Replay buffer with a ring of transitions for every training task, of flat boxes.
 
     A transition's next observation is, but at the end of an episode or of a segment, the
     observation of the row that follows. So it is stored once; a batch of any tasks is still a
     single gather, of rows that reach into their successors. What follows an end is kept apart.
     Actions are stored in 16 bits (to within 1.6e-5 of their range from -1 to 1), all else as
-    float32. Memory is taken as it fills.
-
-    :param buffer_size: Transitions kept per task
-    :param observation_space: Flat Box, as the action space
-    :param feature_dim: Width of the reward features
+    float32. ``buffer_size`` transitions are kept per task; memory is taken as it fills.
     """
 
     def __init__(

@@ -101,12 +101,8 @@ def relabelled_returns(
     features: np.ndarray,
     mask: np.ndarray,
 ) -> np.ndarray:
-    """Returns of trajectories under every task, (tasks, trajectories), without another environment
-    step.
-
-    :param tasks: (tasks, task_dim)
-    :param features: (trajectories, steps, feat_dim)
-    :param mask: (trajectories, steps), which steps count
+    """Returns under tasks (tasks, task_dim) of trajectories' features (trajectories, steps,
+    feat_dim), over the steps of a mask (trajectories, steps): (tasks, trajectories).
     """
     returns = np.empty((len(tasks), len(features)))
     # one row at a time bounds the memory at trajectories x steps

@@ -152,10 +152,8 @@ class FamilyView:
 
     def check_experience(self, tasks: np.ndarray, seed: int, segment: Segment) -> None:
         """Refuse rewards that are not :meth:`compute_rewards`'s, and unknown wrappers that change
-        the family; the first call looks, and the others take its word.
-
-        :param tasks: (copies, task_dim), those of the segment
-        :param seed: Of the reset that it began with
+        the family, by a segment of these tasks (copies, task_dim) from a reset with this seed. The
+        first call looks, and the others take its word.
         """
         if self._experience_is_right:
             return

@@ -13,8 +13,6 @@ def write_atomically(
 ) -> None:
     """Write a file, and missing folders, completely or not at all: a crash, a kill or a full disk
     leaves the previous file whole. ``content`` may be a function that writes to an open file.
-
-    :raises OSError: if the folder cannot be written or the disk is full; names the path
     """
     path = Path(path)
     temporary: str | None = None

@@ -18,11 +18,8 @@ ALIGNMENT = 16
 
 
 class LowPrecisionMLP:
-    """Copies of a perceptron's hidden layers in another arithmetic; the output layer stays the
-    perceptron's own, in float32.
-
-    :param hidden: Hidden layers, each followed by a ReLU
-    :param layer_norm: Whether they are normalised before the ReLU
+    """Copies of a perceptron's hidden layers in another arithmetic, each followed by a ReLU; the
+    output layer stays the perceptron's own, in float32.
     """
 
     def __init__(

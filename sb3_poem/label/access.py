@@ -118,10 +118,7 @@ class AccessMiddleware:
         await self.app(scope, receive_body, send_with_headers)
 
     async def _admit(self, request: Request) -> Response | None:
-        """None lets a request in; a redirect takes the token out of its address.
-
-        :raises HTTPException: If it is refused.
-        """
+        """None lets a request in; a redirect takes the token out of its address."""
         access, headers = self.access, request.headers
         is_guarded = access.password is not None or access.token is not None
         if not is_guarded and _host_name(headers.get("host", "")) not in access.hosts:
@@ -210,9 +207,7 @@ class Connection(H11Protocol):
     was waited for longest ends, and none whose answer is being made: whoever sends a whole request
     at once is served, whatever else comes from their address.
 
-    :param deadline: Seconds for a request, and between two; of an answer some must be taken within
-        thrice as many.
-    :param options: See uvicorn.
+    Of an answer some must be taken within thrice the deadline, in seconds.
     """
 
     def __init__(self, *, deadline: float = DEADLINE, **options: Any) -> None:

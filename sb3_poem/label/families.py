@@ -15,36 +15,23 @@ from sb3_poem.resources import find_folder, shipped_folder
 
 @dataclass(frozen=True)
 class View:
-    """Where a camera sees places in space.
+    """Where a camera sees places in space."""
 
-    :param origin: (3,) the place in the middle of the picture: where the hand begins.
-    :param right: (3,) unit vector to the right in the video.
-    :param up: (3,) unit vector upwards in the video.
-    """
-
-    origin: tuple[float, float, float]
-    right: tuple[float, float, float]
+    origin: tuple[float, float, float]  # in the middle of the picture: where the hand begins
+    right: tuple[float, float, float]  # unit vectors in the video
     up: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Description:
-    """A family in words for somebody who does not program.
-
-    :param hint: What one may wish for.
-    :param picture: How its tasks are drawn: "place", "speed", "direction", or "projection" of the
-        latent.
-    :param unit: Of the numbers in the picture.
-    :param extent: Half the width of a "place" picture, or the largest speed.
-    :param view: How places in space are seen; None for places in the plane.
-    """
+    """A family in words for somebody who does not program."""
 
     title: str
-    hint: str
-    picture: str
-    unit: str = ""
-    extent: float = 1.0
-    view: View | None = None
+    hint: str  # what one may wish for
+    picture: str  # of tasks: "place", "speed", "direction", or "projection" of the latent
+    unit: str = ""  # of the numbers in the picture
+    extent: float = 1.0  # half the width of a "place" picture, or the largest speed
+    view: View | None = None  # of places in space; None for places in the plane
 
 
 BLIND = "It cannot see the place; your answers show the way."
@@ -85,10 +72,8 @@ DESCRIPTIONS = {
 
 
 def describe(env_id: str, task_dim: int | None = None) -> Description:
-    """The description of a family; one that is not known here gets a general one.
-
-    :param task_dim: Of its tasks, if known: those of some of Meta-World's manipulations are more
-        than a place.
+    """The description of a family, of which one that is not known here gets a general one, as do
+    those of Meta-World whose tasks (task_dim,) are more than a place.
     """
     name = env_id.rpartition("/")[2].rpartition("-v")[0] or env_id
     description = DESCRIPTIONS.get(name, Description(name, OTHER_HINT, "projection"))
@@ -98,11 +83,8 @@ def describe(env_id: str, task_dim: int | None = None) -> Description:
 
 
 def as_points(env_id: str, tasks: np.ndarray) -> np.ndarray:
-    """Tasks as points that may be averaged: places, unit vectors of directions, speeds.
-
-    :param tasks: (n, task_dim).
-    :return: (n, 1) speeds, or (n, 2) places or unit vectors, x to the right and y upwards in the
-        videos.
+    """Tasks (n, task_dim) as points that may be averaged: (n, 1) speeds, or (n, 2) places or unit
+    vectors, x to the right and y upwards in the videos.
     """
     description = describe(env_id, tasks.shape[1])
     picture, view = description.picture, description.view
@@ -119,11 +101,7 @@ def as_points(env_id: str, tasks: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class ModelInfo:
-    """A trained model that a person may choose. The browser names it; it never names a file.
-
-    :param name: Unique among those of a server.
-    :param env_id: The environment in which it is shown.
-    """
+    """A trained model that a person may choose, by its name: a browser never names a file."""
 
     name: str
     folder: Path

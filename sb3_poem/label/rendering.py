@@ -63,27 +63,20 @@ class RenderCancelledError(Exception):
 
 @dataclass(frozen=True)
 class TurnRequest:
-    """What a turn is made from.
-
-    :param kind: "question" or "result".
-    :param video: The file to write.
-    :param state: The state of the turn before; None at the start.
-    :param answers: The answers before that turn: ``preference``, ``left``, ``right``.
-    :param pending: That turn's question: ``left``, ``right``.
-    :param preference: The answer to it; None at the start.
-    :param film_every: Steps between two frames of the video, if it moves smoothly enough then.
-    """
+    """What a turn is made from."""
 
     model: ModelInfo
     seed: int
     options: dict[str, Any]
-    kind: str
-    video: Path
+    kind: str  # "question" or "result"
+    video: Path  # to write
+    # The turn before, None at the start: its state, the answers before it (``preference``,
+    # ``left``, ``right``), its question (``left``, ``right``) and the answer to that.
     state: dict[str, Any] | None = None
     answers: Sequence[dict[str, Any]] = ()
     pending: dict[str, Any] | None = None
     preference: str | None = None
-    film_every: int = 1
+    film_every: int = 1  # steps between two frames of the video, if it is smooth enough then
 
     @property
     def marker(self) -> Path:
@@ -93,20 +86,15 @@ class TurnRequest:
 
 @dataclass(frozen=True)
 class Turn:
-    """A question, or a result, and what is believed there.
-
-    :param state: What the next turn is made from, beside the conversation; None where none follows
-        (at a terminal), as then are belief and latent.
-    :param left: The question's left trajectory; None in a result.
-    :param belief: As :func:`sb3_poem.label.beliefs.belief` gives it.
-    :param latent: (d,) of the policy that would be taken now.
+    """A question, or a result, and what is believed there; the state, what the next turn is made
+    from beside the conversation, belief and latent are None at a terminal, where none follows.
     """
 
     state: dict[str, Any] | None
-    left: dict[str, Any] | None
+    left: dict[str, Any] | None  # the question's trajectory, as ``right``; None in a result
     right: dict[str, Any] | None
-    belief: dict[str, Any] | None
-    latent: list[float] | None
+    belief: dict[str, Any] | None  # as :func:`sb3_poem.label.beliefs.belief` gives it
+    latent: list[float] | None  # (d,) of the policy that would be taken now
     fps: float
     frames: int
 

@@ -235,11 +235,7 @@ def make_server(app: Starlette, host: str, port: int, deadline: float = DEADLINE
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """Take a port (0: a free one) before anything else is started; who comes meanwhile waits.
-
-    :raises ValueError: If there is no such port.
-    :raises OSError: If it is taken, or the address is not this machine's.
-    """
+    """Take a port (0: a free one) before anything else is started; who comes meanwhile waits."""
     if not 0 <= port <= 65535:
         raise ValueError(f"--port {port}: must be between 0 and 65535")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET

@@ -95,13 +95,7 @@ class SessionManager:
         self._active: dict[int, _Active] = {}
 
     async def begin(self, model: str) -> str:
-        """Begin a session.
-
-        :param model: The name of a model.
-        :return: The token of its link.
-        :raises RefusedError: If there is no such model.
-        :raises FullError: If too many people are at work.
-        """
+        """Begin a session with a model by name, if too many are not at work; its link's token."""
         info = self.models.get(model)
         if info is None:
             raise RefusedError("there is no model of this name here; choose one from the list")
@@ -113,20 +107,14 @@ class SessionManager:
         return token
 
     async def find(self, token: str) -> Session | None:
-        """The session of a link, if there is one.
-
-        :raises FullError: If its person is not at work and too many others are.
-        """
+        """The session of a link, if there is one; FullError if others leave it no room."""
         session = await asyncio.to_thread(self.store.find, token)
         if session is not None:
             self._activate(session)
         return session
 
     async def view(self, session: Session) -> dict[str, Any]:
-        """All that the page shows, JSON-ready. What is missing for it is begun.
-
-        :raises StorageError: If it cannot be kept.
-        """
+        """All that the page shows, JSON-ready. What is missing for it is begun."""
         active = self._activate(session)
         session, answered, kind, turn, shown = await asyncio.to_thread(self._look, session.id)
         view: dict[str, Any] = {
@@ -165,10 +153,7 @@ class SessionManager:
         return path if path.is_file() else None
 
     def _request(self, session: Session, key: _Key) -> TurnRequest:
-        """What a turn is made from.
-
-        :raises RefusedError: If the session's model is not among those of this server.
-        """
+        """What a turn is made from; refuses a session whose model is not this server's."""
         info = self.models.get(session.model)
         if info is None or info.env_id != session.env_id:
             raise RefusedError(

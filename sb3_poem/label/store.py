@@ -251,10 +251,8 @@ class Store:
             execute("UPDATE turns SET shown = ? WHERE id = ? AND shown IS NULL", now)
 
     def add_answer(self, session: int, question: int, preference: str) -> int:
-        """Keep an answer, "left", "right" or "equal", to a question's turn: once this returns, it
-        is on the disk. The same answer again is no second one.
-
-        :raises RefusedError: If it is no answer, or that question is not the one that waits.
+        """Keep an answer to a question's turn, if that one waits: once this returns, it is on the
+        disk. The same answer again is no second one.
         """
         if preference not in PREFERENCES:
             raise RefusedError(
@@ -280,11 +278,8 @@ class Store:
             )
 
     def undo(self, session: int, answered: int) -> None:
-        """Take the last answer back; or, after an early stop, go back to the question that waited.
-
-        :param answered: How many answers there were where it was asked for: a repeated undo takes
-            back no more
-        :raises RefusedError: If there is nothing to take back, or the conversation has moved on.
+        """Take the last of ``answered`` answers back, as many as there were where it was asked for;
+        or, after an early stop, go back to the question that waited.
         """
         with self._transaction() as execute:
             answers = self.answers(session)
@@ -309,10 +304,8 @@ class Store:
             execute("UPDATE sessions SET stopped = 1 WHERE id = ?", (session,))
 
     def judge(self, session: int, result: int, verdict: str) -> None:
-        """Keep what the person says of a result's turn; "not quite" asks for more questions. The
-        same verdict again changes nothing.
-
-        :raises RefusedError: If it is no verdict, or that result is not the one that is shown.
+        """Keep what the person says of the result that is shown; "not quite" asks for more
+        questions. The same verdict again changes nothing.
         """
         if verdict not in VERDICTS:
             raise RefusedError('a verdict must be "yes" or "not quite"')

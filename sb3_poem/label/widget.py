@@ -34,14 +34,12 @@ class LabelWidget:
     The server runs in this process, on loopback: the browser must run on the same machine, or its
     port be forwarded.
 
-    :param adapter: The adapter; its environment must have been made with
+    :param adapter: A fresh one; its environment must have been made with
         ``render_mode="rgb_array"``. Do not use the adapter or its environment elsewhere meanwhile;
         :meth:`sync` brings it to where the person stands.
     :param store: The folder of the store; None takes a temporary one, which ends with the widget.
     :param height: Of the page in the notebook, pixels.
     :param port: The server's port; 0 takes a free one.
-    :raises ValueError: If the environment does not render, or the adapter has answers already or
-        asks from a library.
     """
 
     def __init__(

@@ -117,9 +117,7 @@ def check_arguments(given: Mapping[str, Any], algorithm: type) -> None:
 
 def with_arguments_of(base: type, without: str) -> Callable[[type[T]], type[T]]:
     """Of a class whose constructor passes ``*args`` and ``**kwargs`` on to its base class's: its
-    signature and its docstring have the arguments of both.
-
-    :param without: An argument of the base class's that it does not take
+    signature and docstring have the arguments of both, ``without`` one of the base class's.
     """
 
     def described(cls: type) -> dict[str, str]:

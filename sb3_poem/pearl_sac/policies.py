@@ -146,9 +146,8 @@ class LatentPolicy(SACPolicy):
             self.reward_norm.update(rewards.reshape(-1, 1))
 
     def action_values(self, obs: th.Tensor, actions: th.Tensor, latents: np.ndarray) -> th.Tensor:
-        """Q(s, a) of the more doubtful critic, (copies, steps), of standardised observations
-        (copies, steps, obs_dim), actions (copies, steps, action_dim) in [-1, 1], latents (copies,
-        latent_dim).
+        """Q(s, a) of the more doubtful critic, (copies, steps), of standardised observations and
+        actions (copies, steps, ...), under latents (copies, latent_dim).
         """
         z = th.as_tensor(latents, dtype=th.float32, device=self.device)
         values = [

@@ -111,9 +111,8 @@ class MetaBatchSampler:
     def _transitions(
         self, task_ids: th.Tensor, chosen: np.ndarray, batch_size: int
     ) -> tuple[TaskBatch, Bootstraps | None]:
-        """``batch_size`` transitions a task, ``relabel_fraction`` of them other tasks' with the
-        task's own rewards and ``mirror_fraction`` seen in a symmetry; and what targets need beyond
-        these.
+        """``batch_size`` transitions a task, ``relabel_fraction`` of them relabelled,
+        ``mirror_fraction`` seen in a symmetry; and what targets need beyond these.
         """
         generator, buffer = self.generators.torch, self.replay_buffer
         sources = task_ids[:, None].expand(-1, batch_size)

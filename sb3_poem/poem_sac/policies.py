@@ -9,10 +9,7 @@ from sb3_poem.pearl_sac.policies import LatentPolicy
 
 
 class POEMPolicy(LatentPolicy):
-    """Adds the embeddings f_r and f_pi of section 5.1 (Xu & Zhu 2025).
-
-    :param two_encoder: False leaves both embeddings out: the ablation ``similarity="inner"``
-    """
+    """Adds the embeddings f_r and f_pi of section 5.1 (Xu & Zhu 2025), if ``two_encoder``."""
 
     def __init__(self, *args: Any, two_encoder: bool = True, **kwargs: Any) -> None:
         self.two_encoder = two_encoder

@@ -9,10 +9,7 @@ from sb3_poem.pearl_sac.sampler import MetaBatchSampler
 
 @dataclass
 class GroupSampler(MetaBatchSampler):
-    """Draws meta-batches of whole groups of tasks, where policies are compared within these only.
-
-    :param groups: Indices of each group's tasks; empty where all policies are compared
-    """
+    """Draws meta-batches of whole groups of tasks, where policies are compared within these."""
 
     groups: list[np.ndarray]
     preference_group_size: int
