@@ -255,7 +255,7 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
     def step(
         self, actions: npt.ArrayLike
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Step every copy by ``(num_envs, action_dim)``; errors of :meth:`TaskFamily.step`."""
+        """Step every copy by ``(num_envs, action_dim)``; errors as of :meth:`TaskFamily.step`."""
         if self._tasks is None:
             raise ResetNeeded("step() was called before the first reset()")
         assert isinstance(self.single_action_space, spaces.Box)

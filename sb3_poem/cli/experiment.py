@@ -36,7 +36,7 @@ CHECKPOINT = "checkpoint.zip"
 
 
 class TrainingInterrupted(KeyboardInterrupt):
-    """Training was interrupted, and what it had learned is saved, ``resumable`` by ``--resume``."""
+    """Training was interrupted and saved; ``resumable``: ``--resume`` finds a checkpoint of it."""
 
     def __init__(self, message: str, resumable: bool) -> None:
         super().__init__(message)
@@ -70,7 +70,7 @@ def stopping_between_epochs(checkpoint: TrainingCheckpointCallback) -> Iterator[
 def make_experiment(
     args: Any, algo: str, env_id: str, log_folder: str, *rest: Any, **kwargs: Any
 ) -> ExperimentManager:
-    """What rl_zoo3's ``train`` takes for its ``ExperimentManager``, once arguments are checked."""
+    """The experiment that rl_zoo3's ``train`` takes for its own, once arguments are checked."""
     # -1 is rl_zoo3's default, and takes the entry's
     if args.n_timesteps < 1 and args.n_timesteps != -1:
         raise ValueError(f"-n/--n-timesteps must be at least 1, got {args.n_timesteps}")

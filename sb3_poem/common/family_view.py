@@ -230,7 +230,7 @@ class FamilyView:
         return self._call("sample_tasks", n, rng)
 
     def test_tasks(self, n: int, seed: int) -> np.ndarray:
-        """(n, task_dim) no training draws; those of a finite family are repeated in turn."""
+        """(n, task_dim) tasks that no training draws; a finite family's are repeated in turn."""
         rng = np.random.default_rng([TEST_TASK_STREAM, seed])
         if self.all_tasks is None:
             return self.sample_tasks(n, rng)

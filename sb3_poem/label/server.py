@@ -249,7 +249,7 @@ def bind(host: str, port: int) -> socket.socket:
 
 
 def link_host(listener: socket.socket, host: str) -> str:
-    """The host of a link to a server: one of all addresses that ``0.0.0.0`` stands for."""
+    """The host of a link to a server; for ``0.0.0.0`` and the like one at which it is reached."""
     if not ipaddress.ip_address(listener.getsockname()[0]).is_unspecified:
         return host.strip("[]")
     for family in (listener.family, socket.AF_INET):  # an IPv6 socket takes IPv4 too

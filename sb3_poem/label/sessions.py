@@ -95,7 +95,7 @@ class SessionManager:
         self._active: dict[int, _Active] = {}
 
     async def begin(self, model: str) -> str:
-        """Begin a session with a model by name, if too many are not at work; its link's token."""
+        """Begin a session with a model of this name, if there is room; its link's token."""
         info = self.models.get(model)
         if info is None:
             raise RefusedError("there is no model of this name here; choose one from the list")
