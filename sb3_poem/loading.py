@@ -37,7 +37,8 @@ def load_model(name: str | Path, device: th.device | str = "auto") -> PEARLSAC:
     """Load a model of either algorithm.
 
     :param name: A file that ``save`` wrote (``.zip`` may be left out), a checkpoint, a folder that
-        ``save_pretrained`` wrote, or the name of a shipped model
+        ``save_pretrained`` wrote, the name of a shipped model, or ``"user/name"`` on the Hugging Face
+        Hub
     :param device: As PyTorch names it
     :raises FileNotFoundError: if it is none of these; the message lists the shipped models
     :raises ValueError: if a file is truncated, or of another program
@@ -55,7 +56,7 @@ def load_model(name: str | Path, device: th.device | str = "auto") -> PEARLSAC:
     if archive.is_file():
         # where that cannot be told, POEMSAC.load says what is wrong with the file
         return BY_CLASS_NAME.get(algorithm_of(archive), POEMSAC).load(archive, device=device)
-    path = find_folder(path)
+    path = find_folder(name)
     return _class_named(read_config(path)["algorithm"], path).from_pretrained(path, device=device)
 
 

@@ -4,6 +4,8 @@ import difflib
 from pathlib import Path
 from typing import Any
 
+from sb3_poem.hub import download, is_repository
+
 _PACKAGE = Path(__file__).resolve().parent
 
 
@@ -78,8 +80,10 @@ def pretrained_folder(name: str) -> Path:
 def find_folder(name: str | Path) -> Path:
     """The folder of a model.
 
-    :param name: a folder's path, or the name of a shipped model
-    :raises FileNotFoundError: if it is neither; the message lists the shipped models
+    :param name: a folder's path, the name of a shipped model, or ``"user/name"``, which is fetched
+        from the Hugging Face Hub
+    :raises FileNotFoundError: if it is none of these; the message lists the shipped models
+    :raises ImportError: if it may be on the Hub, and the extra ``[hub]`` is not installed
     """
     path = Path(name)
     if path.is_dir():
@@ -87,6 +91,8 @@ def find_folder(name: str | Path) -> Path:
     if path.exists():
         needed = "the folder of a model; POEMSAC.load reads a model's file"
         raise FileNotFoundError(f"{name} is a file, but must be {needed}")
+    if is_repository(name):
+        return download(str(name))
     if path.suffix == ".zip" or len(path.parts) > 1:
         raise FileNotFoundError(f"{name}: there is no such file or folder of a model")
     return pretrained_folder(str(name))

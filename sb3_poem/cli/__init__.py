@@ -38,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as stop:
         print(str(stop) or "Interrupted.", file=sys.stderr)
         return 130
-    except (ValueError, TypeError, OSError, EOFError, gymnasium.error.Error) as error:
+    except (ValueError, TypeError, OSError, EOFError, ImportError, gymnasium.error.Error) as error:
         # The library says in these what the user gave and what would be right; a developer wants
         # the place as well.
         if os.environ.get("SB3_POEM_TRACEBACK"):

@@ -119,8 +119,8 @@ def find_models(
 ) -> list[ModelInfo]:
     """The models of a folder, by name.
 
-    :param model: A pretrained model's folder, a folder of such folders, or the name of a shipped
-        model; None takes all that are shipped.
+    :param model: A pretrained model's folder, a folder of such folders, the name of a shipped model,
+        or of one on the Hugging Face Hub; None takes all that are shipped.
     :param env_id: The environment in which they are shown; None takes each model's own.
     :param env_kwargs: Arguments of the environment, over those that each model was trained with.
     :raises FileNotFoundError: If there is none.
@@ -138,5 +138,7 @@ def find_models(
         own = config["env_id"], config["env_kwargs"]
         shown_in, arguments = environment_of(str(folder), *own, env_id, env_kwargs)
         folder = folder.resolve()
-        models.append(ModelInfo(folder.name, folder, shown_in, tuple(sorted(arguments.items()))))
+        # the Hub's cache names a folder by a hash
+        named = folder.name if model is None or Path(model).exists() else Path(model).name
+        models.append(ModelInfo(named, folder, shown_in, tuple(sorted(arguments.items()))))
     return models

@@ -5,16 +5,17 @@ from typing import Any
 RULES = {"bayes": "`Bayes()`", "paper": "`Paper()`"}
 
 
-def model_card(config: dict[str, Any]) -> str:
+def model_card(config: dict[str, Any], name: str | None = None) -> str:
     """Markdown with YAML front matter as the Hugging Face Hub takes it.
 
     :param config: Of a pretrained folder; what ``card`` in it leaves out is left out here.
+    :param name: By which the model is loaded; None is its family's, as of a shipped one
     """
     card, algorithm, env_id = config["card"], config["algorithm"], config["env_id"]
-    name = str(env_id).split("/")[-1].rsplit("-v", 1)[0]
+    name = name or str(env_id).split("/")[-1].rsplit("-v", 1)[0]
     return f"""---
 library_name: sb3_poem
-license: mit
+license: {card.get("license", "mit")}
 tags: [reinforcement-learning, meta-reinforcement-learning, preferences, stable-baselines3]
 ---
 

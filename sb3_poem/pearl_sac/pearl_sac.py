@@ -753,6 +753,20 @@ class PEARLSAC(SAC):
         """Write safetensors, JSON and a model card; see :func:`.saving.save_pretrained`."""
         saving.save_pretrained(self, folder, card)
 
+    def push_to_hub(
+        self, repo_id: str, card: dict[str, Any] | None = None, private: bool | None = None
+    ) -> str:
+        """Write what :meth:`save_pretrained` writes to the Hugging Face Hub; needs the extra
+        ``[hub]`` and a token (``hf auth login``, or ``HF_TOKEN``).
+
+        :param repo_id: ``"user/name"``, by which :meth:`from_pretrained` then finds it; made if
+            missing
+        :param private: Of a repository that is made; None takes the account's default
+        :return: Its address
+        :raises OSError: if the Hub refuses it or cannot be reached
+        """
+        return saving.push_to_hub(self, repo_id, card, private)
+
     @classmethod
     def from_pretrained(
         cls: type[SelfPEARLSAC],
@@ -760,9 +774,12 @@ class PEARLSAC(SAC):
         env: GivenEnv | None = None,
         device: th.device | str = "auto",
     ) -> SelfPEARLSAC:
-        """Read what :meth:`save_pretrained` wrote, or a shipped model by its name.
+        """Read what :meth:`save_pretrained` or :meth:`push_to_hub` wrote.
 
-        :raises FileNotFoundError: if the folder does not hold a model
+        :param folder: The folder, the name of a shipped model, or ``"user/name"`` on the Hugging
+            Face Hub (extra ``[hub]``), if there is no such folder
+        :param env: An environment of the model's family, if it shall be trained on
+        :raises FileNotFoundError: if there is no such model
         :raises ValueError: if a file is truncated or foreign, the model is of another algorithm, or
             env of another family
         """

@@ -30,6 +30,7 @@ from sb3_poem.common.buffers import ContextStore, TaskReplayBuffer
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.files import write_atomically
 from sb3_poem.common.foreign import check_env_id
+from sb3_poem.hub import FILES, upload
 from sb3_poem.pearl_sac.model_card import model_card
 from sb3_poem.pearl_sac.policies import DEFAULT_NET_ARCH
 from sb3_poem.pearl_sac.train_tasks import TrainTasks
@@ -37,7 +38,7 @@ from sb3_poem.resources import find_folder, pretrained_names
 
 CHECKPOINT_FORMAT = "sb3_poem checkpoint 2"
 FORMAT = "sb3_poem pretrained 2"
-WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
+WEIGHTS, CONFIG, CARD = FILES
 #: What a configuration holds of a model, as it is, and of its policy
 FACTS = ("env_id", "env_kwargs", "reward_feature_dim", "num_timesteps", "n_envs")
 POLICY_FACTS = ("net_arch", "layer_norm", "n_critics", "optimizer_kwargs")
@@ -219,20 +220,36 @@ def save_pretrained(model: Any, folder: str | Path, card: dict[str, Any] | None 
 
     :param folder: Where; made if missing
     :param card: What the card should say: ``command``, ``seed``, ``commit``, ``machine``, ``note``,
-        ``results``: any JSON
+        ``license`` (default: MIT), ``results``: any JSON
     :raises OSError: if the folder cannot be written
     :raises ValueError: if the policy's activation is none of torch.nn's or its optimiser none of
         torch.optim's, which JSON could not name
     """
+    for name, content in _files(model, card).items():
+        write_atomically(Path(folder) / name, content)
+
+
+def push_to_hub(
+    model: Any, repo_id: str, card: dict[str, Any] | None = None, private: bool | None = None
+) -> str:
+    """Write the files of :func:`save_pretrained` to the Hugging Face Hub; its errors and those of
+    :func:`sb3_poem.hub.upload`.
+    """
+    return upload(repo_id, _files(model, card, repo_id), private)
+
+
+def _files(model: Any, card: dict[str, Any] | None, name: str | None = None) -> dict[str, bytes]:
+    """All three, so that nothing is written if one cannot be made.
+
+    :param name: By which the card says to load the model; None is its family's
+    """
     config, tensors = model_contents(model, card)
     text = config_text(config)
-    contents = {  # all made before the first is written
+    return {
         WEIGHTS: tensors_to_bytes(tensors),
         CONFIG: (text + "\n").encode(),
-        CARD: model_card(json.loads(text)).encode(),
+        CARD: model_card(json.loads(text), name).encode(),
     }
-    for name, content in contents.items():
-        write_atomically(Path(folder) / name, content)
 
 
 def model_contents(
@@ -340,7 +357,7 @@ def parse_config(text: str | bytes, source: str) -> dict[str, Any]:
 def from_pretrained(algorithm: type[Model], folder: str | Path, device: th.device | str) -> Model:
     """Read a model that :func:`save_pretrained` wrote.
 
-    :param folder: The folder, or the name of a model that ships
+    :param folder: What :func:`sb3_poem.resources.find_folder` takes
     :raises FileNotFoundError: if the folder does not hold a model
     :raises ValueError: if a file is truncated or foreign, or the model is of another algorithm
     """
