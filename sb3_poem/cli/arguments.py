@@ -162,8 +162,8 @@ def _add_show_arguments(parser: argparse.ArgumentParser) -> None:
     model = parser.add_argument_group("what to show")
     _add_subject_arguments(
         model,
-        "a model's .zip, a pretrained folder, a shipped model's name, or a policy that adapt "
-        "--save wrote",
+        "a model's .zip, a pretrained folder, a shipped model's name, user/name on the Hugging Face "
+        "Hub, or a policy that adapt --save wrote",
         "the model's); without --model: the last run of it in --folder",
     )
     _option(model, "--algo", "of that run", default=OUR_ALGORITHMS[0])
@@ -184,7 +184,8 @@ def _add_adapt_arguments(parser: argparse.ArgumentParser) -> None:
     model = parser.add_argument_group("what to adapt")
     _add_subject_arguments(
         model,
-        "a model's .zip, a pretrained folder, or the name of a shipped model",
+        "a model's .zip, a pretrained folder, the name of a shipped model, or user/name on the "
+        "Hugging Face Hub",
         "the one that the model was trained on)",
         required=True,
     )
@@ -265,8 +266,12 @@ def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
         "sb3-poem label",
     )
     _file(export, "--store", store, metavar="FOLDER", **own)
-    _file(export, "--out", "ends in .jsonl or .parquet", nargs="+", required=True)
-    _switch(export, "--trajectories", "with observations, actions and reward features")
+    told = "ends in .jsonl or .parquet; with --format minari a data set's name, as answers-v0"
+    _file(export, "--out", told, nargs="+", required=True)
+    told = "minari: a data set of pairs of episodes for each environment (default: --out's suffix)"
+    _option(export, "--format", told, choices=("jsonl", "parquet", "minari"))
+    told = "with observations, actions and reward features, which minari always has"
+    _switch(export, "--trajectories", told)
     _switch(export, "--undone", "with answers that were taken back")
     replay = _add_command(
         commands,

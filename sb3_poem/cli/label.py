@@ -99,13 +99,21 @@ def read_password(auth: str | None, file: Path | None) -> tuple[str | None, str 
 def run_export(arguments: argparse.Namespace) -> None:
     """Write all answers."""
     from sb3_poem.label.export import export
+    from sb3_poem.label.minari_export import export_minari
 
+    kind, undone = arguments.format, arguments.undone
     for path in arguments.out:
-        check_output("--out", path, (".jsonl", ".parquet"))
+        if kind is None:
+            check_output("--out", path, (".jsonl", ".parquet"))
+    import_packages(arguments.gym_packages)
     store = _open_store(arguments.store)
     for path in arguments.out:
-        count = export(store, path, arguments.trajectories, arguments.undone)
-        say(f"Wrote {count} answers to {path}")
+        if kind == "minari":
+            for dataset, where in export_minari(store, str(path), undone).items():
+                say(f"Wrote the data set {dataset} to {where}")
+        else:
+            count = export(store, path, arguments.trajectories, undone, kind)
+            say(f"Wrote {count} answers to {path}")
     store.close()
 
 

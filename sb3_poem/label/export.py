@@ -37,43 +37,11 @@ def records(
     """
     for row in store.records():
         if session in (None, row["session"]) and (undone or row["undone"] is None):
-            yield _record(row, store.videos.resolve(), trajectories)
+            yield answer_record(row, store.videos.resolve(), trajectories)
 
 
-def session_record(store: Store, session: Session) -> dict[str, Any]:
-    """One session, as its person downloads it, JSON-ready; it names no file of the server."""
-    left_out = {"session", "source", "video", *COMMON}
-    return {
-        "format": "sb3_poem answers 1",
-        **{name: getattr(session, name) for name in COMMON},
-        "started": _time(session.created),
-        "answers": [
-            {name: value for name, value in record.items() if name not in left_out}
-            for record in records(store, session=session.id)
-        ],
-    }
-
-
-def export(store: Store, path: Path, trajectories: bool = False, undone: bool = False) -> int:
-    """Write all answers; see :func:`records`.
-
-    :param path: The file, by whose suffix they become JSON Lines (``.jsonl``) or Parquet
-        (``.parquet``).
-    :return: How many.
-    :raises ValueError: If the suffix is another.
-    """
-    rows = list(records(store, trajectories, undone))
-    if path.suffix == ".jsonl":
-        lines = [json.dumps(row, allow_nan=False) + "\n" for row in rows]
-        write_atomically(path, "".join(lines).encode())
-    elif path.suffix == ".parquet":
-        write_atomically(path, _parquet(rows, trajectories))
-    else:
-        raise ValueError(f"{path}: the name must end in .jsonl or .parquet")
-    return len(rows)
-
-
-def _record(row: sqlite3.Row, videos: Path, trajectories: bool) -> dict[str, Any]:
+def answer_record(row: sqlite3.Row, videos: Path, trajectories: bool = False) -> dict[str, Any]:
+    """The record of a row of :meth:`~sb3_poem.label.store.Store.records`; see :func:`records`."""
     sides = {
         side: Trajectory.from_dict(json.loads(row[f"{side}_trajectory"]))
         for side in ("left", "right")
@@ -94,6 +62,44 @@ def _record(row: sqlite3.Row, videos: Path, trajectories: bool) -> dict[str, Any
         features = shown.reward_features
         record[f"{side}_reward_features"] = None if features is None else features.tolist()
     return record
+
+
+def session_record(store: Store, session: Session) -> dict[str, Any]:
+    """One session, as its person downloads it, JSON-ready; it names no file of the server."""
+    left_out = {"session", "source", "video", *COMMON}
+    return {
+        "format": "sb3_poem answers 1",
+        **{name: getattr(session, name) for name in COMMON},
+        "started": _time(session.created),
+        "answers": [
+            {name: value for name, value in record.items() if name not in left_out}
+            for record in records(store, session=session.id)
+        ],
+    }
+
+
+def export(
+    store: Store,
+    path: Path,
+    trajectories: bool = False,
+    undone: bool = False,
+    kind: str | None = None,
+) -> int:
+    """Write all answers; see :func:`records`.
+
+    :param kind: "jsonl" (JSON Lines) or "parquet"; None is the file's suffix.
+    :return: How many.
+    :raises ValueError: If it is another.
+    """
+    kind, rows = kind or path.suffix[1:], list(records(store, trajectories, undone))
+    if kind == "jsonl":
+        lines = [json.dumps(row, allow_nan=False) + "\n" for row in rows]
+        write_atomically(path, "".join(lines).encode())
+    elif kind == "parquet":
+        write_atomically(path, _parquet(rows, trajectories))
+    else:
+        raise ValueError(f"{path}: the name must end in .jsonl or .parquet")
+    return len(rows)
 
 
 def _parquet(rows: list[dict[str, Any]], trajectories: bool) -> bytes:

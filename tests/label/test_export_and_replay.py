@@ -6,6 +6,7 @@ import asyncio
 import json
 import shutil
 import sqlite3
+import sys
 import time
 import urllib.request
 from collections.abc import Callable
@@ -87,6 +88,65 @@ def test_both_formats_hold_the_same_answers(
     with_undone = list(records(store, undone=True))
     assert [record["undone"] for record in with_undone] == [True, False, False, False, False]
     assert set(with_undone[0]) == set(FIELDS)
+
+
+def test_minari_reads_the_episodes_with_preferences_and_latents(
+    answered: Session,
+    store: Store,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    minari = pytest.importorskip("minari", reason="the extra [minari] is not installed")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    command = ["label", "--store", str(store.folder), "export", "--format", "minari", "--out"]
+    assert cli.main([*command, "answers-v0"]) == 0
+    dataset = minari.load_dataset("poem/PointGoal/answers-v0")
+    assert list(minari.list_local_datasets()) == ["poem/PointGoal/answers-v0"]
+    env = dataset.recover_environment()
+    assert env.spec is not None
+    assert env.spec.id == "poem/PointGoal-v0"
+    assert dataset.observation_space == env.observation_space
+    answers, kept = dataset.storage.metadata["answers"], store.adapter_answers(answered.id, 4)
+    assert "ALL REWARDS ARE ZERO" in dataset.storage.metadata["description"]
+    assert dataset.total_episodes == 8
+    assert len(answers) == 4
+    for answer, item in zip(answers, kept, strict=True):
+        assert answer["preference"] == item["preference"]
+        assert answer["wish"] == store.session(answered.id).wish
+        assert "/" not in answer["video"]
+        for side in ("left", "right"):
+            shown, episode = Trajectory.from_dict(item[side]), dataset[answer[f"{side}_episode"]]
+            np.testing.assert_array_equal(episode.observations, shown.observations)
+            np.testing.assert_array_equal(episode.actions, shown.actions)
+            features = episode.infos["reward_features"]
+            np.testing.assert_array_equal(features[1:], shown.reward_features)
+            assert np.isnan(features[0]).all()
+            assert not episode.rewards.any()
+            assert not episode.terminations.any()
+            assert episode.truncations.tolist() == [False] * (len(shown) - 1) + [True]
+            (about,) = dataset.storage.get_episode_metadata([episode.id])
+            np.testing.assert_array_equal(about["latent"], shown.latent)
+            assert answer[f"{side}_latent"] == shown.latent.tolist()
+            assert answers[about["answer"]] is answer
+            assert (about["side"], about["preference"]) == (side, item["preference"])
+    for name, words in (("answers-v0", "already"), ("answers", "must be like answers-v0")):
+        assert cli.main([*command, name]) == 1
+        assert words in capsys.readouterr().err
+    assert cli.main([*command, "all-v1", "--undone"]) == 0
+    assert minari.load_dataset("poem/PointGoal/all-v1").total_episodes == 10
+    with sqlite3.connect(store.path) as connection:
+        connection.execute("update sessions set env_id = 'this:poem/PointGoal-v0'")
+    assert cli.main([*command, "answers-v2"]) == 1
+    assert "without a module to import" in capsys.readouterr().err
+    with sqlite3.connect(store.path) as connection:
+        connection.execute("update sessions set env_id = 'poem/AntVel-v0'")
+    assert cli.main([*command, "answers-v2"]) == 1
+    assert "recorded in poem/AntVel-v0" in capsys.readouterr().err
+    assert not (tmp_path / "minari/poem/AntVel/answers-v2").exists()
+    monkeypatch.setitem(sys.modules, "minari.storage", None)
+    assert cli.main([*command, "answers-v3"]) == 1
+    assert "pip install 'sb3_poem[minari]'" in capsys.readouterr().err
 
 
 def test_replay_to_the_same_rule_ends_where_the_session_ended(
