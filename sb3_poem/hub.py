@@ -35,8 +35,8 @@ def download(repository: str) -> Path:
         folder = Path(client.HfApi().snapshot_download(repository, allow_patterns=list(FILES)))
     except client.errors.RepositoryNotFoundError as error:
         raise FileNotFoundError(
-            f"{what}, and the Hugging Face Hub has none of that name, or it is private: then log in "
-            "with `hf auth login`, or set HF_TOKEN"
+            f"{what}, and the Hugging Face Hub has none of that name, or it is private: then log "
+            "in with `hf auth login`, or set HF_TOKEN"
         ) from error
     except (OSError, ValueError, HTTPError) as error:
         raise FileNotFoundError(
@@ -73,8 +73,8 @@ def upload(repository: str, contents: Mapping[str, bytes], private: bool | None 
         api.create_commit(repository, files, commit_message="Upload a model of sb3_poem")
     except (OSError, HTTPError) as error:
         raise OSError(
-            f"{repository} was not written to the Hugging Face Hub: {_first_line(error)}. Writing needs a "
-            "network and a token: `hf auth login`, or HF_TOKEN"
+            f"{repository} was not written to the Hugging Face Hub: {_first_line(error)}. "
+            "Writing needs a network and a token: `hf auth login`, or HF_TOKEN"
         ) from error
     return str(address)
 

@@ -37,8 +37,8 @@ def load_model(name: str | Path, device: th.device | str = "auto") -> PEARLSAC:
     """Load a model of either algorithm.
 
     :param name: A file that ``save`` wrote (``.zip`` may be left out), a checkpoint, a folder that
-        ``save_pretrained`` wrote, the name of a shipped model, or ``"user/name"`` on the Hugging Face
-        Hub
+        ``save_pretrained`` wrote, the name of a shipped model, or ``"user/name"`` on the Hugging
+        Face Hub
     :param device: As PyTorch names it
     :raises FileNotFoundError: if it is none of these; the message lists the shipped models
     :raises ValueError: if a file is truncated, or of another program

@@ -162,8 +162,8 @@ def _add_show_arguments(parser: argparse.ArgumentParser) -> None:
     model = parser.add_argument_group("what to show")
     _add_subject_arguments(
         model,
-        "a model's .zip, a pretrained folder, a shipped model's name, user/name on the Hugging Face "
-        "Hub, or a policy that adapt --save wrote",
+        "a model's .zip, a pretrained folder, a shipped model's name, user/name on the Hugging "
+        "Face Hub, or a policy that adapt --save wrote",
         "the model's); without --model: the last run of it in --folder",
     )
     _option(model, "--algo", "of that run", default=OUR_ALGORITHMS[0])
@@ -229,8 +229,10 @@ def _add_adapt_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
     model = parser.add_argument_group("what is taught")
-    told = "a pretrained folder, a folder of such, or the name of a shipped model"
-    _option(model, "--model", f"{told} (default: all that are shipped)")
+    told = (
+        "a pretrained folder, a folder of such, a shipped model's name, or user/name on the Hugging"
+    )
+    _option(model, "--model", f"{told} Face Hub (default: all that are shipped)")
     _add_environment(model, "the one that the model was trained on)")
     _option(model, "--queries", "questions before the result", _count(1), 10)
     _option(model, "--inference", "", default="bayes", choices=INFERENCES)

@@ -119,8 +119,8 @@ def find_models(
 ) -> list[ModelInfo]:
     """The models of a folder, by name.
 
-    :param model: A pretrained model's folder, a folder of such folders, the name of a shipped model,
-        or of one on the Hugging Face Hub; None takes all that are shipped.
+    :param model: A pretrained model's folder, a folder of such folders, the name of a shipped
+        model, or of one on the Hugging Face Hub; None takes all that are shipped.
     :param env_id: The environment in which they are shown; None takes each model's own.
     :param env_kwargs: Arguments of the environment, over those that each model was trained with.
     :raises FileNotFoundError: If there is none.

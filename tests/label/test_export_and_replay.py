@@ -135,6 +135,19 @@ def test_minari_reads_the_episodes_with_preferences_and_latents(
         assert words in capsys.readouterr().err
     assert cli.main([*command, "all-v1", "--undone"]) == 0
     assert minari.load_dataset("poem/PointGoal/all-v1").total_episodes == 10
+    # an episode that ended before its time
+    whole = Trajectory.from_dict(kept[0]["left"])
+    assert whole.reward_features is not None
+    fields = whole.observations[:-1], whole.actions[:-1], whole.latent, whole.reward_features[:-1]
+    question = store.answers(answered.id)[0]["question"]
+    with sqlite3.connect(store.path) as connection:
+        changed = (json.dumps(Trajectory(*fields).to_dict()), question)
+        connection.execute("update turns set left_trajectory = ? where id = ?", changed)
+    assert cli.main([*command, "shorter-v0"]) == 0
+    short, other = list(minari.load_dataset("poem/PointGoal/shorter-v0"))[:2]
+    assert short.terminations.tolist() == [False] * (len(whole) - 2) + [True]
+    assert not short.truncations.any()
+    assert other.truncations.tolist()[-1]
     with sqlite3.connect(store.path) as connection:
         connection.execute("update sessions set env_id = 'this:poem/PointGoal-v0'")
     assert cli.main([*command, "answers-v2"]) == 1
