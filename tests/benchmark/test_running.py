@@ -50,7 +50,7 @@ TINY = Suite(
     (Entry("methods", "Methods", TABLE_METHODS, record_at=(0, 1, 2), curves=(EXACT,)),),
     TABLE_REFERENCES,
     snapshots=2,
-    overrides={"maml": (("gradient_steps", 1), ("batch_size", 8))},
+    overrides={"MAMLReward": (("batch_size", 8), ("gradient_steps", 1))},
 )
 BUDGET = Budget(tasks=2, episodes=1)
 TRAINING = Training(1800, tuple(sorted(TINY_MODEL.items())))
