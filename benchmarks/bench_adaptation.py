@@ -73,27 +73,22 @@ def main() -> None:
     for dim in DIMENSIONS:
         model = make_model(dim)
         for n in CANDIDATES:
-            runs: dict[str, list[np.ndarray]] = {rule: [] for rule in RULES}
+            runs: dict[str, list[np.ndarray]] = {name: [] for name in RULES}
             for repeat in range(repeats if n == CANDIDATES[0] else 1):
-                for rule, options in RULES.items():  # in turns
-                    taken = milliseconds(
-                        model, max(ANSWERS[n]), 1, repeat, named_rule(n_candidates=n, **options)
-                    )
-                    runs[rule].append(taken.sum(axis=1))
-            for rule, of_rule in runs.items():
+                for name, options in RULES.items():  # in turns
+                    rule = named_rule(n_candidates=n, **options)
+                    taken = milliseconds(model, max(ANSWERS[n]), 1, repeat, rule)
+                    runs[name].append(taken.sum(axis=1))
+            for name, of_rule in runs.items():
                 taken = np.median(of_rule, axis=0)
                 means = {f"k = {k}": float(taken[:k].mean()) for k in ANSWERS[n]}
                 worst = {"worst": float(taken.max())}
-                results.append({"rule": rule, "d": dim, "candidates": n, **worst, **means})
+                results.append({"rule": name, "d": dim, "candidates": n, **worst, **means})
     model = make_model(5)
-    many = {
-        rule: float(
-            milliseconds(model, 10, 30, 0, named_rule(n_candidates=100, **options))
-            .sum(axis=1)
-            .mean()
-        )
-        for rule, options in RULES.items()
-    }
+    many = {}
+    for name, options in RULES.items():
+        taken = milliseconds(model, 10, 30, 0, named_rule(n_candidates=100, **options))
+        many[name] = float(taken.sum(axis=1).mean())
     shown = ["rule", "d", "candidates", *(f"k = {k}" for k in ANSWERS[100]), "worst"]
     sections = [
         "Milliseconds of `ask` + `tell`, mean over the first k questions.",

@@ -44,16 +44,11 @@ STEPS_ON_GPU = {"ours": 1000, "ours, float32": 1000, "SAC": 100}
 
 def poem(size: dict[str, Any], precision: str, device: str) -> POEMSAC:
     """A model with an epoch of data, ready for gradient steps."""
-    settings: dict[str, Any] = {
-        "gradient_steps": 0,
-        "n_train_tasks": N_TRAIN_TASKS,
-        "meta_batch_size": size["tasks"],
-        "batch_size": size["batch"],
-        "context_size": CONTEXT_SIZE,
-        "policy_kwargs": {"net_arch": {"pi": size["widths"], "qf": size["widths"]}},
-    }
-    settings |= {"precision": precision, "seed": 0, "device": device}
-    model = POEMSAC("MlpPolicy", "poem/HalfCheetahVel-v0", **settings)
+    settings: dict[str, Any] = {"gradient_steps": 0, "n_train_tasks": N_TRAIN_TASKS, "seed": 0}
+    settings |= {"meta_batch_size": size["tasks"], "batch_size": size["batch"]}
+    settings |= {"context_size": CONTEXT_SIZE, "precision": precision, "device": device}
+    arch = {"net_arch": {"pi": size["widths"], "qf": size["widths"]}}
+    model = POEMSAC("MlpPolicy", "poem/HalfCheetahVel-v0", policy_kwargs=arch, **settings)
     return model.learn(N_TRAIN_TASKS * HORIZON)
 
 
@@ -141,10 +136,8 @@ class Products(TorchDispatchMode):
     @property
     def operations(self) -> float:
         """Floating-point operations."""
-        return sum(
-            2.0 * left[0][0] * left[0][1] * right[0][1] * count
-            for (left, right), count in self.operands.items()
-        )
+        sizes = ((*left[0], right[0][1], count) for (left, right), count in self.operands.items())
+        return sum(2.0 * float(np.prod(size)) for size in sizes)
 
 
 def strided(
@@ -194,11 +187,9 @@ def measure(name: str, device: str, turns: int) -> dict[str, Any]:
     n_steps = {key: steps if device == "cpu" else count for key, count in STEPS_ON_GPU.items()}
     contenders: dict[str, tuple[Callable[[], Any], int]] = {
         "SAC": (lambda: plain_sac.train(n_steps["SAC"], n), n_steps["SAC"]),
-        "products": (
-            products.contender() if device == "cpu" else captured(products.contender()),
-            1,
-        ),
     }
+    run = products.contender()
+    contenders["products"] = (run if device == "cpu" else captured(run), 1)
     ends = {}
 
     def add(key: str, model: POEMSAC, steps: int) -> None:
@@ -222,10 +213,7 @@ def measure(name: str, device: str, turns: int) -> dict[str, Any]:
     timed = {key: partial(synchronised, run) for key, (run, _) in contenders.items()}
     taken = seconds_in_turns(timed, turns)
     seconds = {key: statistics.median(values) for key, values in taken.items()}
-    for (
-        key,
-        end,
-    ) in ends.items():  # posteriors and decoder are measured once an epoch, not in a step
+    for key, end in ends.items():  # posteriors and decoder: once an epoch, not in a step
         seconds[key] -= seconds[end]
     milliseconds = {key: 1e3 * seconds[key] / contenders[key][1] for key in contenders}
     ours, nan = milliseconds["ours"], float("nan")

@@ -10,6 +10,7 @@ waits for what comes next.
 from __future__ import annotations
 
 import json
+import os
 import random
 import re
 import statistics
@@ -20,7 +21,6 @@ import urllib.parse
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import requests
 from common import arguments, label_server
 
@@ -90,20 +90,6 @@ def memory_of(pid: int) -> float:
     return int(line) / 1024
 
 
-def busy_share(seconds: float = 2.0) -> float:
-    """How much of all processors other programs use, before the measurement."""
-
-    def read() -> np.ndarray:
-        values = Path("/proc/stat").read_text().splitlines()[0].split()[1:]
-        times = np.array(values, dtype=float)
-        return np.array([times.sum(), times[3] + times[4]])
-
-    before = read()
-    time.sleep(seconds)
-    total, idle = read() - before
-    return float(1.0 - idle / total)
-
-
 def lost_answers(folder: Path, people: list[Person]) -> int:
     """Sessions whose answers in the store are not those that were given."""
     store = Store(folder)
@@ -131,7 +117,7 @@ def main() -> None:
         raise SystemExit("--seconds must be at most 600")
     if given.out is not None and given.out.is_dir():
         raise SystemExit(f"--out must be a file, but {given.out} is a folder")
-    others = busy_share()
+    load = os.getloadavg()[0]  # of other programs
     words = ["--queries", "1000", "--max-sessions", str(given.people + 1)]
     words += ["--workers", str(given.workers)]
     with label_server(given.model, *words) as (server, url, folder):
@@ -140,8 +126,7 @@ def main() -> None:
         first.run()
         if first.error is not None:
             raise RuntimeError(f"the server does not work: {first.error}")
-        memory_before = memory_of(server.pid)
-        begun = time.monotonic()
+        begun, memory_before = time.monotonic(), memory_of(server.pid)
         until = begun + given.seconds
         people = [Person(*place, given.watch, until, i) for i in range(given.people)]
         for person in people:
@@ -167,7 +152,7 @@ def main() -> None:
         "server_MB": round(memory),
         "server_MB_per_session": round((memory - memory_before) / len(people), 2),
         "workers_MB": [round(value) for value in workers],
-        "busy_with_other_programs_before": round(others, 2),
+        "load_before": load,
     }
     print(json.dumps(result, indent=1))
     if given.out is not None:
