@@ -146,10 +146,8 @@ class PreferenceAdapter:
         return self._pending
 
     def ask(self) -> Query:
-        """The next question, two trajectories on the new task. While one waits for its answer, it
-        is that one again.
-
-        :raises RuntimeError: If all questions have been answered.
+        """The next question, two trajectories on the new task; the same again while it waits for
+        its answer. A ``RuntimeError`` if all questions have been answered.
         """
         if self._pending is None:
             if self.done:
@@ -171,8 +169,7 @@ class PreferenceAdapter:
 
         :param preference: A :class:`Preference`, or "left", "right" or "equal".
         :raises RuntimeError: If no question waits for an answer.
-        :raises TypeError: If it is no answer.
-        :raises ValueError: If it is another word. In both cases the question goes on waiting.
+        :raises TypeError, ValueError: If it is no answer; the question goes on waiting.
         """
         if self._pending is None:
             answered = "the last question has its answer already"
@@ -185,9 +182,7 @@ class PreferenceAdapter:
 
     def undo(self) -> Query:
         """Take the last answer back; its question waits again. One step back, and only until the
-        next question is asked for.
-
-        :raises RuntimeError: If there is nothing to take back.
+        next question is asked for: else a ``RuntimeError``.
         """
         if self._previous is None or self._pending is not None:
             raise RuntimeError(
@@ -208,13 +203,7 @@ class PreferenceAdapter:
         return f"PreferenceAdapter({describe_model(self.model)}, {self.rule}, {answers})"
 
     def adapt(self, oracle: Oracle | None = None, progress_bar: bool = False) -> AdaptedPolicy:
-        """Ask the oracle until done.
-
-        :param oracle: A callable (left, right) -> Preference; None takes the one given at
-            construction.
-        :return: The adapted policy.
-        :raises ValueError: If there is no oracle.
-        """
+        """Ask the oracle (None takes the one given at construction) until done."""
         oracle = self.oracle if oracle is None else oracle
         if oracle is None:
             raise ValueError(
@@ -299,19 +288,12 @@ class PreferenceAdapter:
         render: bool = False,
     ) -> PreferenceAdapter:
         """Continue where :meth:`to_dict` stood: the same answers lead to the same policy as without
-        the interruption.
+        the interruption. Model, task and library must be the same; a stochastic oracle's own
+        generator is its own affair. For the arguments see :class:`PreferenceAdapter`.
 
-        :param data: The dictionary.
-        :param model: The same model.
-        :param env: An environment with the same task.
-        :param oracle: Who answers in :meth:`adapt`. A stochastic oracle's own generator is its own
-            affair.
-        :param library: The same library, if there was one.
-        :param render: See :class:`PreferenceAdapter`.
         :raises OtherModelError: If the model has other weights, another family or another latent's
             dimension.
-        :raises ValueError: If the data is broken, or of another version, or its rule is not
-            imported.
+        :raises ValueError: If the data is broken, of another version, or its rule is not imported.
         """
         form, version = data.get("format"), data.get("version")
         if form != FORMAT:
@@ -344,10 +326,8 @@ class PreferenceAdapter:
         return adapter
 
     def restore(self, data: dict[str, Any]) -> None:
-        """Go to where another adapter of the same model, rule and seed stood when :meth:`to_dict`
-        was called.
-
-        :raises ValueError: If the data is broken.
+        """Go to where another adapter of the same model, rule and seed stood at :meth:`to_dict`;
+        broken data raises a ``ValueError``.
         """
         with _complete():
             answers = [
@@ -370,18 +350,12 @@ class PreferenceAdapter:
         return cls.from_dict(parse_json(text, "the text is"), model, env, **kwargs)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the state as a JSON file; an existing file is replaced only once the new one is
-        whole.
-        """
+        """Write the state as a JSON file, which replaces an existing one only when it is whole."""
         write_json_atomically(path, self.to_dict())
 
     @classmethod
     def load(
-        cls,
-        path: str | os.PathLike[str],
-        model: MetaModel | str | Path,
-        env: Env,
-        **kwargs: Any,
+        cls, path: str | os.PathLike[str], model: MetaModel | str | Path, env: Env, **kwargs: Any
     ) -> PreferenceAdapter:
         """:meth:`from_dict`, with its arguments, of a file of :meth:`save`."""
         return cls.from_dict(read_json(path), model, env, **kwargs)

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sb3_poem.adaptation import queries
 from sb3_poem.adaptation.decisions import DECISIONS, decide
 from sb3_poem.adaptation.meta_model import HasRewardDecoder, HasSimilarity, MetaModel
 from sb3_poem.adaptation.noise import (
@@ -29,13 +30,6 @@ from sb3_poem.adaptation.particles import (
 )
 from sb3_poem.adaptation.preference import Preference, preference_log_likelihood
 from sb3_poem.adaptation.priors import SOURCES, make_prior
-from sb3_poem.adaptation.queries import (
-    QUERY_RULES,
-    check_epsilon,
-    most_informative_pair,
-    random_pair,
-    worst_case_pair,
-)
 from sb3_poem.adaptation.rule import (
     Answer,
     Inference,
@@ -100,9 +94,7 @@ class Thinning(NamedTuple):
 
     @classmethod
     def fit(cls, thin: np.ndarray, full: np.ndarray) -> Thinning:
-        """Fit differences (n,) decoded from some steps and from all, by ridge regression: the more
-        is added to differences that hardly vary, the flatter the line.
-        """
+        """Fit differences (n,) decoded from some steps and from all, by ridge regression."""
         added = full - thin
         covariance = np.mean((thin - thin.mean()) * added)
         slope = covariance / max(thin.var() + np.square(added).mean(), 1e-12)
@@ -163,11 +155,11 @@ class Bayes(Rule):
 
     def __post_init__(self) -> None:
         check_whole("n_particles", self.n_particles, 2)  # a question compares two
-        check_choice("query_rule", self.query_rule, QUERY_RULES)
+        check_choice("query_rule", self.query_rule, queries.QUERY_RULES)
         check_choice("candidates", self.candidates, (*SOURCES, None))
         check_choice("likelihood", self.likelihood, (*LIKELIHOODS, None))
         check_choice("decision", self.decision, DECISIONS)
-        check_epsilon(self.epsilon)
+        queries.check_epsilon(self.epsilon)
         if self.noise_model is not None and not hasattr(self.noise_model, "probability_left"):
             raise ValueError(
                 "`noise_model` must be None or an object as MistakeNoise(0.2), "
@@ -221,11 +213,9 @@ class Bayes(Rule):
         return self.likelihood or ("decoder" if _knows_its_decoder(model) else "similarity")
 
     def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> BayesInference:
-        """See :class:`Rule`."""
         return BayesInference(self, model, rng, setting.library)
 
     def to_dict(self) -> dict[str, Any]:
-        """See :class:`Rule`."""
         data, noise = super().to_dict(), self.noise_model
         data["options"]["noise_model"] = None if noise is None else noise.to_dict()
         return data
@@ -279,38 +269,38 @@ class BayesInference(Inference):
         return float(1.0 / np.square(self.weights).sum())
 
     def ask(self) -> tuple[Shown, Shown]:
-        """See :class:`Inference`."""
         if self.library is not None:
             first, second = self._ask_about(self.library)
             return self.library[first], self.library[second]
         policies = self._query_policies()
         if self.rule.query_rule == "random":
-            first, second = random_pair(len(policies), self.rng)
+            first, second = queries.random_pair(len(policies), self.rng)
             return policies[first], policies[second]
         particles, weights = self._query_particles()
         similarities = self.model.similarities(particles, policies)
         if self.rule.query_rule == "worst-case":
-            first, second = worst_case_pair(similarities, self.rule.epsilon, weights)
+            first, second = queries.worst_case_pair(similarities, self.rule.epsilon, weights)
         else:
             slope, magnitude, noise = self._return_unit()
             error = slope * (QUERY_RESOLUTION * self._spread)
             values = slope * similarities
-            first, second = most_informative_pair(values, weights, noise, error, magnitude)
+            first, second = queries.most_informative_pair(values, weights, noise, error, magnitude)
         return policies[first], policies[second]
 
     def _ask_about(self, library: list[Trajectory]) -> tuple[int, int]:
         if self.rule.query_rule == "random":
-            return random_pair(len(library), self.rng)
+            return queries.random_pair(len(library), self.rng)
         if self._library_returns is None:
             returns = self.model.predicted_returns(self.particles, library, DECODED_STEPS)
             self._library_returns = returns
         returns = self._library_returns
         error = self._decoder_error(2.0 * float(np.mean([len(item) for item in library])))
         magnitude = float(2.0 * np.abs(returns).mean())
-        return most_informative_pair(returns, self.weights, self.noise_model, error, magnitude)
+        return queries.most_informative_pair(
+            returns, self.weights, self.noise_model, error, magnitude
+        )
 
     def tell(self, preference: Preference, left: Shown, right: Shown) -> None:
-        """See :class:`Inference`."""
         if self.likelihood == "decoder":
             trajectories_of('likelihood="decoder"', left, right)
         answer = Answer(preference, left, right)
@@ -321,7 +311,6 @@ class BayesInference(Inference):
             self._rejuvenate()
 
     def estimate(self) -> np.ndarray:
-        """See :class:`Inference`."""
         return decide(
             self.rule.decision,
             self.model if self.has_similarity else None,
@@ -463,7 +452,6 @@ class BayesInference(Inference):
         self.particles[moved] = particles
 
     def restore(self, snapshot: Snapshot, answers: list[Answer]) -> None:
-        """See :class:`Inference`."""
         super().restore(snapshot, answers)
         self._library_returns = None
 

@@ -48,11 +48,6 @@ class AdaptationEvalCallback(EpochCallback):
         otherwise
     :param env_kwargs: Arguments of the environment that differ from training's, for instance a
         ``split`` of its tasks
-    :param verbose: 1 prints each result
-    :raises ValueError: for a number of tasks or episodes below 1; when training starts, for an
-        environment that is not registered, or a rule that the model does not do for
-    :raises TypeError: for ``adaptation_kwargs`` of another kind
-    :raises OSError: when training starts, if the folder cannot be made
     """
 
     def __init__(

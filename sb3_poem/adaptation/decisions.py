@@ -27,20 +27,17 @@ def decide(
     reference: np.ndarray,
     has_holes: bool = False,
 ) -> np.ndarray:
-    """The latent to act on, (d,).
+    """The latent to act on, (d,), given particles (n, d) with weights (n,) that sum to one.
 
     - "expected-fitness": the posterior mean if its policy is nearly as fit as any, else the middle
       of those options that S does not tell from the fittest. Fitness is S(z, option), averaged over
       the posterior of z; options are the particles, the posterior mean and the training tasks'
-      latents. Highest likelihood would run to extreme latents, as the likelihood grows with their
-      norm, and so would highest fitness alone; and the mean of two separate modes fits neither.
+      latents. Highest likelihood, or fitness alone, would run to extreme latents; and the mean of
+      two separate modes fits neither.
     - "posterior-mean": the weighted mean of the particles.
     - "most-likely": the particle of the largest weight.
 
-    :param model: None leaves only the other two, and "expected-fitness" then means the particle
-        nearest to the posterior mean, which lies within a mode.
-    :param particles: (n, d).
-    :param weights: (n,) summing to one.
+    :param model: None has "expected-fitness" mean the particle nearest to the posterior mean.
     :param training_latents: (N, d) or None.
     :param reference: (m, d) draws of the prior, whose policies give S its unit.
     :param has_holes: Whether the prior is a mixture, with latents between its parts that no

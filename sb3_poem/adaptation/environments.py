@@ -24,17 +24,15 @@ COPIES = 60
 def model_and_env(
     model: MetaModel | str | Path, env: Env, n_copies: int = COPIES, render: bool = False
 ) -> tuple[MetaModel, VecEnv]:
-    """What adaptation is given, as it works with it: a model, and a vector environment.
+    """A model, and a vector environment, of what adaptation accepts as such.
 
     :param model: A model, a file or folder of one, or the name of one that ships.
     :param env: A ``gym.Env``, its id, a Gymnasium ``VectorEnv`` or an SB3 ``VecEnv``; the latter
-        stays as it is. The id on which the model was trained makes it with the same arguments.
-    :param n_copies: How many copies an id makes.
-    :param render: Whether they render RGB images.
+        stays as it is. The id on which the model was trained makes ``n_copies`` with the same
+        arguments.
     :raises TypeError: If one of them is something else.
     :raises FileNotFoundError: If there is no such model.
-    :raises ValueError: If the model's file asks for what it may not, see
-        :func:`sb3_poem.common.foreign.environment_of`.
+    :raises ValueError: If the model's file asks for what :func:`environment_of` refuses.
     """
     from stable_baselines3.common.vec_env import VecEnv
 
@@ -60,10 +58,7 @@ def model_and_env(
 
 
 def check_model_fits(model: MetaModel, vec_env: VecEnv) -> None:
-    """Refuse a model of other observations, actions or tasks.
-
-    :raises ValueError: If a space differs, or a wrapper changes what is seen, done or paid.
-    """
+    """Refuse a model of other observations, actions or tasks, or a wrapper that changes them."""
     family, names = FamilyView.of(vec_env), ["observation_space", "action_space"]
     if family is not None:
         family.unknown_wrappers()  # refuses those that change what is seen, done or paid

@@ -13,7 +13,6 @@ from sb3_poem.adaptation.environments import Env, model_and_env
 from sb3_poem.adaptation.many_tasks import OracleFactory, TaskAdaptations, adapt_tasks
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.oracles import ReturnOracle
-from sb3_poem.adaptation.preference import Preference
 from sb3_poem.adaptation.rule import Rule
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.family_view import FamilyView
@@ -38,9 +37,19 @@ class EpisodeOutcomes:
     returns: np.ndarray
     successes: np.ndarray | None
 
+    @property
+    def mean_return(self) -> float:
+        """Mean over rows and episodes."""
+        return float(self.returns.mean())
+
+    @property
+    def success_rate(self) -> float | None:
+        """Share of successful episodes; None for a family that does not say."""
+        return None if self.successes is None else float(self.successes.mean())
+
     def __repr__(self) -> str:
         rows, episodes = self.returns.shape
-        mean = f"mean return {self.returns.mean():.1f}"
+        mean = f"mean return {self.mean_return:.1f}"
         return f"EpisodeOutcomes({rows} times {episodes} episodes, {mean})"
 
 
@@ -53,17 +62,12 @@ def evaluate_episodes(
     seed: int = 0,
     deterministic: bool = True,
 ) -> EpisodeOutcomes:
-    """True returns of latents on tasks: an episode's rewards up to its end, early or not, not
-    discounted; and successes.
+    """True returns of latents (n, latent_dim) on tasks (n, task_dim), row by row: an episode's
+    rewards up to its end, early or not, not discounted; and successes.
 
     Episode e of row i always starts from the same seed, so the same rows with other latents are
-    compared on equal starts.
+    compared on equal starts. For ``model`` and ``env`` see :func:`adapt_tasks`.
 
-    :param model: See :func:`adapt_tasks`.
-    :param env: See :func:`adapt_tasks`.
-    :param latents: (n, latent_dim).
-    :param tasks: (n, task_dim), row i for latent i.
-    :param n_episodes: Episodes per row.
     :param seed: Where the episodes' reset seeds start.
     :param deterministic: Whether policies act by their mode.
     :raises ValueError: If shapes do not fit or an episode is not finite.
@@ -91,23 +95,15 @@ def evaluate_episodes(
 
 
 @dataclass(frozen=True, eq=False)
-class AdaptationEvaluation:
+class AdaptationEvaluation(TaskAdaptations):
     """True returns of adapted policies.
 
-    :param tasks: (n_tasks, task_dim).
-    :param record_at: Numbers of answers, ascending.
-    :param latents: (n_tasks, len(record_at), latent_dim) the estimates.
     :param returns: (n_tasks, len(record_at), n_episodes).
-    :param preferences: A task's answers in order.
     :param successes: (n_tasks, len(record_at), n_episodes), whether an episode was a success; None
         for a family that does not say.
     """
 
-    tasks: np.ndarray
-    record_at: tuple[int, ...]
-    latents: np.ndarray
     returns: np.ndarray
-    preferences: list[list[Preference]]
     successes: np.ndarray | None = None
 
     def __repr__(self) -> str:
@@ -131,19 +127,14 @@ class AdaptationEvaluation:
         return None if self.successes is None else self.successes.mean(axis=(0, 2))
 
     def after(self, n_answers: int) -> float:
-        """Mean return after so many answers, one of ``record_at``.
-
-        :raises ValueError: If it was not recorded.
-        """
+        """Mean return after so many answers, which must be one of ``record_at``."""
         if n_answers not in self.record_at:
             recorded = f"returns were recorded after {self.record_at} answers"
             raise ValueError(f"{recorded}, not after {n_answers}")
         return float(self.mean_returns[self.record_at.index(n_answers)])
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-ready: every task's mean return, and success rate if there are successes, after
-        every recorded number of answers; and the means.
-        """
+        """JSON-ready: means, and every task's, after every recorded number of answers."""
         data: dict[str, Any] = {
             "queries": list(self.record_at),
             "mean_return": self.mean_returns.tolist(),
@@ -176,13 +167,11 @@ def evaluate_adaptation(
 
     Arguments that are not explained here are those of :func:`adapt_tasks`.
 
-    :param tasks: (n_tasks, task_dim), or a number: so many that no model was trained on, which
-        ``seed`` draws, the same as in :func:`known_task_return`; None takes 30.
+    :param tasks: (n_tasks, task_dim), or a number (None is 30) of tasks that no model was trained
+        on, which ``seed`` draws, the same as in :func:`known_task_return`.
     :param record_at: After how many answers to measure; the largest is the number of questions.
-    :param n_episodes: Episodes per measurement.
     :param seed: Task i adapts with seed + i; the episodes' seeds follow from it too.
     :param on_record: Called with all that is measured so far, after each measurement.
-    :raises ValueError: If an argument is out of its range.
     """
     if len(record_at) == 0:
         given = tuple(record_at)
@@ -224,9 +213,7 @@ def _evaluation(
     returns = np.stack([outcome.returns for outcome in outcomes], axis=1)
     known = [outcome.successes for outcome in outcomes if outcome.successes is not None]
     successes = np.stack(known, axis=1) if len(known) == len(outcomes) else None
-    return AdaptationEvaluation(
-        adapted.tasks, adapted.record_at, adapted.latents, returns, adapted.preferences, successes
-    )
+    return AdaptationEvaluation(**vars(adapted), returns=returns, successes=successes)
 
 
 def choose_test_tasks(
@@ -240,8 +227,5 @@ def choose_test_tasks(
 
 
 def evaluation_seed(seed: int, stream: int = 0) -> int:
-    """Where the reset seeds of evaluation episodes start: far from those of the questions.
-
-    :param stream: Different episodes for different purposes.
-    """
+    """Where the reset seeds of evaluation episodes start, by purpose: far from the questions'."""
     return int(np.random.SeedSequence([seed, 3, stream]).generate_state(1)[0] >> 2)

@@ -21,13 +21,7 @@ ANSWERS = {
 
 @dataclass(frozen=True, eq=False)
 class HumanAnswer:
-    """An answer, with all that is known of it.
-
-    :param video: The file in which both were shown.
-    :param fps: Its frames per second.
-    :param asked: When the question came up, seconds since 1970.
-    :param shown: When its video was ready.
-    """
+    """An answer with its video, and when (seconds since 1970) it was asked for and shown."""
 
     preference: Preference
     left: Trajectory
@@ -47,13 +41,11 @@ class HumanOracle:
 
     :param folder: Where the videos go; it is made if missing.
     :param video_format: "gif" (any viewer plays it) or "mp4" (smaller).
-    :param fps: Frames per second.
     :param mistake_rate: How often a person is taken to err, for the Bayesian rule.
     :param read: Reads a line after showing a prompt; ``input`` by default.
     :param write: Shows a line; ``print`` by default.
     :param record: Called with each :class:`HumanAnswer` as soon as it is understood;
         ``sb3_poem.label`` has one that keeps them in the store of the web page.
-    :raises ValueError: If the format is unknown.
     """
 
     needs_frames = True
@@ -79,10 +71,8 @@ class HumanOracle:
         return f"HumanOracle({self.n_asked} asked, videos in {self.folder})"
 
     def __call__(self, left: Trajectory, right: Trajectory) -> Preference:
-        """Write the video of two trajectories with frames, and ask until an answer is understood.
-
-        :raises ValueError: If a trajectory has no frames.
-        :raises EOFError: If standard input has ended, or is closed.
+        """Write the video of two trajectories with frames, and ask until an answer is understood;
+        an ``EOFError`` if standard input has ended.
         """
         asked = time.time()
         name = f"query-{self.n_asked + 1:03d}.{self.video_format}"

@@ -10,6 +10,7 @@ import numpy as np
 
 from sb3_poem.adaptation.environments import Env, model_and_env
 from sb3_poem.adaptation.evaluation import (
+    EpisodeOutcomes,
     choose_test_tasks,
     evaluate_episodes,
     evaluation_seed,
@@ -30,51 +31,43 @@ LATENTS_WITH_OWN_DYNAMICS, LATENTS_WITH_SHARED_DYNAMICS = 30, 300
 
 
 @dataclass(frozen=True, eq=False)
-class KnownTaskReturn:
-    """What the model's repertoire holds for each task.
+class KnownTaskReturn(EpisodeOutcomes):
+    """What the model's repertoire holds for each task: outcomes of its best latent, on episodes
+    that had no part in choosing it.
 
     :param tasks: (n_tasks, task_dim).
-    :param returns: (n_tasks, n_episodes) of each task's best latent, on episodes that had no part
-        in choosing it.
-    :param latents: (n_tasks, latent_dim) those latents.
+    :param latents: (n_tasks, latent_dim) the best ones.
     :param candidate_latents: (n_latents, latent_dim) all that were tried.
     :param candidate_returns: (n_tasks, n_latents) their returns on every task (J).
-    :param successes: (n_tasks, n_episodes), of the episodes of ``returns``; None for a family that
-        does not say.
     """
 
     tasks: np.ndarray
-    returns: np.ndarray
     latents: np.ndarray
     candidate_latents: np.ndarray
     candidate_returns: np.ndarray
-    successes: np.ndarray | None = None
 
     def __repr__(self) -> str:
         latents = f"the best of {len(self.candidate_latents)} latents"
         found = f"mean return {self.mean_return:.1f} of {latents}"
         return f"KnownTaskReturn({len(self.tasks)} tasks, {found})"
 
-    @property
-    def mean_return(self) -> float:
-        """Mean over tasks and episodes."""
-        return float(self.returns.mean())
-
-    @property
-    def success_rate(self) -> float | None:
-        """Share of successful episodes; None for a family that does not say."""
-        return None if self.successes is None else float(self.successes.mean())
-
     def limit(self, k: int, noise_model: NoiseModel | None = None) -> float:
-        """The mean return that :func:`information_limit` gives for k answers within this
-        repertoire.
+        """See :func:`repertoire_limit`."""
+        return repertoire_limit(self.tasks, self.candidate_returns, k, noise_model)
 
-        :param noise_model: How the oracle errs; None is an oracle that does not.
-        """
-        returns, ordered = self.candidate_returns, self.tasks.shape[1] == 1
-        if ordered:
-            returns = returns[np.argsort(self.tasks[:, 0])]
-        return information_limit(returns, k, noise_model=noise_model, ordered=ordered)
+
+def repertoire_limit(
+    tasks: np.ndarray, returns: np.ndarray, k: int, noise_model: NoiseModel | None = None
+) -> float:
+    """The :func:`information_limit` of a matrix (n_tasks, n_latents) of returns on tasks (n_tasks,
+    task_dim), which lie on a line if they are numbers.
+
+    :param noise_model: How the oracle errs; None is an oracle that does not.
+    """
+    ordered = tasks.shape[1] == 1
+    if ordered:
+        returns = returns[np.argsort(tasks[:, 0])]
+    return information_limit(returns, k, noise_model=noise_model, ordered=ordered)
 
 
 def known_task_return(
@@ -96,17 +89,14 @@ def known_task_return(
     trajectory relabelled for every task. The winners are then rolled out anew, so that the luck of
     having been chosen does not count.
 
-    :param model: See :func:`adapt_tasks`.
-    :param env: See :func:`adapt_tasks`.
+    :param model: And ``env``: see :func:`adapt_tasks`.
     :param tasks: See :func:`evaluate_adaptation`.
-    :param n_latents: How many latents to try; None for 300, or for 30 where tasks do not share
-        their dynamics and every latent must be rolled out in every task.
+    :param n_latents: How many to try; None for 300, or for 30 where every latent must be rolled out
+        in every task.
     :param n_episodes: Fresh episodes per winner.
-    :param seed: Of the draws and the episodes.
     :param source: Where latents come from: "prior", "aggregate", or "both" in equal parts.
     :param selection_episodes: Episodes per latent (and task, where dynamics differ) for choosing.
     :param deterministic: Whether policies act by their mode.
-    :raises ValueError: If an argument is out of its range.
     """
     model, vec_env = model_and_env(model, env)
     tasks = choose_test_tasks(model, vec_env, tasks, seed)
@@ -121,7 +111,8 @@ def known_task_return(
     )
     best, start = candidates[np.argmax(returns, axis=1)], evaluation_seed(seed)
     fresh = evaluate_episodes(model, vec_env, best, tasks, n_episodes, start, deterministic)
-    return KnownTaskReturn(tasks, fresh.returns, best, candidates, returns, fresh.successes)
+    own = {"tasks": tasks, "latents": best, "candidate_latents": candidates}
+    return KnownTaskReturn(**vars(fresh), **own, candidate_returns=returns)
 
 
 def return_matrix(
@@ -133,16 +124,9 @@ def return_matrix(
     seed: int = 0,
     deterministic: bool = True,
 ) -> np.ndarray:
-    """J[i, j], (n_tasks, n_latents), the mean true return on task i of the policy of latent j.
-
-    :param vec_env: Of the task family. If its tasks share their dynamics each latent is rolled out
-        once for all tasks, else once for each.
-    :param tasks: (n_tasks, task_dim).
-    :param latents: (n_latents, latent_dim).
-    :param n_episodes: Episodes to average over.
-    :param seed: Where the reset seeds start.
-    :param deterministic: Whether policies act by their mode.
-    :raises ValueError: If shapes do not fit or an episode is not finite.
+    """J[i, j], (n_tasks, n_latents), the mean true return on task i (n_tasks, task_dim) of the
+    policy of latent j (n_latents, latent_dim) over so many episodes, whose reset seeds start at
+    ``seed``. Where tasks share their dynamics each latent is rolled out once for all of them.
     """
     tasks, latents = np.asarray(tasks, dtype=np.float64), np.asarray(latents, dtype=np.float64)
     family, shape = FamilyView(vec_env), (len(tasks), len(latents))
@@ -162,14 +146,12 @@ def return_matrix(
 
 
 def property_one(similarities: np.ndarray, returns: np.ndarray) -> tuple[float, float]:
-    """How well S orders policies as true returns do (Property 1).
+    """How well S(z_i, z_j), (n_tasks, n_policies), orders policies as true returns J[i, j] do
+    (Property 1).
 
-    :param similarities: (n_tasks, n_policies) S(z_i, z_j).
-    :param returns: (n_tasks, n_policies) J[i, j].
     :return: Preference accuracy, the share of pairs of policies with different returns that S puts
         in the right order (a tie of S counts one half); and Kendall's tau-b, averaged over tasks.
         NaN if no task tells any two policies apart.
-    :raises ValueError: If the shapes differ.
     """
     similarities = np.asarray(similarities, dtype=np.float64)
     returns = np.asarray(returns, dtype=np.float64)
@@ -193,10 +175,9 @@ def property_one(similarities: np.ndarray, returns: np.ndarray) -> tuple[float, 
 
 
 def preference_order(model: HasSimilarity, known: KnownTaskReturn) -> tuple[float, float]:
-    """Property 1 on held-out tasks. A held-out task's latent is the best of the candidates for it;
-    S between those latents is compared with the returns of their policies on those tasks.
-
-    :return: Preference accuracy and Kendall's tau, see :func:`property_one`.
+    """:func:`property_one` on held-out tasks. A held-out task's latent is the best of the
+    candidates for it; S between those latents is compared with the returns of their policies on
+    those tasks.
     """
     best = np.argmax(known.candidate_returns, axis=1)
     policies = np.unique(best)

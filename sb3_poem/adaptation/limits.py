@@ -32,7 +32,6 @@ def information_limit(
 
     :param returns: (n_tasks, n_policies) return of each policy on each task (J).
     :param noise_model: How the oracle errs; None is an oracle that does not.
-    :param ordered: See :func:`best_codebook`.
     :raises ValueError: If the matrix is empty or not finite, k is negative, or the noise model is
         of an unknown kind.
     """
@@ -55,13 +54,11 @@ def best_codebook(returns: np.ndarray, size: int, *, ordered: bool = False) -> n
     Found exactly where all sets can be tried, or by dynamic programming where tasks lie on a line
     (``ordered``); else by greedy choice and swaps, which may lie slightly below the optimum.
 
-    :param returns: (n_tasks, n_policies).
     :param ordered: Whether the rows are in the order of a one-dimensional task parameter. The
         optimum is then found among all ways to cut the line into ``size`` intervals, one policy
         each. That is exact if of any two policies the one is better up to some task and the other
         from there on, as with a goal speed; noise in the returns may break this, so the general
         search is tried too.
-    :raises ValueError: If the matrix is empty or not finite, or the size is below 1.
     """
     returns = _check_returns(returns)
     if size < 1:
@@ -81,7 +78,7 @@ def best_codebook(returns: np.ndarray, size: int, *, ordered: bool = False) -> n
 
 def best_intervals(returns: np.ndarray, size: int) -> np.ndarray:
     """The policies of the best cut of an ordered list of tasks into at most ``size`` intervals, by
-    dynamic programming: at most ``size`` indices, ascending and each once.
+    dynamic programming: their indices, ascending and each once.
     """
     n_tasks = len(returns)
     sums = np.concatenate([np.zeros((1, returns.shape[1])), np.cumsum(returns, axis=0)])

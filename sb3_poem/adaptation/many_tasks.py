@@ -15,14 +15,7 @@ from sb3_poem.adaptation.bayes import Bayes
 from sb3_poem.adaptation.environments import Env, model_and_env, warn_if_untrained
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.preference import Preference, as_preference
-from sb3_poem.adaptation.rule import (
-    Rule,
-    Setting,
-    as_rule,
-    inference_rng,
-    latent_of,
-    rollout_seed,
-)
+from sb3_poem.adaptation.rule import Rule, Setting, as_rule, inference_rng, latent_of, rollout_seed
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
@@ -32,12 +25,9 @@ OracleFactory = Callable[..., Callable[[Trajectory, Trajectory], Any]]
 
 @dataclass(frozen=True, eq=False)
 class TaskAdaptations:
-    """Many tasks, adapted.
-
-    :param tasks: (n_tasks, task_dim).
-    :param record_at: Numbers of answers at which estimates were kept, ascending.
-    :param latents: (n_tasks, len(record_at), latent_dim).
-    :param preferences: A task's answers in order.
+    """Many tasks, adapted: ``tasks`` (n_tasks, task_dim), the numbers of answers at which estimates
+    were kept, ascending, those ``latents`` (n_tasks, len(record_at), latent_dim), and each task's
+    answers in order.
     """
 
     tasks: np.ndarray
@@ -65,7 +55,8 @@ def adapt_tasks(
     progress_bar: bool = False,
     on_record: Callable[[TaskAdaptations], None] | None = None,
 ) -> TaskAdaptations:
-    """Adapt a model to each of many tasks, with all rollouts of a question at once.
+    """Adapt a model to each of many tasks (n_tasks, task_dim), with all rollouts of a question at
+    once.
 
     Task i is adapted as ``PreferenceAdapter(model, env, seed=seed + i, ...)`` would alone: with the
     same candidates, questions and reset seeds. (Matrix products may round otherwise in a batch than
@@ -77,18 +68,13 @@ def adapt_tasks(
 
     :param env: A task family. Any number of copies will do; twice the number of tasks is best, and
         an id makes 60.
-    :param tasks: (n_tasks, task_dim).
     :param oracle_factory: Called as ``oracle_factory(env=vec_env, task=task, seed=seed + i)``,
-        gives task i's oracle. The oracles' classes will do, and ``functools.partial(MistakeOracle,
-        0.1)``. The first task's oracle says how all err.
+        gives task i's oracle: an oracle's class, say, or ``functools.partial(MistakeOracle, 0.1)``.
+        The first task's oracle says how all err.
     :param record_at: Numbers of answers at which to keep the estimate; None keeps 0, 1, ...,
         n_queries.
-    :param seed: Task i takes seed + i.
     :param on_record: Called with all that there is so far, each time that estimates are kept. It
         may use ``vec_env``.
-    :raises ValueError: If an argument is out of its range, or the model belongs to another
-        environment.
-    :raises TypeError: If an argument is of another kind.
     """
     model, vec_env = model_and_env(model, env)
     _check_factory(oracle_factory)

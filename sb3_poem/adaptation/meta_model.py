@@ -98,6 +98,6 @@ class HasRewardDecoder(Protocol):
     def predicted_returns(
         self, latents: np.ndarray, trajectories: Sequence[Trajectory], max_steps: int | None = None
     ) -> np.ndarray:
-        """(m, number of trajectories), if each of the latents (m, latent_dim) were the task's;
-        of a longer trajectory only ``max_steps`` steps are decoded.
+        """(m, number of trajectories), if each of the latents (m, latent_dim) were the task's; of a
+        longer trajectory only ``max_steps`` steps are decoded.
         """

@@ -16,13 +16,11 @@ def named_rule(
     mistake_rate: float | None = None,
     **options: Any,
 ) -> Rule:
-    """The rule that these words mean.
+    """The rule of these words, "bayes" or "paper"; None takes its own numbers.
 
-    :param inference: "bayes" or "paper".
-    :param n_candidates: Of Algorithm 2, or particles; None takes the rule's own number.
+    :param n_candidates: Of Algorithm 2, or particles.
     :param mistake_rate: How often who answers errs, which Algorithm 2 takes no notice of.
     :param options: Others of the rule.
-    :raises ValueError: If one is out of its range.
     """
     check_choice("inference", inference, ("bayes", "paper"))
     if inference == "paper":

@@ -1,17 +1,14 @@
 """How an oracle errs, as the Bayesian rule sees it: P(answer | returns of the two trajectories).
 
-Every model here answers one question, "how probable is LEFT, given that the answer is LEFT or
-RIGHT?", for *predicted* returns. Two sources of doubt meet in it: the oracle's own noise, and the
-error of the prediction. The second is folded in by averaging over it; for a step function and a
-Gaussian error that gives a probit, and for a logistic function very nearly a logistic function of a
-shrunken argument (MacKay 1992). Both are evaluated as logistic functions, which differ from the
-probit by less than 0.01 and have heavier tails: an answer that the prediction calls impossible
-should not veto a latent.
+The doubt about *predicted* returns is folded into the oracle's own noise by averaging over it: a
+step function and a Gaussian error give a probit, a logistic function nearly one of a shrunken
+argument (MacKay 1992). Both are evaluated as logistic functions, whose tails are heavier: an answer
+that the prediction calls impossible should not veto a latent.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -29,23 +26,19 @@ Values = np.ndarray | float
 class NoiseModel(Protocol):
     """P(LEFT) from the difference of two returns."""
 
-    def probability_left(
-        self, difference: np.ndarray, error: Values, magnitude: Values
-    ) -> np.ndarray:
-        """Probability that the oracle says LEFT, given that it says LEFT or RIGHT.
+    def probability_left(self, difference: Values, error: Values, magnitude: Values) -> Any:
+        """P(LEFT), given that the oracle says LEFT or RIGHT, in (0, 1); arguments broadcast.
 
-        :param difference: Predicted return of the left trajectory minus that of the right one, any
-            shape.
-        :param error: Standard deviation of that prediction, same unit, broadcasts.
-        :param magnitude: The sum of both returns' absolute values, same unit, broadcasts.
-        :return: Probabilities in (0, 1), of the broadcast shape.
+        :param difference: Predicted return of the left trajectory minus that of the right one.
+        :param error: Standard deviation of that prediction, same unit.
+        :param magnitude: The sum of both returns' absolute values, same unit.
         """
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready; :func:`noise_model_from_dict` reads it."""
 
 
-def _logistic(x: np.ndarray, slope: Values) -> np.ndarray:
+def _logistic(x: Values, slope: Values) -> np.ndarray:
     # It stays float32 if it is; whole numbers would cut the slope off.
     x = np.asarray(x)
     x = x.astype(np.result_type(x.dtype, np.float32), copy=False)
@@ -67,8 +60,7 @@ class _Serialisable:
     kind: str
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-ready; :func:`noise_model_from_dict` reads it."""
-        return {"kind": self.kind, **asdict(self)}  # type: ignore[call-overload]
+        return {"kind": self.kind, **vars(self)}
 
 
 @dataclass(frozen=True)
@@ -77,19 +69,13 @@ class ExactNoise(_Serialisable):
 
     kind = "exact"
 
-    def probability_left(
-        self, difference: np.ndarray, error: Values, magnitude: Values
-    ) -> np.ndarray:
-        """See :class:`NoiseModel`."""
+    def probability_left(self, difference: Values, error: Values, magnitude: Values) -> Any:
         return _with_lapse(_logistic(difference, PROBIT_SLOPE / np.maximum(error, 1e-12)))
 
 
 @dataclass(frozen=True)
 class MistakeNoise(_Serialisable):
-    """The right answer, flipped with a fixed probability.
-
-    :param rate: The probability, in [0, 0.5].
-    """
+    """The right answer, flipped with a fixed probability, in [0, 0.5]."""
 
     rate: float = 0.2
     kind = "mistake"
@@ -98,20 +84,15 @@ class MistakeNoise(_Serialisable):
         if not 0.0 <= self.rate <= 0.5:
             raise ValueError(f"`rate` must lie in [0, 0.5], but is {self.rate}")
 
-    def probability_left(
-        self, difference: np.ndarray, error: Values, magnitude: Values
-    ) -> np.ndarray:
-        """See :class:`NoiseModel`."""
+    def probability_left(self, difference: Values, error: Values, magnitude: Values) -> Any:
         right = ExactNoise().probability_left(difference, error, magnitude)
         return self.rate + (1.0 - 2.0 * self.rate) * right
 
 
 @dataclass(frozen=True)
 class BoltzmannNoise(_Serialisable):
-    """LEFT with probability 1 / (1 + exp(-beta (R_left - R_right))) (C.6 of Xu & Zhu 2025).
-
-    :param beta: Inverse temperature, one over the unit of returns; None is the paper's
-        ``1 / (|R_left| + |R_right|)``.
+    """LEFT with probability 1 / (1 + exp(-beta (R_left - R_right))) (C.6 of Xu & Zhu 2025); a beta
+    of None is the paper's ``1 / (|R_left| + |R_right|)``.
     """
 
     beta: float | None = None
@@ -121,10 +102,7 @@ class BoltzmannNoise(_Serialisable):
         if self.beta is not None and not (np.isfinite(self.beta) and self.beta > 0):
             raise ValueError(f"`beta` must be positive and finite, or None, but is {self.beta}")
 
-    def probability_left(
-        self, difference: np.ndarray, error: Values, magnitude: Values
-    ) -> np.ndarray:
-        """See :class:`NoiseModel`."""
+    def probability_left(self, difference: Values, error: Values, magnitude: Values) -> Any:
         beta = 1.0 / np.maximum(magnitude, 1e-12) if self.beta is None else self.beta
         shrink = np.sqrt(1.0 + np.pi / 8.0 * (beta * np.asarray(error)) ** 2)
         return _with_lapse(_logistic(difference, beta / shrink))
@@ -134,12 +112,8 @@ _KINDS: dict[str, type] = {cls.kind: cls for cls in (ExactNoise, MistakeNoise, B
 
 
 def noise_model_from_dict(data: dict[str, Any]) -> NoiseModel:
-    """Read what a noise model's ``to_dict`` wrote.
-
-    :raises ValueError: If its kind is unknown.
-    """
-    arguments = dict(data)
-    kind = arguments.pop("kind", None)
+    """Read what a noise model's ``to_dict`` wrote."""
+    arguments, kind = {k: v for k, v in data.items() if k != "kind"}, data.get("kind")
     if kind not in _KINDS:
         raise ValueError(f"unknown noise model {kind!r}; known are {sorted(_KINDS)}")
     return _KINDS[kind](**arguments)

@@ -31,6 +31,8 @@ class TaskOracle(ABC):
     """
 
     needs_frames = False
+    #: How this oracle errs, for the Bayesian rule.
+    noise_model: NoiseModel = ExactNoise()
 
     def __init__(
         self,
@@ -44,16 +46,10 @@ class TaskOracle(ABC):
         self.rng = np.random.default_rng(None if seed is None else [seed, ORACLE_STREAM])
 
     def __repr__(self) -> str:
-        own = {name: value for name, value in vars(self).items() if name not in ("env", "rng")}
-        task = own.pop("task")
-        own["task"] = "the environment's" if task is None else task.tolist()
-        shown = ", ".join(f"{name}={value}" for name, value in own.items())
-        return f"{type(self).__name__}({shown})"
-
-    @property
-    @abstractmethod
-    def noise_model(self) -> NoiseModel:
-        """How this oracle errs, for the Bayesian rule."""
+        hidden = ("env", "task", "rng", "noise_model")
+        own = "".join(f"{k}={value}, " for k, value in vars(self).items() if k not in hidden)
+        task = "the environment's" if self.task is None else self.task.tolist()
+        return f"{type(self).__name__}({own}task={task})"
 
     @abstractmethod
     def _compare(self, left: float, right: float) -> Preference:
@@ -67,19 +63,11 @@ class TaskOracle(ABC):
         return self
 
     def __call__(self, left: Trajectory, right: Trajectory) -> Preference:
-        """Compare two trajectories.
-
-        :raises ValueError: If a trajectory has no reward features.
-        :raises RuntimeError: If no environment was given.
-        """
+        """Compare two trajectories with reward features."""
         return self._compare(self.true_return(left), self.true_return(right))
 
     def true_return(self, trajectory: Trajectory) -> float:
-        """The undiscounted return of a trajectory under the task, from its reward features.
-
-        :raises ValueError: If it has no reward features, or its return is not finite.
-        :raises RuntimeError: If no environment was given.
-        """
+        """The undiscounted return of a trajectory under the task, from its reward features."""
         name = type(self).__name__
         if self.env is None:
             raise RuntimeError(f"{name} has no environment: pass `env` or call bind(env)")
@@ -99,11 +87,6 @@ class TaskOracle(ABC):
 class ReturnOracle(TaskOracle):
     """The larger true return wins; equal returns are EQUAL. See :class:`TaskOracle`."""
 
-    @property
-    def noise_model(self) -> NoiseModel:
-        """No error."""
-        return ExactNoise()
-
     def _compare(self, left: float, right: float) -> Preference:
         return _better(left, right)
 
@@ -111,12 +94,9 @@ class ReturnOracle(TaskOracle):
 class BoltzmannOracle(TaskOracle):
     """Left wins with probability 1 / (1 + exp(-beta (R_left - R_right))) (C.6 of Xu & Zhu 2025).
 
-    With the paper's beta the exponent's magnitude is at most 1, so an answer is right at most 73 %
-    of the time, and ten answers carry less than two bits.
-
-    :param beta: Inverse temperature; None is the paper's ``1 / (|R_left| + |R_right|)``.
-    :param seed: Seeds the answers; for the others see :class:`TaskOracle`.
-    :raises ValueError: If beta is not positive.
+    With the paper's beta (None), ``1 / (|R_left| + |R_right|)``, an answer is right at most 73 % of
+    the time, and ten answers carry less than two bits. For the other arguments see
+    :class:`TaskOracle`.
     """
 
     def __init__(
@@ -127,15 +107,10 @@ class BoltzmannOracle(TaskOracle):
         seed: int | None = None,
     ) -> None:
         super().__init__(env, task, seed)
-        self.noise = BoltzmannNoise(beta)
-
-    @property
-    def noise_model(self) -> NoiseModel:
-        """Boltzmann, with this beta."""
-        return self.noise
+        self.beta, self.noise_model = beta, BoltzmannNoise(beta)
 
     def _compare(self, left: float, right: float) -> Preference:
-        beta = self.noise.beta
+        beta = self.beta
         if beta is None:
             magnitude = abs(left) + abs(right)
             beta = 1.0 / magnitude if magnitude > 0 else 0.0
@@ -144,11 +119,8 @@ class BoltzmannOracle(TaskOracle):
 
 
 class MistakeOracle(TaskOracle):
-    """The right answer, flipped with a fixed probability. Equal returns stay EQUAL.
-
-    :param rate: The probability, in [0, 1]; 1 always lies. The noise model knows rates up to 0.5.
-    :param seed: Seeds the mistakes; for the others see :class:`TaskOracle`.
-    :raises ValueError: If the rate is out of its range.
+    """The right answer, flipped with a probability in [0, 1], of which the noise model knows those
+    up to 0.5. Equal returns stay EQUAL. For the other arguments see :class:`TaskOracle`.
     """
 
     def __init__(
@@ -161,12 +133,7 @@ class MistakeOracle(TaskOracle):
         if not 0.0 <= rate <= 1.0:
             raise ValueError(f"`rate` must lie in [0, 1], but is {rate}")
         super().__init__(env, task, seed)
-        self.rate = rate
-
-    @property
-    def noise_model(self) -> NoiseModel:
-        """Mistakes at this rate."""
-        return MistakeNoise(min(self.rate, 0.5))
+        self.rate, self.noise_model = rate, MistakeNoise(min(rate, 0.5))
 
     def _compare(self, left: float, right: float) -> Preference:
         if self.rng.random() < self.rate:
@@ -177,10 +144,7 @@ class MistakeOracle(TaskOracle):
 def step_rewards(
     env: gym.Env | VecEnv, task: np.ndarray | None, trajectory: Trajectory
 ) -> np.ndarray:
-    """The true rewards (T,) of a trajectory; for the arguments see :class:`TaskOracle`.
-
-    :raises ValueError: If it has no reward features, or the environment is no task family.
-    """
+    """The true rewards (T,) of a trajectory; for the arguments see :class:`TaskOracle`."""
     if trajectory.reward_features is None:
         gave = 'its environment gave no info["reward_features"]'
         raise ValueError(f"the trajectory has no reward features: {gave}")

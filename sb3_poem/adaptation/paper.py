@@ -7,19 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from sb3_poem.adaptation import queries
 from sb3_poem.adaptation.meta_model import HasSimilarity, MetaModel
 from sb3_poem.adaptation.preference import SIGNS, Preference, preference_log_likelihood
 from sb3_poem.adaptation.priors import SOURCES, make_prior
-from sb3_poem.adaptation.queries import (
-    QUERY_RULES,
-    check_epsilon,
-    information_gains,
-    pair_at,
-    pair_differences,
-    random_pair,
-    tolerance,
-    worst_case_pair,
-)
 from sb3_poem.adaptation.rule import (
     Answer,
     Inference,
@@ -50,7 +41,6 @@ class Paper(Rule):
     :param candidates: Where they come from: "prior" (the paper's N(0, I)) or "aggregate" (the
         training tasks' posteriors).
     :param query_rule: "worst-case" (the paper's), "information-gain" or "random".
-    :raises ValueError: If an option is out of its range.
     """
 
     n_candidates: int = 100
@@ -62,9 +52,9 @@ class Paper(Rule):
 
     def __post_init__(self) -> None:
         check_whole("n_candidates", self.n_candidates, 2)  # a question compares two
-        check_epsilon(self.epsilon)
+        queries.check_epsilon(self.epsilon)
         check_choice("candidates", self.candidates, SOURCES)
-        check_choice("query_rule", self.query_rule, QUERY_RULES)
+        check_choice("query_rule", self.query_rule, queries.QUERY_RULES)
 
     def check(self, model: MetaModel, setting: Setting) -> None:
         """See :class:`Rule`: Algorithm 2 needs S."""
@@ -74,7 +64,6 @@ class Paper(Rule):
             raise ValueError(f"rule=Paper() needs a model with a similarity S; {name} has none")
 
     def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> PaperInference:
-        """See :class:`Rule`."""
         return PaperInference(self, model, rng)
 
 
@@ -96,17 +85,16 @@ class PaperInference(Inference):
             self.candidates = self._draw_candidates()
             self.fresh = np.array([True])
         if self.rule.query_rule == "random":
-            first, second = random_pair(len(self.candidates), self.rng)
+            first, second = queries.random_pair(len(self.candidates), self.rng)
         else:
             similarities = self.model.similarities(self.candidates, self.candidates)
             if self.rule.query_rule == "worst-case":
-                first, second = worst_case_pair(similarities, self.rule.epsilon)
+                first, second = queries.worst_case_pair(similarities, self.rule.epsilon)
             else:
                 first, second = self._most_informative(similarities)
         return self.candidates[first].copy(), self.candidates[second].copy()
 
     def tell(self, preference: Preference, left: Shown, right: Shown) -> None:
-        """See :class:`Inference`."""
         self.answers.append(Answer(preference, left, right))
         self.fresh = np.array([False])
 
@@ -128,10 +116,10 @@ class PaperInference(Inference):
         return self._satisfied(self._differences(latents))
 
     def _most_informative(self, similarities: np.ndarray) -> tuple[int, int]:
-        probabilities = np.exp(log_sigmoid(pair_differences(similarities)))  # eq. 7
+        probabilities = np.exp(log_sigmoid(queries.pair_differences(similarities)))  # eq. 7
         n = len(self.candidates)
-        gains = information_gains(probabilities, np.full(n, 1.0 / n))
-        return pair_at(int(np.argmax(gains)), n)
+        gains = queries.information_gains(probabilities, np.full(n, 1.0 / n))
+        return queries.pair_at(int(np.argmax(gains)), n)
 
     def _differences(self, latents: np.ndarray) -> np.ndarray:
         """(m, k) S(z, z_left) - S(z, z_right) of every answered question."""
@@ -140,7 +128,7 @@ class PaperInference(Inference):
         return similarities[:, 0::2] - similarities[:, 1::2]
 
     def _satisfied(self, differences: np.ndarray) -> np.ndarray:
-        slack = tolerance(self.rule.epsilon)
+        slack = queries.tolerance(self.rule.epsilon)
         signs = np.array([SIGNS[answer.preference] for answer in self.answers])
         return np.count_nonzero(differences * signs >= -slack, axis=1)
 

@@ -54,13 +54,12 @@ def kernel_neighbours(
 ) -> np.ndarray:
     """A neighbour of each particle (n, d), without a look at the likelihood.
 
-    The kernel shrinks towards the mean as much as it spreads, so that the particles' mean and
-    covariance stay (Liu & West 2001). Where the prior has holes (between the modes of a mixture,
-    off the surface on which its latents lie) there should be no particles however the likelihood
-    looks: then a step is taken with the ratio of the prior's densities.
+    The kernel shrinks towards the mean (d,) as much as it spreads by the covariance's lower
+    triangular factor (d, d), so that both stay (Liu & West 2001). Where the prior has holes
+    (between the modes of a mixture, off the surface on which its latents lie) there should be no
+    particles however the likelihood looks: then a step is taken with the ratio of the prior's
+    densities.
 
-    :param mean: (d,) of all particles.
-    :param factor: (d, d) lower triangular factor of their covariance.
     :param width: Of the kernel, as a share of the particles' spread, in (0, 1).
     :param log_prior: Maps (m, d) to (m,), up to a constant; None where the prior has no holes.
     """
@@ -83,7 +82,8 @@ def elliptical_slice_moves(
     tries: int,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One elliptical slice move (Murray, Adams & MacKay 2010) of every particle, all together.
+    """One elliptical slice move (Murray, Adams & MacKay 2010) of every particle (n, d), all
+    together; returns them, and their log-likelihoods (n,).
 
     The ellipse belongs to a reference Gaussian that is fitted to the posterior, and the ratio of
     prior times likelihood to it is the slice's function (Nishihara, Murray & Adams 2014): so any
@@ -92,14 +92,10 @@ def elliptical_slice_moves(
     is, which leaves the posterior invariant too: the path to any point within the tries is as
     probable as its reverse.
 
-    :param particles: (n, d).
-    :param log_likelihoods: (n,) at them.
-    :param log_likelihood: Maps (m, d) to (m,).
-    :param log_prior: Maps (m, d) to (m,), up to a constant.
+    :param log_likelihoods: (n,) at the particles.
     :param mean: (d,) of the reference.
     :param factor: (d, d) lower triangular factor of its covariance.
     :param tries: Bound on the evaluations per particle.
-    :return: Moved particles (n, d), and their log-likelihoods (n,).
     """
     n, dim = particles.shape
     inverse = np.linalg.inv(factor)

@@ -26,11 +26,9 @@ class AdaptedPolicy:
     """A model with its latent fixed. It follows SB3's ``predict`` protocol, so ``evaluate_policy``
     and every other program of SB3's that only predicts takes it for a model.
 
-    :param latent: (latent_dim,).
     :param n_answers: How many answers led to it.
     :param env: The vector environment to whose task (its first copy's) it was adapted; None for a
         policy from a file. It does not know the task itself.
-    :raises ValueError: If the latent has another shape, or is not finite.
     """
 
     def __init__(
@@ -60,12 +58,8 @@ class AdaptedPolicy:
         episode_start: np.ndarray | None = None,
         deterministic: bool = True,
     ) -> tuple[np.ndarray, Any]:
-        """SB3's ``predict``: actions (act_dim,) or (n, act_dim), and the latents as SB3's state.
-
-        :param observation: (obs_dim,) or (n, obs_dim).
-        :param state: Ignored: the latent is fixed. It is there for SB3's callers.
-        :param episode_start: Ignored: nothing is remembered within an episode.
-        :param deterministic: Whether to take the mode.
+        """SB3's ``predict`` of (obs_dim,) or (n, obs_dim): actions, and the latents as SB3's state.
+        What is given as state is ignored, for the latent is fixed, and ``episode_start`` too.
         """
         observation = np.asarray(observation)
         single = observation.ndim == len(self.observation_space.shape)
@@ -74,9 +68,8 @@ class AdaptedPolicy:
         return actions, latents
 
     def to_bytes(self) -> bytes:
-        """The policy as one safetensors file, which :meth:`from_bytes` reads: the model, its
-        configuration in the header, the latent and the number of answers. Nothing in it can run
-        code.
+        """The policy as one safetensors file: the model, its configuration in the header, the
+        latent and the number of answers. Nothing in it can run code.
         """
         import torch as th
         from safetensors.torch import save
@@ -89,18 +82,13 @@ class AdaptedPolicy:
         return save({**named, LATENT: th.as_tensor(self.latent)}, facts)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write :meth:`to_bytes` to a file, whose name should end in ``.safetensors``.
-
-        :raises OSError: If it cannot be written.
-        """
+        """Write :meth:`to_bytes` to a file, whose name should end in ``.safetensors``."""
         write_atomically(Path(path), self.to_bytes())
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], device: str = "auto") -> AdaptedPolicy:
-        """Read what :meth:`save` wrote, or what the page for answering gives for download.
-
-        :raises FileNotFoundError: If there is no such file.
-        :raises ValueError: If it is truncated, or of another program.
+        """Read what :meth:`save` wrote, or what the page for answering gives for download; see
+        :meth:`from_bytes`.
         """
         return cls.from_bytes(Path(path).read_bytes(), device, os.fspath(path))
 
@@ -108,10 +96,8 @@ class AdaptedPolicy:
     def from_bytes(
         cls, content: bytes, device: str = "auto", source: str = "the content"
     ) -> AdaptedPolicy:
-        """Read what :meth:`to_bytes` gave.
-
-        :param source: Where it comes from, for the message.
-        :raises ValueError: If it is truncated, or of another program.
+        """Read what :meth:`to_bytes` gave; a ``ValueError``, which names ``source``, if it is
+        truncated or of another program.
         """
         import torch as th
         from safetensors import SafetensorError

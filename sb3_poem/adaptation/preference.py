@@ -31,11 +31,8 @@ class Query:
     right: Trajectory
 
     def to_video(self, path: str | Path, fps: float = 20.0) -> Path:
-        """Write both side by side, as MP4 or GIF by the suffix of the file, whose path is returned;
-        missing folders are made.
-
-        :param fps: Frames per second.
-        :raises ValueError: If they have no frames, or the suffix is another.
+        """Write both side by side, as MP4 or GIF by the file's suffix, and return its path; missing
+        folders are made. A ``ValueError`` if they have no frames, or the suffix is another.
         """
         from sb3_poem.common.video import side_by_side, write_video
 
@@ -50,13 +47,9 @@ class Query:
 
 
 def as_preference(answer: Any) -> Preference:
-    """Read an answer: a :class:`Preference`, or one of the words "left", "right" and "equal".
-
-    Numbers and booleans are refused, because their meaning is a convention that differs between
-    programs, and a preference read the wrong way round is worse than none.
-
-    :raises ValueError: If it is another word.
-    :raises TypeError: If it is anything else.
+    """Read an answer: a :class:`Preference`, or one of the words "left", "right" and "equal"; else
+    a ``ValueError`` or ``TypeError``. Numbers and booleans are refused: their meaning differs
+    between programs, and a preference read the wrong way round is worse than none.
     """
     if isinstance(answer, Preference):
         return answer
@@ -75,13 +68,10 @@ def as_preference(answer: Any) -> Preference:
 def preference_log_likelihood(
     log_left: np.ndarray, log_right: np.ndarray, answers: list[Preference]
 ) -> np.ndarray:
-    """(m,) log-likelihood of k answers from the log-probabilities of LEFT and RIGHT.
+    """(m,) log-likelihood of k answers from the log-probabilities (m, k) of LEFT and RIGHT.
 
     EQUAL has the geometric mean of both: it is largest where neither is more probable and, other
     than half of each, it tells a latent that calls the two alike from one that is sure of either.
-
-    :param log_left: (m, k) log P(LEFT) of k questions under m latents.
-    :param log_right: (m, k) log P(RIGHT).
     """
     left_share = 0.5 + 0.5 * np.array([SIGNS[answer] for answer in answers])
     return log_left @ left_share + log_right @ (1.0 - left_share)

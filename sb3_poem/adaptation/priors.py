@@ -29,7 +29,7 @@ class Prior(Protocol):
         """(m,) log density at (m, d), up to a constant."""
 
 
-class GaussianPrior:
+class GaussianPrior(Prior):
     """N(0, I) of d dimensions, Algorithm 2's own prior."""
 
     has_holes = False
@@ -38,28 +38,23 @@ class GaussianPrior:
         self.dim = dim
 
     def sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """(n, d) draws."""
         return rng.standard_normal((n, self.dim))
 
     def balanced_sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """(n, d) draws in pairs of z and -z, so that their mean is the prior's own (an odd one is
-        left over).
+        """Draws in pairs of z and -z, so that their mean is the prior's own (an odd one is left
+        over).
         """
         half = rng.standard_normal(((n + 1) // 2, self.dim))
         return np.concatenate([half, -half])[:n]
 
     def log_density(self, latents: np.ndarray) -> np.ndarray:
-        """(m,) log density at (m, d), up to a constant."""
         return -0.5 * np.square(latents).sum(axis=1)
 
 
-class AggregatePrior:
+class AggregatePrior(Prior):
     """The mixture of the training tasks' posteriors. A model can draw from it but does not give its
-    density, which moving particles needs; so this *is* a mixture of Gaussians around draws of the
-    model, with a small common width.
-
-    :param centres: (M, d) draws of the model's aggregate posterior.
-    :param bandwidth: Width of each Gaussian as a share of the draws' distance to their neighbours.
+    density, which moving particles needs; so this *is* a mixture of Gaussians around draws (M, d)
+    of the model, whose common width is a share of the draws' distance to their neighbours.
     """
 
     has_holes = True
@@ -74,18 +69,16 @@ class AggregatePrior:
         self.width = max(bandwidth * nearest, 1e-6)
 
     def sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """(n, d) draws."""
         chosen = self.centres[rng.integers(len(self.centres), size=n)]
         return chosen + self.width * rng.standard_normal(chosen.shape)
 
     def balanced_sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """(n, d) draws, no centre taken once more than another."""
+        """Draws of which no centre is taken once more than another."""
         rounds = [rng.permutation(len(self.centres)) for _ in range(-(-n // len(self.centres)))]
         chosen = self.centres[np.concatenate(rounds)[:n]]
         return chosen + self.width * rng.standard_normal(chosen.shape)
 
     def log_density(self, latents: np.ndarray) -> np.ndarray:
-        """(m,) log density at (m, d), up to a constant."""
         squared = (
             np.square(latents).sum(axis=1)[:, None]
             - 2.0 * latents @ self.centres.T

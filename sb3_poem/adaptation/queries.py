@@ -18,10 +18,7 @@ BLOCK_ENTRIES = 2**17
 
 
 def check_epsilon(epsilon: float) -> None:
-    """Refuse a tolerated error outside [0, 0.5).
-
-    :raises ValueError: Names the value.
-    """
+    """Refuse a tolerated error outside [0, 0.5)."""
     if not 0.0 <= epsilon < 0.5:
         raise ValueError(f"`epsilon` must lie in [0, 0.5), but is {epsilon}")
 
@@ -41,7 +38,6 @@ def worst_case_sizes(
     (eq. 10's objective), (n (n - 1) / 2,) in the order of ``numpy.triu_indices(n, 1)``.
 
     :param similarities: (m, n) S(z_i, z_j) of m latents and n policies.
-    :param epsilon: The tolerated error of eq. 9.
     :param weights: (m,) a latent's weight; None counts each as one.
     """
     first, second = _pairs(similarities.shape[1])
@@ -70,13 +66,11 @@ def worst_case_pair(
 
 def information_gains(probabilities: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Expected information gain of questions, (pairs,) in nats: the entropy of the answer minus its
-    mean entropy under each latent.
+    mean entropy under each of m latents, whose ``weights`` (m,) sum to one and who say LEFT with
+    these probabilities (pairs, m).
 
     Of two policies that do the same, every latent says 1/2, so the gain is 0: a resolution limit
     within the probabilities is what keeps questions apart that nobody could answer.
-
-    :param probabilities: (pairs, m) P(LEFT) under each latent.
-    :param weights: (m,) summing to one.
     """
     weights = weights.astype(probabilities.dtype, copy=False)
     return _entropy(probabilities @ weights) - _entropy(probabilities) @ weights
@@ -85,13 +79,12 @@ def information_gains(probabilities: np.ndarray, weights: np.ndarray) -> np.ndar
 def most_informative_pair(
     values: np.ndarray, weights: np.ndarray, noise: NoiseModel, error: float, magnitude: float
 ) -> tuple[int, int]:
-    """The pair of policies whose comparison is expected to tell most.
+    """The pair of n policies whose comparison is expected to tell most.
 
-    :param values: (m, n) predicted fitness of n policies under m latents, in the unit of ``error``.
+    :param values: (m, n) predicted fitness under m latents, in the unit of ``error``, a predicted
+        difference's standard deviation, and of ``magnitude``, the typical sum of both returns'
+        absolute values.
     :param weights: (m,) summing to one.
-    :param noise: The oracle's noise model.
-    :param error: Standard deviation of a predicted difference.
-    :param magnitude: Typical sum of both returns' absolute values, same unit.
     """
     probabilities = noise.probability_left(pair_differences(values), error, magnitude)
     return pair_at(int(np.argmax(information_gains(probabilities, weights))), values.shape[1])

@@ -25,7 +25,6 @@ def answer_capacity(noise: NoiseModel | None, returns: np.ndarray) -> float:
     :param returns: (n_tasks, n_policies). With a fixed ``beta`` an answer is the surer the larger
         the difference of returns, and no question is supposed to show a larger one than there is
         between two policies here.
-    :raises ValueError: If the noise model is of a kind whose capacity is not known.
     """
     if noise is None or isinstance(noise, ExactNoise):
         return 1.0
@@ -51,7 +50,6 @@ def rate_distortion_limit(returns: np.ndarray, bits: float) -> float:
     (Csiszar 1974): where iterations are stopped early it is too high, never too low.
 
     :param returns: (n_tasks, n_policies), finite.
-    :raises ValueError: If ``bits`` is negative.
     """
     if not bits >= 0:
         raise ValueError(f"`bits` must not be negative, but is {bits}")

@@ -46,10 +46,7 @@ class Snapshot:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Snapshot:
-        """Read what :meth:`to_dict` wrote.
-
-        :raises ValueError: If it is incomplete or broken.
-        """
+        """Read what :meth:`to_dict` wrote; a ``ValueError`` if it is incomplete or broken."""
         try:
             arrays = {str(name): decode_array(array) for name, array in data["arrays"].items()}
             return cls(dict(data["random_state"]), arrays)
@@ -59,9 +56,7 @@ class Snapshot:
 
 class Inference(ABC):
     """One task's inference under a rule: ``ask`` says what to compare, ``tell`` takes the answer,
-    ``estimate`` gives the latent to act on.
-
-    :param rng: The only source of randomness.
+    ``estimate`` gives the latent to act on. ``rng`` is the only source of randomness.
     """
 
     #: Names of the attributes, arrays, that change while answers come in, beside the answers and
@@ -98,10 +93,7 @@ class Inference(ABC):
         return Snapshot(dict(self.rng.bit_generator.state), arrays)
 
     def restore(self, snapshot: Snapshot, answers: list[Answer]) -> None:
-        """Go back, or on, to a snapshot and the answers up to then.
-
-        :raises ValueError: If the snapshot belongs to another kind of inference.
-        """
+        """Go back, or on, to a snapshot of such an inference and the answers up to then."""
         missing = [name for name in self.state if name not in snapshot.arrays]
         if missing:
             raise ValueError(f"not a snapshot of {type(self).__name__}: {missing[0]} is missing")
@@ -115,11 +107,10 @@ class Inference(ABC):
 class Setting:
     """What an adaptation is given beside model and rule.
 
-    :param n_queries: How many answers there will be.
     :param library: Trajectories to ask about instead of new rollouts.
     :param env: Where rollouts are made; None where none are.
-    :param task: (task_dim,) for a rule that may read rewards: by which; None takes the one in
-        effect in ``env``. A rule that infers from answers does not look at it.
+    :param task: (task_dim,) by which a rule that may read rewards reads them; None takes the one in
+        effect in ``env``.
     """
 
     n_queries: int = 10
@@ -153,10 +144,7 @@ class Rule(ABC):
         return f"{type(self).__name__}({options})"
 
     def check(self, model: MetaModel, setting: Setting) -> None:
-        """Refuse what the rule cannot run with, before anything starts.
-
-        :raises ValueError: If something does not fit.
-        """
+        """Refuse, by a ``ValueError``, what the rule cannot run with, before anything starts."""
         if setting.env is not None:
             check_model_fits(model, setting.env)
         if setting.library is not None and self.refuses_library:
@@ -182,10 +170,7 @@ class Rule(ABC):
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Rule:
-        """Read what :meth:`to_dict` of any rule wrote.
-
-        :raises ValueError: If there is no rule of this name, or an option is out of its range.
-        """
+        """Read what :meth:`to_dict` of any imported rule wrote."""
         name, module = data["name"], data["module"]
         if name not in cls._known:
             raise ValueError(
@@ -200,10 +185,7 @@ class Rule(ABC):
 
 
 def as_rule(rule: Any) -> Rule:
-    """A rule as it is.
-
-    :raises TypeError: If it is none; the message says what to write.
-    """
+    """A rule as it is; a ``TypeError`` that says what to write if it is none."""
     if isinstance(rule, Rule):
         return rule
     if isinstance(rule, type):
@@ -216,10 +198,7 @@ def as_rule(rule: Any) -> Rule:
 
 
 def check_choice(name: str, value: Any, allowed: Sequence[str | None]) -> None:
-    """Refuse an option's value that is none of those allowed.
-
-    :raises ValueError: Names the option, the value and what it may be.
-    """
+    """Refuse an option's value that is none of those allowed."""
     if value not in allowed:
         raise ValueError(f"`{name}` must be one of {tuple(allowed)}, but is {value!r}")
 
@@ -230,10 +209,7 @@ def latent_of(shown: Shown) -> np.ndarray:
 
 
 def trajectories_of(name: str, left: Shown, right: Shown) -> list[Trajectory]:
-    """Both, as trajectories, which a rule of that name needs.
-
-    :raises ValueError: If one is a latent alone.
-    """
+    """Both, as trajectories, which a rule of that name needs."""
     if not (isinstance(left, Trajectory) and isinstance(right, Trajectory)):
         shown = "the two trajectories that were shown, not their latents alone"
         raise ValueError(f"{name} needs {shown}")

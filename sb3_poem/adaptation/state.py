@@ -13,10 +13,7 @@ from sb3_poem.common.files import write_atomically
 
 
 def generator_from_state(state: dict[str, Any]) -> np.random.Generator:
-    """A generator that continues where the one with this ``bit_generator.state`` stood.
-
-    :raises ValueError: If it is no state of a PCG64 generator.
-    """
+    """A generator that continues where the one with this ``bit_generator.state`` stood."""
     rng = np.random.default_rng(0)
     try:
         rng.bit_generator.state = state
@@ -26,28 +23,17 @@ def generator_from_state(state: dict[str, Any]) -> np.random.Generator:
 
 
 def write_json_atomically(path: str | os.PathLike[str], data: dict[str, Any]) -> None:
-    """Write JSON so that the file is either the old one or the whole new one, whatever happens in
-    between; missing folders are made.
-
-    :raises OSError: If it cannot be written.
-    """
+    """Write JSON, so that the file is always the old one or the whole new one; makes folders."""
     write_atomically(Path(path), json.dumps(data, indent=1, allow_nan=False).encode())
 
 
 def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read a JSON object.
-
-    :raises ValueError: If the file is truncated, or is no JSON object.
-    """
+    """Read a JSON object; a ``ValueError`` if the file is truncated, or holds none."""
     return parse_json(Path(path).read_text(encoding="utf-8"), f"{os.fspath(path)} is")
 
 
 def parse_json(text: str, this_is: str) -> dict[str, Any]:
-    """A saved adaptation as data.
-
-    :param this_is: How the message of an error begins.
-    :raises ValueError: If the text is no JSON object.
-    """
+    """A saved adaptation as data; ``this_is`` begins the message of a ``ValueError``."""
     try:
         data = json.loads(text)
     except (ValueError, RecursionError) as error:

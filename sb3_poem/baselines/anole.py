@@ -57,7 +57,6 @@ class ANOLE(Rule):
     :param fragment_length: Steps of a fragment from the replay buffer; None takes 50, or an episode
         that is shorter (the paper gives none).
     :param candidates: Where candidates come from: "prior" or "aggregate".
-    :raises ValueError: If an option is out of its range.
     """
 
     strategy: str = "berlekamp"
@@ -119,7 +118,6 @@ class ANOLE(Rule):
             )
 
     def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> ANOLEInference:
-        """See :class:`Rule`."""
         library = setting.library
         if library is None:
             length = self.fragment_length or default_fragment_length(model.horizon)
@@ -182,7 +180,6 @@ class ANOLEInference(Inference):
         return worst_case_volumes(differences, self.contradictions, left, self.budget)
 
     def tell(self, preference: Preference, left: Shown, right: Shown) -> None:
-        """See :class:`Inference`."""
         shown = trajectories_of("ANOLE", left, right)
         returns = self.model.predicted_returns(self.candidates, shown)
         contradicted = SIGNS[preference] * (returns[:, 0] - returns[:, 1]) < 0
@@ -197,7 +194,6 @@ class ANOLEInference(Inference):
         return self.candidates[np.lexsort((self.priority, worse))[0]].copy()
 
     def restore(self, snapshot: Snapshot, answers: list[Answer]) -> None:
-        """See :class:`Inference`."""
         super().restore(snapshot, answers)
         self._library_returns = None
 

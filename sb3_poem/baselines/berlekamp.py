@@ -10,13 +10,9 @@ import numpy as np
 
 
 def berlekamp_volumes(contradictions: np.ndarray, n_left: int, budget: int) -> np.ndarray:
-    """A candidate's volume: in how many ways the remaining answers may lie without exceeding the
-    budget, if it is the truth.
-
-    :param contradictions: (...) how many of the answers so far a candidate contradicts (m).
-    :param n_left: Questions to come (K - k).
-    :param budget: Lies that all answers together may hold (E).
-    :return: (...) sum over e = 0, ..., budget - m of C(n_left, e); 0 where m exceeds the budget.
+    """In how many ways the ``n_left`` answers to come (K - k) may lie without exceeding the budget
+    (E), if a candidate is the truth that contradicts so many answers (m): sum over e = 0, ..., E -
+    m of C(n_left, e); 0 where m exceeds E.
     """
     by_lies_left = np.cumsum([float(comb(n_left, lies)) for lies in range(budget + 1)])
     lies_left = budget - np.asarray(contradictions)
@@ -26,12 +22,11 @@ def berlekamp_volumes(contradictions: np.ndarray, n_left: int, budget: int) -> n
 def worst_case_volumes(
     differences: np.ndarray, contradictions: np.ndarray, n_left: int, budget: int
 ) -> np.ndarray:
-    """(n_pairs,) the volume that the worse of two answers leaves, over all candidates.
+    """(n_pairs,) the volume that the worse of two answers leaves, over all candidates, with
+    ``n_left`` questions to come after it.
 
     :param differences: (n_candidates, n_pairs) predicted return of the left fragment minus that of
         the right one.
-    :param contradictions: (n_candidates,) of the answers so far.
-    :param n_left: Questions to come after this one.
     """
     kept = berlekamp_volumes(contradictions, n_left, budget)
     lost = kept - berlekamp_volumes(contradictions + 1, n_left, budget)

@@ -31,8 +31,6 @@ def replay_fragments(
 
     A fragment lies within one episode. Which latent acted is not kept in the buffers; a fragment
     carries the latest latent of the training task that it comes from.
-
-    :raises ValueError: If no episode in the buffers is as long.
     """
     buffer, policy = model.replay_buffer, model.policy
     with_room = np.flatnonzero(buffer.counts >= length)
@@ -60,13 +58,9 @@ def replay_fragments(
 def training_rollouts(
     model: PEARLSAC | str | Path, env: Env, n: int, seed: int = 0, deterministic: bool = False
 ) -> list[Trajectory]:
-    """n episodes of training tasks under their own policies: a ``library`` for a model that was
-    loaded without its replay buffer.
-
-    :param model: A trained :class:`PEARLSAC`, or its name, see :class:`PreferenceAdapter`.
-    :param env: An environment of its family, or its id. Tasks are set in it.
-    :param seed: Draws the training tasks and seeds the episodes.
-    :param deterministic: Whether policies act by their mode.
+    """n episodes of training tasks, drawn by ``seed``, under their own policies: a ``library`` for
+    a model that was loaded without its replay buffer. For ``model`` and ``env``, in which tasks are
+    set, see :class:`PreferenceAdapter`.
     """
     trained, vec_env = model_and_env(model, env)
     if not isinstance(trained, PEARLSAC):
@@ -79,13 +73,8 @@ def training_rollouts(
 def rollout_fragments(
     model: PEARLSAC | str | Path, env: Env, n: int, length: int, seed: int = 0
 ) -> list[Trajectory]:
-    """Fragments of :func:`training_rollouts`, one from a random place of each: what a replay buffer
-    would hold of the present policies, for a model that was loaded without one.
-
-    :param model: See :func:`training_rollouts`.
-    :param env: See :func:`training_rollouts`.
-    :param length: Steps of a fragment; an episode that ended earlier is taken whole.
-    :param seed: Of the training tasks, the episodes and the places.
+    """Fragments of so many steps of :func:`training_rollouts`, one from a random place of each (of
+    an earlier end all of it): what a replay buffer would hold of the present policies.
     """
     rng = np.random.default_rng([seed, 6])
     fragments = []

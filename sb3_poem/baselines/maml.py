@@ -16,12 +16,9 @@ Parameters = dict[str, th.Tensor]
 
 
 class PreferencePairs(NamedTuple):
-    """Pairs of fragments and which is better.
-
-    :param left: (..., pairs, steps, in_dim + 1) transitions as :class:`RewardNetwork` takes them.
-    :param right: (..., pairs, steps, in_dim + 1).
-    :param label: (..., pairs) 1 where the left one is better, 0 where the right one is, 0.5 where
-        neither is.
+    """Pairs of fragments, (..., pairs, steps, in_dim + 1) transitions as :class:`RewardNetwork`
+    takes them, and ``label`` (..., pairs): 1 where the left one is better, 0 where the right one
+    is, 0.5 where neither is.
     """
 
     left: th.Tensor
@@ -30,11 +27,7 @@ class PreferencePairs(NamedTuple):
 
 
 class RewardNetwork(nn.Module):
-    """Reward of a transition, unknown up to scale.
-
-    :param in_dim: Width of (s, a, s').
-    :param net_arch: Widths of the hidden layers.
-    """
+    """Reward of a transition (s, a, s') of width ``in_dim``, unknown up to scale."""
 
     def __init__(self, in_dim: int, net_arch: Sequence[int] = (64, 64)) -> None:
         super().__init__()

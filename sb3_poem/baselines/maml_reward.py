@@ -103,21 +103,14 @@ class MAMLRewardModel(MetaModel):
 @dataclass(frozen=True, repr=False)
 class MAMLReward(Rule):
     """MAML-reward (Hejna & Sadigh 2023): a meta-trained reward is adapted to the answers, and SB3's
-    SAC learns the policy on it from the trajectories that were shown, at most 2 K.
+    SAC learns the policy on it from the trajectories that were shown, at most 2 K. The model is a
+    :class:`MAMLRewardModel`.
 
     After each answer the reward is adapted anew from the meta-trained start to all answers,
-    everything that was shown is relabelled with it, and SAC goes on learning from that. What is
-    learnt follows from the seed and the answers alone, so a saved adaptation keeps no networks:
-    they are learnt again. Questions show exploring policies: nothing else brings SAC its
-    experience.
-
-    The model is a :class:`MAMLRewardModel`.
-
-    :param gradient_steps: SAC's gradient steps after each answer.
-    :param batch_size: SAC's.
-    :param learning_rate: SAC's.
-    :param gamma: SAC's.
-    :raises ValueError: If an option is out of its range.
+    everything that was shown is relabelled with it, and SAC goes on learning from that
+    (``gradient_steps``; the other options are SAC's too). What is learnt follows from the seed and
+    the answers alone, so a saved adaptation keeps no networks: they are learnt again. Questions
+    show exploring policies: nothing else brings SAC its experience.
     """
 
     gradient_steps: int = 200
@@ -152,7 +145,6 @@ class MAMLReward(Rule):
             )
 
     def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> MAMLRewardInference:
-        """See :class:`Rule`."""
         return MAMLRewardInference(self, model, rng, setting.n_queries)
 
 
@@ -187,7 +179,6 @@ class MAMLRewardInference(Inference):
         return self.latent.copy(), self.latent * np.array([1.0, -1.0])
 
     def tell(self, preference: Preference, left: Shown, right: Shown) -> None:
-        """See :class:`Inference`."""
         trajectories_of("MAML-reward", left, right)
         self.answers.append(Answer(preference, left, right))
         parameters = self.model.reward.adapted(self.answers)

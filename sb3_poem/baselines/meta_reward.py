@@ -40,9 +40,7 @@ class MetaReward:
     """A reward network from which a few preferences lead to a task's reward.
 
     :param policy: Whose standardisation of observations is used.
-    :param net_arch: Hidden layers of the network.
-    :param inner_learning_rate: Step size of MAML's inner loop.
-    :param inner_steps: Gradient steps of the inner loop.
+    :param inner_learning_rate: Step size of MAML's inner loop, which has ``inner_steps``.
     :param seed: Of the initial parameters.
     """
 
@@ -75,10 +73,8 @@ class MetaReward:
         return digest_of({**self.parameters, **_standardisation(self.policy)})
 
     def save(self, folder: str | Path) -> None:
-        """Write the parameters as safetensors and the settings as JSON, into a folder that is made
-        if missing.
-
-        :raises OSError: If it cannot be written.
+        """Write the parameters as safetensors and the settings as JSON; the folder is made if
+        missing.
         """
         own = {f"network.{name}": value.detach() for name, value in self.parameters.items()}
         tensors = {**own, **_standardisation(self.policy)}
@@ -94,12 +90,7 @@ class MetaReward:
 
     @classmethod
     def load(cls, folder: str | Path, policy: LatentPolicy) -> MetaReward:
-        """Read what :meth:`save` wrote.
-
-        :param policy: The one with which it was meta-trained.
-        :raises FileNotFoundError: If the folder does not hold one.
-        :raises ValueError: If a file is broken or of another version, or the policy is another one.
-        """
+        """Read what :meth:`save` wrote; the policy must be that of the meta-training."""
         weights, settings = Path(folder) / WEIGHTS, Path(folder) / CONFIG
         if not settings.is_file():
             raise FileNotFoundError(f"{folder} holds no meta-trained reward: it has no {CONFIG}")
@@ -168,11 +159,9 @@ def meta_train_reward(
     **arguments: Any,
 ) -> MetaReward:
     """Meta-train a reward on the preferences of a model's training tasks about fragments from its
-    replay buffer.
+    replay buffer. Every training task judges fragments of all of them, so the family must share
+    dynamics.
 
-    Every training task judges fragments of all of them, so the family must share dynamics.
-
-    :param model: A trained model with its environment and its replay buffer.
     :param n_iterations: Steps of the outer loop.
     :param n_fragments: Fragments that pairs are drawn from.
     :param fragment_length: Steps of a fragment; None takes 50, or an episode that is shorter.
@@ -180,9 +169,7 @@ def meta_train_reward(
     :param n_support: Pairs that a task adapts to.
     :param n_query: Pairs that it is judged by.
     :param learning_rate: Of Adam in the outer loop.
-    :param seed: Of everything.
     :param arguments: Of :class:`MetaReward`.
-    :raises ValueError: If the family does not share dynamics, or the replay buffer is empty.
     """
     if not model.family.shared_dynamics:
         raise ValueError(

@@ -59,15 +59,12 @@ class RewardOracle(Rule):
         FamilyView(_env_of(setting))  # which refuses what is no family
 
     def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> RewardInference:
-        """See :class:`Rule`."""
         return RewardInference(model, rng, _env_of(setting), setting.task)
 
 
 class RewardInference(Inference):
-    """See :class:`RewardOracle`.
-
-    :param env: Whose rewards to read.
-    :param task: (task_dim,); None takes the one in effect in ``env``.
+    """See :class:`RewardOracle`; a task of None is the one in effect in ``env``, whose rewards are
+    read.
     """
 
     state = ("mean", "variance", "transitions")

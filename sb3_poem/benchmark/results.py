@@ -11,7 +11,7 @@ import numpy as np
 from rliable import library, metrics
 from scipy.stats import sem, trim_mean
 
-from sb3_poem.adaptation.known_task import KnownTaskReturn
+from sb3_poem.adaptation.known_task import repertoire_limit
 from sb3_poem.benchmark.cells import make_oracle_factory
 from sb3_poem.benchmark.methods import METHODS
 from sb3_poem.benchmark.store import Record
@@ -35,12 +35,8 @@ BOOTSTRAP_SAMPLES = 2000
 
 @dataclass(frozen=True)
 class Condition:
-    """What must be equal for cells to stand in one table.
-
-    :param env_id: The family.
-    :param budget: But for the numbers of answers.
-    :param training: What differs from the hyperparameter files.
-    :param revision: See :data:`REVISION`.
+    """What must be equal for cells to stand in one table (of the budget all but the numbers of
+    answers).
     """
 
     env_id: str
@@ -85,24 +81,27 @@ def _success_rates(records: Sequence[Record]) -> np.ndarray | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Series:
-    """One method under one condition and one oracle, over seeds.
-
-    :param method: Its name.
-    :param oracle: Who answered.
-    :param snapshot: The share of the training after which; None: all.
-    :param records: Of the seeds.
-    """
+class _Measured:
+    """A method's records, one a seed."""
 
     method: str
-    oracle: OracleSpec
-    snapshot: float | None
     records: tuple[Record, ...]
 
     @property
     def label(self) -> str:
         """As in tables and figures."""
         return METHODS[self.method].label
+
+
+@dataclass(frozen=True, eq=False)
+class Series(_Measured):
+    """One method under one condition and one oracle, over seeds.
+
+    :param snapshot: The share of the training after which; None: all.
+    """
+
+    oracle: OracleSpec
+    snapshot: float | None
 
     @property
     def queries(self) -> tuple[int, ...]:
@@ -131,20 +130,8 @@ class Series:
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
-    """What the policies of one kind of model could earn.
-
-    :param method: Its name.
-    :param records: Of the seeds.
-    """
-
-    method: str
-    records: tuple[Record, ...]
-
-    @property
-    def label(self) -> str:
-        """As in tables."""
-        return METHODS[self.method].label
+class Reference(_Measured):
+    """What the policies of one kind of model could earn."""
 
     @property
     def known(self) -> np.ndarray:
@@ -165,23 +152,16 @@ class Reference:
 @cache
 def _limits(reference: Reference, queries: int, oracle: OracleSpec) -> tuple[float, ...]:
     """Tables and figures ask for the same ones."""
-    noise, empty = make_oracle_factory(oracle)().noise_model, np.empty((0, 0))
-    limits = []
-    for record in reference.records:
-        tasks, returns, candidates = (
-            np.array(record.result[name]) for name in ("tasks", "task_returns", "candidate_returns")
-        )
-        known = KnownTaskReturn(tasks, returns[:, None], empty, empty, candidates)
-        limits.append(known.limit(queries, noise))
+    noise, limits = make_oracle_factory(oracle)().noise_model, []
+    for result in (record.result for record in reference.records):
+        tasks, candidates = np.array(result["tasks"]), np.array(result["candidate_returns"])
+        limits.append(repertoire_limit(tasks, candidates, queries, noise))
     return tuple(limits)
 
 
 class Selection:
-    """What there is of a suite. Models that were trained with other hyperparameters than the newest
-    of their kind are left out.
-
-    :param records: Of a store.
-    :param families: Only these; None: all.
+    """What there is of a suite, of some families (None: all). Models that were trained with other
+    hyperparameters than the newest of their kind are left out.
     """
 
     def __init__(
@@ -218,13 +198,14 @@ class Selection:
         self._references: dict[Condition, list[Reference]] = {}
 
     def series(self, entry: Entry, condition: Condition) -> list[Series]:
-        """The finished cells of an entry under a condition, final models and those along the
-        training, in the order of the entry.
-        """
+        """The finished cells of an entry under a condition, those along the training too."""
         found: dict[tuple[str, OracleSpec, float | None], list[Record]] = {}
         for cell, record in self._cells(entry, condition):
             found.setdefault((cell.method, cell.oracle, cell.snapshot), []).append(record)
-        series = [Series(*key, tuple(records)) for key, records in found.items()]
+        series = [
+            Series(name, tuple(records), oracle, snapshot)
+            for (name, oracle, snapshot), records in found.items()
+        ]
         return sorted(series, key=lambda one: entry.methods.index(one.method))
 
     def references(self, condition: Condition) -> list[Reference]:
@@ -260,14 +241,9 @@ def _handed_over(record: Record) -> bool:
 
 @dataclass(frozen=True)
 class Summary:
-    """What several seeds earned.
-
-    :param mean: Of the seeds' mean returns.
-    :param deviation: Their standard deviation (n - 1); None for one seed.
-    :param iqm: The interquartile mean over seeds and tasks.
-    :param iqm_low: Of its 95 % interval; None for one seed, and where none is wanted.
-    :param task_error: Standard error over tasks of their returns, means over seeds; None for one
-        task.
+    """What several seeds earned: the mean of their mean returns, its deviation (n - 1), and the
+    interquartile mean over seeds and tasks with its 95 % interval (both None for one seed); and the
+    standard error over tasks of their means over seeds (None for one task).
     """
 
     n_seeds: int
@@ -282,12 +258,9 @@ class Summary:
 def summarise(returns: np.ndarray, intervals: bool = True) -> list[Summary]:
     """Summarise one method on one family after several numbers of answers.
 
-    :param returns: (n_seeds, n_tasks, n_records) mean returns; column j is the same test task for
-        all seeds.
-    :param intervals: Whether intervals are wanted, which take about a second.
-    :return: A summary for each record. The intervals are rliable's: percentiles of stratified
-        bootstrap samples, which draw the seeds anew for every task.
-    :raises ValueError: If the shape is wrong, or a value not finite.
+    :param returns: (n_seeds, n_tasks, n_records); column j is the same test task for all seeds.
+    :param intervals: Whether intervals are wanted, which take about a second: rliable's percentiles
+        of stratified bootstrap samples, which draw the seeds anew for every task.
     """
     returns = np.asarray(returns, dtype=np.float64)
     if returns.ndim != 3 or 0 in returns.shape or not np.isfinite(returns).all():

@@ -236,7 +236,7 @@ class Adaptation:
         answers = [answer.preference for answer in adapter.answers]
         records = tuple(range(len(latents)))
         return AdaptationEvaluation(
-            subject.tasks, records, latents[None], outcomes.returns[None], [answers], successes
+            subject.tasks, records, latents[None], [answers], outcomes.returns[None], successes
         )
 
     def _known_task_return(self) -> KnownTaskReturn:
