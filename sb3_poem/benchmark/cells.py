@@ -11,12 +11,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_poem.adaptation import (
-    BoltzmannOracle,
-    MistakeOracle,
-    ReturnOracle,
-    TaskOracle,
-)
+from sb3_poem.adaptation import BoltzmannOracle, MistakeOracle, ReturnOracle, TaskOracle
 from sb3_poem.adaptation.evaluation import evaluate_adaptation
 from sb3_poem.adaptation.known_task import known_task_return, preference_order
 from sb3_poem.adaptation.meta_model import HasSimilarity
@@ -36,14 +31,7 @@ DIGITS = 4  # of returns in the store
 
 
 def run_cell(cell: Cell, library: ModelLibrary, say: Say = print) -> Record:
-    """Run one cell. Its model is trained first if it is missing.
-
-    :param library: The models.
-    :param say: Takes a line of progress.
-    :return: What to keep.
-    :raises ValueError: If the method and the model do not fit.
-    :raises TrainingError: If the model's training fails.
-    """
+    """Run one cell. Its model is trained first if it is missing (or a ``TrainingError``)."""
     training = library.ensure(cell.model_key, say)
     th.set_num_threads(library.workplace.num_threads)
     env = make_task_vec_env(cell.env_id, 2 * cell.budget.tasks)
@@ -81,12 +69,7 @@ def run_cell(cell: Cell, library: ModelLibrary, say: Say = print) -> Record:
 
 
 def make_oracle_factory(spec: OracleSpec) -> Callable[..., TaskOracle]:
-    """What makes a task's oracle.
-
-    :param spec: Who answers.
-    :return: A function of ``env``, ``task`` and ``seed``.
-    :raises ValueError: If the kind is unknown.
-    """
+    """What makes a task's oracle: a function of ``env``, ``task`` and ``seed``."""
     if spec.kind == "return":
         return ReturnOracle
     if spec.kind == "boltzmann":

@@ -38,11 +38,7 @@ COPIES, STEPS, UPDATES = 20, 128, 20
 
 @dataclass(frozen=True)
 class Pace:
-    """How fast a machine is on a family.
-
-    :param step: Seconds of an environment step of one copy, with the policy's action.
-    :param update: Seconds of a gradient step.
-    """
+    """Seconds of an environment step of one copy with its action, and of a gradient step."""
 
     step: float
     update: float
@@ -50,23 +46,13 @@ class Pace:
 
 @cache
 def measure_pace(env_id: str, device: str = "cpu", num_threads: int = 1) -> Pace:
-    """Train for two short epochs with the hyperparameters that ship, and look at the second.
-
-    :param env_id: The family.
-    :param device: As PyTorch names it.
-    :param num_threads: Of PyTorch.
-    :return: The pace.
-    """
+    """Train for two short epochs with the hyperparameters that ship, and look at the second."""
     th.set_num_threads(num_threads)
     facts = family_facts(env_id)
     tasks, steps = min(COPIES, facts.n_tasks or COPIES), min(facts.horizon, STEPS)
     with contextlib.closing(make_task_vec_env(env_id, COPIES, max_episode_steps=steps)) as env:
-        changes: dict[str, Any] = {
-            "env": env,
-            "n_train_tasks": tasks,
-            "trajectories_per_task": COPIES // tasks,
-        }
-        changes |= {"gradient_steps": UPDATES, "device": device}
+        changes: dict[str, Any] = {"env": env, "gradient_steps": UPDATES, "device": device}
+        changes |= {"n_train_tasks": tasks, "trajectories_per_task": COPIES // tasks}
         try:
             model = POEMSAC.from_zoo(env_id, **changes)
         except ValueError:  # there is no entry for it
@@ -77,38 +63,24 @@ def measure_pace(env_id: str, device: str = "cpu", num_threads: int = 1) -> Pace
 
 
 def training_seconds(key: ModelKey, pace: Pace) -> float:
-    """Of a model's training from scratch; of one that is made from another's, what comes on top.
-
-    :param key: The model.
-    :param pace: On its family.
-    """
+    """Of a model's training from scratch; of one that is made from another's, what comes on top."""
     if VARIANTS[key.variant].base is not None:
-        return (
-            META_ITERATIONS_OF.get(key.family, META_ITERATIONS)
-            * UPDATES_PER_META_ITERATION
-            * pace.update
-        )
+        iterations = META_ITERATIONS_OF.get(key.family, META_ITERATIONS)
+        return iterations * UPDATES_PER_META_ITERATION * pace.update
     plan = training_plan(key)
     return PROCESS_SECONDS + plan.timesteps * pace.step + plan.updates * pace.update
 
 
 def cell_seconds(cell: Cell, pace: Pace) -> float:
-    """Of a cell whose model is there.
-
-    :param pace: On its family.
-    """
+    """Of a cell whose model is there."""
     budget, facts, method = cell.budget, family_facts(cell.env_id), cell.definition
     queries = budget.record_at[-1]
     if method.rule is None:
-        latents = (
-            LATENTS_WITH_SHARED_DYNAMICS
-            if facts.shared_dynamics
-            else LATENTS_WITH_OWN_DYNAMICS * budget.tasks
-        )
-        episodes = (
-            latents * min(budget.episodes, SELECTION_EPISODES) + budget.tasks * budget.episodes
-        )
-        return episodes * facts.horizon * pace.step
+        latents = LATENTS_WITH_OWN_DYNAMICS * budget.tasks
+        if facts.shared_dynamics:
+            latents = LATENTS_WITH_SHARED_DYNAMICS
+        episodes = latents * min(budget.episodes, SELECTION_EPISODES)
+        return (episodes + budget.tasks * budget.episodes) * facts.horizon * pace.step
     episodes = budget.tasks * budget.episodes * len(budget.record_at)
     rule = method.make_rule(**dict(cell.overrides))
     if method.rule != "ANOLE":  # which asks about what there is

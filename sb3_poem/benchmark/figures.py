@@ -139,10 +139,7 @@ def _tolerance_figure(entry: Entry, found: dict[Condition, list[Series]]) -> Fig
 
 
 def _draw(axes: Axes, x: Sequence[float], by_seed: Any, label: str, style: dict[str, str]) -> None:
-    """A line with the deviation over seeds.
-
-    :param by_seed: For each x the returns of the seeds; or (n_seeds, n_points).
-    """
+    """A line with the deviation over seeds: for each x their returns, or (n_seeds, n_points)."""
     columns = by_seed.T if isinstance(by_seed, np.ndarray) else by_seed
     means = np.array([column.mean() for column in columns])
     deviations = np.array([column.std(ddof=1) if len(column) > 1 else 0.0 for column in columns])

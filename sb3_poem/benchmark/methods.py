@@ -1,8 +1,8 @@
-"""The methods that are compared: which model each adapts, and how. Nothing heavy is imported here."""
+"""The methods that are compared: which model each adapts, and how. Imports nothing heavy."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,8 @@ META_ITERATIONS = 500
 META_ITERATIONS_OF = {"PointGoal": 100}
 
 SHARED_DYNAMICS_REASONS = {
-    "ANOLE": "ANOLE asks which fragment of the training tasks is better on the new task, and here these show another world",
+    "ANOLE": "ANOLE asks which fragment of the training tasks is better on the new task, and here "
+    "these show another world",
     "MAMLReward": "MAML-reward learns from what tasks say of each other's fragments",
 }
 
@@ -37,10 +38,8 @@ RECORDED: dict[str | None, tuple[str, dict[str, str]]] = {
 
 @dataclass(frozen=True)
 class Variant:
-    """A model to be trained.
+    """A model to be trained, named as its folder.
 
-    :param name: Of the variant, and of its folder.
-    :param algorithm: "poem_sac" or "pearl_sac".
     :param hyperparameters: What differs from the entry of ``zoo_configs/<algorithm>.yml``.
     :param base: The variant that this one is derived from without a training run of its own.
     """
@@ -55,11 +54,8 @@ class Variant:
 class Method:
     """A row of the tables.
 
-    :param name: As on the command line.
-    :param label: As in tables and figures.
     :param variant: The model that it adapts.
     :param rule: The rule's name in :mod:`sb3_poem`; None for what the model's policies could earn.
-    :param options: Of the rule.
     :param paper_row: Its row in Table 3 of Xu & Zhu 2025.
     """
 
@@ -71,20 +67,13 @@ class Method:
     paper_row: str | None = None
 
     def objection(self, shared_dynamics: bool) -> str | None:
-        """Why the method cannot run on a family; None if it can.
-
-        :param shared_dynamics: Whether the family's tasks share their dynamics.
-        :return: The reason.
-        """
+        """Why the method cannot run on a family; None if it can."""
         if shared_dynamics or self.rule not in SHARED_DYNAMICS_REASONS:
             return None
         return f"its tasks do not share their dynamics, and {SHARED_DYNAMICS_REASONS[self.rule]}"
 
     def make_rule(self, **changes: Any) -> Rule:
-        """The rule, with these changes of its options.
-
-        :raises ValueError: If the method has none.
-        """
+        """The rule, with these changes of its options; a ``ValueError`` if the method has none."""
         import sb3_poem
 
         if self.rule is None:
@@ -98,68 +87,54 @@ class Method:
         return {"kind": kind, "options": {**words, **self.options, **changes}}
 
 
-def _variants() -> dict[str, Variant]:
-    variants = [
+VARIANTS = {
+    variant.name: variant
+    for variant in (
         Variant("poem", "poem_sac"),
         Variant("poem-inner", "poem_sac", {"similarity": "inner"}),
         Variant("poem-pearl-context", "poem_sac", {"context": "pearl"}),
         *(Variant(f"poem-d{d}", "poem_sac", {"latent_dim": d}) for d in LATENT_DIMS),
         Variant("pearl", "pearl_sac"),
         Variant("maml-reward", "pearl_sac", base="pearl"),
-    ]
-    return {variant.name: variant for variant in variants}
+    )
+}
 
 
-def _methods() -> dict[str, Method]:
-    methods = [
-        Method("poem-bayes", "POEM (Bayes)", "poem", "Bayes", paper_row="POEM"),
-        Method("poem-paper", "POEM (paper)", "poem", "Paper", paper_row="POEM"),
-        Method("anole", "ANOLE", "pearl", "ANOLE", {"strategy": "berlekamp"}, "ANOLE"),
-        *(
-            Method(
-                f"anole-{way}", f"ANOLE-{way}", "pearl", "ANOLE", {"strategy": way}, f"ANOLE-{way}"
-            )
-            for way in ("greedy", "random")
-        ),
-        Method("maml-reward", "MAML-reward", "maml-reward", "MAMLReward", paper_row="MAML-reward"),
-        Method("reward-oracle", "reward oracle", "pearl", "RewardOracle"),
-        Method("known-task", "task known (POEM's policies)", "poem"),
-        Method("known-task-pearl", "task known (PEARL's policies)", "pearl"),
-    ]
-    ablations = {
-        "poem-inner": "inner product",
-        "poem-pearl-context": "PEARL's context",
-        **{f"poem-d{d}": f"d = {d}" for d in LATENT_DIMS},
-    }
-    for variant, label in ablations.items():
-        methods.append(Method(f"known-task-{variant}", f"task known ({label})", variant))
-        for inference, poem in INFERENCE_LABELS.items():
-            name, rule = f"{variant}-{inference}", inference.capitalize()
-            methods.append(Method(name, f"{poem}, {label}", variant, rule))
-    for inference, poem in INFERENCE_LABELS.items():
+def _methods() -> Iterator[Method]:
+    yield Method("poem-bayes", "POEM (Bayes)", "poem", "Bayes", paper_row="POEM")
+    yield Method("poem-paper", "POEM (paper)", "poem", "Paper", paper_row="POEM")
+    for name, strategy in (
+        ("ANOLE", "berlekamp"),
+        ("ANOLE-greedy", "greedy"),
+        ("ANOLE-random", "random"),
+    ):
+        yield Method(name.lower(), name, "pearl", "ANOLE", {"strategy": strategy}, name)
+    yield Method("maml-reward", "MAML-reward", "maml-reward", "MAMLReward", paper_row="MAML-reward")
+    yield Method("reward-oracle", "reward oracle", "pearl", "RewardOracle")
+    yield Method("known-task", "task known (POEM's policies)", "poem")
+    yield Method("known-task-pearl", "task known (PEARL's policies)", "pearl")
+    ablations = {"poem-inner": "inner product", "poem-pearl-context": "PEARL's context"}
+    for variant, label in (ablations | {f"poem-d{d}": f"d = {d}" for d in LATENT_DIMS}).items():
+        yield Method(f"known-task-{variant}", f"task known ({label})", variant)
+        for rule, poem in INFERENCE_LABELS.items():
+            yield Method(f"{variant}-{rule}", f"{poem}, {label}", variant, rule.capitalize())
+    for rule, poem in INFERENCE_LABELS.items():
         for asked in QUERY_RULES:
-            if asked != DEFAULT_QUERY_RULE[inference]:
-                name, label = f"poem-{inference}-{asked}", f"{poem}, {asked} queries"
-                rule, options = inference.capitalize(), {"query_rule": asked}
-                methods.append(Method(name, label, "poem", rule, options))
+            if asked != DEFAULT_QUERY_RULE[rule]:
+                name, label = f"poem-{rule}-{asked}", f"{poem}, {asked} queries"
+                yield Method(name, label, "poem", rule.capitalize(), {"query_rule": asked})
     for epsilon in EPSILONS:
         # 0.1 is the default, and so the same cell as poem-paper.
         tolerant = {} if epsilon == 0.1 else {"epsilon": epsilon}
         name, label = f"poem-paper-epsilon-{epsilon:g}", f"epsilon = {epsilon:g}"
-        methods.append(Method(name, label, "poem", "Paper", tolerant))
-    return {method.name: method for method in methods}
+        yield Method(name, label, "poem", "Paper", tolerant)
 
 
-VARIANTS = _variants()
-METHODS = _methods()
+METHODS = {method.name: method for method in _methods()}
 
 
 def find_method(name: str) -> Method:
-    """A method by its name.
-
-    :return: The method.
-    :raises ValueError: If there is none; the message lists all.
-    """
+    """A method by its name; a ``ValueError`` that lists all if there is none."""
     if name not in METHODS:
         raise ValueError(
             f"--methods {name}: there is no such method; there are: {', '.join(METHODS)}"

@@ -47,13 +47,9 @@ Say = Callable[[str], None]
 
 @contextlib.contextmanager
 def locked(path: Path, on_wait: Callable[[], None] | None = None) -> Iterator[int]:
-    """Hold a lock, after waiting for whoever holds it. The system lets go of it when its holder
-    dies, however it dies.
-
-    :param path: The lock's file; it stays behind, empty.
-    :param on_wait: Called once, if there is a wait.
-    :return: A context whose value is the file's descriptor: a child process that inherits it holds
-        the lock as well.
+    """Hold a lock, after waiting (``on_wait`` is called once before) for whoever holds it. The
+    system lets go of it when its holder dies, however it dies. The context's value is the file's
+    descriptor: a child process that inherits it holds the lock as well.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a") as file:
@@ -79,8 +75,6 @@ class Workplace:
     :param runs: Folder of the trainings, and of locks.
     :param models: Folders with models that were handed over, see :meth:`ModelLibrary.given`.
     :param named: Models that were handed over one by one: family, variant, seed, path.
-    :param device: As PyTorch names it.
-    :param num_threads: Of PyTorch.
     """
 
     runs: str
@@ -117,8 +111,6 @@ class ModelLibrary:
         """The file or folder of a model that was handed over: one that was named;
         ``<Family>/<variant>/seed<seed>`` (a folder, or with ``.zip`` a file) in a folder of models;
         or ``<Family>`` there, a pretrained model of that variant and seed. None if there is none.
-
-        :raises ValueError: If a model that was named does not exist, or is a folder without one.
         """
         if not key.training.is_default:
             return None
@@ -151,10 +143,8 @@ class ModelLibrary:
 
     def origin(self, key: ModelKey) -> str:
         """What a model is, or will be, made of, as part of a cell's identity: the file that was
-        handed over; or the hyperparameters, and the revision of the code that trained with them.
-
-        :raises ValueError: If there are no hyperparameters for it, or what there is of it was
-            trained with others.
+        handed over; or the hyperparameters, and the revision of the code that trained with them. A
+        ``ValueError`` if there are none, or what there is of it was trained with others.
         """
         path = self.given(key)
         if path is not None:
@@ -192,12 +182,8 @@ class ModelLibrary:
             return not free
 
     def ensure(self, key: ModelKey, say: Say = print) -> dict[str, Any]:
-        """Train the model if it is missing, or finish its training; another process that is at it
-        is waited for.
-
-        :param say: Takes a line of progress.
-        :return: How it was trained, JSON-ready.
-        :raises TrainingError: If the training fails.
+        """Train the model if it is missing, or finish its training (another process that is at it
+        is waited for); how it was trained, JSON-ready. A ``TrainingError`` if that fails.
         """
         path = self.given(key)
         if path is not None:
@@ -215,14 +201,12 @@ class ModelLibrary:
         return read_json(finished)
 
     def load(self, key: ModelKey, env: VecEnv, snapshot: float | None = None) -> Any:
-        """A model that :meth:`ensure` has made sure of.
+        """A model that :meth:`ensure` has made sure of, or a :class:`MAMLRewardModel`; with its
+        replay buffer where that was kept.
 
         :param env: An environment of its family, which it gets.
         :param snapshot: The share of the training after which to take it; None: all.
-        :return: The model, or a :class:`MAMLRewardModel`; with its replay buffer where that was
-            kept.
-        :raises ValueError: If a model that was handed over is another, or was not saved along its
-            training.
+        :raises ValueError: If one that was handed over is another, or not saved along its training.
         """
         base = VARIANTS[key.variant].base
         path = self.given(key)
@@ -240,22 +224,18 @@ class ModelLibrary:
             run = self.folder(key) / read_json(self.folder(key) / FINISHED)["run"]
             # PEARL's replay buffer is asked about
             file = run / (CHECKPOINT if algorithm is PEARLSAC else _zip_name(key.env_id))
-        device = self.workplace.device
+        read: Callable[..., Any] = algorithm.load
         if file.name == CONFIG:
-            model = algorithm.from_pretrained(file.parent, env, device=device)
+            read, file = algorithm.from_pretrained, file.parent
         elif is_checkpoint(file):
-            model = algorithm.load_checkpoint(file, env, device=device)
-        else:
-            model = algorithm.load(file, env, device=device)
+            read = algorithm.load_checkpoint
+        model = read(file, env, device=self.workplace.device)
         if path is not None:
             _check_variant(model, key, path)
         return model
 
     def snapshot_file(self, key: ModelKey, snapshot: float) -> Path:
-        """The model that was saved nearest to a share of the training.
-
-        :raises ValueError: If none was saved within one interval of it.
-        """
+        """The model that was saved within one interval of a share of the training."""
         plan = training_plan(key)
         wanted = snapshot * plan.timesteps
         files = {
@@ -296,11 +276,9 @@ class ModelLibrary:
                 "remove it"
             )
         sessions = [read_json(each) for each in folder.glob(f"{SESSIONS}/*.json")]
-        seconds, processor = (
-            round(sum(session[name] for session in sessions), 1)
-            for name in ("seconds", "cpu_seconds")
-        )
-        say(f"trained {key} in {seconds:.0f} s")
+        names = ("seconds", "cpu_seconds")
+        took = {name: round(sum(session[name] for session in sessions), 1) for name in names}
+        say(f"trained {key} in {took['seconds']:.0f} s")
         return {
             "source": "trained",
             "run": str(file.parent.relative_to(folder)),
@@ -310,8 +288,7 @@ class ModelLibrary:
             "overrides": plan.overrides,
             "env_steps": int(model.num_timesteps),
             "updates": int(model._n_updates),
-            "seconds": seconds,
-            "cpu_seconds": processor,
+            **took,
             "sessions": len(sessions),
         }
 
@@ -372,36 +349,30 @@ def _is_variant(config: dict[str, Any], key: ModelKey) -> bool:
     if variant.base is not None or config["algorithm"] != ALGORITHMS[variant.algorithm].__name__:
         return False
     facts = (arguments.get("similarity"), arguments.get("context"), arguments["latent_dim"])
-    found = (config["env_id"], arguments.get("seed"), facts)
-    return found == (key.env_id, key.seed, _expected(key))
+    return (config["env_id"], arguments.get("seed"), facts) == _expected(key)
 
 
 def _check_variant(model: Any, key: ModelKey, path: Path) -> None:
     """Refuse a model that is not the one as which it was handed over."""
     facts = (getattr(model, "similarity", None), getattr(model, "context", None), model.latent_dim)
-    found, expected = (model.env_id, model.seed, facts), (key.env_id, key.seed, _expected(key))
     names = ("env_id", "seed", "(similarity, context, latent_dim)")
-    wrong = [
-        f"{name} {one!r} instead of {other!r}"
-        for name, one, other in zip(names, found, expected, strict=True)
-        if one != other
-    ]
+    both = zip(names, (model.env_id, model.seed, facts), _expected(key), strict=True)
+    wrong = [f"{name} {one!r} instead of {other!r}" for name, one, other in both if one != other]
     if wrong:
         raise ValueError(f"{path} was handed over as {key}, but has {', '.join(wrong)}")
 
 
-def _expected(key: ModelKey) -> tuple[str | None, str | None, int]:
-    """Similarity, context and latent dimension of a model: as its family's entry would make it, or
-    as the algorithm's defaults do without one.
+def _expected(key: ModelKey) -> tuple[str, int, tuple[str | None, str | None, int]]:
+    """Environment, seed, and (similarity, context, latent dimension) of a model: as its family's
+    entry would make it, or as the algorithm's defaults do without one.
     """
     variant = VARIANTS[key.variant]
     given = variant.hyperparameters
     with contextlib.suppress(MissingEntryError):  # a family that nothing is trained on here
         given = training_plan(key).hyperparameters
-    dim = int(given.get("latent_dim", 5))
-    if variant.algorithm == "pearl_sac":
-        return None, None, dim
-    return given.get("similarity", "two-encoder"), given.get("context", "optimal"), dim
+    kinds = given.get("similarity", "two-encoder"), given.get("context", "optimal")
+    similarity, context = (None, None) if variant.algorithm == "pearl_sac" else kinds
+    return key.env_id, key.seed, (similarity, context, int(given.get("latent_dim", 5)))
 
 
 def _describe_given(path: Path) -> dict[str, Any]:

@@ -2,8 +2,8 @@
 
 Models come first, each a trial that trains it; then the cells. Trials hand their records to this
 process, which alone writes the store. Trainings go on from their checkpoints in the folder of runs,
-which all machines must share; and the store knows what is finished: so a lost worker's trial is
-tried again where it stood, and the same command resumes a whole experiment.
+which all machines must share: so a lost worker's trial is tried again where it stood, and the same
+command resumes a whole experiment.
 """
 
 from __future__ import annotations
@@ -27,13 +27,9 @@ from sb3_poem.benchmark.suites import Cell, ModelKey
 
 @dataclass(frozen=True)
 class RayOptions:
-    """How to use Ray.
-
-    :param address: Of a cluster; None: the one that this process is connected to, or else one on
-        this machine.
-    :param cpus: Processor cores of a trial.
-    :param gpus: GPUs of a trial.
-    :param max_failures: How often a trial is tried again when it fails or its worker is lost.
+    """How to use Ray: an address of None is the cluster that this process is connected to, or else
+    one on this machine; ``cpus`` and ``gpus`` of a trial, which is tried again ``max_failures``
+    times when it fails or its worker is lost.
     """
 
     address: str | None = None
@@ -45,12 +41,8 @@ class RayOptions:
 def run_with_ray(
     plan: Plan, library: ModelLibrary, store: Store, options: RayOptions, say: Say = print
 ) -> list[str]:
-    """Run a plan as Tune trials.
-
-    :param library: The models; its folders must be the same on all machines.
-    :param say: Takes lines of progress.
-    :return: What failed, a line each; the other cells were run all the same.
-    :raises ValueError: If Ray is not installed.
+    """Run a plan as Tune trials; what failed, a line each. The library's folders must be the same
+    on all machines.
     """
     try:
         import ray

@@ -59,16 +59,9 @@ def make_plan(
     training: Training,
     snapshots: int | None = None,
 ) -> Plan:
-    """Look at what there is.
-
-    :param store: Results; None: none yet.
-    :param families: Names or ids; None: the suite's own.
-    :param methods: Only these; None: all of the suite, without those that cannot run on a family.
-    :param budget: Numbers of tasks and episodes.
-    :param training: What differs from the hyperparameter files.
-    :param snapshots: See :meth:`Suite.cells`.
-    :raises ValueError: If a family or method does not exist, a method that was named cannot run on
-        a family, or there are no hyperparameters for a model that is missing.
+    """Look at what there is, in a store if there is one yet. For ``families``, ``methods`` and
+    ``snapshots`` None is the suite's own; methods that were not named are left out where they
+    cannot run.
     """
     plan = Plan()
     facts = {fact.env_id: fact for fact in map(family_facts, families or suite.families)}
@@ -149,12 +142,9 @@ def _minutes(seconds: float) -> str:
 def run_cells(
     cells: Sequence[Cell], library: ModelLibrary, store: Store, say: Say = print
 ) -> list[str]:
-    """Run cells, and keep each as soon as it is finished. It may be interrupted at any moment; what
-    another process is at, or has finished, is left to it, and cells whose model another process is
-    training come last.
-
-    :param say: Takes lines of progress.
-    :return: What failed, a line each; the other cells were run all the same.
+    """Run cells, and keep each as soon as it is finished; what failed, a line each. It may be
+    interrupted at any moment; what another process is at, or has finished, is left to it, and cells
+    whose model another process is training come last.
     """
     failures: list[str] = []
     postponed: list[Cell] = []
@@ -208,12 +198,8 @@ def summary(result: dict) -> str:
 
 
 def export_model(cells: Sequence[Cell], library: ModelLibrary, store: Store, folder: Path) -> None:
-    """Write the model of finished cells as a pretrained folder, with how it was trained and what it
-    earns on its card.
-
-    :param cells: Of one model: methods with preferences, and what is known.
-    :param folder: Where; made if missing.
-    :raises ValueError: If a cell is not finished.
+    """Write the model of finished cells (of its methods with preferences, and what is known) as a
+    pretrained folder, with how it was trained and what it earns on its card.
     """
     from sb3_poem.benchmark.results import Reference  # rliable is slow to import
 

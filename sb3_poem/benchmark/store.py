@@ -57,14 +57,9 @@ _CELLS = sa.Table(
 
 @dataclass(frozen=True)
 class Record:
-    """A finished cell.
-
-    :param key: :attr:`Cell.key`.
-    :param method: The method under whose name it was run first.
-    :param identity: :meth:`Cell.identity`.
-    :param result: Every task's return after every recorded number of answers, samples and times.
-    :param provenance: Commit, versions, machine, and how the model was trained.
-    :param created: When, in UTC.
+    """A finished cell: :attr:`Cell.key`, the method under whose name it was run first,
+    :meth:`Cell.identity`, every task's return after every recorded number of answers with samples
+    and times, where it comes from, and when (UTC).
     """
 
     key: str
@@ -83,12 +78,8 @@ class Record:
 
 class Store:
     """A store of finished cells. Several processes may use one file: every access is a transaction
-    of its own, and a cell that is there stays as it is.
-
-    :param path: The file.
-    :param create: Whether to make it where it is missing.
-    :raises FileNotFoundError: If it is missing and shall not be made.
-    :raises ValueError: If the file is something else, or of another version.
+    of its own, and a cell that is there stays as it is. A missing file is made only with
+    ``create``; one of another program or version is refused by a ``ValueError``.
     """
 
     def __init__(self, path: str | Path, create: bool = True) -> None:

@@ -72,13 +72,8 @@ NOISES = (BOLTZMANN, OracleSpec("mistake", 0.1), OracleSpec("mistake", 0.2))
 
 @dataclass(frozen=True)
 class Budget:
-    """What a cell may spend on evaluation.
-
-    :param tasks: Test tasks, alike for all methods and seeds.
-    :param episodes: Per task and measurement.
-    :param record_at: Numbers of answers after which returns are measured; the largest is the number
-        of questions.
-    :param task_seed: Of the test tasks.
+    """What a cell may spend on evaluation: test tasks (alike for all methods and seeds, drawn by
+    ``task_seed``), episodes per task and measurement, and after how many answers to measure.
     """
 
     tasks: int = 30
@@ -89,10 +84,8 @@ class Budget:
 
 @dataclass(frozen=True)
 class Training:
-    """What differs from the hyperparameter files, for all models of a run.
-
-    :param timesteps: Environment steps; None takes those of the files.
-    :param hyperparameters: Names and values, sorted by name.
+    """What differs from the hyperparameter files, for all models of a run: environment steps, and
+    hyperparameters, sorted by name.
     """
 
     timesteps: int | None = None
@@ -128,10 +121,9 @@ class ModelKey:
 
 @dataclass(frozen=True)
 class Cell:
-    """One entry of the store: a method with its settings on a family, with one seed.
+    """One entry of the store: a method with its settings on a family, with one seed, of the
+    training and of what is random in the adaptation.
 
-    :param method: A name of :data:`METHODS`.
-    :param seed: Of the training, and of what is random in the adaptation.
     :param snapshot: The share of the training after which the model is taken; None: all of it.
     :param overrides: Options of the rule that differ from the method's own, sorted by name.
     :param model: What the model is made of, see :meth:`ModelLibrary.origin`; None: not told.
@@ -205,7 +197,6 @@ class Cell:
 class Entry:
     """Methods that a suite compares under the same conditions: a table, and a figure.
 
-    :param name: Of the comparison; part of its figures' names.
     :param curves: With whose answers the methods are measured along the training too.
     :param by_inference: Whether figures have a row for each of POEM's inference rules.
     :param shown: Numbers of answers that tables show, of those that were recorded.
@@ -228,13 +219,11 @@ class Entry:
 class Suite:
     """A declared set of cells.
 
-    :param families: What it runs on unless told otherwise.
-    :param references: Methods that say what the models' policies could earn, for the limits in the
-        tables.
+    :param references: Methods that say what the models' policies could earn, for the tables'
+        limits.
     :param snapshots: In how many equal parts the training is cut for measurements along it; 1
         measures its end only.
-    :param budget: Unless told otherwise.
-    :param overrides: Options of rules by the rule's name, where the suite differs from their
+    :param overrides: Options of rules by the rule's name, where the suite differs from the
         defaults.
     """
 
@@ -262,13 +251,8 @@ class Suite:
         training: Training | None = None,
         snapshots: int | None = None,
     ) -> list[Cell]:
-        """The suite's cells, each once, in the order in which they should be run.
-
-        :param methods: Only these; None: all.
-        :param budget: Numbers of tasks and episodes, if not the suite's own; ``record_at`` is the
-            entries'.
-        :param snapshots: See the class; None takes the suite's own.
-        :raises ValueError: If the suite does not hold a method.
+        """The suite's cells, each once, in the order in which they should be run; None takes all
+        methods, and the suite's own numbers (``record_at`` is always the entries').
         """
         for name in methods or ():
             if find_method(name).name not in self.methods:
@@ -297,10 +281,8 @@ class Suite:
         training: Training,
         shares: Sequence[float],
     ) -> list[Cell]:
-        """The cells of one entry, for one family and seed.
-
-        :param shares: After which shares of the training the methods are measured too, where the
-            entry has curves.
+        """The cells of one entry, for one family and seed; its curves are measured after these
+        shares of the training too.
         """
         cells = []
         for name in entry.methods:
@@ -324,9 +306,7 @@ def digest(data: Any) -> str:
 
 def hashable(value: Any) -> Any:
     """A hyperparameter's value, with tuples for lists: a model is looked up by its hyperparameters,
-    and JSON has no tuples.
-
-    :raises ValueError: if it is, or holds, a dictionary
+    and JSON has no tuples. A dictionary is refused.
     """
     if isinstance(value, dict):
         raise ValueError(

@@ -6,7 +6,7 @@ import csv
 import io
 import json
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,87 +19,23 @@ from sb3_poem.benchmark.store import Store
 from sb3_poem.benchmark.suites import EXACT, SUITES, Entry, OracleSpec
 
 SUFFIX = {"md": ".md", "latex": ".tex", "csv": ".csv", "json": ".json"}
-#: Table 3 of Xu & Zhu (ICML 2025): family -> row -> (mean, standard deviation) after 1, 5 and 10
+#: Table 3 of Xu & Zhu (ICML 2025): family -> row -> [mean, standard deviation] after 1, 5 and 10
 #: queries
-TABLE_3: dict[str, dict[str, tuple[tuple[float, float], ...]]] = {
-    "HalfCheetahVel": {
-        "MAML-reward": ((-201, 13), (-193, 11), (-182, 11)),
-        "ANOLE": ((-173, 12), (-120, 10), (-112, 14)),
-        "ANOLE-random": ((-172, 14), (-125, 13), (-115, 13)),
-        "ANOLE-greedy": ((-169, 12), (-128, 18), (-115, 12)),
-        "POEM": ((-65, 10), (-50, 8), (-46, 6)),
-    },
-    "HalfCheetahFwdBack": {
-        "MAML-reward": ((-120, 130), (-40, 138), (-4, 142)),
-        "ANOLE": ((503, 149), (1012, 121), (1198, 89)),
-        "ANOLE-random": ((1236, 203), (1419, 108), (1483, 45)),
-        "ANOLE-greedy": ((1367, 155), (1482, 91), (1493, 89)),
-        "POEM": ((1689, 54), (1684, 32), (1709, 23)),
-    },
-    "AntGoal": {
-        "MAML-reward": ((-610, 81), (-603, 85), (-602, 89)),
-        "ANOLE": ((-550, 21), (-405, 29), (-380, 19)),
-        "ANOLE-random": ((-551, 22), (-419, 26), (-378, 16)),
-        "ANOLE-greedy": ((-560, 25), (-412, 38), (-401, 51)),
-        "POEM": ((-351, 9), (-203, 12), (-202, 7)),
-    },
-    "AntFwdBack": {
-        "MAML-reward": ((101, 11), (105, 12), (105, 11)),
-        "ANOLE": ((618, 60), (830, 20), (802, 38)),
-        "ANOLE-random": ((808, 38), (810, 22), (812, 29)),
-        "ANOLE-greedy": ((788, 39), (806, 23), (820, 32)),
-        "POEM": ((1030, 12), (1013, 56), (1015, 48)),
-    },
-    "AntDir2D": {
-        "MAML-reward": ((102, 20), (101, 23), (112, 30)),
-        "ANOLE": ((308, 45), (515, 78), (588, 67)),
-        "ANOLE-random": ((181, 30), (432, 45), (498, 35)),
-        "ANOLE-greedy": ((172, 20), (443, 30), (414, 25)),
-        "POEM": ((671, 15), (732, 45), (749, 40)),
-    },
-    "AntVel": {
-        "MAML-reward": ((-3, 9), (-1, 10), (6, 8)),
-        "ANOLE": ((36, 5), (80, 10), (83, 7)),
-        "ANOLE-random": ((20, 5), (60, 10), (100, 6)),
-        "ANOLE-greedy": ((30, 5), (70, 10), (110, 5)),
-        "POEM": ((95, 5), (108, 8), (112, 4)),
-    },
-    "HumanoidDir2D": {
-        "MAML-reward": ((504, 52), (529, 56), (523, 58)),
-        "ANOLE": ((754, 59), (703, 55), (722, 62)),
-        "ANOLE-random": ((232, 54), (780, 64), (796, 58)),
-        "ANOLE-greedy": ((231, 30), (781, 59), (798, 54)),
-        "POEM": ((812, 45), (1462, 14), (1451, 67)),
-    },
-    "MetaWorldML10": {
-        "MAML-reward": ((153, 18), (164, 19), (166, 15)),
-        "ANOLE": ((238, 31), (192, 42), (240, 21)),
-        "ANOLE-random": ((242, 31), (192, 39), (229, 29)),
-        "ANOLE-greedy": ((239, 34), (175, 26), (183, 13)),
-        "POEM": ((326, 17), (324, 13), (349, 7)),
-    },
-    "MetaWorldML1": {
-        "MAML-reward": ((680, 36), (691, 40), (692, 49)),
-        "ANOLE": ((1086, 67), (1042, 70), (1018, 82)),
-        "ANOLE-random": ((1117, 64), (1045, 80), (1145, 52)),
-        "ANOLE-greedy": ((1091, 47), (1011, 67), (1122, 76)),
-        "POEM": ((1435, 12), (1588, 32), (1601, 13)),
-    },
-}
+TABLE_3: dict[str, dict[str, list[list[int]]]] = json.loads(
+    Path(__file__).with_name("paper_table3.json").read_text()
+)
 QUERIES = (1, 5, 10)
 
 
 @dataclass(frozen=True)
 class Row:
-    """A method, or a yardstick, after some number of answers; what CSV and JSON hold.
+    """A method, or a yardstick, after some number of answers; what CSV and JSON hold. For the
+    figures see :class:`Summary`.
 
     :param kind: "method", "limit" or "known".
     :param queries: After how many answers; None for "known".
     :param snapshot: The share of the training after which; None: all.
     :param samples: Environment steps of the training, mean over seeds.
-    :param mean: And what follows: see :class:`Summary`.
-    :param paper_mean: What the paper reports, with its deviation.
-    :param success_rate: Mean over seeds and tasks, where the family has successes.
     """
 
     suite: str
@@ -143,14 +79,10 @@ def make_report(
     out: Path | None = None,
     seeds: Sequence[int] | None = None,
 ) -> tuple[str, list[Path]]:
-    """Tables as text and, in a folder, the figures beside them.
+    """Tables as text and, in the folder ``out``, written with the figures beside them. None takes
+    all suites of which there is something, all families and all seeds.
 
-    :param suites: Names of suites; None: all of which there is something.
-    :param families: Names of families; None: all.
     :param kind: "md", "latex", "csv" or "json".
-    :param out: Where to write ``<suite>.<suffix>`` and the figures; None writes nothing.
-    :param seeds: Only these, say where some methods have more of them than others; None: all.
-    :return: The text of all suites, and the files.
     :raises ValueError: If the store holds nothing of what is asked for.
     """
     records = [record for record in store.records() if seeds is None or record.seed in seeds]
@@ -210,11 +142,6 @@ def suite_tables(selection: Selection) -> list[Table]:
 
 
 def format_tables(title: str, tables: Sequence[Table], kind: str) -> str:
-    """Tables as text.
-
-    :param title: Of the whole.
-    :param kind: "md" or "latex".
-    """
     if kind == "md":
         return "\n\n".join([f"# {title}", *map(_markdown, tables)]) + "\n"
     head = f"% {title}; needs \\usepackage{{booktabs}}"
@@ -222,11 +149,7 @@ def format_tables(title: str, tables: Sequence[Table], kind: str) -> str:
 
 
 def format_rows(rows: Iterable[Row], kind: str) -> str:
-    """Rows as text.
-
-    :param kind: "csv" or "json".
-    """
-    data = [asdict(row) for row in rows]
+    data = [vars(row) for row in rows]
     if kind == "json":
         return json.dumps(data, indent=1) + "\n"
     text = io.StringIO()
@@ -237,10 +160,7 @@ def format_rows(rows: Iterable[Row], kind: str) -> str:
 
 
 def paper_figure(family: str, row: str | None, queries: int) -> tuple[float, float] | None:
-    """Mean and standard deviation that the paper reports; None if it reports nothing.
-
-    :param row: A row of its table.
-    """
+    """Mean and standard deviation of a row of the paper's table; None if it reports nothing."""
     figures = TABLE_3.get(family, {}).get(row or "")
     if figures is None or queries not in QUERIES:
         return None
@@ -325,9 +245,9 @@ def _comparison(
                     continue
                 interval = (row.iqm_low, row.iqm_high)
                 spread = _number(row.task_error) if entry.by_task else _number(row.iqm, *interval)
-                cells += [_mean(row.mean, row.deviation), spread]
+                cells += [_number(row.mean, row.deviation), spread]
                 if has_paper:
-                    cells.append(_mean(row.paper_mean, row.paper_deviation))
+                    cells.append(_number(row.paper_mean, row.paper_deviation))
             body.append(tuple(cells))
     also = (
         "standard error over tasks of their means over seeds"
@@ -336,7 +256,7 @@ def _comparison(
     )
     notes = [f"Mean and standard deviation over seeds; {also}."]
     notes += [
-        f"{row.label}: {_mean(row.mean, row.deviation)}" for row in final if row.kind == "known"
+        f"{row.label}: {_number(row.mean, row.deviation)}" for row in final if row.kind == "known"
     ]
     if any(row.kind == "limit" for row in rows):
         notes.append(
@@ -402,18 +322,14 @@ def _shown(value: float | None, form: str) -> str:
     return "" if value is None else format(value, form)
 
 
-def _mean(mean: float | None, deviation: float | None) -> str:
-    if mean is None:
-        return ""
-    form = ",.0f" if abs(mean) >= 1000 else ",.1f"
-    return format(mean, form) + ("" if deviation is None else f" ± {deviation:{form}}")
-
-
-def _number(value: float | None, low: float | None = None, high: float | None = None) -> str:
+def _number(value: float | None, *beside: float | None) -> str:
+    """With its deviation, or the two ends of its interval, unless that is None."""
     if value is None:
         return ""
     form = ",.0f" if abs(value) >= 1000 else ",.1f"
-    return format(value, form) + ("" if low is None else f" [{low:{form}}, {high:{form}}]")
+    others = [format(other, form) for other in beside if other is not None]
+    shown = f" ± {others[0]}" if len(others) == 1 else f" [{', '.join(others)}]" if others else ""
+    return format(value, form) + shown
 
 
 def _markdown(table: Table) -> str:

@@ -49,12 +49,7 @@ class MissingEntryError(ValueError):
 
 @dataclass(frozen=True)
 class FamilyFacts:
-    """What the benchmark must know of a family before it starts anything.
-
-    :param horizon: Steps of an episode.
-    :param n_tasks: How many tasks there are; None: infinitely many.
-    :param shared_dynamics: Whether tasks differ in their rewards alone.
-    """
+    """What must be known of a family before anything starts; ``n_tasks`` None: infinitely many."""
 
     env_id: str
     horizon: int
@@ -64,12 +59,7 @@ class FamilyFacts:
 
 @cache
 def family_facts(name: str) -> FamilyFacts:
-    """Look at a family.
-
-    :param name: An id, or AntGoal for poem/AntGoal-v0.
-    :raises ValueError: If there is no such environment, or it is no task family, or has no time
-        limit.
-    """
+    """Look at a family: an id, or AntGoal for poem/AntGoal-v0."""
     env_id = family_id(name)
     try:
         with contextlib.closing(vectorised(gym.make(env_id))) as env:
@@ -87,14 +77,8 @@ def family_facts(name: str) -> FamilyFacts:
 
 @dataclass(frozen=True)
 class TrainingPlan:
-    """A training, in figures.
-
-    :param algorithm: "poem_sac" or "pearl_sac".
-    :param hyperparameters: All that differs from the algorithm's defaults.
-    :param overrides: The part of them that differs from the hyperparameter file.
-    :param timesteps: Environment steps asked for.
-    :param epoch_steps: Environment steps of an epoch.
-    :param updates: Gradient steps.
+    """A training: all that differs from the algorithm's defaults, the part of it that differs from
+    the hyperparameter file, environment steps in all and of an epoch, and gradient steps.
     """
 
     algorithm: str
@@ -111,10 +95,7 @@ class TrainingPlan:
 
 
 def training_plan(key: ModelKey) -> TrainingPlan:
-    """How a model is trained.
-
-    :raises MissingEntryError: If there are no hyperparameters for the family.
-    """
+    """How a model is trained; a :class:`MissingEntryError` if its family has no entry."""
     from sb3_poem.pearl_sac.train_tasks import DEFAULT_TRAIN_TASKS
 
     variant = VARIANTS[key.variant]
@@ -155,16 +136,9 @@ def train_arguments(key: ModelKey, plan: TrainingPlan) -> list[str]:
 def run_training(
     arguments: list[str], save_steps: int, folder: Path, lock: int, device: str, num_threads: int
 ) -> None:
-    """Train, or go on with a training, in a child process.
-
-    :param arguments: See :func:`train_arguments`.
-    :param save_steps: Environment steps between two checkpoints.
-    :param folder: Of the training.
-    :param lock: A lock's file descriptor, which the child inherits: nobody else trains while it
-        still ends.
-    :param device: As PyTorch names it.
-    :param num_threads: Of PyTorch.
-    :raises TrainingError: If it fails.
+    """Train, or go on with a training, in a child process, with the arguments of
+    :func:`train_arguments`; it inherits a lock's file descriptor: nobody else trains while it still
+    ends.
     """
     session = folder / SESSIONS / f"{len(list(folder.glob(f'{SESSIONS}/*.json'))) + 1}.json"
     command = [sys.executable, "-m", "sb3_poem.benchmark.training", str(os.getpid()), str(session)]
@@ -196,11 +170,7 @@ def run_training(
 
 
 def end_with_parent(parent: int) -> None:
-    """Ask the system to kill this process when its parent is gone; where it cannot, nothing
-    happens.
-
-    :param parent: The parent's process id, which may be gone already.
-    """
+    """Have the system kill this process when its parent, which may be gone already, is gone."""
     if sys.platform == "linux":
         with contextlib.suppress(OSError, AttributeError):
             ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -211,8 +181,8 @@ def end_with_parent(parent: int) -> None:
 @contextlib.contextmanager
 def timed(session: Path) -> Iterator[None]:
     """Write to a file how long the training took, by the clock and of the processor (all threads):
-    at its end, and whenever there is a new checkpoint, since what comes after the last one is lost
-    with a process that is killed.
+    at its end, and at each new checkpoint, since what comes after the last is lost with a killed
+    process.
     """
     started = time.monotonic()
 
