@@ -66,7 +66,6 @@ def milliseconds(model: POEMSAC, n_answers: int, n_tasks: int, seed: int, rule: 
 
 
 def main() -> None:
-    """Measure and write."""
     repeats = (given := common.arguments(__doc__, repeats=3)).repeats
     th.set_num_threads(1)
     results: list[dict[str, Any]] = []

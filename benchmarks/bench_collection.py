@@ -168,7 +168,6 @@ def measure(env_id: str, nthread: int, repeats: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Measure and write."""
     given = common.arguments(__doc__, env=DEFAULT_IDS, threads=available_cores(), repeats=5)
     settings = {
         "copies": N_TASKS,

@@ -232,7 +232,6 @@ def measure(name: str, device: str, turns: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Measure, print, write."""
     sizes = {"nargs": "+", "choices": SIZES, "default": list(SIZES)}
     given = arguments(__doc__, sizes=sizes, threads=[1, 2], turns=5, device=DEVICE)
     on_cpu = given.device == "cpu"

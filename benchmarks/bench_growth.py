@@ -120,7 +120,6 @@ def plot(
 
 
 def main() -> None:
-    """Measure, plot and write."""
     threads = [n for n in (1, 2) if n <= available_cores()]
     given = common.arguments(__doc__, repeats=3, threads=threads)
     th.set_num_threads(1)

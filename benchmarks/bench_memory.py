@@ -105,7 +105,6 @@ def sampling(name: str, size: int, repeats: int) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Measure and write."""
     size = {"type": int, "default": 100_000, "help": "transitions of a task"}
     given = common.arguments(__doc__, size=size, repeats=300)
     th.set_num_threads(1)

@@ -32,7 +32,6 @@ COMMANDS: dict[str, list[str]] = {
 
 
 def main() -> None:
-    """Measure and write."""
     given = common.arguments(__doc__, repeats=5)
     contenders = {
         name: partial(subprocess.run, [sys.executable, *words], check=True, capture_output=True)

@@ -48,7 +48,6 @@ def waits(
 
 
 def main() -> None:
-    """Start a server, answer, print."""
     given = arguments(
         __doc__,
         model="HalfCheetahVel",

@@ -103,7 +103,6 @@ def lost_answers(folder: Path, people: list[Person]) -> int:
 
 
 def main() -> None:
-    """Let people answer, and print."""
     given = arguments(
         __doc__,
         model="HalfCheetahVel",

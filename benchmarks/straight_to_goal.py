@@ -30,7 +30,6 @@ def episode(env: gym.Env, goal: np.ndarray, gain: float) -> tuple[float, bool]:
 
 
 def main() -> None:
-    """Measure and write."""
     tasks = FamilyView(make_task_vec_env(ENV_ID, 1)).test_tasks(30, 100)
     env = gym.make(ENV_ID)
     rows = []

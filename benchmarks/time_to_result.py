@@ -95,7 +95,6 @@ def train(env_id: str, entry: dict[str, Any], seed: int, clock: Clock, device: s
 
 
 def main() -> None:
-    """Measure, print, write."""
     given = arguments(
         __doc__,
         env="poem/HalfCheetahVel-v0",

@@ -52,7 +52,6 @@ def limits(
 
 
 def main() -> None:
-    """Measure and write."""
     given = arguments(
         __doc__,
         family={"required": True},

@@ -259,7 +259,6 @@ class BayesInference(Inference):
 
     @property
     def weights(self) -> np.ndarray:
-        """(n_particles,) posterior weights, summing to one."""
         weights = np.exp(self.log_weights - self.log_weights.max())
         return weights / weights.sum()
 

@@ -209,7 +209,6 @@ def evaluate_adaptation(
 def _evaluation(
     adapted: TaskAdaptations, outcomes: Sequence[EpisodeOutcomes]
 ) -> AdaptationEvaluation:
-    """One outcome (n_tasks, n_episodes) for each number of answers."""
     returns = np.stack([outcome.returns for outcome in outcomes], axis=1)
     known = [outcome.successes for outcome in outcomes if outcome.successes is not None]
     successes = np.stack(known, axis=1) if len(known) == len(outcomes) else None

@@ -52,7 +52,6 @@ class KnownTaskReturn(EpisodeOutcomes):
         return f"KnownTaskReturn({len(self.tasks)} tasks, {found})"
 
     def limit(self, k: int, noise_model: NoiseModel | None = None) -> float:
-        """See :func:`repertoire_limit`."""
         return repertoire_limit(self.tasks, self.candidate_returns, k, noise_model)
 
 

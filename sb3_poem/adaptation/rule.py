@@ -40,7 +40,6 @@ class Snapshot:
     arrays: dict[str, np.ndarray]
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-ready."""
         arrays = {name: encode_array(array) for name, array in self.arrays.items()}
         return {"random_state": self.random_state, "arrays": arrays}
 

@@ -80,7 +80,6 @@ class ANOLE(Rule):
         return floor(self.mistake_rate * n_queries + 1e-9)
 
     def total_candidates(self, n_queries: int) -> int:
-        """How many candidates are drawn."""
         if self.strategy == "greedy":
             return 2**n_queries
         return max(self.n_candidates, n_distinguishable(n_queries, self.budget(n_queries)))

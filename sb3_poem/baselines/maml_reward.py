@@ -61,11 +61,9 @@ class MAMLRewardModel(MetaModel):
 
     @property
     def digest(self) -> str:
-        """Of the meta-trained reward's numbers."""
         return self.reward.digest
 
     def sample_latents(self, n: int, rng: np.random.Generator, source: str = "prior") -> np.ndarray:
-        """There are no policies but those that answers led to."""
         raise NotImplementedError("a MAMLRewardModel has no policies before the first answer")
 
     def add(self, actor: Any) -> np.ndarray:
@@ -196,7 +194,6 @@ class MAMLRewardInference(Inference):
         self.latent = self.model.add(self.sac.actor)
 
     def estimate(self) -> np.ndarray:
-        """See :class:`Inference`: the latest policy."""
         return self.latent.copy()
 
     def restore(self, snapshot: Snapshot, answers: list[Answer]) -> None:

@@ -69,7 +69,6 @@ class MetaReward:
 
     @property
     def digest(self) -> str:
-        """Of its numbers, the standardisation's included."""
         return digest_of({**self.parameters, **_standardisation(self.policy)})
 
     def save(self, folder: str | Path) -> None:

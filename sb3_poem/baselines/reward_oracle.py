@@ -102,7 +102,6 @@ class RewardInference(Inference):
         self.variance = variance[0].double().cpu().numpy()
 
     def estimate(self) -> np.ndarray:
-        """See :class:`Inference`: the posterior's mean."""
         return self.mean.copy()
 
     def _context_rows(self, shown: Trajectory) -> np.ndarray:

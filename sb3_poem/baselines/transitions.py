@@ -10,7 +10,6 @@ from sb3_poem.pearl_sac.policies import LatentPolicy
 
 
 def standardised(policy: LatentPolicy, trajectory: Trajectory) -> th.Tensor:
-    """(T + 1, obs_dim) observations."""
     with th.no_grad():
         return policy.standardise(_tensor(policy, trajectory.observations))
 

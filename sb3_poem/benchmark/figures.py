@@ -120,7 +120,6 @@ def _samples_figure(
 
 
 def _tolerance_figure(entry: Entry, found: dict[Condition, list[Series]]) -> Figure:
-    """Return against epsilon, a row for each oracle."""
     figure, panels = _grid(entry, {one: series for one, series in found.items() if series}, True)
     for axes, _, series in panels:
         for number, queries in enumerate((1, 5, 10)):

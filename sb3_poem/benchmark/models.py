@@ -94,14 +94,11 @@ class Workplace:
 
 
 class ModelLibrary:
-    """The models of a workplace."""
-
     def __init__(self, workplace: Workplace) -> None:
         self.workplace = workplace
         self.runs = Path(workplace.runs)
 
     def folder(self, key: ModelKey) -> Path:
-        """Where a model's training is kept."""
         variant = key.variant
         if not key.training.is_default:
             variant += "-" + digest(key.training.to_dict())[:8]
@@ -166,7 +163,6 @@ class ModelLibrary:
         return f"hyperparameters {digest(found)}"
 
     def lock_file(self, key: ModelKey) -> Path:
-        """Held by whoever trains the model."""
         return self.folder(key) / ".lock"
 
     def is_taken(self, key: ModelKey) -> bool:
@@ -344,7 +340,6 @@ def _content(path: Path) -> Path:
 
 
 def _is_variant(config: dict[str, Any], key: ModelKey) -> bool:
-    """Whether a pretrained folder's configuration is that of a model."""
     variant, arguments = VARIANTS[key.variant], config["arguments"]
     if variant.base is not None or config["algorithm"] != ALGORITHMS[variant.algorithm].__name__:
         return False
@@ -353,7 +348,6 @@ def _is_variant(config: dict[str, Any], key: ModelKey) -> bool:
 
 
 def _check_variant(model: Any, key: ModelKey, path: Path) -> None:
-    """Refuse a model that is not the one as which it was handed over."""
     facts = (getattr(model, "similarity", None), getattr(model, "context", None), model.latent_dim)
     names = ("env_id", "seed", "(similarity, context, latent_dim)")
     both = zip(names, (model.env_id, model.seed, facts), _expected(key), strict=True)

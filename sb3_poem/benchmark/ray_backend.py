@@ -120,7 +120,6 @@ def _run_trials(
 def _run_trial(
     config: dict[str, Any], jobs: Sequence[ModelKey | Cell], workplace: Workplace
 ) -> None:
-    """What a trial runs, in a worker."""
     from ray import tune
 
     job, library, record = jobs[config["number"]], ModelLibrary(workplace), ""

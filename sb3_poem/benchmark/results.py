@@ -46,7 +46,6 @@ class Condition:
 
     @classmethod
     def of(cls, record: Record) -> Condition:
-        """Of a finished cell."""
         identity, training = record.identity, record.identity["training"]
         given = sorted((k, hashable(v)) for k, v in training["hyperparameters"].items())
         sizes = {name: identity[name] for name in ("tasks", "episodes", "task_seed")}
@@ -55,7 +54,6 @@ class Condition:
 
     @property
     def family(self) -> str:
-        """The family's name."""
         return family_name(self.env_id)
 
     @property
@@ -89,7 +87,6 @@ class _Measured:
 
     @property
     def label(self) -> str:
-        """As in tables and figures."""
         return METHODS[self.method].label
 
 
@@ -105,7 +102,6 @@ class Series(_Measured):
 
     @property
     def queries(self) -> tuple[int, ...]:
-        """After how many answers returns were measured."""
         return tuple(self.records[0].result["queries"])
 
     @cached_property
@@ -115,7 +111,6 @@ class Series(_Measured):
 
     @property
     def samples(self) -> float:
-        """Environment steps of the training, mean over seeds."""
         return float(np.mean([record.result["training_samples"] for record in self.records]))
 
     @property

@@ -72,7 +72,6 @@ class Record:
     created: str = ""
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-ready."""
         return dict(vars(self))
 
 
@@ -130,14 +129,12 @@ class Store:
         self.close()
 
     def close(self) -> None:
-        """Let go of the file."""
         self._engine.dispose()
 
     def __contains__(self, key: str) -> bool:
         return key in self.keys()
 
     def keys(self) -> set[str]:
-        """Of all finished cells."""
         with self._engine.connect() as connection:
             return set(connection.execute(sa.select(_CELLS.c.key)).scalars())
 

@@ -58,7 +58,6 @@ class OracleSpec:
 
     @property
     def label(self) -> str:
-        """As in tables."""
         if self.kind == "return":
             return "exact answers"
         if self.kind == "mistake":
@@ -93,11 +92,9 @@ class Training:
 
     @property
     def is_default(self) -> bool:
-        """Whether nothing differs."""
         return self == Training()
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-ready."""
         return {"timesteps": self.timesteps, "hyperparameters": dict(self.hyperparameters)}
 
 
@@ -112,7 +109,6 @@ class ModelKey:
 
     @property
     def family(self) -> str:
-        """See :func:`family_name`."""
         return family_name(self.env_id)
 
     def __str__(self) -> str:
@@ -143,17 +139,14 @@ class Cell:
 
     @property
     def family(self) -> str:
-        """See :func:`family_name`."""
         return family_name(self.env_id)
 
     @property
     def definition(self) -> Method:
-        """What the method is."""
         return METHODS[self.method]
 
     @property
     def model_key(self) -> ModelKey:
-        """The model that is adapted."""
         return ModelKey(self.env_id, self.definition.variant, self.seed, self.training)
 
     def identity(self) -> dict[str, Any]:
@@ -179,7 +172,6 @@ class Cell:
 
     @property
     def key(self) -> str:
-        """A digest of :meth:`identity`."""
         return digest(self.identity())
 
     def __str__(self) -> str:
@@ -238,7 +230,6 @@ class Suite:
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """All that it compares, each once."""
         compared = [name for entry in self.entries for name in entry.methods]
         return tuple(dict.fromkeys([*compared, *self.references]))
 

@@ -269,7 +269,6 @@ def _comparison(
 
 
 def _successes(condition: Condition, entry: Entry, rows: Sequence[Row]) -> Table:
-    """Success rates against numbers of answers."""
     body = []
     for label in dict.fromkeys(row.label for row in rows if row.kind == "method"):
         mine = {row.queries: row.success_rate for row in rows if row.label == label}
