@@ -11,7 +11,12 @@ from sb3_poem.adaptation.evaluation import (
 )
 from sb3_poem.adaptation.human import HumanOracle
 from sb3_poem.adaptation.known_task import KnownTaskReturn, known_task_return, property_one
-from sb3_poem.adaptation.limits import best_codebook, information_limit
+from sb3_poem.adaptation.limits import (
+    answer_capacity,
+    best_codebook,
+    information_limit,
+    rate_distortion_limit,
+)
 from sb3_poem.adaptation.many_tasks import TaskAdaptations, adapt_tasks
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.named_rule import named_rule
@@ -20,6 +25,5 @@ from sb3_poem.adaptation.oracles import BoltzmannOracle, MistakeOracle, ReturnOr
 from sb3_poem.adaptation.paper import Paper
 from sb3_poem.adaptation.policy import AdaptedPolicy
 from sb3_poem.adaptation.preference import Preference, Query
-from sb3_poem.adaptation.rate_distortion import answer_capacity, rate_distortion_limit
 from sb3_poem.adaptation.rule import Answer, Inference, Rule, Setting
 from sb3_poem.common.trajectory import Trajectory

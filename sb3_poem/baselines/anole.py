@@ -8,20 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from sb3_poem.adaptation import Answer, Inference, Rule, Setting
 from sb3_poem.adaptation.meta_model import HasRewardDecoder, MetaModel
 from sb3_poem.adaptation.preference import SIGNS, Preference
 from sb3_poem.adaptation.priors import SOURCES, make_prior
 from sb3_poem.adaptation.queries import random_pair
-from sb3_poem.adaptation.rule import (
-    Answer,
-    Inference,
-    Rule,
-    Setting,
-    Shown,
-    Snapshot,
-    check_choice,
-    trajectories_of,
-)
+from sb3_poem.adaptation.rule import Shown, Snapshot, check_choice, trajectories_of
 from sb3_poem.baselines.berlekamp import n_distinguishable, worst_case_volumes
 from sb3_poem.baselines.fragments import default_fragment_length, replay_fragments
 from sb3_poem.common.checks import check_whole

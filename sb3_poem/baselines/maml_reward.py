@@ -14,17 +14,10 @@ import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
 
+from sb3_poem.adaptation import Answer, Inference, Rule, Setting
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.preference import Preference
-from sb3_poem.adaptation.rule import (
-    Answer,
-    Inference,
-    Rule,
-    Setting,
-    Shown,
-    Snapshot,
-    trajectories_of,
-)
+from sb3_poem.adaptation.rule import Shown, Snapshot, trajectories_of
 from sb3_poem.baselines.meta_reward import MetaReward
 from sb3_poem.baselines.transitions import standardised
 from sb3_poem.common.checks import check_whole

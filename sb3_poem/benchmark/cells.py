@@ -52,20 +52,10 @@ def run_cell(cell: Cell, library: ModelLibrary, say: Say = print) -> Record:
     result |= {"training_samples": int(samples), "updates": int(updates)}
     result["training_seconds"] = training.get("seconds")
     result["training_cpu_seconds"] = training.get("cpu_seconds")
-    about = {
-        **provenance(),
-        "device": library.workplace.device,
-        "num_threads": library.workplace.num_threads,
-    }
-    return Record(
-        cell.key,
-        cell.family,
-        cell.method,
-        cell.seed,
-        cell.identity(),
-        result,
-        {**about, "model": trained},
-    )
+    place = library.workplace
+    about = {**provenance(), "device": place.device, "num_threads": place.num_threads}
+    which = (cell.key, cell.family, cell.method, cell.seed, cell.identity())
+    return Record(*which, result, {**about, "model": trained})
 
 
 def make_oracle_factory(spec: OracleSpec) -> Callable[..., TaskOracle]:
