@@ -369,9 +369,7 @@ def test_what_a_notebook_shows(point_goal):
         rf"Query\(left={trajectory}, right={trajectory}\)": query,
         r"ReturnOracle\(task=the environment's\)": ReturnOracle(),
         r"MistakeOracle\(rate=0.7, task=\[1.0\]\)": MistakeOracle(0.7, task=[1.0]),
-        r"BoltzmannOracle\(noise=BoltzmannNoise\(beta=2\), task=the environment's\)": BoltzmannOracle(
-            2
-        ),
+        r"BoltzmannOracle\(beta=2, task=the environment's\)": BoltzmannOracle(2),
         r"HumanOracle\(0 asked, videos in preference_queries\)": HumanOracle(),
         r"EpisodeOutcomes\(2 times 3 episodes, mean return -\d+\.\d\)": outcomes,
         r"AdaptationEvaluation\(2 tasks, mean return -\d+\.\d, -\d+\.\d after 0, 1 answers\)": adapted,
