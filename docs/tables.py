@@ -62,7 +62,8 @@ def after(found: list[dict[str, Any]], k: int, what: str = "mean_return") -> str
 def summary() -> str:
     """README's table: a row a family."""
     lines = [
-        "| family | paper: best baseline, 10 | POEM, 1 | POEM, 10 | ours: 1 | 10 | task known | seeds |",
+        "| family | paper: best baseline, 10 | POEM, 1 | POEM, 10 | ours: 1 | 10 | task known "
+        "| seeds |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for family in FAMILIES:
@@ -119,10 +120,12 @@ def results_page() -> str:
     """The page docs/results.md."""
     head = f"""# Results
 
-Made from the records in `benchmarks/results/` by `python docs/tables.py`; each folder's manifest has the commands. Mean return over 30 test
-tasks that no training saw (10 of `PointGoal`), after exact answers; ± is the standard deviation over training seeds. *Task known*: what the model's own
-policies earn when the task need not be found out. *Limit*: the best choice of 2^k of these policies, chosen with the test tasks in sight: an
-optimistic bound for k exact answers. What is not listed was not measured.
+Made from the records in `benchmarks/results/` by `python docs/tables.py`; each folder's manifest
+has the commands. Mean return over 30 test tasks that no training saw (10 of `PointGoal`), after
+exact answers; ± is the standard deviation over training seeds. *Task known*: what the model's own
+policies earn when the task need not be found out. *Limit*: the best choice of 2^k of these
+policies, chosen with the test tasks in sight: an optimistic bound for k exact answers. What is not
+listed was not measured.
 
 {summary()}
 """

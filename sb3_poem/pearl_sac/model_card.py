@@ -1,4 +1,4 @@
-"""The card of a pretrained folder, for readers: what the model is, how to use it, what it earned."""
+"""The card of a pretrained folder: what the model is, how to use it, what it earned."""
 
 from typing import Any
 
@@ -43,7 +43,8 @@ policy = adapter.adapt()
 ## Limits
 
 Made for this family alone, in simulation. What it earns on tasks outside of the family's
-distribution, or from people, was not measured. `config.json` holds all arguments and the whole record.
+distribution, or from people, was not measured. `config.json` holds all arguments and the whole
+record.
 """
 
 
