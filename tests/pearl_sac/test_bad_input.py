@@ -181,9 +181,7 @@ class DictObservations(gym.Env):
     action_space = Walk.action_space
 
 
-NO_FAMILY = (
-    r"env <.*> is no task family.*poem_envs\.TaskFamily.*poem_envs\.GoalFamily.*docs/families\.md"
-)
+NO_FAMILY = r"env <.*> is no task family.*poem_envs\.TaskFamily.*poem_envs\.GoalFamily.*docs/guides/families\.md"
 
 
 @pytest.mark.parametrize(
