@@ -2,15 +2,13 @@
 
 import inspect
 import re
-import sys
 from pathlib import Path
 
+import gymnasium as gym
+
+import sb3_poem
+
 TOP = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(TOP / "tests"))  # toy families that pages use
-
-import gymnasium as gym  # noqa: E402
-
-import sb3_poem  # noqa: E402
 
 project = "sb3_poem"
 author = "the sb3_poem contributors"
