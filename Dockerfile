@@ -14,7 +14,7 @@ RUN apt-get update \
 WORKDIR /sb3_poem
 COPY constraints.txt .
 # The page needs no GPU. For torch's CPU build, which is much smaller:
-# --build-arg TORCH="--index-url ADDRESS torch" with the address that pytorch.org gives.
+# --build-arg TORCH="--index-url ADDRESS torch" with the address that PyTorch names for it.
 ARG TORCH=torch
 RUN pip install --no-cache-dir -c constraints.txt ${TORCH}
 COPY . .

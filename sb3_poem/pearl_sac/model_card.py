@@ -65,8 +65,9 @@ def _training(config: dict[str, Any]) -> str:
 
 
 def _results(card: dict[str, Any]) -> str:
-    measured = card.get("results", {}).get("adaptation to 30 unseen tasks", ())
-    measured = [one for one in measured if one["inference"] in RULES]
+    results = card.get("results", {})
+    what = next((name for name in results if name.startswith("adaptation to ")), None)
+    measured = [one for one in results.get(what, ()) if one["inference"] in RULES]
     if not measured:
         return ""
     ks = [k for k in measured[0]["queries"] if all(k in one["queries"] for one in measured)]
@@ -74,13 +75,13 @@ def _results(card: dict[str, Any]) -> str:
     rows = [head, ["---"] * len(head)]
     for one in measured:
         returns = [f"{one['mean_return'][one['queries'].index(k)]:.1f}" for k in ks]
-        known = f"{one['known_task_return']:.1f}"
-        rows.append([RULES[one["inference"]], one["candidates"], *returns, known])
+        source, known = one.get("candidates", "default"), f"{one['known_task_return']:.1f}"
+        rows.append([RULES[one["inference"]], source, *returns, known])
     table = "\n".join(f"| {' | '.join(row)} |" for row in rows)
     return f"""
 ## Results
 
-Mean return over 30 tasks that training did not see, after k exact answers.
+Mean return after k exact answers, {what}.
 
 {table}
 """
