@@ -8,6 +8,7 @@ import sys
 import sysconfig
 import tomllib
 import zipfile
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -85,6 +86,7 @@ def test_every_tested_version_is_within_the_declared_ranges(
             tested[canonicalize_name(name)] = version
     extras = setup_cfg["options.extras_require"]
     declared = setup_cfg["options"]["install_requires"] + extras["dev"] + extras["label"]
+    declared += extras["metaworld"]
     requirements = [
         Requirement(line)
         for line in declared.splitlines()
@@ -95,6 +97,15 @@ def test_every_tested_version_is_within_the_declared_ranges(
         assert requirement.specifier.contains(tested[canonicalize_name(requirement.name)]), (
             requirement
         )
+
+
+def test_the_tested_mujoco_is_the_one_that_meta_world_takes(
+    setup_cfg: configparser.ConfigParser,
+) -> None:
+    pin = next(line for line in metadata.requires("metaworld") or [] if "mujoco" in line)
+    assert pin.replace(" ", "") in (ROOT / "constraints.txt").read_text().split()
+    assert "metaworld" not in setup_cfg["options"]["install_requires"]
+    assert "-e '.[dev,label,metaworld]'" in (ROOT / "Makefile").read_text()
 
 
 def test_the_supported_pythons_are_the_same_everywhere(
