@@ -3,6 +3,7 @@
 import configparser
 import json
 import os
+import re
 import subprocess
 import sys
 import sysconfig
@@ -127,11 +128,13 @@ def test_the_supported_pythons_are_the_same_everywhere(
     assert f"Python {first} to {last}" in (ROOT / "README.md").read_text()
 
 
-def test_citation_names_this_version() -> None:
-    assert (
-        f"version: {(ROOT / 'sb3_poem/version.txt').read_text().strip()}\n"
-        in (ROOT / "CITATION.cff").read_text()
-    )
+def test_changelog_and_citation_name_this_version() -> None:
+    version = (ROOT / "sb3_poem/version.txt").read_text().strip()
+    newest = re.search(r"^## (\S+) - (\d{4}-\d\d-\d\d)$", (ROOT / "CHANGELOG.md").read_text(), re.M)
+    assert newest is not None
+    assert newest[1] == version
+    citation = (ROOT / "CITATION.cff").read_text()
+    assert f"version: {version}\ndate-released: {newest[2]}\n" in citation
 
 
 def test_wheel_holds_all_that_is_needed_and_nothing_else(wheel: Path) -> None:
