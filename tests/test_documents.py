@@ -172,6 +172,9 @@ def test_figures_come_from_records() -> None:
 
 
 def test_readme_is_two_screens() -> None:
-    lines = (TOP / "README.md").read_text().splitlines()
-    assert len(lines) <= 130
-    assert max(map(len, lines)) <= 120
+    assert len((TOP / "README.md").read_text().splitlines()) <= 130
+
+
+@pytest.mark.parametrize("page", [*PAGES, "CHANGELOG.md"])
+def test_lines_fit_a_screen(page: str) -> None:
+    assert max(map(len, (TOP / page).read_text().splitlines())) <= 120
