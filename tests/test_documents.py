@@ -142,16 +142,28 @@ LINKED = (
 )
 
 
+def anchors(page: Path) -> set[str]:
+    """What GitHub and MyST name a page's headings by."""
+    text = page.read_text()
+    headings = re.findall(r"^#+ (.+)$", text, flags=re.MULTILINE)
+    return {
+        re.sub(r"[^\w -]", "", heading.strip().lower()).replace(" ", "-") for heading in headings
+    }
+
+
 def test_every_relative_link_leads_somewhere() -> None:
     pages = [page for pattern in LINKED for page in TOP.glob(pattern)]
     assert len(pages) > 60
     for page in pages:
-        for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text()):
-            assert "://" in target or (page.parent / target).exists(), (
-                f"{page.relative_to(TOP)}: {target}"
-            )
-        for target in re.findall(r"benchmarks/results/[\w*/.-]*[\w/]", page.read_text()):
-            assert list(TOP.glob(target)), f"{page.relative_to(TOP)}: {target}"
+        text, name = page.read_text(), page.relative_to(TOP)
+        for target, anchor in re.findall(r"\]\(([^)#\s]*)#?([^)\s]*)[^)]*\)", text):
+            if "://" in target or target.startswith("mailto:"):
+                continue
+            linked = page.parent / target if target else page
+            assert linked.exists(), f"{name}: {target}"
+            assert not anchor or anchor in anchors(linked), f"{name}: {target}#{anchor}"
+        for target in re.findall(r"benchmarks/results/[\w*/.-]*[\w/]", text):
+            assert list(TOP.glob(target)), f"{name}: {target}"
 
 
 def test_results_are_small_and_listed() -> None:
