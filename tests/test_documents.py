@@ -1,5 +1,7 @@
 """What README and guides show is what runs: their Python blocks and commands, on little."""
 
+import doctest
+import importlib
 import io
 import re
 import runpy
@@ -87,6 +89,20 @@ def test_python_blocks_run(page: str, folder: Path, monkeypatch: pytest.MonkeyPa
     finally:
         gym.registry.clear()
         gym.registry.update(registered)
+
+
+def test_examples_in_docstrings_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    attempted = 0
+    for root, package in ((TOP, "sb3_poem"), (TOP / "envs", "poem_envs")):
+        for file in sorted((root / package).rglob("*.py")):
+            if ">>> " not in file.read_text():
+                continue
+            name = ".".join(file.relative_to(root).with_suffix("").parts)
+            failed, run = doctest.testmod(importlib.import_module(name))
+            assert not failed, f"an example in {name} fails: see the output"
+            attempted += run
+    assert attempted > 50
 
 
 def commands(page: str) -> Iterator[str]:
