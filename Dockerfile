@@ -18,7 +18,7 @@ COPY constraints.txt .
 ARG TORCH=torch
 RUN pip install --no-cache-dir -c constraints.txt ${TORCH}
 COPY . .
-RUN pip install --no-cache-dir -c constraints.txt '.[label]'
+RUN pip install --no-cache-dir -c constraints.txt '.[label,metaworld]'
 
 RUN useradd --create-home person && install -d -m 700 -o person /answers
 USER person

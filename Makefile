@@ -3,29 +3,32 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help run label docs test test-all lint format bench bench-gpu venv rendering browser wheel clean
+.PHONY: help run label docs test test-all test-mujoco lint format bench bench-gpu venv rendering browser wheel clean
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 OUT ?= out
+# MuJoCo's newest release and no Meta-World, which takes 3.3.0 alone.
+NEWEST := .venv-mujoco
 # Two test processes of one thread each use two cores fully; more threads only wait for one another.
 THREADS := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
 help:
-	@echo "make run       meta-train a model, adapt it from ten preferences, show the result (files in $(OUT)/)"
-	@echo "make label     the page on which a person answers, on this machine"
-	@echo "make docs      the documentation, in docs/_build/html/"
-	@echo "make test      the default test suite"
-	@echo "make test-all  the default suite and the slow tests"
-	@echo "make lint      ruff, mypy and import-linter"
-	@echo "make format    let ruff format the code"
-	@echo "make bench     the benchmarks of speed and memory; tables go to benchmarks/results/speed/"
-	@echo "make bench-gpu the same of what runs on a CUDA device"
-	@echo "make venv      only set up $(VENV)"
-	@echo "make wheel     build the distribution in dist/"
-	@echo "make clean     remove what was built, and $(VENV)"
+	@echo "make run         meta-train a model, adapt it from ten preferences, show the result (files in $(OUT)/)"
+	@echo "make label       the page on which a person answers, on this machine"
+	@echo "make docs        the documentation, in docs/_build/html/"
+	@echo "make test        the default test suite"
+	@echo "make test-all    the default suite and the slow tests"
+	@echo "make test-mujoco the MuJoCo families' tests on MuJoCo's newest release, in $(NEWEST)"
+	@echo "make lint        ruff, mypy and import-linter"
+	@echo "make format      let ruff format the code"
+	@echo "make bench       the benchmarks of speed and memory; tables go to benchmarks/results/speed/"
+	@echo "make bench-gpu   the same of what runs on a CUDA device"
+	@echo "make venv        only set up $(VENV)"
+	@echo "make wheel       build the distribution in dist/"
+	@echo "make clean       remove what was built, and $(VENV)"
 
 run: $(STAMP) rendering
 	$(BIN)/python -m sb3_poem.demo --out $(OUT)
@@ -45,6 +48,16 @@ test: $(STAMP) rendering browser
 test-all: $(STAMP) rendering browser
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[ray]'
 	$(THREADS) $(BIN)/python -m pytest -n 2 -m "not gpu" $(PYTEST_ARGS)
+
+test-mujoco: rendering
+	test -x $(NEWEST)/bin/python || $(PYTHON) -m venv $(NEWEST)
+	grep -v '^mujoco==' constraints.txt >$(NEWEST)/constraints.txt
+	$(NEWEST)/bin/python -m pip install --quiet -c $(NEWEST)/constraints.txt torch
+	$(NEWEST)/bin/python -m pip install --quiet -c $(NEWEST)/constraints.txt -e '.[dev,label]'
+	$(NEWEST)/bin/python -m pip install --quiet --upgrade mujoco
+	$(THREADS) $(NEWEST)/bin/python -m pytest -n 2 -m "not slow and not gpu and not metaworld" \
+		tests/poem_envs tests/test_family_contract.py tests/common/test_vec_env.py \
+		tests/common/test_collection.py tests/poem_sac/test_external_families.py $(PYTEST_ARGS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
@@ -74,7 +87,7 @@ $(STAMP): setup.cfg pyproject.toml constraints.txt
 		|| { echo "sb3_poem needs Python 3.11 or newer; name one with make PYTHON=..." >&2; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet -c constraints.txt torch
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev,label]'
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev,label,metaworld]'
 	@touch $@
 
 # MuJoCo draws off screen through EGL or OSMesa. Nothing else needs either, so their absence is no error.
@@ -103,4 +116,4 @@ wheel: $(STAMP)
 	$(BIN)/python -m build --outdir dist .
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info .import_linter_cache .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(NEWEST) build dist *.egg-info .import_linter_cache .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -126,7 +126,7 @@ def family_section(family: str) -> str:
         for page, text in PAGES.items()
         if (folder / f"{page}.md").exists()
     ]
-    lines += [f"More: {', '.join(links)}.", ""]
+    lines += ["More: " + ",\n".join(links) + ".", ""]
     for picture in sorted(folder.glob("*.png")):
         caption = next(text for start, text in CAPTIONS.items() if picture.stem.startswith(start))
         lines += [f"![{caption}]({where}/{picture.name})", "", f"*{caption}.*", ""]

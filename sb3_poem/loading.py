@@ -36,6 +36,9 @@ def as_model(model: Any, device: th.device | str = "auto") -> Any:
 def load_model(name: str | Path, device: th.device | str = "auto") -> PEARLSAC:
     """Load a model of either algorithm.
 
+    >>> load_model("PointGoal").env_id
+    'poem/PointGoal-v0'
+
     :param name: A file that ``save`` wrote (``.zip`` may be left out), a checkpoint, a folder that
         ``save_pretrained`` wrote, the name of a shipped model, or ``"user/name"`` on the Hugging
         Face Hub

@@ -21,6 +21,9 @@ def plot_returns(
 ) -> "Figure":
     """Return against the number of preference queries, beside what could be reached.
 
+    >>> returns = np.array([[-4.0, -2.0, -1.0], [-5.0, -2.5, -1.0]])  # of two tasks
+    >>> figure = plot_returns([0, 5, 10], returns, limit=[-4.0, -1.5, -0.9], path="returns.png")
+
     :param queries: (n_records,) the numbers of answers after which the policy was evaluated
     :param returns: (n_tasks, n_records) every test task's return; the band is the standard error
         over tasks

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from poem_envs import headless
+from poem_envs import headless, sawyer
 from sb3_poem import cli, resources
 
 
@@ -119,6 +119,17 @@ def test_a_wrong_command_is_refused(
         cli.main(arguments)
     assert stop.value.code == 2
     assert words in capsys.readouterr().err
+
+
+def test_a_missing_extra_is_named(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def absent(name: str) -> None:
+        raise sawyer.PackageNotFoundError(name)
+
+    monkeypatch.setattr(sawyer, "version", absent)
+    assert cli.main(["adapt", "--model", "MetaWorldML1"]) == 1
+    assert "error: the Meta-World families need metaworld" in capsys.readouterr().err
 
 
 def test_unknown_model_lists_the_shipped_ones(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,5 +1,7 @@
 """What README and guides show is what runs: their Python blocks and commands, on little."""
 
+import doctest
+import importlib
 import io
 import re
 import runpy
@@ -89,6 +91,20 @@ def test_python_blocks_run(page: str, folder: Path, monkeypatch: pytest.MonkeyPa
         gym.registry.update(registered)
 
 
+def test_examples_in_docstrings_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    attempted = 0
+    for root, package in ((TOP, "sb3_poem"), (TOP / "envs", "poem_envs")):
+        for file in sorted((root / package).rglob("*.py")):
+            if ">>> " not in file.read_text():
+                continue
+            name = ".".join(file.relative_to(root).with_suffix("").parts)
+            failed, run = doctest.testmod(importlib.import_module(name))
+            assert not failed, f"an example in {name} fails: see the output"
+            attempted += run
+    assert attempted > 50
+
+
 def commands(page: str) -> Iterator[str]:
     """The lines of ``sb3-poem`` in a page, without their comments."""
     for block in re.findall(
@@ -142,16 +158,28 @@ LINKED = (
 )
 
 
+def anchors(page: Path) -> set[str]:
+    """What GitHub and MyST name a page's headings by."""
+    text = page.read_text()
+    headings = re.findall(r"^#+ (.+)$", text, flags=re.MULTILINE)
+    return {
+        re.sub(r"[^\w -]", "", heading.strip().lower()).replace(" ", "-") for heading in headings
+    }
+
+
 def test_every_relative_link_leads_somewhere() -> None:
     pages = [page for pattern in LINKED for page in TOP.glob(pattern)]
     assert len(pages) > 60
     for page in pages:
-        for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text()):
-            assert "://" in target or (page.parent / target).exists(), (
-                f"{page.relative_to(TOP)}: {target}"
-            )
-        for target in re.findall(r"benchmarks/results/[\w*/.-]*[\w/]", page.read_text()):
-            assert list(TOP.glob(target)), f"{page.relative_to(TOP)}: {target}"
+        text, name = page.read_text(), page.relative_to(TOP)
+        for target, anchor in re.findall(r"\]\(([^)#\s]*)#?([^)\s]*)[^)]*\)", text):
+            if "://" in target or target.startswith("mailto:"):
+                continue
+            linked = page.parent / target if target else page
+            assert linked.exists(), f"{name}: {target}"
+            assert not anchor or anchor in anchors(linked), f"{name}: {target}#{anchor}"
+        for target in re.findall(r"benchmarks/results/[\w*/.-]*[\w/]", text):
+            assert list(TOP.glob(target)), f"{name}: {target}"
 
 
 def test_results_are_small_and_listed() -> None:
@@ -172,6 +200,9 @@ def test_figures_come_from_records() -> None:
 
 
 def test_readme_is_two_screens() -> None:
-    lines = (TOP / "README.md").read_text().splitlines()
-    assert len(lines) <= 130
-    assert max(map(len, lines)) <= 120
+    assert len((TOP / "README.md").read_text().splitlines()) <= 130
+
+
+@pytest.mark.parametrize("page", [*PAGES, "CHANGELOG.md"])
+def test_lines_fit_a_screen(page: str) -> None:
+    assert max(map(len, (TOP / page).read_text().splitlines())) <= 120

@@ -43,8 +43,15 @@ FAMILIES = [
 ]
 
 
+def marked(env_id, kwargs):
+    marks = [pytest.mark.metaworld] if "MetaWorld" in env_id else []
+    return pytest.param(env_id, kwargs, marks=marks)
+
+
 @pytest.mark.parametrize(
-    ("env_id", "kwargs"), FAMILIES, ids=lambda value: value if isinstance(value, str) else ""
+    ("env_id", "kwargs"),
+    [marked(*family) for family in FAMILIES],
+    ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_every_registered_family_keeps_the_contract(env_id, kwargs):
     check_task_family(env_id, n_steps=8, **kwargs)

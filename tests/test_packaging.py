@@ -3,11 +3,13 @@
 import configparser
 import json
 import os
+import re
 import subprocess
 import sys
 import sysconfig
 import tomllib
 import zipfile
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -85,6 +87,7 @@ def test_every_tested_version_is_within_the_declared_ranges(
             tested[canonicalize_name(name)] = version
     extras = setup_cfg["options.extras_require"]
     declared = setup_cfg["options"]["install_requires"] + extras["dev"] + extras["label"]
+    declared += extras["metaworld"]
     requirements = [
         Requirement(line)
         for line in declared.splitlines()
@@ -95,6 +98,15 @@ def test_every_tested_version_is_within_the_declared_ranges(
         assert requirement.specifier.contains(tested[canonicalize_name(requirement.name)]), (
             requirement
         )
+
+
+def test_the_tested_mujoco_is_the_one_that_meta_world_takes(
+    setup_cfg: configparser.ConfigParser,
+) -> None:
+    pin = next(line for line in metadata.requires("metaworld") or [] if "mujoco" in line)
+    assert pin.replace(" ", "") in (ROOT / "constraints.txt").read_text().split()
+    assert "metaworld" not in setup_cfg["options"]["install_requires"]
+    assert "-e '.[dev,label,metaworld]'" in (ROOT / "Makefile").read_text()
 
 
 def test_the_supported_pythons_are_the_same_everywhere(
@@ -116,11 +128,13 @@ def test_the_supported_pythons_are_the_same_everywhere(
     assert f"Python {first} to {last}" in (ROOT / "README.md").read_text()
 
 
-def test_citation_names_this_version() -> None:
-    assert (
-        f"version: {(ROOT / 'sb3_poem/version.txt').read_text().strip()}\n"
-        in (ROOT / "CITATION.cff").read_text()
-    )
+def test_changelog_and_citation_name_this_version() -> None:
+    version = (ROOT / "sb3_poem/version.txt").read_text().strip()
+    newest = re.search(r"^## (\S+) - (\d{4}-\d\d-\d\d)$", (ROOT / "CHANGELOG.md").read_text(), re.M)
+    assert newest is not None
+    assert newest[1] == version
+    citation = (ROOT / "CITATION.cff").read_text()
+    assert f"version: {version}\ndate-released: {newest[2]}\n" in citation
 
 
 def test_wheel_holds_all_that_is_needed_and_nothing_else(wheel: Path) -> None:

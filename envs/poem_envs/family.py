@@ -24,7 +24,12 @@ BOUNDS_TOLERANCE = 1e-6
 
 
 class SignedPermutation(NamedTuple):
-    """A reordering with changes of sign: entry i is ``signs[i]`` (1, -1) times ``order[i]``'s."""
+    """A reordering with changes of sign: entry i is ``signs[i]`` (1, -1) times ``order[i]``'s.
+
+    >>> swap = SignedPermutation(order=(1, 0), signs=(1, -1))
+    >>> swap(np.array([2.0, 3.0]))
+    array([ 3., -2.])
+    """
 
     order: tuple[int, ...]
     signs: tuple[int, ...]

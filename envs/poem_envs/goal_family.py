@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
@@ -112,6 +113,8 @@ class GoalFamily(TaskFamily):
         self._rewards_broadcast = self._check_reward()
 
     def _make(self) -> gym.Env:
+        if "gymnasium_robotics" in (str(self._source).partition(":")[0], *sys.modules):
+            _mend_joint_access()
         if isinstance(self._source, str):
             env = gym.make(self._source, disable_env_checker=True, **self._env_kwargs)
         else:
@@ -297,6 +300,28 @@ def hide_goal_sites(env: gym.Env) -> None:
     for site in range(0 if model is None else model.nsite):
         if model.site(site).name.startswith(GOAL_SITE):
             model.site(site).rgba[3] = 0.0
+
+
+def _mend_joint_access() -> None:
+    """Let gymnasium-robotics 1.4 know hinges and slides under MuJoCo 3.12 and newer, where the
+    test by which it does, ``number in (enumeration, ...)``, is false.
+    """
+    if mujoco.mjtJoint.mjJNT_HINGE == np.int32(mujoco.mjtJoint.mjJNT_HINGE):
+        return
+    from gymnasium_robotics.utils import mujoco_utils
+
+    def mend(kind: str) -> None:
+        def get_joint(model: Any, data: mujoco.MjData, name: str) -> np.ndarray:
+            return getattr(data.joint(name), kind).copy()
+
+        def set_joint(model: Any, data: mujoco.MjData, name: str, value: npt.ArrayLike) -> None:
+            getattr(data.joint(name), kind)[:] = value
+
+        setattr(mujoco_utils, f"get_joint_{kind}", get_joint)
+        setattr(mujoco_utils, f"set_joint_{kind}", set_joint)
+
+    mend("qpos")
+    mend("qvel")
 
 
 def check_goal_env(env: gym.Env) -> None:

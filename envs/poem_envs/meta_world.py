@@ -186,6 +186,8 @@ class MetaWorldML1Env(MetaWorldEnv):
     There is no early end. `gymnasium.make` truncates episodes after 200 steps.
 
     ## Arguments
+    The extra `metaworld` is needed: `pip install 'sb3_poem[metaworld]'`.
+
     ```python
     import gymnasium as gym
     env = gym.make("poem_envs:poem/MetaWorldML1-v0", env_name="push")

@@ -75,7 +75,7 @@ class StateRenderer(_Renderer):
         return np.ascontiguousarray(image) if isinstance(image, np.ndarray) else image
 
     def close(self) -> None:
-        self._renderer.close()
+        _empty(self._renderer)
         super().close()
 
 
@@ -236,8 +236,11 @@ def close_viewers(env: Any) -> None:
     Gymnasium's own ``close`` keeps what it has closed, and renders black with it.
     """
     renderer = renderer_inside(env)
-    if renderer is None:
-        return
+    if renderer is not None:
+        _empty(renderer)
+
+
+def _empty(renderer: Any) -> None:
     for viewer in renderer._viewers.values():
         viewer.make_context_current()
         if hasattr(viewer, "opengl_context"):

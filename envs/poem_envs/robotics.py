@@ -88,7 +88,7 @@ class FetchPushEnv(_RoboticsFamily):
             "FetchPush-v4",
             observe_achieved_goal=False,
             goal_low=(1.19, 0.59, 0.42),
-            goal_high=(1.50, 0.90, 0.43),
+            goal_high=(1.52, 0.90, 0.43),
             **kwargs,
         )
 

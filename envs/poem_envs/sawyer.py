@@ -13,7 +13,7 @@ import numpy as np
 
 from poem_envs.mujoco_rendering import FastRenderer, close_viewers, fit_buffer, prepare_to_render
 
-INSTALL = "install it: pip install 'metaworld>=3.1,<4'"
+INSTALL = "pip install 'sb3_poem[metaworld]'"
 
 
 def load_metaworld() -> Any:
@@ -25,12 +25,12 @@ def load_metaworld() -> Any:
     try:
         found = version("metaworld")
     except PackageNotFoundError:
-        raise ImportError(f"{needed}; {INSTALL}") from None
+        raise ImportError(f"{needed}: {INSTALL}") from None
     major, minor = (int(part) for part in found.split(".")[:2])
     if major != 3 or minor < 1:
         raise ImportError(
             f"{needed}, but metaworld {found} is installed, whose rewards and placements are "
-            f"others; {INSTALL}"
+            f"others: {INSTALL}"
         )
     import metaworld.env_dict
 

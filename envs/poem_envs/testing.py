@@ -31,6 +31,8 @@ def check_task_family(
     potential and the symmetries (of a family that has them), the vectorised version (of a
     registered id that has one), rendering and closing, in this order.
 
+    >>> check_task_family("poem_envs:poem/PointGoal-v0")  # it keeps the contract
+
     :param env: The id of a registered environment, or a class or function that makes one
     :param n_steps: How many steps of an episode to compare; the episode may be shorter
     :param seed: Of the episodes, tasks and actions

@@ -346,6 +346,13 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
 def set_task(env: Any, task: npt.ArrayLike) -> None:
     """Choose the task of a family that may be inside wrappers, from the next reset on.
 
+    >>> import gymnasium as gym
+    >>> env = gym.make("poem_envs:poem/PointGoal-v0")
+    >>> set_task(env, [1.5])
+    >>> observation, info = env.reset(seed=0)
+    >>> env.unwrapped.task
+    array([1.5])
+
     :param env: a ``gym.Env``, a Gymnasium ``VectorEnv``, or an SB3 ``VecEnv``
     :param task: ``(task_dim,)``; of a vectorised environment for all copies, or
         ``(num_envs, task_dim)``, one for each

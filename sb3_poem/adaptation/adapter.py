@@ -53,13 +53,13 @@ class PreferenceAdapter:
     ``policy()`` is usable at any time. The adapter reads no rewards and neither reads nor sets the
     task.
 
-    .. code-block:: python
-
-        adapter = PreferenceAdapter(model, env, seed=0)
-        while not adapter.done:
-            query = adapter.ask()
-            adapter.tell(oracle(query.left, query.right))
-        policy = adapter.policy()
+    >>> from sb3_poem import PreferenceAdapter, ReturnOracle
+    >>> adapter = PreferenceAdapter("PointGoal", "poem/PointGoal-v0", seed=0)
+    >>> oracle = ReturnOracle(adapter.env)
+    >>> while not adapter.done:
+    ...     query = adapter.ask()
+    ...     adapter.tell(oracle(query.left, query.right))
+    >>> policy = adapter.policy()
 
     The new task is the one in effect in :attr:`env`, or the one that its first reset draws. Measure
     the policy there: ``evaluate_policy(policy, adapter.env)``. Another environment has another

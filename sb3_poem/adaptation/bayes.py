@@ -130,6 +130,12 @@ class Bayes(Rule):
     would be empty after a few answers; this one has as many different particles after fifty, in any
     dimension.
 
+    >>> from sb3_poem import PreferenceAdapter
+    >>> rule = Bayes(n_particles=100)
+    >>> adapter = PreferenceAdapter("PointGoal", "poem/PointGoal-v0", rule=rule, seed=0)
+    >>> adapter.inference.particles.shape
+    (100, 5)
+
     :param n_particles: How many, at least 2.
     :param query_rule: "information-gain", "worst-case" (eq. 10) or "random".
     :param candidates: Where particles come from: "prior" (N(0, I)) or "aggregate" (the training

@@ -35,6 +35,11 @@ class AdaptationEvalCallback(EpochCallback):
     whether a step was a success, ``eval/success_rate_after_<k>_queries`` and
     ``eval/known_task_success_rate`` too.
 
+    >>> from sb3_poem import POEMSAC
+    >>> model = POEMSAC("MlpPolicy", "poem/PointGoal-v0", n_train_tasks=4, gradient_steps=1)
+    >>> evaluation = AdaptationEvalCallback(every=5, best_model_save_path="best")
+    >>> model = model.learn(400, callback=evaluation)  # four epochs: none is evaluated yet
+
     :param every: Epochs between two evaluations
     :param n_tasks: Held-out tasks; a finite family of no more than that is evaluated on all its
         tasks

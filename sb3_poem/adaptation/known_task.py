@@ -88,6 +88,10 @@ def known_task_return(
     trajectory relabelled for every task. The winners are then rolled out anew, so that the luck of
     having been chosen does not count.
 
+    >>> best = known_task_return("PointGoal", "poem/PointGoal-v0", 5, n_latents=50)
+    >>> best.latents.shape  # a policy for each of five tasks
+    (5, 5)
+
     :param model: And ``env``: see :func:`adapt_tasks`.
     :param tasks: See :func:`evaluate_adaptation`.
     :param n_latents: How many to try; None for 300, or for 30 where every latent must be rolled out
@@ -147,6 +151,11 @@ def return_matrix(
 def property_one(similarities: np.ndarray, returns: np.ndarray) -> tuple[float, float]:
     """How well S(z_i, z_j), (n_tasks, n_policies), orders policies as true returns J[i, j] do
     (Property 1).
+
+    >>> similarities, returns = np.array([[0.1, 0.5, 0.9]]), np.array([[-3.0, -1.0, -2.0]])
+    >>> accuracy, tau = property_one(similarities, returns)  # of three pairs two are in order
+    >>> round(accuracy, 2), round(tau, 2)
+    (0.67, 0.33)
 
     :return: Preference accuracy, the share of pairs of policies with different returns that S puts
         in the right order (a tie of S counts one half); and Kendall's tau-b, averaged over tasks.

@@ -32,6 +32,11 @@ def information_limit(
     return after five answers. For a bound on the family take a dense grid of tasks. An answer of
     EQUAL, which tells a little more than LEFT or RIGHT alone, is not provided for.
 
+    >>> speeds = np.linspace(0, 3, 61)
+    >>> returns = -np.abs(speeds[:, None] - speeds)  # of policies that run at some speed
+    >>> [round(information_limit(returns, k, ordered=True), 2) for k in range(4)]
+    [-0.76, -0.38, -0.19, -0.1]
+
     :param returns: (n_tasks, n_policies) return of each policy on each task (J).
     :param noise_model: How the oracle errs; None is an oracle that does not.
     :raises ValueError: If the matrix is empty or not finite, k is negative, or the noise model is
@@ -55,6 +60,10 @@ def best_codebook(returns: np.ndarray, size: int, *, ordered: bool = False) -> n
 
     Found exactly where all sets can be tried, or by dynamic programming where tasks lie on a line
     (``ordered``); else by greedy choice and swaps, which may lie slightly below the optimum.
+
+    >>> places = np.arange(6)
+    >>> best_codebook(-np.abs(places[:, None] - places), 2, ordered=True)
+    array([1, 4])
 
     :param ordered: Whether the rows are in the order of a one-dimensional task parameter. The
         optimum is then found among all ways to cut the line into ``size`` intervals, one policy
@@ -111,6 +120,10 @@ def answer_capacity(noise: NoiseModel | None, returns: np.ndarray) -> float:
     since the information is convex in them; and asking in the light of earlier answers adds nothing
     (Cover & Thomas, Elements of Information Theory, 7.12).
 
+    >>> from sb3_poem.adaptation import MistakeNoise
+    >>> round(answer_capacity(MistakeNoise(0.1), np.zeros((1, 1))), 2)  # a tenth is wrong
+    0.53
+
     :param noise: How the oracle errs; None is an oracle that does not.
     :param returns: (n_tasks, n_policies). With a fixed ``beta`` an answer is the surer the larger
         the difference of returns, and no question is supposed to show a larger one than there is
@@ -138,6 +151,9 @@ def rate_distortion_limit(returns: np.ndarray, bits: float) -> float:
     bits, tasks being equally likely (Shannon 1959), found by the algorithm of Blahut and Arimoto.
     What is returned is the value of the dual problem, with the bound that holds at every iterate
     (Csiszar 1974): where iterations are stopped early it is too high, never too low.
+
+    >>> rate_distortion_limit(np.eye(2), bits=1.0), rate_distortion_limit(np.eye(2), bits=0.0)
+    (1.0, 0.5)
 
     :param returns: (n_tasks, n_policies), finite.
     """

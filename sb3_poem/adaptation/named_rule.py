@@ -18,6 +18,9 @@ def named_rule(
 ) -> Rule:
     """The rule of these words, "bayes" or "paper"; None takes its own numbers.
 
+    >>> named_rule("paper", n_candidates=50)
+    Paper(n_candidates=50)
+
     :param n_candidates: Of Algorithm 2, or particles.
     :param mistake_rate: How often who answers errs, which Algorithm 2 takes no notice of.
     :param options: Others of the rule.

@@ -75,7 +75,12 @@ class ExactNoise(_Serialisable):
 
 @dataclass(frozen=True)
 class MistakeNoise(_Serialisable):
-    """The right answer, flipped with a fixed probability, in [0, 0.5]."""
+    """The right answer, flipped with a fixed probability, in [0, 0.5].
+
+    >>> p = MistakeNoise(0.1).probability_left(difference=3.0, error=0.0, magnitude=20.0)
+    >>> round(float(p), 2)
+    0.9
+    """
 
     rate: float = 0.2
     kind = "mistake"
@@ -93,6 +98,10 @@ class MistakeNoise(_Serialisable):
 class BoltzmannNoise(_Serialisable):
     """LEFT with probability 1 / (1 + exp(-beta (R_left - R_right))) (C.6 of Xu & Zhu 2025); a beta
     of None is the paper's ``1 / (|R_left| + |R_right|)``.
+
+    >>> p = BoltzmannNoise().probability_left(difference=3.0, error=0.0, magnitude=20.0)
+    >>> round(float(p), 2)
+    0.54
     """
 
     beta: float | None = None

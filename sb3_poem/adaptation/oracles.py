@@ -85,7 +85,12 @@ class TaskOracle(ABC):
 
 
 class ReturnOracle(TaskOracle):
-    """The larger true return wins; equal returns are EQUAL. See :class:`TaskOracle`."""
+    """The larger true return wins; equal returns are EQUAL. See :class:`TaskOracle`.
+
+    >>> from sb3_poem import PreferenceAdapter
+    >>> adapter = PreferenceAdapter("PointGoal", "poem/PointGoal-v0", oracle=ReturnOracle(), seed=0)
+    >>> policy = adapter.adapt()
+    """
 
     def _compare(self, left: float, right: float) -> Preference:
         return _better(left, right)
@@ -121,6 +126,9 @@ class BoltzmannOracle(TaskOracle):
 class MistakeOracle(TaskOracle):
     """The right answer, flipped with a probability in [0, 1], of which the noise model knows those
     up to 0.5. Equal returns stay EQUAL. For the other arguments see :class:`TaskOracle`.
+
+    >>> MistakeOracle(0.1).noise_model
+    MistakeNoise(rate=0.1)
     """
 
     def __init__(

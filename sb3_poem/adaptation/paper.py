@@ -37,6 +37,12 @@ class Paper(Rule):
     are bounded; what is missing is filled up by the draws that satisfy most answers, and among
     those by the highest likelihood. EQUAL excludes nobody.
 
+    >>> from sb3_poem import PreferenceAdapter
+    >>> rule = Paper(n_candidates=50, epsilon=0.2)
+    >>> adapter = PreferenceAdapter("PointGoal", "poem/PointGoal-v0", rule=rule, seed=0)
+    >>> adapter.inference.candidates.shape
+    (50, 5)
+
     :param n_candidates: N_z, at least 2.
     :param epsilon: Tolerated error of eq. 9, in [0, 0.5).
     :param candidates: Where they come from: "prior" (the paper's N(0, I)) or "aggregate" (the

@@ -26,6 +26,11 @@ class AdaptedPolicy:
     """A model with its latent fixed. It follows SB3's ``predict`` protocol, so ``evaluate_policy``
     and every other program of SB3's that only predicts takes it for a model.
 
+    >>> from sb3_poem import PreferenceAdapter
+    >>> policy = PreferenceAdapter("PointGoal", "poem/PointGoal-v0", seed=0).policy()
+    >>> policy.save("policy.safetensors")
+    >>> action, _ = AdaptedPolicy.load("policy.safetensors").predict([0.0, 0.0])
+
     :param n_answers: How many answers led to it.
     :param env: The vector environment to whose task (its first copy's) it was adapted; None for a
         policy from a file. It does not know the task itself.

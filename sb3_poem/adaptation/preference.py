@@ -25,7 +25,13 @@ SIGNS = {Preference.LEFT: 1.0, Preference.RIGHT: -1.0, Preference.EQUAL: 0.0}
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """A question: which of two trajectories on the new task is better?"""
+    """A question: which of two trajectories on the new task is better?
+
+    >>> from sb3_poem import PreferenceAdapter
+    >>> query = PreferenceAdapter("PointGoal", "poem/PointGoal-v0", seed=0).ask()
+    >>> query.left.observations.shape, query.right.actions.shape
+    ((26, 2), (25, 2))
+    """
 
     left: Trajectory
     right: Trajectory

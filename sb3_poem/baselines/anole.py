@@ -41,6 +41,14 @@ class ANOLE(Rule):
       disagrees is dropped, unless nothing would be left.
     - "random": one random pair, else as ANOLE.
 
+    >>> from sb3_poem import PreferenceAdapter
+    >>> from sb3_poem.baselines import rollout_fragments
+    >>> name, env = "PointGoal", "poem/PointGoal-v0"  # the model, which ships without its buffer
+    >>> library = rollout_fragments(name, env, 40, length=10)
+    >>> adapter = PreferenceAdapter(name, env, rule=ANOLE(), library=library, seed=0)
+    >>> adapter.ask().left.actions.shape
+    (10, 2)
+
     :param strategy: "berlekamp", "greedy" or "random".
     :param n_candidates: Candidates at least; "greedy" takes 2^K.
     :param mistake_rate: The share of answers that may be mistakes: E = floor(rate K).

@@ -61,6 +61,10 @@ def training_rollouts(
     """n episodes of training tasks, drawn by ``seed``, under their own policies: a ``library`` for
     a model that was loaded without its replay buffer. For ``model`` and ``env``, in which tasks are
     set, see :class:`PreferenceAdapter`.
+
+    >>> library = training_rollouts("PointGoal", "poem/PointGoal-v0", 4)
+    >>> len(library), library[0].actions.shape
+    (4, (25, 2))
     """
     trained, vec_env = model_and_env(model, env)
     if not isinstance(trained, PEARLSAC):

@@ -17,8 +17,17 @@ from sb3_poem.benchmark.estimate import cell_seconds, measure_pace, training_sec
 from sb3_poem.benchmark.methods import VARIANTS
 from sb3_poem.benchmark.models import ModelLibrary, Say, locked, try_lock
 from sb3_poem.benchmark.store import Store
-from sb3_poem.benchmark.suites import EXACT, Budget, Cell, ModelKey, Suite, Training
-from sb3_poem.benchmark.training import family_facts, training_plan
+from sb3_poem.benchmark.suites import (
+    EXACT,
+    Budget,
+    Cell,
+    ModelKey,
+    Suite,
+    Training,
+    family_id,
+    family_label,
+)
+from sb3_poem.benchmark.training import FamilyFacts, family_facts, training_plan
 from sb3_poem.common.vec_env import make_task_vec_env
 
 
@@ -61,13 +70,24 @@ def make_plan(
 ) -> Plan:
     """Look at what there is, in a store if there is one yet. For ``families``, ``methods`` and
     ``snapshots`` None is the suite's own; methods that were not named are left out where they
-    cannot run.
+    cannot run, families where their extra is missing.
     """
     plan = Plan()
-    facts = {fact.env_id: fact for fact in map(family_facts, families or suite.families)}
+    facts: dict[str, FamilyFacts] = {}
+    missing: dict[str, str] = {}
+    for name in families or suite.families:
+        try:
+            facts[family_id(name)] = family_facts(name)
+        except ImportError as error:
+            if families:
+                raise ValueError(f"--families {name}: {error}") from error
+            missing[family_id(name)] = f"{family_label(name)}: {error}"
     finished = set() if store is None else store.keys()
     origins: dict[ModelKey, str] = {}
-    for cell in suite.cells(list(facts), seeds, methods, budget, training, snapshots):
+    for cell in suite.cells([*facts, *missing], seeds, methods, budget, training, snapshots):
+        if cell.env_id in missing:
+            plan.skipped.append((cell, missing[cell.env_id]))
+            continue
         key = cell.model_key
         objection = cell.definition.objection(facts[cell.env_id].shared_dynamics)
         if objection is not None:

@@ -211,6 +211,10 @@ class Entry:
 class Suite:
     """A declared set of cells.
 
+    >>> cells = SUITES["smoke"].cells(["poem/PointGoal-v0"], seeds=[0, 1, 2])
+    >>> sorted({cell.oracle.kind for cell in cells})
+    ['boltzmann', 'return']
+
     :param references: Methods that say what the models' policies could earn, for the tables'
         limits.
     :param snapshots: In how many equal parts the training is cut for measurements along it; 1

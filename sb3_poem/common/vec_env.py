@@ -44,6 +44,11 @@ class TaskVecEnv(VecEnv):
     ``Monitor`` and ``DummyVecEnv`` included, and ``"reward_features"``. ``get_attr`` and
     ``env_method`` see each copy as a single :class:`poem_envs.TaskFamily`.
 
+    >>> from stable_baselines3.common.env_util import make_vec_env
+    >>> env = make_vec_env("poem/PointGoal-v0", 4, vec_env_cls=TaskVecEnv)
+    >>> env.reset().shape
+    (4, 2)
+
     :param env_fns: One function a copy that returns an environment. Only the first is called: all
         copies are made alike, from its registration and arguments. If its ``Monitor`` has a file,
         the episodes of all copies are written to that file.

@@ -58,6 +58,11 @@ class PEARLSAC(SAC):
     standardised by the mean and deviation of all that were collected. Arguments that are not
     described are SAC's.
 
+    >>> model = PEARLSAC("MlpPolicy", "poem/PointGoal-v0", n_train_tasks=4, gradient_steps=1)
+    >>> model = model.learn(200)  # two epochs of four episodes
+    >>> observation = model.get_env().reset()
+    >>> action, _ = model.predict(observation, state=model.task_latents[:1])  # for the first task
+
     :param policy: The policy model to use: "MlpPolicy", or a subclass of its class
     :param env: A task family: an environment, a vectorised one of SB3 or Gymnasium, or a registered
         id (which is then vectorised)

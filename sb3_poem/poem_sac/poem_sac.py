@@ -39,6 +39,11 @@ class POEMSAC(PEARLSAC):
     Of the arguments of :class:`PEARLSAC` it lacks ``context_relabel_fraction`` (contexts are of the
     task's own policy, eq. 8), and defaults of the losses' weights are others.
 
+    >>> model = POEMSAC("MlpPolicy", "poem/PointGoal-v0", n_train_tasks=4, gradient_steps=1, seed=0)
+    >>> model = model.learn(200)  # two epochs of four episodes; a real one takes 500 times as many
+    >>> model.similarities(model.task_latents, model.task_latents).shape  # tasks, policies
+    (4, 4)
+
     :param preference_coef: Weight of the preference loss
     :param similarity: "two-encoder": <f_r(z_i), f_pi(z_j)>; "inner": <z_i, z_j>, the ablation of
         Proposition 1

@@ -14,7 +14,7 @@ from sb3_poem import PEARLSAC, POEMSAC
 from sb3_poem.benchmark.estimate import Pace
 from sb3_poem.benchmark.models import ModelLibrary, Workplace
 from sb3_poem.benchmark.running import describe, make_plan
-from sb3_poem.benchmark.suites import REVISION, SUITES, Budget, ModelKey, Training
+from sb3_poem.benchmark.suites import REVISION, SUITES, Budget, ModelKey, Training, family_id
 from sb3_poem.benchmark.training import FamilyFacts, family_facts, training_plan
 from sb3_poem.cli import main
 from sb3_poem.common.vec_env import make_task_vec_env
@@ -26,7 +26,7 @@ POINT = "poem/PointGoal-v0"
 def plan_for(
     library: ModelLibrary,
     suite: str,
-    families: list[str],
+    families: list[str] | None,
     methods: list[str] | None = None,
     seeds: int = 1,
 ):
@@ -205,6 +205,25 @@ def test_a_method_that_cannot_run_on_a_family_says_so_before_training(
         with pytest.raises(ValueError, match=message):
             plan_for(library, "table3", families)
     assert not any(tmp_path.iterdir())
+
+
+def test_families_whose_extra_is_missing_are_left_out_unless_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def facts(name: str) -> FamilyFacts:
+        if "MetaWorld" in name:
+            raise ImportError("pip install 'sb3_poem[metaworld]'")
+        return FamilyFacts(family_id(name), 200, None, True)
+
+    monkeypatch.setattr("sb3_poem.benchmark.running.family_facts", facts)
+    library = ModelLibrary(Workplace(str(tmp_path)))
+    plan = plan_for(library, "table3", None)
+    assert "poem/AntVel-v0" in {cell.env_id for cell in plan.todo}
+    assert {reason for cell, reason in plan.skipped if cell.family.startswith("MetaWorld")} == {
+        f"MetaWorld{name}: pip install 'sb3_poem[metaworld]'" for name in ("ML1", "ML10")
+    }
+    with pytest.raises(ValueError, match=r"--families MetaWorldML1: pip install 'sb3_poem\["):
+        plan_for(library, "table3", ["MetaWorldML1"])
 
 
 def test_the_plan_names_each_model_once_and_a_base_first(tmp_path: Path) -> None:

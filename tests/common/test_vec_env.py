@@ -171,8 +171,8 @@ def test_ids_that_name_their_module():
 
 
 def test_attributes_of_a_family_in_processes():
-    env = make_task_vec_env("poem/MetaWorldML1-v0", 2, nthread=1)
-    assert env.get_attr("env_name") == ["reach", "reach"]
+    env = make_task_vec_env("poem/FetchReach-v0", 2, nthread=1)
+    assert env.get_attr("max_episode_steps") == [50, 50]
 
 
 def test_set_attr():

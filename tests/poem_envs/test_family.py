@@ -14,7 +14,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 from worlds import Walk1D
 
-from poem_envs import TaskFamily
+from poem_envs import TaskFamily, sawyer
 
 
 @pytest.mark.filterwarnings("ignore:.*A Box observation space m.*imum value is")
@@ -113,6 +113,18 @@ print(seconds, heavy, sum(id.startswith("poem/") for id in gymnasium.registry))
     runs = [run_python(code).split(maxsplit=1) for _ in range(2)]
     assert {rest.strip() for _, rest in runs} == {"[] 13"}
     assert min(float(seconds) for seconds, _ in runs) < 1.0
+
+
+@pytest.mark.parametrize("make", [gym.make, gym.make_vec])
+@pytest.mark.parametrize("name", ["ML1", "ML10"])
+def test_meta_world_is_an_extra(monkeypatch, make, name):
+    def absent(name):
+        raise sawyer.PackageNotFoundError(name)
+
+    monkeypatch.setattr(sawyer, "version", absent)
+    needed = r"need metaworld >= 3.1, < 4: pip install 'sb3_poem\[metaworld\]'"
+    with pytest.raises(ImportError, match=needed):
+        make(f"poem/MetaWorld{name}-v0")
 
 
 def test_gymnasium_imports_the_package_by_its_name_in_an_id():

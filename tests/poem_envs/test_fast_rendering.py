@@ -12,7 +12,12 @@ from poem_envs.headless import can_draw
 
 @pytest.mark.skipif(not can_draw(), reason="no off-screen OpenGL")
 @pytest.mark.parametrize(
-    "env_id", ["poem/HalfCheetahVel-v0", "poem/AntGoal-v0", "poem/MetaWorldML1-v0"]
+    "env_id",
+    [
+        "poem/HalfCheetahVel-v0",
+        "poem/AntGoal-v0",
+        pytest.param("poem/MetaWorldML1-v0", marks=pytest.mark.metaworld),
+    ],
 )
 def test_the_same_scene_from_the_same_camera(env_id: str) -> None:
     images = {}
@@ -50,7 +55,9 @@ def test_a_scene_that_is_too_small_for_the_task(tmp_path, monkeypatch) -> None:
     env.close()
 
 
-@pytest.mark.parametrize("env_id", ["poem/AntVel-v0", "poem/MetaWorldML1-v0"])
+@pytest.mark.parametrize(
+    "env_id", ["poem/AntVel-v0", pytest.param("poem/MetaWorldML1-v0", marks=pytest.mark.metaworld)]
+)
 def test_it_renders_images_alone(env_id: str) -> None:
     with pytest.raises(ValueError, match="render_quality"):
         gym.make(env_id, render_quality="best")

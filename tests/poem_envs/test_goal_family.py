@@ -37,6 +37,13 @@ def test_rewards_are_the_environments_own(env_id, own_id, reward_type, rng):
         )
 
 
+@pytest.mark.parametrize("env", ["FetchSlide-v4", "HandReach-v3"])
+def test_other_environments_of_gymnasium_robotics(env):
+    family = GoalFamily(f"gymnasium_robotics:{env}")
+    family.reset(seed=0)
+    family.step(family.action_space.sample())
+
+
 def test_the_goal_is_reached_where_the_task_says(rng):
     env = gym.make("poem/FetchReach-v0").unwrapped
     for task in env.sample_tasks(3, rng):

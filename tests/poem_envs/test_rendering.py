@@ -141,7 +141,12 @@ def test_rendering_without_a_mode(env_id):
 
 
 @pytest.mark.parametrize(
-    "env_id", ["poem/MetaWorldML1-v0", "poem/FetchReach-v0", "poem/AntMaze-v0"]
+    "env_id",
+    [
+        pytest.param("poem/MetaWorldML1-v0", marks=pytest.mark.metaworld),
+        "poem/FetchReach-v0",
+        "poem/AntMaze-v0",
+    ],
 )
 def test_other_environments_that_render_or_close_change_nothing(env_id):
     def image(env):
@@ -166,6 +171,7 @@ def test_other_environments_that_render_or_close_change_nothing(env_id):
     again.close()
 
 
+@pytest.mark.metaworld
 def test_tasks_of_different_manipulations_render_in_turn():
     env = gym.make("poem/MetaWorldML10-v0", render_mode="rgb_array")
     tasks = env.unwrapped.sample_tasks(3, np.random.default_rng(0))

@@ -24,7 +24,10 @@ def make_model(env_id, n_tasks=4, n_envs=4, **env_kwargs):
     return POEMSAC("MlpPolicy", env, n_train_tasks=n_tasks, seed=0, **options)
 
 
-@pytest.mark.parametrize("env_id", ["poem/MetaWorldML1-v0", "poem/FetchReach-v0"])
+@pytest.mark.parametrize(
+    "env_id",
+    [pytest.param("poem/MetaWorldML1-v0", marks=pytest.mark.metaworld), "poem/FetchReach-v0"],
+)
 def test_preferences_are_relabelled_where_dynamics_are_shared(env_id):
     model = make_model(env_id).learn(2 * 4 * HORIZON)
     assert model.num_timesteps == 2 * 4 * HORIZON
@@ -32,6 +35,7 @@ def test_preferences_are_relabelled_where_dynamics_are_shared(env_id):
     assert np.isfinite(model.epoch_context.returns.numpy()).all()
 
 
+@pytest.mark.metaworld
 def test_preferences_of_ml10_are_measured_by_rollouts_that_count(monkeypatch):
     """An epoch runs four tasks, and the twelve pairs of the one group, each once; its returns are
     theirs.
@@ -62,6 +66,7 @@ def test_preferences_of_ml10_are_measured_by_rollouts_that_count(monkeypatch):
         POEMSAC("MlpPolicy", model.env, n_train_tasks=4, preference_source="relabel")
 
 
+@pytest.mark.metaworld
 def test_what_a_deterministic_rollout_measures_is_what_a_single_environment_gives():
     """Returns and successes of one latent in tasks with different dynamics, against a loop over one
     environment.
