@@ -27,7 +27,6 @@ from starlette.responses import (
     FileResponse,
     HTMLResponse,
     JSONResponse,
-    PlainTextResponse,
     RedirectResponse,
     Response,
 )
@@ -50,6 +49,12 @@ DISK_FULL = (
     "This could not be kept: the disk of this server is full, or cannot be written. What you "
     "answered before is safe; tell whoever runs the page, and try again when there is room."
 )
+LOST = "There is no conversation under this link. Is it whole?"
+ERROR_TITLES = {
+    404: "There is nothing here",
+    503: "All places are taken",
+    507: "This could not be kept",
+}
 LARGEST = 2**63 - 1  # of SQLite's whole numbers
 # Addresses of nobody, to ask the system from which of its own it would speak to the world.
 ELSEWHERE = {socket.AF_INET: "192.0.2.1", socket.AF_INET6: "2001:db8::1"}
@@ -88,7 +93,7 @@ class _Pages:
             ],
             middleware=[Middleware(AccessMiddleware, access=access)],
             exception_handlers=dict.fromkeys(
-                (HTTPException, RefusedError, FullError, StorageError), _error_response
+                (HTTPException, RefusedError, FullError, StorageError), self.error
             ),
             lifespan=self.lifespan,
         )
@@ -103,7 +108,7 @@ class _Pages:
             session = await self.sessions.find(token) if len(token) <= LONGEST_TOKEN else None
             if session is None:
                 await asyncio.sleep(0.05)
-                raise HTTPException(404, "There is no conversation under this link. Is it whole?")
+                raise HTTPException(404, LOST)
             return await endpoint(request, session)
 
         return Route(f"/s/{{token}}{path}", find_session, methods=[method])
@@ -147,7 +152,7 @@ class _Pages:
         if re.fullmatch("[0-9]{1,18}", number):
             path = await asyncio.to_thread(self.sessions.video, session, int(number))
         if path is None:
-            raise HTTPException(404)
+            raise HTTPException(404, "There is no such video.")
         # What a turn shows never changes, and only this browser may keep it.
         caching = {"Cache-Control": "private, max-age=86400, immutable"}
         return FileResponse(path, media_type="video/mp4", headers=caching)
@@ -170,8 +175,26 @@ class _Pages:
         model = self.sessions.load(info)
         return AdaptedPolicy(model, json.loads(turn["latent"]), answered).to_bytes()
 
-    def _html(self, name: str, **values: Any) -> HTMLResponse:
-        return HTMLResponse(self.templates.get_template(name).render(**values))
+    async def error(self, request: Request, error: Exception) -> Response:
+        """A sentence: a page for who opens one, else JSON."""
+        words, status, headers = str(error), 409, None
+        if isinstance(error, HTTPException):
+            words, status, headers = error.detail, error.status_code, error.headers
+        elif isinstance(error, StorageError):
+            _logger.error("%s", error)
+            words, status = DISK_FULL, 507
+        elif isinstance(error, FullError):
+            status, headers = 503, {"Retry-After": "60"}
+        if "text/html" not in request.headers.get("accept", ""):
+            return JSONResponse({"error": words}, status, headers)
+        title = ERROR_TITLES.get(status, "This did not work")
+        values = {"title": title, "words": words, "retry": request.method == "GET"}
+        return self._html("error.html", status, headers, **values)
+
+    def _html(
+        self, name: str, status: int = 200, headers: Any = None, **values: Any
+    ) -> HTMLResponse:
+        return HTMLResponse(self.templates.get_template(name).render(**values), status, headers)
 
 
 def _download(content: str | bytes, name: str, media_type: str) -> Response:
@@ -199,21 +222,6 @@ async def _fields(request: Request, **kinds: type) -> dict[str, Any]:
         if kind is str and any("\ud800" <= character <= "\udfff" for character in value):
             raise HTTPException(400, f"`{name}` holds half a character (a lone surrogate)")
     return data
-
-
-async def _error_response(request: Request, error: Exception) -> Response:
-    """A sentence: plain for who sees it as a page, else JSON."""
-    words, status, headers = str(error), 409, None
-    if isinstance(error, HTTPException):
-        words, status, headers = error.detail, error.status_code, error.headers
-    elif isinstance(error, StorageError):
-        _logger.error("%s", error)
-        words, status = DISK_FULL, 507
-    elif isinstance(error, FullError):
-        status, headers = 503, {"Retry-After": "60"}
-    if "text/html" in request.headers.get("accept", ""):
-        return PlainTextResponse(f"{words}\n", status, headers)
-    return JSONResponse({"error": words}, status, headers)
 
 
 def make_server(app: Starlette, host: str, port: int, deadline: float = DEADLINE) -> uvicorn.Server:

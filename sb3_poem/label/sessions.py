@@ -31,6 +31,7 @@ AT_WORK_SECONDS = 60.0
 CROWDED_FILM_EVERY = 2
 # Errors that say in words why a turn could not be made.
 WORDED_ERRORS = (RefusedError, OtherModelError, StorageError)
+UNWORDED = "The videos could not be made. It is tried again; your answers are safe."
 # After a turn that could not be made: not at once again.
 RETRY_SECONDS = 5.0
 
@@ -133,8 +134,7 @@ class SessionManager:
             if isinstance(error, StorageError):
                 raise error
             if error is not None:
-                unworded = f"{type(error).__name__}; it is tried again"
-                view["failed"] = str(error) if isinstance(error, WORDED_ERRORS) else unworded
+                view["failed"] = str(error) if isinstance(error, WORDED_ERRORS) else UNWORDED
             return view
         if turn["shown"] is None:
             await asyncio.to_thread(self.store.mark_shown, turn["id"])

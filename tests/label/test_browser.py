@@ -39,6 +39,7 @@ pytestmark = [
 ]
 SEED = 3
 DESKTOP, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
+LANDSCAPE = {"width": 844, "height": 390}
 SHOWN = "() => typeof view !== 'undefined' && view !== null && view.phase !== 'preparing' && !busy"
 
 
@@ -170,7 +171,7 @@ class Person:
         return self.oracle(*sides).value
 
     def answer(self, times: int = 1, keyboard: bool = False) -> None:
-        keys = {"left": "ArrowLeft", "right": "ArrowRight", "equal": "ArrowDown"}
+        keys = {"left": "ArrowLeft", "right": "ArrowRight", "equal": "2"}
         for _ in range(times):
             self.page.wait_for_function(SHOWN)
             answered = self.answered()
@@ -318,7 +319,7 @@ def test_two_people_and_a_second_tab(
         ben.answer()
     # The second tab of the same session still shows the first question: its answer is refused, and
     # it catches up.
-    tab.keyboard.press("ArrowDown")
+    tab.keyboard.press("2")
     tab.wait_for_function("() => view.answered === 2 && view.phase === 'question' && !busy")
     assert ann.stored() != ben.stored()
     assert len(ann.stored()) == len(ben.stored()) == 2
@@ -351,8 +352,18 @@ def test_the_keyboard_alone(
     assert person.answered() == 2
     page.keyboard.press("Tab")
     page.evaluate("() => document.activeElement.blur()")
+    page.keyboard.press("ArrowDown")  # scrolls
     page.keyboard.press("u")
     page.wait_for_function("() => view.answered === 1 && !busy")
+    page.uncheck("#keys")  # WCAG 2.1.4
+    for _ in range(2):
+        for key in ("1", "u", "ArrowRight", "Space"):
+            page.evaluate("() => document.activeElement.blur()")
+            page.keyboard.press(key)
+        assert page.evaluate("() => [view.answered, busy, player.wantsToPlay]") == [1, False, False]
+        page.reload()
+        page.wait_for_function(SHOWN)
+    page.check("#keys")
     for element in page.query_selector_all(
         "button:visible, a:visible, input:visible, select:visible, textarea:visible"
     ):
@@ -403,6 +414,83 @@ def test_a_phone(open_page: Callable[..., Any], server: Server, point_goal: Mode
         box = page.locator(selector).bounding_box()
         assert box["height"] >= 44
         assert box["y"] + box["height"] <= PHONE["height"]  # all that is needed is in sight
+
+
+def test_a_phone_on_its_side(
+    open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
+) -> None:
+    person = begin(open_page, server, point_goal, 2.0, viewport=LANDSCAPE, has_touch=True)
+    for selector in ("#left-screen", "#play", "[data-preference=left]", "[data-preference=equal]"):
+        box = person.page.locator(selector).bounding_box()
+        assert box["y"] >= 0
+        assert box["y"] + box["height"] <= LANDSCAPE["height"], selector
+    assert person.page.locator("#left-screen").bounding_box()["height"] >= 120
+
+
+def test_what_is_said_offline_is_sent_later(
+    open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
+) -> None:
+    person = begin(open_page, server, point_goal, 1.0)
+    page = person.page
+    page.context.set_offline(True)
+    page.keyboard.press("1")
+    page.fill("#wish", "far to the left")
+    page.wait_for_selector("#error:visible")
+    assert "kept in this browser" in page.text_content("#error")
+    assert person.stored() == []
+    page.context.set_offline(False)
+    page.wait_for_function("() => view.answered === 1 && view.phase === 'question' && !busy")
+    assert page.is_hidden("#error")
+    page.wait_for_function("() => Object.keys(unsent).length === 0")
+    # Whoever closes the page while they are offline finds it sent when they come back.
+    page.context.set_offline(True)
+    page.click("[data-preference=right]")
+    page.fill("#wish", "farther")
+    page.wait_for_selector("#error:visible")
+    address = page.url
+    context = page.context
+    page.close()
+    assert person.stored() == ["left"]
+    context.set_offline(False)
+    page = context.new_page()
+    page.goto(address)
+    page.wait_for_function("() => view !== null && view.answered === 2 && !busy")
+    assert person.stored() == ["left", "right"]
+    # Who types and closes the page at once loses no word.
+    page.wait_for_function(SHOWN)
+    page.fill("#wish", "at once")
+    page.click("#robots")
+    page.wait_for_url(f"{server.url}/")
+    page.goto(address)
+    assert page.input_value("#wish") == "at once"
+
+
+def test_the_page_is_readable_for_all(
+    open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
+) -> None:
+    page = open_page(f"{server.url}/s/none")
+    assert page.text_content("h1") == "There is nothing here"
+    page.click("text=Choose a robot")
+    page.click(f"button[value={point_goal.name}]")
+    page.wait_for_url("**/s/*")
+    assert page.get_by_role("img", name=re.compile("It believes")).count() == 1
+    page.wait_for_function(SHOWN)  # what waits is pale
+    ratios = page.evaluate(
+        """() => [...document.querySelectorAll('kbd, .note, .hint, figcaption')].map(element => {
+            const light = colour => colour.match(/[\\d.]+/g).slice(0, 3).map(Number)
+                .map(c => (c /= 255) <= .04045 ? c / 12.92 : ((c + .055) / 1.055) ** 2.4)
+                .reduce((sum, c, i) => sum + c * [.2126, .7152, .0722][i], 0);
+            const style = getComputedStyle(element);
+            let behind = element, opacity = 1;
+            for (let e = element; e; e = e.parentElement) opacity *= getComputedStyle(e).opacity;
+            while (getComputedStyle(behind).backgroundColor === 'rgba(0, 0, 0, 0)')
+                behind = behind.parentElement;
+            const back = light(getComputedStyle(behind).backgroundColor);
+            const front = back + opacity * (light(style.color) - back);
+            return (Math.max(back, front) + .05) / (Math.min(back, front) + .05);
+        })"""
+    )
+    assert min(ratios) >= 4.5
 
 
 def test_the_server_is_killed_in_the_middle(

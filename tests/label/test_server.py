@@ -420,3 +420,25 @@ def test_answers_json_is_strict_json(served: tuple[TestClient, Store]) -> None:
         raise AssertionError(constant)
 
     assert json.loads(text, parse_constant=refuse)["answers"] == []
+
+
+def test_a_browser_gets_pages_where_something_is_refused(
+    store: Store, point_goal: ModelInfo
+) -> None:
+    app = make_app(make_sessions(store, point_goal, max_sessions=1))
+    with TestClient(app, base_url=HOST, headers={"Accept": "text/html,*/*;q=0.8"}) as client:
+        begun = client.post("/start", data={"model": "PointGoal"}, follow_redirects=False)
+        full = client.post("/start", data={"model": "PointGoal"})
+        lost, nowhere = client.get("/s/lost"), client.get("/nowhere")
+        unknown = client.post("/start", data={"model": "R2D2"})
+    assert (begun.status_code, full.status_code, unknown.status_code) == (303, 503, 409)
+    assert (lost.status_code, nowhere.status_code) == (404, 404)
+    for response, words in (
+        (full, "1 people are at work"),
+        (lost, "no conversation under this link"),
+        (nowhere, "There is nothing here"),
+        (unknown, "choose one from the list"),
+    ):
+        assert words in response.text
+        assert '<a href="/">Choose a robot</a>' in response.text
+        assert response.headers["content-type"] == "text/html; charset=utf-8"

@@ -21,7 +21,7 @@ from sb3_poem.adaptation.adapter import PreferenceAdapter
 from sb3_poem.adaptation.noise import MistakeNoise
 from sb3_poem.label.families import ModelInfo
 from sb3_poem.label.rendering import load_shown_model
-from sb3_poem.label.sessions import FullError, SessionManager
+from sb3_poem.label.sessions import UNWORDED, FullError, SessionManager
 from sb3_poem.label.store import RefusedError, Session, Store
 
 ANSWERS = ("left", "right", "equal", "left")
@@ -138,6 +138,21 @@ def test_a_session_does_not_go_on_with_a_model_of_other_weights(
         return view["failed"]
 
     assert "with a model of other weights" in asyncio.run(second_half())
+
+
+def test_what_cannot_be_filmed_is_said_without_an_errors_name(
+    run_server: Callable[..., Any], point_goal: ModelInfo
+) -> None:
+    async def life(sessions: SessionManager) -> str:
+        session, _ = await begin(sessions)
+        view = await sessions.view(session)
+        while "failed" not in view:
+            await asyncio.sleep(0.02)
+            view = await sessions.view(session)
+        return view["failed"]
+
+    broken = replace(point_goal, env_kwargs=(("step_length", "far"),))
+    assert run_server(life, broken) == UNWORDED
 
 
 def test_undo_and_the_same_answer_lead_to_the_same_question(

@@ -2,6 +2,7 @@
 "use strict";
 
 const POLL_MILLISECONDS = 150;
+const RETRY_MILLISECONDS = 1000;
 const SLOW_AFTER_MILLISECONDS = 4000;
 const base = window.location.pathname.replace(/\/+$/, "");
 const byId = (id) => document.getElementById(id);
@@ -18,6 +19,7 @@ let waitingSince = null;
 async function ask(path, body) {
   const options = body === undefined ? {} : {
     method: "POST",
+    keepalive: true, // a page that is closed still sends it
     headers: { "Content-Type": "application/json" },
     body: JSON.stringify(body),
   };
@@ -31,6 +33,46 @@ async function ask(path, body) {
   return data;
 }
 
+// What the server has not confirmed, by path: it outlives the page, and is sent until it is kept.
+// The server takes the same thing twice as once.
+const unsent = JSON.parse(localStorage.getItem(base) || "{}");
+const deliveries = {};
+
+function send(path, body) {
+  unsent[path] = body;
+  localStorage.setItem(base, JSON.stringify(unsent));
+  deliveries[path] ??= deliver(path).finally(() => delete deliveries[path]);
+  return deliveries[path];
+}
+
+async function deliver(path) {
+  for (;;) {
+    const body = unsent[path];
+    let next = null;
+    try {
+      next = await ask(path, body);
+    } catch (error) {
+      if (isPassing(error)) {
+        showError(connectionMessage(error));
+        await pause(RETRY_MILLISECONDS, "online");
+        continue;
+      }
+      forget(path);
+      throw error;
+    }
+    showError("");
+    if (unsent[path] === body) return forget(path) || next;
+  }
+}
+
+function forget(path) {
+  delete unsent[path];
+  if (Object.keys(unsent).length) localStorage.setItem(base, JSON.stringify(unsent));
+  else localStorage.removeItem(base);
+}
+
+const isPassing = (error) => error.status === undefined || [502, 503, 504].includes(error.status);
+
 function showError(message) {
   byId("error").textContent = message || "";
   byId("error").hidden = !message;
@@ -40,7 +82,10 @@ function say(text) {
   byId("status").textContent = text;
 }
 
-const pause = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
+const pause = (milliseconds, event) => new Promise((resolve) => {
+  setTimeout(resolve, milliseconds);
+  if (event) window.addEventListener(event, resolve, { once: true });
+});
 
 // Sends what the person did, then follows the conversation until something is shown again.
 async function act(path, body) {
@@ -49,7 +94,7 @@ async function act(path, body) {
   showError("");
   byId("board").classList.add("busy");
   try {
-    await show(await ask(path, body));
+    await show(await send(path, body));
   } catch (error) {
     // Out of step, perhaps because of another tab: see where the conversation is.
     if (error.status !== 409) showError(connectionMessage(error));
@@ -60,7 +105,8 @@ async function act(path, body) {
 }
 
 function connectionMessage(error) {
-  return error.status === undefined ? "The server does not answer. Nothing that you answered is lost; trying again…" : error.message;
+  if (error.status !== undefined) return error.message;
+  return "The server does not answer. What you answered is kept in this browser, and sent as soon as it does…";
 }
 
 async function follow() {
@@ -73,8 +119,8 @@ async function follow() {
       await pause(POLL_MILLISECONDS);
     } catch (error) {
       showError(connectionMessage(error));
-      if (error.status !== undefined && error.status !== 503 && error.status < 500) return;
-      await pause(1000);
+      if (error.status !== undefined && error.status < 500) return;
+      await pause(RETRY_MILLISECONDS, "online");
     }
   }
 }
@@ -163,13 +209,16 @@ byId("stop").addEventListener("click", () => act("/stop", {}));
 const KEYS = {
   ArrowLeft: () => answer("left"),
   ArrowRight: () => answer("right"),
-  ArrowDown: () => answer("equal"),
+  1: () => answer("left"),
+  2: () => answer("equal"),
+  3: () => answer("right"),
   u: undo,
   U: undo,
   ",": () => player.step(-1),
   ".": () => player.step(1),
 };
 document.addEventListener("keydown", (event) => {
+  if (!byId("keys").checked) return;
   if (event.altKey || event.ctrlKey || event.metaKey || event.repeat) return;
   if (event.target.closest("input, textarea, select")) return; // there the arrows mean something else
   if (event.key === " " && !event.target.closest("button, a")) {
@@ -184,17 +233,23 @@ document.addEventListener("keydown", (event) => {
 let wishTimer = null;
 async function saveWish() {
   clearTimeout(wishTimer);
-  try {
-    await ask("/wish", { wish: byId("wish").value });
-  } catch (error) {
-    showError(connectionMessage(error));
-  }
+  wishTimer = null;
+  await send("/wish", { wish: byId("wish").value }).catch((error) => showError(error.message));
 }
 byId("wish").addEventListener("input", () => {
   clearTimeout(wishTimer);
   wishTimer = setTimeout(saveWish, 600);
 });
 byId("wish").addEventListener("change", saveWish);
+window.addEventListener("pagehide", () => {
+  if (wishTimer !== null) saveWish();
+  for (const [path, body] of Object.entries(unsent)) ask(path, body).catch(() => {});
+});
+
+byId("keys").checked = localStorage.getItem("keys") !== "off";
+byId("keys").addEventListener("change", () => {
+  localStorage.setItem("keys", byId("keys").checked ? "on" : "off");
+});
 
 // Another tab, or the back button, may have moved the conversation on.
 document.addEventListener("visibilitychange", () => {
@@ -203,6 +258,10 @@ document.addEventListener("visibilitychange", () => {
 
 async function start() {
   busy = true;
+  for (const [path, body] of Object.entries(unsent)) {
+    if (path === "/wish") byId("wish").value = body.wish;
+    await send(path, body).catch(() => {}); // refused: the conversation has gone on without it
+  }
   await follow();
   busy = false;
 }
