@@ -11,8 +11,6 @@ from poem_envs import (
     BatchFamily,
     BatchTaskFamily,
     ProcessFamilyVector,
-    SignedPermutation,
-    Symmetry,
     TaskFamily,
     TaskFamilyVector,
 )
@@ -306,23 +304,6 @@ class PotentialOfItsOwnState(Walk):
         return -np.abs(observations[..., 0] - tasks[..., 0]) - np.abs(self.x[0])
 
 
-class SymmetryOfAnotherWidth(Walk):
-    symmetries = (Symmetry(SignedPermutation((0,), (-1,)), *[SignedPermutation((0,), (-1,))] * 2),)
-
-
-class SymmetryThatScales(Walk):
-    symmetries = (
-        Symmetry(SignedPermutation((0, 1), (-1, 2)), *[SignedPermutation((0,), (-1,))] * 2),
-    )
-
-
-class SymmetryOfUnevenActions(Walk):
-    action_space = spaces.Box(-1.0, 2.0, (1,), np.float32)
-    symmetries = (
-        Symmetry(SignedPermutation((0, 1), (-1, 1)), *[SignedPermutation((0,), (-1,))] * 2),
-    )
-
-
 class InfinitePotential(Walk):
     def _potential(self, tasks, observations):
         return np.full(np.broadcast_shapes(tasks.shape[:-1], observations.shape[:-1]), -np.inf)
@@ -365,9 +346,6 @@ BROKEN = [
     (PotentialThatDoesNotBroadcast, "compute_potential must broadcast"),
     (PotentialOfItsOwnState, "potentials at once as one after another"),
     (InfinitePotential, "compute_potential must give finite numbers"),
-    (SymmetryOfAnotherWidth, "observations.order must hold each of the indices 0 to 1 once"),
-    (SymmetryThatScales, "observations.signs must be 2 of 1 and -1"),
-    (SymmetryOfUnevenActions, "actions must leave the bounds of the space as they are"),
     (RewardWithoutItsCosts, "step must return exactly compute_rewards"),
     (RenderingThatMoves, "rendering must not change the episode"),
     (RenderingOfTheTask, "images must not show the task unless render_task=True"),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from gymnasium.envs.registration import register
 
-from poem_envs.family import SignedPermutation, Symmetry, TaskDefinition, TaskFamily
+from poem_envs.family import TaskDefinition, TaskFamily
 from poem_envs.vector import BatchFamily, BatchTaskFamily, TaskFamilyVector, set_task
 
 if TYPE_CHECKING:
@@ -22,8 +22,6 @@ __all__ = [
     "BatchTaskFamily",
     "GoalFamily",
     "ProcessFamilyVector",
-    "SignedPermutation",
-    "Symmetry",
     "TaskDefinition",
     "TaskFamily",
     "TaskFamilyVector",

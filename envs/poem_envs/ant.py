@@ -7,44 +7,9 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from poem_envs.family import SignedPermutation, Symmetry
 from poem_envs.legged import DirectionFamily, LeggedFamily
 from poem_envs.mujoco_family import MujocoTaskEnv, MujocoTaskVectorEnv
 from poem_envs.mujoco_rendering import arrow, pole
-
-
-def _symmetries(hidden_qpos: int) -> tuple[Symmetry, ...]:
-    """The model's own: left is like right, and the front like the back; the observation leaves out
-    so many of the torso's x and y.
-    """
-    # The hinges are hip_1, ankle_1, ..., ankle_4; legs 1 to 4 stand at (+, +), (-, +), (-, -) and
-    # (+, -) of x and y. A reflection turns the hips the other way; a half turn finds the axes of
-    # the ankles reversed.
-    half_turn = SignedPermutation((4, 5, 6, 7, 0, 1, 2, 3), (1, -1) * 4)
-    reflection = SignedPermutation((6, 7, 4, 5, 2, 3, 0, 1), (-1, 1) * 4)
-    motors = (6, 7, 0, 1, 2, 3, 4, 5)  # hip_4, ankle_4, hip_1, ankle_1, ..., ankle_3
-
-    def whole(
-        hinges: SignedPermutation, position: tuple[int, ...], *root: tuple[int, ...]
-    ) -> Symmetry:
-        """:param root: signs of its quaternion and of its angular velocity"""
-        quaternion, turning = root
-        placed = position[hidden_qpos:]
-        order = [*range(len(placed) + 4)]
-        order += [len(order) + i for i in hinges.order]
-        n = len(order)
-        order += [*range(n, n + 6), *(n + 6 + i for i in hinges.order)]
-        signs = (*placed, *quaternion, *hinges.signs, *position, *turning, *hinges.signs)
-        actions = SignedPermutation(
-            tuple(motors.index(hinges.order[hinge]) for hinge in motors),
-            tuple(hinges.signs[hinge] for hinge in motors),
-        )
-        features = SignedPermutation((0, 1, 2), (*position[:2], 1))
-        return Symmetry(SignedPermutation(tuple(order), signs), actions, features)
-
-    turned = whole(half_turn, (-1, -1, 1), (1, -1, -1, 1), (-1, -1, 1))
-    reflected = whole(reflection, (1, -1, 1), (1, -1, 1, -1), (-1, 1, -1))
-    return turned, reflected, turned.then(reflected)
 
 
 class _Ant(LeggedFamily):
@@ -65,8 +30,6 @@ class _Ant(LeggedFamily):
             healthy_z_range=healthy_z_range,
             **kwargs,
         )
-        if xml_file == "ant.xml":
-            self.symmetries = _symmetries(self.hidden_qpos)
 
     def _reward_features(self, qpos_before: np.ndarray, actions: np.ndarray) -> np.ndarray:
         velocity = (self._qpos[:, :2] - qpos_before[:, :2]) / self.dt

@@ -8,7 +8,7 @@ vectorised ones on the same contract.
 from __future__ import annotations
 
 from abc import ABC, ABCMeta, abstractmethod
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -21,39 +21,6 @@ from poem_envs.headless import has_display
 # Rounding in float32 policies and files may leave a value just outside its bounds: up to this it is
 # clipped, not refused.
 BOUNDS_TOLERANCE = 1e-6
-
-
-class SignedPermutation(NamedTuple):
-    """A reordering with changes of sign: entry i is ``signs[i]`` (1, -1) times ``order[i]``'s."""
-
-    order: tuple[int, ...]
-    signs: tuple[int, ...]
-
-    def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Of ``(..., n)``, a new array."""
-        return values[..., list(self.order)] * np.array(self.signs, dtype=values.dtype)
-
-    def then(self, other: SignedPermutation) -> SignedPermutation:
-        """This one first, the other next."""
-        signs = (sign * self.signs[i] for i, sign in zip(other.order, other.signs, strict=True))
-        return SignedPermutation(tuple(self.order[i] for i in other.order), tuple(signs))
-
-
-class Symmetry(NamedTuple):
-    """A symmetry of a family's dynamics, as the reflection of a robot whose left is like its right.
-
-    If an action takes the environment from one observation to the next, with some reward features,
-    then the mirrored action takes it from the one's mirror image to the other's, with the mirrored
-    features; rewards are computed from these, for any task.
-    """
-
-    observations: SignedPermutation
-    actions: SignedPermutation
-    features: SignedPermutation
-
-    def then(self, other: Symmetry) -> Symmetry:
-        """This one first, the other next."""
-        return Symmetry(*(mine.then(its) for mine, its in zip(self, other, strict=True)))
 
 
 class TaskDefinition(ABC):
@@ -72,8 +39,6 @@ class TaskDefinition(ABC):
     #: Whether tasks differ in the reward alone, so that one task's trajectories can be relabelled
     #: with another's rewards.
     shared_dynamics: bool = True
-    #: Symmetries of the dynamics, by which training may see every transition in other forms too.
-    symmetries: tuple[Symmetry, ...] = ()
     #: The names of the sets that tasks can be drawn from, of which the first is for training.
     splits: tuple[str, ...] = ("train",)
     #: The one that :meth:`sample_tasks` draws from.

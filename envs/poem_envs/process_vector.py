@@ -216,7 +216,7 @@ class ProcessFamilyVector(TaskFamilyVector):
         self.task_space, self.all_tasks = template.task_space, template.all_tasks
         self.reward_feature_dim = template.reward_feature_dim
         self.shared_dynamics = template.shared_dynamics
-        self.symmetries, self.splits = template.symmetries, template.splits
+        self.splits = template.splits
         assert isinstance(template.observation_space, spaces.Box)
         assert isinstance(template.action_space, spaces.Box)
         super().__init__(
