@@ -7,13 +7,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from poem_envs import (
-    BatchFamily,
-    BatchTaskFamily,
-    ProcessFamilyVector,
-    TaskFamily,
-    TaskFamilyVector,
-)
+from poem_envs import BatchFamily, TaskFamily, TaskFamilyVector
 from poem_envs.testing import check_task_family
 
 SMALL = {"width": 64, "height": 64}
@@ -83,7 +77,7 @@ class Walk(TaskFamily):
         return image
 
 
-class WalkVector(ProcessFamilyVector):
+class WalkVector(TaskFamilyVector):
     def __init__(self, **kwargs):
         super().__init__(Walk, **kwargs)
 
@@ -369,13 +363,9 @@ def test_each_violation_has_its_message(family, message):
 class _Batch(BatchFamily):
     """A batch whose copies are not quite alike."""
 
+    observation_space, action_space = Walk.observation_space, Walk.action_space
     task_space, reward_feature_dim = Walk.task_space, 1
     wrong = ""
-
-    def __init__(self, **kwargs):
-        super().__init__(
-            observation_space=Walk.observation_space, action_space=Walk.action_space, **kwargs
-        )
 
     def _allocate(self, n):
         self._x = np.zeros((n, 2))
@@ -398,9 +388,6 @@ class _Batch(BatchFamily):
     def _observations(self):
         return self._x.copy()
 
-    def _physics_state(self, copy):
-        return self._x[copy].copy()
-
     def _reward(self, tasks, features):
         return -np.abs(features[..., 0] - tasks[..., 0])
 
@@ -415,10 +402,10 @@ class _Batch(BatchFamily):
     ],
 )
 def test_a_vectorised_version_that_differs(wrong, message):
-    single = type("Single", (_Batch, BatchTaskFamily), {"wrong": wrong})
-    vector = type("Vector", (_Batch, TaskFamilyVector), {"wrong": wrong})
+    family = type("Family", (_Batch,), {"wrong": wrong})
+    vector = functools.partial(TaskFamilyVector, family)
     gym.register(
-        "test/Differs-v0", entry_point=single, vector_entry_point=vector, max_episode_steps=5
+        "test/Differs-v0", entry_point=family, vector_entry_point=vector, max_episode_steps=5
     )
     try:
         with pytest.raises(AssertionError, match=f"{message} must equal the single environment's"):
@@ -453,7 +440,7 @@ def test_a_good_registration():
     gym.register(
         "test/Good-v0",
         entry_point=Walk,
-        vector_entry_point=functools.partial(ProcessFamilyVector, Walk),
+        vector_entry_point=functools.partial(TaskFamilyVector, Walk),
         max_episode_steps=5,
     )
     try:

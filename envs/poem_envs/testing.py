@@ -296,7 +296,7 @@ def check_vector_parity(case: Case, env_id: str, env_kwargs: dict[str, Any]) -> 
     vector_env = gym.make_vec(env_id, n, vectorization_mode="vector_entry_point", **arguments)
     assert isinstance(vector_env, TaskFamilyVector), (
         f"the vector_entry_point of {env_id} must make a poem_envs.TaskFamilyVector, but makes a "
-        f"{type(vector_env).__name__}; use functools.partial(poem_envs.ProcessFamilyVector, "
+        f"{type(vector_env).__name__}; use functools.partial(poem_envs.TaskFamilyVector, "
         "YourFamily)"
     )
 
