@@ -232,7 +232,7 @@ class ProcessCopies:
         self._interrupted = False
         return results
 
-    def begin(self, starts: Sequence[EpisodeStart]) -> list[np.random.Generator]:
+    def begin(self, starts: Sequence[EpisodeStart]) -> dict[int, np.random.Generator]:
         """Begin episodes of some copies, and return their generators after all draws."""
         by_group: dict[int, list[EpisodeStart]] = {}
         for start in starts:
@@ -244,7 +244,7 @@ class ProcessCopies:
             for start, observation, rng in zip(by_group[group], *answer, strict=True):
                 copy = self._firsts[group] + start.copy
                 self._last_observations[copy], drawn[copy] = observation, rng
-        return [drawn[start.copy] for start in starts]
+        return drawn
 
     def advance(
         self, actions: np.ndarray, describe: Callable[[int], str]

@@ -81,12 +81,6 @@ class BatchFamily(TaskFamily):
     def _release(self) -> None:
         """Free threads, windows and the like. Called by ``close``, possibly more than once."""
 
-    def begin(self, starts: Sequence[EpisodeStart]) -> list[np.random.Generator]:
-        """Begin episodes of some copies, and return their generators after all draws."""
-        rngs = [start.rng for start in starts]
-        self._begin_episodes(np.array([start.copy for start in starts]), rngs)
-        return rngs
-
     def advance(
         self, actions: np.ndarray, describe: Callable[[int], str]
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -375,13 +369,17 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         self._elapsed_steps[copies] = 0
         self._succeeded[copies] = False
         self._episodes[copies] += 1
-        places = ((self._seeds[copy], int(self._episodes[copy])) for copy in copies)
+        rngs = [self._rngs[copy] for copy in copies]
+        if isinstance(self._copies, BatchFamily):
+            self._copies._begin_episodes(copies, rngs)
+            return
+        tasks, episodes = self._tasks.copy(), self._episodes.tolist()
         starts = [
-            EpisodeStart(copy, self._rngs[copy], self._tasks[copy].copy(), *place)
-            for copy, place in zip(copies.tolist(), places, strict=True)
+            EpisodeStart(copy, rng, tasks[copy], self._seeds[copy], episodes[copy])
+            for copy, rng in zip(copies.tolist(), rngs, strict=True)
         ]
-        for start, rng in zip(starts, self._copies.begin(starts), strict=True):
-            self._rngs[start.copy] = rng  # which another process may have drawn from
+        for copy, rng in self._copies.begin(starts).items():
+            self._rngs[copy] = rng  # which has drawn, in another process
 
     def _describe_episode(self, copy: int) -> str:
         return (
