@@ -63,17 +63,22 @@ def row(family: str, method: str, queries: int | None = None, kind: str = "metho
     return None
 
 
-def cell(found: Any, error: bool = False, rate: bool = False) -> str:
-    """A return, with its standard error over tasks and the rate of success where there are any."""
+def cell(found: Any, error: bool = False) -> str:
+    """A return, with its standard error over tasks."""
     if found is None:
         return ""
     digits = 0 if abs(found["mean"]) >= 100 else 1
     text = f"{found['mean']:,.{digits}f}"
     if error and found["task_error"] is not None:
         text += f" ± {found['task_error']:.{digits}f}"
-    if rate and found["success_rate"] is not None:
-        text += f" ({100 * found['success_rate']:.0f} %)"
     return text
+
+
+def rate(found: Any) -> str:
+    """The share of successes, where the family knows of success."""
+    if found is None or found["success_rate"] is None:
+        return ""
+    return f"{100 * found['success_rate']:.0f} %"
 
 
 def steps(family: str) -> str:
@@ -116,8 +121,10 @@ def family_section(family: str) -> str:
     ):
         figures = [row(family, method, k, kind) for k in ANSWERS]
         known = row(family, "known-task", kind="known") if kind == "method" else None
-        cells = [cell(one, error=True, rate=True) for one in figures]
-        rows.append([name, *cells, cell(known, rate=True)])
+        rows.append([name, *(cell(one, error=True) for one in figures), cell(known)])
+        rates = [rate(one) for one in (*figures, known)]
+        if any(rates):
+            rows.append([f"{name}, success", *rates])
     lines = [f"## {family}", ""]
     lines += table(["rule", *(f"k = {k}" for k in ANSWERS), "task known"], rows)
     lines += ["", *([REMARKS[family], ""] if family in REMARKS else [])]
@@ -141,7 +148,7 @@ What the models that ship earn, as `sb3-poem benchmark run --suite shipped --mod
 --seeds 1` measures it; `python docs/tables.py` writes this page from
 [its store](../benchmarks/results/shipped/manifest.md). One training seed each. Mean return over 30
 test tasks that no training saw, 10 episodes each, after k exact answers; ± is the standard error
-over tasks, and the share of successes stands in brackets where a family knows of success. *Task
+over tasks; families that know of success have the share of successes below each return. *Task
 known*: the best of the model's policies for each task, found by trying. *Limit*: the best choice of
 2^k of these policies, chosen with the test tasks in sight: an optimistic bound for k exact answers.
 † marks a training of other steps than the family's entry in `zoo_configs/` names. Comparisons with

@@ -14,7 +14,7 @@ from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from poem_envs import SignedPermutation, Symmetry, TaskFamily
+from poem_envs import TaskFamily
 from sb3_poem.pearl_sac.pearl_sac import PEARLSAC
 from sb3_poem.poem_sac.poem_sac import POEMSAC
 
@@ -80,19 +80,6 @@ class Walk(TaskFamily):
 
     def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
         return -np.abs(features[..., 0] - tasks[..., 0]) - 0.01 * features[..., 1] ** 2
-
-
-class EvenWalk(Walk):
-    """Left is like right."""
-
-    action_space = spaces.Box(-3.0, 3.0, (1,), np.float32)
-    symmetries = (
-        Symmetry(
-            SignedPermutation((0, 1), (-1, 1)),
-            SignedPermutation((0,), (-1,)),
-            SignedPermutation((0, 1), (-1, -1)),
-        ),
-    )
 
 
 class TwoWalks(Walk):

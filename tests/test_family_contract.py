@@ -7,15 +7,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from poem_envs import (
-    BatchFamily,
-    BatchTaskFamily,
-    ProcessFamilyVector,
-    SignedPermutation,
-    Symmetry,
-    TaskFamily,
-    TaskFamilyVector,
-)
+from poem_envs import BatchFamily, TaskFamily, TaskFamilyVector
 from poem_envs.testing import check_task_family
 
 SMALL = {"width": 64, "height": 64}
@@ -92,7 +84,7 @@ class Walk(TaskFamily):
         return image
 
 
-class WalkVector(ProcessFamilyVector):
+class WalkVector(TaskFamilyVector):
     def __init__(self, **kwargs):
         super().__init__(Walk, **kwargs)
 
@@ -313,23 +305,6 @@ class PotentialOfItsOwnState(Walk):
         return -np.abs(observations[..., 0] - tasks[..., 0]) - np.abs(self.x[0])
 
 
-class SymmetryOfAnotherWidth(Walk):
-    symmetries = (Symmetry(SignedPermutation((0,), (-1,)), *[SignedPermutation((0,), (-1,))] * 2),)
-
-
-class SymmetryThatScales(Walk):
-    symmetries = (
-        Symmetry(SignedPermutation((0, 1), (-1, 2)), *[SignedPermutation((0,), (-1,))] * 2),
-    )
-
-
-class SymmetryOfUnevenActions(Walk):
-    action_space = spaces.Box(-1.0, 2.0, (1,), np.float32)
-    symmetries = (
-        Symmetry(SignedPermutation((0, 1), (-1, 1)), *[SignedPermutation((0,), (-1,))] * 2),
-    )
-
-
 class InfinitePotential(Walk):
     def _potential(self, tasks, observations):
         return np.full(np.broadcast_shapes(tasks.shape[:-1], observations.shape[:-1]), -np.inf)
@@ -372,9 +347,6 @@ BROKEN = [
     (PotentialThatDoesNotBroadcast, "compute_potential must broadcast"),
     (PotentialOfItsOwnState, "potentials at once as one after another"),
     (InfinitePotential, "compute_potential must give finite numbers"),
-    (SymmetryOfAnotherWidth, "observations.order must hold each of the indices 0 to 1 once"),
-    (SymmetryThatScales, "observations.signs must be 2 of 1 and -1"),
-    (SymmetryOfUnevenActions, "actions must leave the bounds of the space as they are"),
     (RewardWithoutItsCosts, "step must return exactly compute_rewards"),
     (RenderingThatMoves, "rendering must not change the episode"),
     (RenderingOfTheTask, "images must not show the task unless render_task=True"),
@@ -398,13 +370,9 @@ def test_each_violation_has_its_message(family, message):
 class _Batch(BatchFamily):
     """A batch whose copies are not quite alike."""
 
+    observation_space, action_space = Walk.observation_space, Walk.action_space
     task_space, reward_feature_dim = Walk.task_space, 1
     wrong = ""
-
-    def __init__(self, **kwargs):
-        super().__init__(
-            observation_space=Walk.observation_space, action_space=Walk.action_space, **kwargs
-        )
 
     def _allocate(self, n):
         self._x = np.zeros((n, 2))
@@ -427,9 +395,6 @@ class _Batch(BatchFamily):
     def _observations(self):
         return self._x.copy()
 
-    def _physics_state(self, copy):
-        return self._x[copy].copy()
-
     def _reward(self, tasks, features):
         return -np.abs(features[..., 0] - tasks[..., 0])
 
@@ -444,10 +409,10 @@ class _Batch(BatchFamily):
     ],
 )
 def test_a_vectorised_version_that_differs(wrong, message):
-    single = type("Single", (_Batch, BatchTaskFamily), {"wrong": wrong})
-    vector = type("Vector", (_Batch, TaskFamilyVector), {"wrong": wrong})
+    family = type("Family", (_Batch,), {"wrong": wrong})
+    vector = functools.partial(TaskFamilyVector, family)
     gym.register(
-        "test/Differs-v0", entry_point=single, vector_entry_point=vector, max_episode_steps=5
+        "test/Differs-v0", entry_point=family, vector_entry_point=vector, max_episode_steps=5
     )
     try:
         with pytest.raises(AssertionError, match=f"{message} must equal the single environment's"):
@@ -482,7 +447,7 @@ def test_a_good_registration():
     gym.register(
         "test/Good-v0",
         entry_point=Walk,
-        vector_entry_point=functools.partial(ProcessFamilyVector, Walk),
+        vector_entry_point=functools.partial(TaskFamilyVector, Walk),
         max_episode_steps=5,
     )
     try:

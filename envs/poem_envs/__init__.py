@@ -10,21 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 from gymnasium.envs.registration import register
 
-from poem_envs.family import SignedPermutation, Symmetry, TaskDefinition, TaskFamily
-from poem_envs.vector import BatchFamily, BatchTaskFamily, TaskFamilyVector, set_task
+from poem_envs.family import TaskFamily
+from poem_envs.vector import BatchFamily, TaskFamilyVector, set_task
 
 if TYPE_CHECKING:
     from poem_envs.goal_family import GoalFamily
-    from poem_envs.process_vector import ProcessFamilyVector
 
 __all__ = [
     "BatchFamily",
-    "BatchTaskFamily",
     "GoalFamily",
-    "ProcessFamilyVector",
-    "SignedPermutation",
-    "Symmetry",
-    "TaskDefinition",
     "TaskFamily",
     "TaskFamilyVector",
     "set_task",
@@ -32,10 +26,9 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    homes = {"GoalFamily": "goal_family", "ProcessFamilyVector": "process_vector"}
-    if name not in homes:
+    if name != "GoalFamily":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"poem_envs.{homes[name]}"), name)
+    return import_module("poem_envs.goal_family").GoalFamily
 
 
 def _register(module: str, max_episode_steps: int, *names: str) -> None:

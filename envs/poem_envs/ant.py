@@ -2,49 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
-from poem_envs.family import SignedPermutation, Symmetry
 from poem_envs.legged import DirectionFamily, LeggedFamily
-from poem_envs.mujoco_family import MujocoTaskEnv, MujocoTaskVectorEnv
 from poem_envs.mujoco_rendering import arrow, pole
-
-
-def _symmetries(hidden_qpos: int) -> tuple[Symmetry, ...]:
-    """The model's own: left is like right, and the front like the back; the observation leaves out
-    so many of the torso's x and y.
-    """
-    # The hinges are hip_1, ankle_1, ..., ankle_4; legs 1 to 4 stand at (+, +), (-, +), (-, -) and
-    # (+, -) of x and y. A reflection turns the hips the other way; a half turn finds the axes of
-    # the ankles reversed.
-    half_turn = SignedPermutation((4, 5, 6, 7, 0, 1, 2, 3), (1, -1) * 4)
-    reflection = SignedPermutation((6, 7, 4, 5, 2, 3, 0, 1), (-1, 1) * 4)
-    motors = (6, 7, 0, 1, 2, 3, 4, 5)  # hip_4, ankle_4, hip_1, ankle_1, ..., ankle_3
-
-    def whole(
-        hinges: SignedPermutation, position: tuple[int, ...], *root: tuple[int, ...]
-    ) -> Symmetry:
-        """:param root: signs of its quaternion and of its angular velocity"""
-        quaternion, turning = root
-        placed = position[hidden_qpos:]
-        order = [*range(len(placed) + 4)]
-        order += [len(order) + i for i in hinges.order]
-        n = len(order)
-        order += [*range(n, n + 6), *(n + 6 + i for i in hinges.order)]
-        signs = (*placed, *quaternion, *hinges.signs, *position, *turning, *hinges.signs)
-        actions = SignedPermutation(
-            tuple(motors.index(hinges.order[hinge]) for hinge in motors),
-            tuple(hinges.signs[hinge] for hinge in motors),
-        )
-        features = SignedPermutation((0, 1, 2), (*position[:2], 1))
-        return Symmetry(SignedPermutation(tuple(order), signs), actions, features)
-
-    turned = whole(half_turn, (-1, -1, 1), (1, -1, -1, 1), (-1, -1, 1))
-    reflected = whole(reflection, (1, -1, 1), (1, -1, 1, -1), (-1, 1, -1))
-    return turned, reflected, turned.then(reflected)
+from poem_envs.vector import TaskFamilyVector
 
 
 class _Ant(LeggedFamily):
@@ -65,92 +31,13 @@ class _Ant(LeggedFamily):
             healthy_z_range=healthy_z_range,
             **kwargs,
         )
-        if xml_file == "ant.xml":
-            self.symmetries = _symmetries(self.hidden_qpos)
 
     def _reward_features(self, qpos_before: np.ndarray, actions: np.ndarray) -> np.ndarray:
         velocity = (self._qpos[:, :2] - qpos_before[:, :2]) / self.dt
         return np.column_stack([velocity, np.square(actions).sum(axis=1)])
 
 
-class _AntVel(_Ant):
-    task_space = spaces.Box(0.0, 3.0, (1,), np.float64)
-
-    def __init__(
-        self,
-        *,
-        forward_reward_weight: float = 1.0,
-        forward_reward_offset: float = 1.0,
-        healthy_reward: float = 0.05,
-        ctrl_cost_weight: float = 0.005,
-        **kwargs: Any,
-    ) -> None:
-        self.forward_reward_weight = forward_reward_weight
-        self.forward_reward_offset = forward_reward_offset
-        self.healthy_reward = healthy_reward
-        super().__init__(ctrl_cost_weight=ctrl_cost_weight, **kwargs)
-
-    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
-        error = np.abs(features[..., 0] - tasks[..., 0])
-        forward = self.forward_reward_offset - self.forward_reward_weight * error
-        return forward - self.ctrl_cost_weight * features[..., 2] + self.healthy_reward
-
-    def _task_markers(self, task: np.ndarray, position: np.ndarray) -> list[dict[str, Any]]:
-        return [arrow(self._marker_place(position), (1.0, 0.0), length=float(task[0]) / 2)]
-
-
-class _AntFwdBack(_Ant, DirectionFamily):
-    task_space = spaces.Box(0.0, np.pi, (1,), np.float64)
-    all_tasks = np.array([[0.0], [np.pi]])
-
-
-class _AntDir2D(_Ant, DirectionFamily):
-    task_space = spaces.Box(-np.pi / 2, np.pi / 2, (1,), np.float64)
-
-
-class _AntGoal(_Ant):
-    hidden_qpos = 0
-    camera_config = {**_Ant.camera_config, "distance": 9.0, "elevation": -45.0}  # noqa: RUF012
-    goal_radius = 3.0
-    task_space = spaces.Box(-goal_radius, goal_radius, (2,), np.float64)
-
-    def __init__(
-        self,
-        *,
-        distance_reward_weight: float = 1.0,
-        ctrl_cost_weight: float = 0.1,
-        terminate_when_unhealthy: bool = False,
-        **kwargs: Any,
-    ) -> None:
-        self.distance_reward_weight = distance_reward_weight
-        super().__init__(
-            ctrl_cost_weight=ctrl_cost_weight,
-            terminate_when_unhealthy=terminate_when_unhealthy,
-            **kwargs,
-        )
-
-    def _draw_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        # the root makes the density even over the disc
-        radius = self.goal_radius * np.sqrt(rng.uniform(size=n))
-        angle = rng.uniform(0.0, 2 * np.pi, size=n)
-        return np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
-
-    def _reward_features(self, qpos_before: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        return np.column_stack([self._qpos[:, :2], np.square(actions).sum(axis=1)])
-
-    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
-        return self._potential(tasks, features) - self.ctrl_cost_weight * features[..., 2]
-
-    def _potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
-        # observations and features both begin with the position
-        x, y = (np.abs(observations[..., i] - tasks[..., i]) for i in range(2))
-        return -self.distance_reward_weight * (x + y)
-
-    def _task_markers(self, task: np.ndarray, position: np.ndarray) -> list[dict[str, Any]]:
-        return [pole(float(task[0]), float(task[1]), height=1.0)]
-
-
-class AntVelEnv(_AntVel, MujocoTaskEnv):
+class AntVelEnv(_Ant):
     r"""
     ## Description
     The Ant, a quadruped with eight hinges, is to run forward (in x direction) at a speed that it
@@ -226,12 +113,32 @@ class AntVelEnv(_AntVel, MujocoTaskEnv):
     task: an arrow, half a metre long for each m/s.
     """
 
+    task_space = spaces.Box(0.0, 3.0, (1,), np.float64)
 
-class AntVelVectorEnv(_AntVel, MujocoTaskVectorEnv):
-    """The vectorised :class:`AntVelEnv`, with the arguments of a vectorised MuJoCo family too."""
+    def __init__(
+        self,
+        *,
+        forward_reward_weight: float = 1.0,
+        forward_reward_offset: float = 1.0,
+        healthy_reward: float = 0.05,
+        ctrl_cost_weight: float = 0.005,
+        **kwargs: Any,
+    ) -> None:
+        self.forward_reward_weight = forward_reward_weight
+        self.forward_reward_offset = forward_reward_offset
+        self.healthy_reward = healthy_reward
+        super().__init__(ctrl_cost_weight=ctrl_cost_weight, **kwargs)
+
+    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
+        error = np.abs(features[..., 0] - tasks[..., 0])
+        forward = self.forward_reward_offset - self.forward_reward_weight * error
+        return forward - self.ctrl_cost_weight * features[..., 2] + self.healthy_reward
+
+    def _task_markers(self, task: np.ndarray, position: np.ndarray) -> list[dict[str, Any]]:
+        return [arrow(self._marker_place(position), (1.0, 0.0), length=float(task[0]) / 2)]
 
 
-class AntFwdBackEnv(_AntFwdBack, MujocoTaskEnv):
+class AntFwdBackEnv(_Ant, DirectionFamily):
     r"""
     ## Description
     The Ant is to run as fast as it can forward or backward (in x direction), and cannot see which.
@@ -265,12 +172,11 @@ class AntFwdBackEnv(_AntFwdBack, MujocoTaskEnv):
     `render_task=True` shows the hidden task: an arrow.
     """
 
+    task_space = spaces.Box(0.0, np.pi, (1,), np.float64)
+    all_tasks = np.array([[0.0], [np.pi]])
 
-class AntFwdBackVectorEnv(_AntFwdBack, MujocoTaskVectorEnv):
-    """The vectorised :class:`AntFwdBackEnv`."""
 
-
-class AntDir2DEnv(_AntDir2D, MujocoTaskEnv):
+class AntDir2DEnv(_Ant, DirectionFamily):
     r"""
     ## Description
     The Ant is to run as fast as it can in a direction of the plane that it cannot see.
@@ -286,12 +192,10 @@ class AntDir2DEnv(_AntDir2D, MujocoTaskEnv):
     As :class:`AntFwdBackEnv`.
     """
 
-
-class AntDir2DVectorEnv(_AntDir2D, MujocoTaskVectorEnv):
-    """The vectorised :class:`AntDir2DEnv`."""
+    task_space = spaces.Box(-np.pi / 2, np.pi / 2, (1,), np.float64)
 
 
-class AntGoalEnv(_AntGoal, MujocoTaskEnv):
+class AntGoalEnv(_Ant):
     r"""
     ## Description
     The Ant is to walk to a place that it cannot see, and to stay there.
@@ -332,6 +236,48 @@ class AntGoalEnv(_AntGoal, MujocoTaskEnv):
     `render_task=True` shows the hidden task: a pole at the goal.
     """
 
+    hidden_qpos = 0
+    camera_config = {**_Ant.camera_config, "distance": 9.0, "elevation": -45.0}  # noqa: RUF012
+    goal_radius = 3.0
+    task_space = spaces.Box(-goal_radius, goal_radius, (2,), np.float64)
 
-class AntGoalVectorEnv(_AntGoal, MujocoTaskVectorEnv):
-    """The vectorised :class:`AntGoalEnv`."""
+    def __init__(
+        self,
+        *,
+        distance_reward_weight: float = 1.0,
+        ctrl_cost_weight: float = 0.1,
+        terminate_when_unhealthy: bool = False,
+        **kwargs: Any,
+    ) -> None:
+        self.distance_reward_weight = distance_reward_weight
+        super().__init__(
+            ctrl_cost_weight=ctrl_cost_weight,
+            terminate_when_unhealthy=terminate_when_unhealthy,
+            **kwargs,
+        )
+
+    def _draw_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        # the root makes the density even over the disc
+        radius = self.goal_radius * np.sqrt(rng.uniform(size=n))
+        angle = rng.uniform(0.0, 2 * np.pi, size=n)
+        return np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
+
+    def _reward_features(self, qpos_before: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        return np.column_stack([self._qpos[:, :2], np.square(actions).sum(axis=1)])
+
+    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
+        return self._potential(tasks, features) - self.ctrl_cost_weight * features[..., 2]
+
+    def _potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
+        # observations and features both begin with the position
+        x, y = (np.abs(observations[..., i] - tasks[..., i]) for i in range(2))
+        return -self.distance_reward_weight * (x + y)
+
+    def _task_markers(self, task: np.ndarray, position: np.ndarray) -> list[dict[str, Any]]:
+        return [pole(float(task[0]), float(task[1]), height=1.0)]
+
+
+AntVelVectorEnv = functools.partial(TaskFamilyVector, AntVelEnv)
+AntFwdBackVectorEnv = functools.partial(TaskFamilyVector, AntFwdBackEnv)
+AntDir2DVectorEnv = functools.partial(TaskFamilyVector, AntDir2DEnv)
+AntGoalVectorEnv = functools.partial(TaskFamilyVector, AntGoalEnv)

@@ -1,14 +1,13 @@
 """Task families: environments that share observations and actions, and differ in a hidden
 parameter, the *task*.
 
-:class:`TaskFamily` is the base class of a single environment; :mod:`poem_envs.vector` builds
-vectorised ones on the same contract.
+:class:`TaskFamily` is their base class; :mod:`poem_envs.vector` makes vectorised ones of them.
 """
 
 from __future__ import annotations
 
-from abc import ABC, ABCMeta, abstractmethod
-from typing import Any, ClassVar, NamedTuple
+from abc import ABCMeta, abstractmethod
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -21,180 +20,6 @@ from poem_envs.headless import has_display
 # Rounding in float32 policies and files may leave a value just outside its bounds: up to this it is
 # clipped, not refused.
 BOUNDS_TOLERANCE = 1e-6
-
-
-class SignedPermutation(NamedTuple):
-    """A reordering with changes of sign: entry i is ``signs[i]`` (1, -1) times ``order[i]``'s.
-
-    >>> swap = SignedPermutation(order=(1, 0), signs=(1, -1))
-    >>> swap(np.array([2.0, 3.0]))
-    array([ 3., -2.])
-    """
-
-    order: tuple[int, ...]
-    signs: tuple[int, ...]
-
-    def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Of ``(..., n)``, a new array."""
-        return values[..., list(self.order)] * np.array(self.signs, dtype=values.dtype)
-
-    def then(self, other: SignedPermutation) -> SignedPermutation:
-        """This one first, the other next."""
-        signs = (sign * self.signs[i] for i, sign in zip(other.order, other.signs, strict=True))
-        return SignedPermutation(tuple(self.order[i] for i in other.order), tuple(signs))
-
-
-class Symmetry(NamedTuple):
-    """A symmetry of a family's dynamics, as the reflection of a robot whose left is like its right.
-
-    If an action takes the environment from one observation to the next, with some reward features,
-    then the mirrored action takes it from the one's mirror image to the other's, with the mirrored
-    features; rewards are computed from these, for any task.
-    """
-
-    observations: SignedPermutation
-    actions: SignedPermutation
-    features: SignedPermutation
-
-    def then(self, other: Symmetry) -> Symmetry:
-        """This one first, the other next."""
-        return Symmetry(*(mine.then(its) for mine, its in zip(self, other, strict=True)))
-
-
-class TaskDefinition(ABC):
-    """The tasks of a family and their rewards, of its single and its vectorised environment.
-
-    A subclass sets the attributes below and defines :meth:`_reward`; unless its tasks are uniform
-    on ``task_space`` or finitely many (``all_tasks``), it defines :meth:`_draw_tasks` too.
-    """
-
-    #: Where tasks live: a bounded box of shape ``(task_dim,)``.
-    task_space: spaces.Box
-    #: Every task of a finite family, ``(n, task_dim)``; None where there are infinitely many.
-    all_tasks: np.ndarray | None = None
-    #: Number of reward features, the last dimension of ``info["reward_features"]``.
-    reward_feature_dim: int
-    #: Whether tasks differ in the reward alone, so that one task's trajectories can be relabelled
-    #: with another's rewards.
-    shared_dynamics: bool = True
-    #: Symmetries of the dynamics, by which training may see every transition in other forms too.
-    symmetries: tuple[Symmetry, ...] = ()
-    #: The names of the sets that tasks can be drawn from, of which the first is for training.
-    splits: tuple[str, ...] = ("train",)
-    #: The one that :meth:`sample_tasks` draws from.
-    split: str = "train"
-
-    def sample_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Draw ``(n, task_dim)`` float64 tasks from the family's own distribution with a generator
-        (not the environment's own); of a finite family without replacement.
-
-        :raises ValueError: if ``n`` is below 1 or above the number of tasks of a finite family
-        """
-        if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1:
-            raise ValueError(f"n={n!r} must be a whole number, at least 1")
-        if self.all_tasks is None:
-            return np.asarray(self._draw_tasks(int(n), rng), dtype=np.float64)
-        size = len(self.all_tasks)
-        if n > size:
-            raise ValueError(
-                f"n={n} tasks were asked for, but {type(self).__name__} is a finite family of "
-                f"{size}; ask for at most {size}"
-            )
-        return np.asarray(rng.permutation(self.all_tasks)[:n], dtype=np.float64)
-
-    def compute_rewards(self, tasks: npt.ArrayLike, features: npt.ArrayLike) -> np.ndarray:
-        """The rewards ``(...)`` float64 that steps with features ``(..., reward_feature_dim)``, as
-        in ``info["reward_features"]``, earn in tasks ``(..., task_dim)``, broadcast.
-
-        A pure function: ``step`` returns exactly this for its own task and features, so that a
-        trajectory logged in one task can be relabelled for any other.
-        """
-        tasks = np.asarray(tasks, dtype=np.float64)
-        features = np.asarray(features, dtype=np.float64)
-        task_dim, feature_dim = self.task_space.shape[0], self.reward_feature_dim
-        if tasks.shape[-1:] != (task_dim,):
-            raise ValueError(
-                f"tasks has shape {tasks.shape}, but its last dimension must be task_dim={task_dim}"
-            )
-        if features.shape[-1:] != (feature_dim,):
-            raise ValueError(
-                f"features has shape {features.shape}, but its last dimension must be "
-                f"reward_feature_dim={feature_dim}"
-            )
-        return self._reward(tasks, features)
-
-    @property
-    def has_potential(self) -> bool:
-        """Whether the family says how good it is to be somewhere: :meth:`compute_potential`."""
-        return type(self)._potential is not TaskDefinition._potential
-
-    def compute_potential(self, tasks: npt.ArrayLike, observations: npt.ArrayLike) -> np.ndarray:
-        """The reward per step ``(...)`` of staying where observations ``(..., obs_dim)`` show the
-        robot, roughly, in tasks ``(..., task_dim)``; by it training can be shaped (Ng, Harada &
-        Russell, ICML 1999), which changes how fast policies are learned, not which are best.
-
-        :raises NotImplementedError: if the family defines none (:attr:`has_potential`)
-        """
-        return self._potential(np.asarray(tasks), np.asarray(observations))
-
-    def _potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
-        """Optional, for families whose rewards say where to be rather than how to move."""
-        raise NotImplementedError(
-            f"{type(self).__name__} defines no _potential(tasks, observations)"
-        )
-
-    @abstractmethod
-    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
-        """Elementwise operations alone, so that one step and a batch give the same bits."""
-
-    def _draw_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Draw from an infinite family: uniformly on ``task_space`` unless overridden."""
-        space = self.task_space
-        return rng.uniform(space.low, space.high, size=(n, *space.shape))
-
-    def _physics_state(self, copy: int) -> np.ndarray:
-        """Optional: all that determines how a copy goes on, ``(state_dim,)``, a new array."""
-        raise NotImplementedError(f"{type(self).__name__} defines no _physics_state(copy)")
-
-    def _set_physics_state(self, copy: int, state: np.ndarray) -> None:
-        """Put a copy into a state that :meth:`_physics_state` returned."""
-        raise NotImplementedError(f"{type(self).__name__} defines no _set_physics_state")
-
-    @abstractmethod
-    def _describe_episode(self, copy: int) -> str:
-        """Where a copy's episode is, for error messages."""
-
-    def _choose_split(self, split: str) -> None:
-        """Set :attr:`split`, or raise a ValueError that lists those that there are."""
-        if split not in self.splits:
-            raise ValueError(
-                f"split={split!r}: {type(self).__name__} has no such split of its tasks, it has "
-                f"{', '.join(map(repr, self.splits))}. Tasks that another generator draws are new "
-                "ones too: sample_tasks(n, np.random.default_rng(seed))"
-            )
-        self.split = split
-
-    def _checked_tasks(self, tasks: npt.ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:
-        """``tasks`` as a new float64 array; a ValueError says what is wrong with them."""
-        array = _numbers(tasks, shape, name)
-        low, high = self.task_space.low, self.task_space.high
-        clipped = np.clip(array, low, high)
-        inside = np.all(np.abs(array - clipped) <= BOUNDS_TOLERANCE, axis=-1)  # false for NaN
-        if not inside.all():
-            raise ValueError(
-                f"{_first(array, ~inside, name)} must be finite and inside task_space, from {low} "
-                f"to {high}"
-            )
-        if self.all_tasks is None:
-            return clipped
-        distance = np.abs(clipped[..., None, :] - self.all_tasks).max(axis=-1)
-        member = distance.min(axis=-1) <= BOUNDS_TOLERANCE
-        if not member.all():
-            raise ValueError(
-                f"{_first(array, ~member, name)} is not among this family's tasks, which are "
-                f"{self.all_tasks.tolist()}"
-            )
-        return self.all_tasks[distance.argmin(axis=-1)]
 
 
 class _NothingToRender:
@@ -265,11 +90,12 @@ class _FamilyType(ABCMeta):
         return family
 
 
-class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
+class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
     """Base class of a single environment whose task is hidden.
 
     A subclass sets ``observation_space``, ``action_space``, ``task_space``, ``reward_feature_dim``
-    and defines three methods::
+    and defines three methods; unless its tasks are uniform on ``task_space`` or finitely many
+    (``all_tasks``), it defines :meth:`_draw_tasks` too::
 
         class Walk1D(TaskFamily):
             observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float64)
@@ -299,7 +125,7 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray], metaclass=_Fam
     of the episode itself, so two tasks see the same start.
 
     **The info** of every step holds ``"reward_features"``, ``(reward_feature_dim,)`` float64:
-    everything that rewards of this family depend on (see :meth:`~TaskDefinition.compute_rewards`).
+    everything that rewards of this family depend on (see :meth:`compute_rewards`).
     A family whose :meth:`_step_info` gives ``"success"``, whether the step reached what the task
     asks for, has ``"is_success"`` there too, as SB3 calls it: whether any step of the episode so
     far did. Training, evaluation and the command line then report success rates.
@@ -309,6 +135,19 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray], metaclass=_Fam
     :param split: one of :attr:`splits`, to draw tasks from
     """
 
+    #: Where tasks live: a bounded box of shape ``(task_dim,)``.
+    task_space: spaces.Box
+    #: Every task of a finite family, ``(n, task_dim)``; None where there are infinitely many.
+    all_tasks: np.ndarray | None = None
+    #: Number of reward features, the last dimension of ``info["reward_features"]``.
+    reward_feature_dim: int
+    #: Whether tasks differ in the reward alone, so that one task's trajectories can be relabelled
+    #: with another's rewards.
+    shared_dynamics: bool = True
+    #: The names of the sets that tasks can be drawn from, of which the first is for training.
+    splits: tuple[str, ...] = ("train",)
+    #: The one that :meth:`sample_tasks` draws from.
+    split: str = "train"
     metadata: dict[str, Any] = _NothingToRender()  # type: ignore[assignment]
     render_task: bool = False
 
@@ -324,7 +163,13 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray], metaclass=_Fam
         self, *, render_mode: str | None = None, render_task: bool = False, split: str = "train"
     ) -> None:
         check_render_mode(render_mode, self.metadata)
-        self._choose_split(split)
+        if split not in self.splits:
+            raise ValueError(
+                f"split={split!r}: {type(self).__name__} has no such split of its tasks, it has "
+                f"{', '.join(map(repr, self.splits))}. Tasks that another generator draws are new "
+                "ones too: sample_tasks(n, np.random.default_rng(seed))"
+            )
+        self.split = split
         self.render_mode = render_mode
         self.render_task = render_task
 
@@ -395,19 +240,102 @@ class TaskFamily(TaskDefinition, gym.Env[np.ndarray, np.ndarray], metaclass=_Fam
         """Further entries of the info of the step just taken, say ``{"success": True}``."""
         return {}
 
-    def get_physics_state(self) -> np.ndarray:
-        """The simulator's state, ``(state_dim,)``, from which it can go on."""
-        return self._physics_state(0)
-
-    def set_physics_state(self, state: npt.ArrayLike) -> None:
-        """Put the simulator into a state of :meth:`get_physics_state`; the task stays."""
-        self._set_physics_state(0, checked_state(state, self._physics_state(0).shape))
-
-    def _describe_episode(self, copy: int = 0) -> str:
+    def _describe_episode(self) -> str:
+        """Where the episode is, for error messages."""
         return (
             f"step {self._elapsed_steps} of episode {self._episode} since "
             f"reset(seed={self.np_random_seed})"
         )
+
+    def sample_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """Draw ``(n, task_dim)`` float64 tasks from the family's own distribution with a generator
+        (not the environment's own); of a finite family without replacement.
+
+        :raises ValueError: if ``n`` is below 1 or above the number of tasks of a finite family
+        """
+        if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1:
+            raise ValueError(f"n={n!r} must be a whole number, at least 1")
+        if self.all_tasks is None:
+            return np.asarray(self._draw_tasks(int(n), rng), dtype=np.float64)
+        size = len(self.all_tasks)
+        if n > size:
+            raise ValueError(
+                f"n={n} tasks were asked for, but {type(self).__name__} is a finite family of "
+                f"{size}; ask for at most {size}"
+            )
+        return np.asarray(rng.permutation(self.all_tasks)[:n], dtype=np.float64)
+
+    def compute_rewards(self, tasks: npt.ArrayLike, features: npt.ArrayLike) -> np.ndarray:
+        """The rewards ``(...)`` float64 that steps with features ``(..., reward_feature_dim)``, as
+        in ``info["reward_features"]``, earn in tasks ``(..., task_dim)``, broadcast.
+
+        A pure function: ``step`` returns exactly this for its own task and features, so that a
+        trajectory logged in one task can be relabelled for any other.
+        """
+        tasks = np.asarray(tasks, dtype=np.float64)
+        features = np.asarray(features, dtype=np.float64)
+        task_dim, feature_dim = self.task_space.shape[0], self.reward_feature_dim
+        if tasks.shape[-1:] != (task_dim,):
+            raise ValueError(
+                f"tasks has shape {tasks.shape}, but its last dimension must be task_dim={task_dim}"
+            )
+        if features.shape[-1:] != (feature_dim,):
+            raise ValueError(
+                f"features has shape {features.shape}, but its last dimension must be "
+                f"reward_feature_dim={feature_dim}"
+            )
+        return self._reward(tasks, features)
+
+    @property
+    def has_potential(self) -> bool:
+        """Whether the family says how good it is to be somewhere: :meth:`compute_potential`."""
+        return type(self)._potential is not TaskFamily._potential
+
+    def compute_potential(self, tasks: npt.ArrayLike, observations: npt.ArrayLike) -> np.ndarray:
+        """The reward per step ``(...)`` of staying where observations ``(..., obs_dim)`` show the
+        robot, roughly, in tasks ``(..., task_dim)``; by it training can be shaped (Ng, Harada &
+        Russell, ICML 1999), which changes how fast policies are learned, not which are best.
+
+        :raises NotImplementedError: if the family defines none (:attr:`has_potential`)
+        """
+        return self._potential(np.asarray(tasks), np.asarray(observations))
+
+    def _potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
+        """Optional, for families whose rewards say where to be rather than how to move."""
+        raise NotImplementedError(
+            f"{type(self).__name__} defines no _potential(tasks, observations)"
+        )
+
+    @abstractmethod
+    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
+        """Elementwise operations alone, so that one step and a batch give the same bits."""
+
+    def _draw_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """Draw from an infinite family: uniformly on ``task_space`` unless overridden."""
+        space = self.task_space
+        return rng.uniform(space.low, space.high, size=(n, *space.shape))
+
+    def _checked_tasks(self, tasks: npt.ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:
+        """``tasks`` as a new float64 array; a ValueError says what is wrong with them."""
+        array = _numbers(tasks, shape, name)
+        low, high = self.task_space.low, self.task_space.high
+        clipped = np.clip(array, low, high)
+        inside = np.all(np.abs(array - clipped) <= BOUNDS_TOLERANCE, axis=-1)  # false for NaN
+        if not inside.all():
+            raise ValueError(
+                f"{_first(array, ~inside, name)} must be finite and inside task_space, from {low} "
+                f"to {high}"
+            )
+        if self.all_tasks is None:
+            return clipped
+        distance = np.abs(clipped[..., None, :] - self.all_tasks).max(axis=-1)
+        member = distance.min(axis=-1) <= BOUNDS_TOLERANCE
+        if not member.all():
+            raise ValueError(
+                f"{_first(array, ~member, name)} is not among this family's tasks, which are "
+                f"{self.all_tasks.tolist()}"
+            )
+        return self.all_tasks[distance.argmin(axis=-1)]
 
 
 def task_stream(rng: np.random.Generator) -> np.random.Generator:
@@ -466,17 +394,6 @@ def checked_actions(
         f"action{copy} is {array[index]} at component {', '.join(map(str, component))}, but it "
         f"must be finite and inside [{low[component]:g}, {high[component]:g}]"
     )
-
-
-def checked_state(state: npt.ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
-    """A simulator's state as a new array; refuses other shapes, and what is not finite."""
-    array = np.array(state, dtype=np.float64)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise ValueError(
-            f"state={state!r} must be finite and have shape {shape}, as get_physics_state() "
-            "returns it"
-        )
-    return array
 
 
 def _numbers(values: npt.ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:

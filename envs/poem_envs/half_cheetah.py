@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
-from poem_envs.mujoco_family import MujocoFamily, MujocoTaskEnv, MujocoTaskVectorEnv
+from poem_envs.mujoco_family import MujocoFamily
 from poem_envs.mujoco_rendering import arrow
+from poem_envs.vector import TaskFamilyVector
 
 
 class _HalfCheetah(MujocoFamily):
@@ -33,30 +35,7 @@ class _HalfCheetah(MujocoFamily):
         return np.stack([velocity, np.square(actions).sum(axis=1)], axis=1)
 
 
-class _HalfCheetahVel(_HalfCheetah):
-    task_space = spaces.Box(0.0, 3.0, (1,), np.float64)
-
-    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
-        error = np.abs(features[..., 0] - tasks[..., 0])
-        return -self.forward_reward_weight * error - self.ctrl_cost_weight * features[..., 1]
-
-    def _task_markers(self, task: np.ndarray, position: np.ndarray) -> list[dict[str, Any]]:
-        return [arrow(np.array([position[0], 0.0, 1.3]), (1.0, 0.0), length=float(task[0]) / 2)]
-
-
-class _HalfCheetahFwdBack(_HalfCheetah):
-    task_space = spaces.Box(-1.0, 1.0, (1,), np.float64)
-    all_tasks = np.array([[1.0], [-1.0]])
-
-    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
-        forward = self.forward_reward_weight * tasks[..., 0] * features[..., 0]
-        return forward - self.ctrl_cost_weight * features[..., 1]
-
-    def _task_markers(self, task: np.ndarray, position: np.ndarray) -> list[dict[str, Any]]:
-        return [arrow(np.array([position[0], 0.0, 1.3]), (float(task[0]), 0.0), length=1.0)]
-
-
-class HalfCheetahVelEnv(_HalfCheetahVel, MujocoTaskEnv):
+class HalfCheetahVelEnv(_HalfCheetah):
     r"""
     ## Description
     The HalfCheetah, a planar robot of 9 body parts, is to run forward at a speed that it cannot
@@ -121,12 +100,17 @@ class HalfCheetahVelEnv(_HalfCheetahVel, MujocoTaskEnv):
     the hidden task: an arrow, half a metre long for each m/s.
     """
 
+    task_space = spaces.Box(0.0, 3.0, (1,), np.float64)
 
-class HalfCheetahVelVectorEnv(_HalfCheetahVel, MujocoTaskVectorEnv):
-    """The vectorised :class:`HalfCheetahVelEnv`."""
+    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
+        error = np.abs(features[..., 0] - tasks[..., 0])
+        return -self.forward_reward_weight * error - self.ctrl_cost_weight * features[..., 1]
+
+    def _task_markers(self, task: np.ndarray, position: np.ndarray) -> list[dict[str, Any]]:
+        return [arrow(np.array([position[0], 0.0, 1.3]), (1.0, 0.0), length=float(task[0]) / 2)]
 
 
-class HalfCheetahFwdBackEnv(_HalfCheetahFwdBack, MujocoTaskEnv):
+class HalfCheetahFwdBackEnv(_HalfCheetah):
     r"""
     ## Description
     The HalfCheetah is to run as fast as it can, forward or backward, and cannot see which.
@@ -144,6 +128,16 @@ class HalfCheetahFwdBackEnv(_HalfCheetahFwdBack, MujocoTaskEnv):
     $(v_x, \|action\|_2^2)$.
     """
 
+    task_space = spaces.Box(-1.0, 1.0, (1,), np.float64)
+    all_tasks = np.array([[1.0], [-1.0]])
 
-class HalfCheetahFwdBackVectorEnv(_HalfCheetahFwdBack, MujocoTaskVectorEnv):
-    """The vectorised :class:`HalfCheetahFwdBackEnv`."""
+    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
+        forward = self.forward_reward_weight * tasks[..., 0] * features[..., 0]
+        return forward - self.ctrl_cost_weight * features[..., 1]
+
+    def _task_markers(self, task: np.ndarray, position: np.ndarray) -> list[dict[str, Any]]:
+        return [arrow(np.array([position[0], 0.0, 1.3]), (float(task[0]), 0.0), length=1.0)]
+
+
+HalfCheetahVelVectorEnv = functools.partial(TaskFamilyVector, HalfCheetahVelEnv)
+HalfCheetahFwdBackVectorEnv = functools.partial(TaskFamilyVector, HalfCheetahFwdBackEnv)

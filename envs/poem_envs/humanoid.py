@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,96 +11,12 @@ import numpy as np
 from gymnasium import spaces
 
 from poem_envs.legged import DirectionFamily
-from poem_envs.mujoco_family import MujocoTaskEnv, MujocoTaskVectorEnv
+from poem_envs.vector import TaskFamilyVector
 
 TORSO = 1  # its subtree is the whole robot
 
 
-class _HumanoidDir2D(DirectionFamily):
-    within = np.less
-    marker_height = 2.0
-    camera_config = {"distance": 5.0, "elevation": -20.0, "lookat": np.array([0.0, 0.0, 1.2])}  # noqa: RUF012
-    task_space = spaces.Box(-np.pi / 2, np.pi / 2, (1,), np.float64)
-    _forward_data: mujoco.MjData | None = None
-
-    def __init__(
-        self,
-        *,
-        xml_file: str = "humanoid.xml",
-        forward_reward_weight: float = 1.25,
-        ctrl_cost_weight: float = 0.1,
-        healthy_reward: float = 5.0,
-        healthy_z_range: tuple[float, float] = (1.0, 2.0),
-        reset_noise_scale: float = 1e-2,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(
-            xml_file=xml_file,
-            forward_reward_weight=forward_reward_weight,
-            ctrl_cost_weight=ctrl_cost_weight,
-            healthy_reward=healthy_reward,
-            healthy_z_range=healthy_z_range,
-            reset_noise_scale=reset_noise_scale,
-            **kwargs,
-        )
-
-    def _derived_dim(self) -> int:
-        return (10 + 6 + 6) * self.model.nbody + self.model.nv
-
-    def _observation_dim(self) -> int:
-        return super()._observation_dim() + self._derived_dim()
-
-    def _allocate(self, n: int) -> None:
-        super()._allocate(n)
-        self._derived = np.zeros((n, self._derived_dim()))  # cinert, cvel, qfrc_actuator, cfrc_ext
-        self._centre_of_mass = np.zeros((n, 2))
-
-    def _draw_start(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        scale = self.reset_noise_scale
-        qpos = self.init_qpos + rng.uniform(low=-scale, high=scale, size=self.model.nq)
-        qvel = self.init_qvel + rng.uniform(low=-scale, high=scale, size=self.model.nv)
-        return qpos, qvel
-
-    def _begin_episodes(self, copies: np.ndarray, rngs: Sequence[np.random.Generator]) -> None:
-        super()._begin_episodes(copies, rngs)
-        self._derive(copies, np.zeros((len(copies), self.model.nu)))
-
-    def _set_physics_state(self, copy: int, state: np.ndarray) -> None:
-        super()._set_physics_state(copy, state)
-        self._derive(np.array([copy]), np.zeros((1, self.model.nu)))
-
-    def _reward_features(self, qpos_before: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        before = self._centre_of_mass.copy()
-        self._derive(np.arange(len(actions)), actions)
-        velocity = (self._centre_of_mass - before) / self.dt
-        return np.column_stack([velocity, np.square(actions).sum(axis=1)])
-
-    def _observations(self) -> np.ndarray:
-        return np.concatenate([super()._observations(), self._derived], axis=1)
-
-    def _derive(self, copies: np.ndarray, controls: np.ndarray) -> None:
-        """Compute what observation and reward take from the simulator, for some copies."""
-        model = self.model
-        if self._forward_data is None:
-            self._forward_data = mujoco.MjData(model)
-        data = self._forward_data
-        cinert, cvel, cfrc_ext = (
-            field.reshape(-1) for field in (data.cinert, data.cvel, data.cfrc_ext)
-        )
-        derived = [cinert, cvel, data.qfrc_actuator, cfrc_ext]  # views, as are those below
-        ctrl, warm_start = data.ctrl, data.qacc_warmstart
-        centre_of_mass = data.subtree_com[TORSO, :2]
-        for copy, control in zip(copies.tolist(), controls, strict=True):
-            mujoco.mj_setState(model, data, self._states[copy], mujoco.mjtState.mjSTATE_FULLPHYSICS)
-            ctrl[:] = control
-            warm_start[:] = 0.0
-            mujoco.mj_forward(model, data)
-            mujoco.mj_rnePostConstraint(model, data)
-            np.concatenate(derived, out=self._derived[copy])
-            self._centre_of_mass[copy] = centre_of_mass
-
-
-class HumanoidDir2DEnv(_HumanoidDir2D, MujocoTaskEnv):
+class HumanoidDir2DEnv(DirectionFamily):
     r"""
     ## Description
     The Humanoid, a robot with 17 hinges, is to run in a direction of the plane that it cannot see,
@@ -175,6 +92,83 @@ class HumanoidDir2DEnv(_HumanoidDir2D, MujocoTaskEnv):
     the hidden task: an arrow.
     """
 
+    within = np.less
+    marker_height = 2.0
+    camera_config = {"distance": 5.0, "elevation": -20.0, "lookat": np.array([0.0, 0.0, 1.2])}  # noqa: RUF012
+    task_space = spaces.Box(-np.pi / 2, np.pi / 2, (1,), np.float64)
+    _forward_data: mujoco.MjData | None = None
 
-class HumanoidDir2DVectorEnv(_HumanoidDir2D, MujocoTaskVectorEnv):
-    """The vectorised :class:`HumanoidDir2DEnv`."""
+    def __init__(
+        self,
+        *,
+        xml_file: str = "humanoid.xml",
+        forward_reward_weight: float = 1.25,
+        ctrl_cost_weight: float = 0.1,
+        healthy_reward: float = 5.0,
+        healthy_z_range: tuple[float, float] = (1.0, 2.0),
+        reset_noise_scale: float = 1e-2,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(
+            xml_file=xml_file,
+            forward_reward_weight=forward_reward_weight,
+            ctrl_cost_weight=ctrl_cost_weight,
+            healthy_reward=healthy_reward,
+            healthy_z_range=healthy_z_range,
+            reset_noise_scale=reset_noise_scale,
+            **kwargs,
+        )
+
+    def _derived_dim(self) -> int:
+        return (10 + 6 + 6) * self.model.nbody + self.model.nv
+
+    def _observation_dim(self) -> int:
+        return super()._observation_dim() + self._derived_dim()
+
+    def _allocate(self, n: int) -> None:
+        super()._allocate(n)
+        self._derived = np.zeros((n, self._derived_dim()))  # cinert, cvel, qfrc_actuator, cfrc_ext
+        self._centre_of_mass = np.zeros((n, 2))
+
+    def _draw_start(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        scale = self.reset_noise_scale
+        qpos = self.init_qpos + rng.uniform(low=-scale, high=scale, size=self.model.nq)
+        qvel = self.init_qvel + rng.uniform(low=-scale, high=scale, size=self.model.nv)
+        return qpos, qvel
+
+    def _begin_episodes(self, copies: np.ndarray, rngs: Sequence[np.random.Generator]) -> None:
+        super()._begin_episodes(copies, rngs)
+        self._derive(copies, np.zeros((len(copies), self.model.nu)))
+
+    def _reward_features(self, qpos_before: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        before = self._centre_of_mass.copy()
+        self._derive(np.arange(len(actions)), actions)
+        velocity = (self._centre_of_mass - before) / self.dt
+        return np.column_stack([velocity, np.square(actions).sum(axis=1)])
+
+    def _observations(self) -> np.ndarray:
+        return np.concatenate([super()._observations(), self._derived], axis=1)
+
+    def _derive(self, copies: np.ndarray, controls: np.ndarray) -> None:
+        """Compute what observation and reward take from the simulator, for some copies."""
+        model = self.model
+        if self._forward_data is None:
+            self._forward_data = mujoco.MjData(model)
+        data = self._forward_data
+        cinert, cvel, cfrc_ext = (
+            field.reshape(-1) for field in (data.cinert, data.cvel, data.cfrc_ext)
+        )
+        derived = [cinert, cvel, data.qfrc_actuator, cfrc_ext]  # views, as are those below
+        ctrl, warm_start = data.ctrl, data.qacc_warmstart
+        centre_of_mass = data.subtree_com[TORSO, :2]
+        for copy, control in zip(copies.tolist(), controls, strict=True):
+            mujoco.mj_setState(model, data, self.states[copy], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+            ctrl[:] = control
+            warm_start[:] = 0.0
+            mujoco.mj_forward(model, data)
+            mujoco.mj_rnePostConstraint(model, data)
+            np.concatenate(derived, out=self._derived[copy])
+            self._centre_of_mass[copy] = centre_of_mass
+
+
+HumanoidDir2DVectorEnv = functools.partial(TaskFamilyVector, HumanoidDir2DEnv)

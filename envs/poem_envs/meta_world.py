@@ -13,7 +13,6 @@ from gymnasium import spaces
 
 from poem_envs.family import TaskFamily
 from poem_envs.mujoco_rendering import renders_fast
-from poem_envs.process_vector import ProcessFamilyVector
 from poem_envs.sawyer import (
     PlacementRefusedError,
     Sawyer,
@@ -23,6 +22,7 @@ from poem_envs.sawyer import (
     placements_of,
     take_sawyer,
 )
+from poem_envs.vector import TaskFamilyVector
 
 OBSERVATION_DIM = 39
 #: Manipulations whose goal is nothing but a place that the hand is to reach.
@@ -106,12 +106,6 @@ class MetaWorldEnv(TaskFamily):
         if self._sawyer is None:
             raise RuntimeError(f"{method}() was called before the first reset()")
         return self._sawyer
-
-    def _physics_state(self, copy: int) -> np.ndarray:
-        return self._begun("get_physics_state").get_state()
-
-    def _set_physics_state(self, copy: int, state: np.ndarray) -> None:
-        self._begun("set_physics_state").set_state(state)
 
     def render(self) -> Any:
         """Render the current state as ``render_mode`` says: an image ``(height, width, 3)`` for
@@ -342,10 +336,10 @@ class MetaWorldML10Env(MetaWorldEnv):
         return self.manipulations[number], task[1 : 1 + self._placement_dims[number]].copy()
 
 
-#: The vectorised :class:`MetaWorldML1Env`: same arguments, and those of ``ProcessFamilyVector``.
-MetaWorldML1VectorEnv = functools.partial(ProcessFamilyVector, MetaWorldML1Env)
+#: The vectorised :class:`MetaWorldML1Env`: same arguments, and those of ``TaskFamilyVector``.
+MetaWorldML1VectorEnv = functools.partial(TaskFamilyVector, MetaWorldML1Env)
 #: The vectorised :class:`MetaWorldML10Env`.
-MetaWorldML10VectorEnv = functools.partial(ProcessFamilyVector, MetaWorldML10Env)
+MetaWorldML10VectorEnv = functools.partial(TaskFamilyVector, MetaWorldML10Env)
 
 
 def split_stream(rng: np.random.Generator, split: int) -> np.random.Generator:

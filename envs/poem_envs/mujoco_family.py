@@ -1,6 +1,4 @@
-"""MuJoCo task families: one robot, one reward, any number of copies stepped by MuJoCo's own
-threads.
-"""
+"""MuJoCo task families, any number of whose copies are stepped by MuJoCo's own threads."""
 
 from __future__ import annotations
 
@@ -12,17 +10,16 @@ import gymnasium
 import mujoco
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode
 from mujoco.rollout import Rollout
 
 from poem_envs.mujoco_rendering import FastRenderer, StateRenderer, renders_fast
-from poem_envs.vector import BatchFamily, BatchTaskFamily, TaskFamilyVector, checked_nthread
+from poem_envs.vector import BatchFamily, DivergenceError
 
 RENDER_MODES = ["human", "rgb_array", "depth_array", "rgbd_tuple"]
 
 
 class MujocoFamily(BatchFamily):
-    """The dynamics of a MuJoCo robot, for :class:`MujocoTaskEnv` and :class:`MujocoTaskVectorEnv`.
+    """Base class of the families of MuJoCo robots.
 
     A robot sets the class attributes and defines :meth:`_reward_features`, :meth:`_draw_start`
     where its start is another, and :meth:`_unhealthy` where it can fall. A family on top of it
@@ -61,8 +58,7 @@ class MujocoFamily(BatchFamily):
     #: The following camera: attributes of ``mujoco.MjvCamera``.
     camera_config: dict[str, Any] = {"distance": 4.0}  # noqa: RUF012 (never changed)
 
-    metadata: dict[str, Any]
-    _nthread: int = 0  # the calling one
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES}  # noqa: RUF012 (Gymnasium's way)
     _rollout: Rollout | None = None
     _renderer: StateRenderer | FastRenderer | None = None
 
@@ -104,11 +100,10 @@ class MujocoFamily(BatchFamily):
         }
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.dt)}
         low, high = self.model.actuator_ctrlrange.astype(np.float32).T
-        super().__init__(
-            observation_space=spaces.Box(-np.inf, np.inf, (self._observation_dim(),), np.float64),
-            action_space=spaces.Box(low, high, dtype=np.float32),
-            **kwargs,
-        )
+        shape = (self._observation_dim(),)
+        self.observation_space = spaces.Box(-np.inf, np.inf, shape, np.float64)
+        self.action_space = spaces.Box(low, high, dtype=np.float32)
+        super().__init__(**kwargs)
 
     @property
     def dt(self) -> float:
@@ -118,7 +113,7 @@ class MujocoFamily(BatchFamily):
     @property
     def _qpos(self) -> np.ndarray:
         """Positions of all copies, ``(n, nq)``, a view."""
-        return self._states[:, 1 : 1 + self.model.nq]
+        return self.states[:, 1 : 1 + self.model.nq]
 
     def _draw_start(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """An episode's first ``qpos`` and ``qvel``; unless overridden, as Gymnasium's HalfCheetah
@@ -140,7 +135,7 @@ class MujocoFamily(BatchFamily):
 
     def _unhealthy(self) -> np.ndarray:
         """Which copies end their episode now, ``(n,)``: none unless overridden."""
-        return np.zeros(len(self._states), dtype=bool)
+        return np.zeros(len(self.states), dtype=bool)
 
     def _task_markers(self, task: np.ndarray, position: np.ndarray) -> list[dict[str, Any]]:
         """Shapes that show a task, as ``MujocoRenderer``'s ``add_marker`` takes them, where the
@@ -152,34 +147,34 @@ class MujocoFamily(BatchFamily):
         return self.model.nq - self.hidden_qpos + self.model.nv
 
     def _allocate(self, n: int) -> None:
-        # time, qpos, qvel: MuJoCo's mjSTATE_FULLPHYSICS
-        self._states = np.zeros((n, 1 + self.model.nq + self.model.nv))
+        #: Of all copies, MuJoCo's mjSTATE_FULLPHYSICS: time, positions, velocities.
+        self.states = np.zeros((n, 1 + self.model.nq + self.model.nv))
 
     def _begin_episodes(self, copies: np.ndarray, rngs: Sequence[np.random.Generator]) -> None:
         for copy, rng in zip(copies, rngs, strict=True):
-            self._states[copy] = np.concatenate(([0.0], *self._draw_start(rng)))
+            self.states[copy] = np.concatenate(([0.0], *self._draw_start(rng)))
 
     def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         after = self._integrate(actions)
         self._check_divergence(after)
         qpos_before = self._qpos.copy()
-        self._states[:] = after
+        self.states[:] = after
         return self._reward_features(qpos_before, actions), self._unhealthy()
 
     def _integrate(self, actions: np.ndarray) -> np.ndarray:
         """The states after a control step, with a cold solver start: a view that the next call
         overwrites.
         """
-        n, steps = len(self._states), self.frame_skip
+        n, steps = len(self.states), self.frame_skip
         if self._rollout is None:
-            nthread = min(self._nthread, n)
+            nthread = min(self.nthread, n)
             self._rollout = Rollout(nthread=nthread if nthread > 1 else 0)
-            self._rollout_data = [mujoco.MjData(self.model) for _ in range(max(nthread, 1))]
-            self._after = np.empty((n, steps, self._states.shape[1]))
+            self._rollout_data = [mujoco.MjData(self.model) for _ in range(nthread)]
+            self._after = np.empty((n, steps, self.states.shape[1]))
         self._rollout.rollout(
             [self.model] * n,
             self._rollout_data,
-            self._states,
+            self.states,
             np.repeat(actions[:, None], steps, axis=1),
             control_spec=mujoco.mjtState.mjSTATE_CTRL.value,
             skip_checks=True,
@@ -191,58 +186,32 @@ class MujocoFamily(BatchFamily):
     def _check_divergence(self, after: np.ndarray) -> None:
         # A simulation that blows up is reset by MuJoCo within the step, with no more than a
         # warning; its clock tells.
-        late = np.abs(after[:, 0] - self._states[:, 0] - self.dt) > 0.5 * self.model.opt.timestep
+        late = np.abs(after[:, 0] - self.states[:, 0] - self.dt) > 0.5 * self.model.opt.timestep
         diverged = late | ~np.isfinite(after).all(axis=1)
         if diverged.any():
             copy = int(np.flatnonzero(diverged)[0])
-            qpos, qvel = np.split(np.abs(self._states[copy, 1:]), [self.model.nq])
-            raise RuntimeError(
-                f"the simulation of {type(self).__name__} diverged at "
-                f"{self._describe_episode(copy)}: MuJoCo met a state that is not finite or too "
-                f"large; the state before had max|qpos|={qpos.max():.3g} and "
-                f"max|qvel|={qvel.max():.3g}"
+            qpos, qvel = np.split(np.abs(self.states[copy, 1:]), [self.model.nq])
+            raise DivergenceError(
+                copy,
+                "MuJoCo met a state that is not finite or too large; the state before had "
+                f"max|qpos|={qpos.max():.3g} and max|qvel|={qvel.max():.3g}",
             )
 
     def _observations(self) -> np.ndarray:
-        return self._states[:, 1 + self.hidden_qpos :].copy()
-
-    def _physics_state(self, copy: int) -> np.ndarray:
-        return self._states[copy].copy()
-
-    def _set_physics_state(self, copy: int, state: np.ndarray) -> None:
-        self._states[copy] = state
+        return self.states[:, 1 + self.hidden_qpos :].copy()
 
     def _render_copy(self, copy: int, render_mode: str, task: np.ndarray | None) -> Any:
         markers = [] if task is None else self._task_markers(task, self._qpos[copy, :3])
         if self._renderer is None:
             renderer = FastRenderer if self._renders_fast else StateRenderer
             self._renderer = renderer(self.model, **self._render_arguments)
-        return self._renderer.render(self._states[copy], render_mode, markers)
+        return self._renderer.render(self.states[copy], render_mode, markers)
 
     def _release(self) -> None:
         for held in (self._rollout, self._renderer):
             if held is not None:
                 held.close()
         self._rollout = self._renderer = None
-
-
-class MujocoTaskEnv(MujocoFamily, BatchTaskFamily):
-    """A single MuJoCo environment with a hidden task; see :class:`MujocoFamily`."""
-
-    metadata: dict[str, Any] = {"render_modes": RENDER_MODES}  # noqa: RUF012 (Gymnasium's way)
-
-
-class MujocoTaskVectorEnv(MujocoFamily, TaskFamilyVector):
-    """Many copies of a MuJoCo environment, stepped together in threads; see :class:`MujocoFamily`.
-
-    :param nthread: number of threads; None for as many as this process may use cores
-    """
-
-    metadata = {**MujocoTaskEnv.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
-
-    def __init__(self, *, nthread: int | None = None, **kwargs: Any) -> None:
-        self._nthread = checked_nthread(nthread)
-        super().__init__(**kwargs)
 
 
 def _model_path(xml_file: str) -> str:

@@ -2,94 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode
 
 from poem_envs.drawing import Canvas, ImageWindow
-from poem_envs.vector import BatchFamily, BatchTaskFamily, TaskFamilyVector
+from poem_envs.vector import BatchFamily, TaskFamilyVector
 
 
-class _PointGoal(BatchFamily):
-    task_space = spaces.Box(0.0, np.pi, (1,), np.float64)
-    reward_feature_dim = 2
-    metadata: dict[str, Any]
-    _window: ImageWindow | None = None
-
-    def __init__(
-        self,
-        *,
-        step_length: float = 0.05,
-        reset_noise_scale: float = 0.02,
-        width: int = 480,
-        height: int = 480,
-        **kwargs: Any,
-    ) -> None:
-        self.step_length = step_length
-        self.reset_noise_scale = reset_noise_scale
-        self.width, self.height = width, height
-        super().__init__(
-            observation_space=spaces.Box(-np.inf, np.inf, (2,), np.float64),
-            action_space=spaces.Box(-1.0, 1.0, (2,), np.float32),
-            **kwargs,
-        )
-
-    def _allocate(self, n: int) -> None:
-        self._positions = np.zeros((n, 2))
-
-    def _begin_episodes(self, copies: np.ndarray, rngs: Sequence[np.random.Generator]) -> None:
-        for copy, rng in zip(copies, rngs, strict=True):
-            self._positions[copy] = self.reset_noise_scale * rng.standard_normal(2)
-
-    def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        self._positions += self.step_length * actions
-        return self._positions.copy(), np.zeros(len(actions), dtype=bool)
-
-    def _observations(self) -> np.ndarray:
-        return self._positions.copy()
-
-    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
-        angle = np.array(tasks[..., 0])  # contiguous: strided input may be rounded differently
-        x = features[..., 0] - np.cos(angle)
-        y = features[..., 1] - np.sin(angle)
-        return -np.sqrt(x * x + y * y)
-
-    def _potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
-        return self._reward(tasks, observations)  # the position is seen, and it earns
-
-    def _physics_state(self, copy: int) -> np.ndarray:
-        return self._positions[copy].copy()
-
-    def _set_physics_state(self, copy: int, state: np.ndarray) -> None:
-        self._positions[copy] = state
-
-    def _render_copy(self, copy: int, render_mode: str, task: np.ndarray | None) -> Any:
-        canvas = Canvas(self.width, self.height, centre=(0.0, 0.4), extent=2.7)
-        canvas.upper_half_circle(1.0, 0.015, (190, 190, 190))
-        canvas.disc(0.0, 0.0, 0.02, (190, 190, 190))
-        if task is not None:
-            canvas.disc(np.cos(task[0]), np.sin(task[0]), 0.07, (60, 160, 75))
-        canvas.disc(self._positions[copy, 0], self._positions[copy, 1], 0.045, (31, 90, 180))
-        image = canvas.image()
-        if render_mode == "rgb_array":
-            return image
-        if self._window is None:
-            self._window = ImageWindow(self.width, self.height, "PointGoal")
-        self._window.show(image)
-        time.sleep(1.0 / self.metadata["render_fps"])
-        return None
-
-    def _release(self) -> None:
-        if self._window is not None:
-            self._window.close()
-            self._window = None
-
-
-class PointGoalEnv(_PointGoal, BatchTaskFamily):
+class PointGoalEnv(BatchFamily):
     r"""
     ## Description
     A point starts near the origin of the plane and is to move to a goal on the upper unit
@@ -133,10 +58,70 @@ class PointGoalEnv(_PointGoal, BatchTaskFamily):
     | `render_task`       | **bool**  | `False` | Whether rendering shows the goal             |
     """
 
-    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 10}  # noqa: RUF012
+    observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+    task_space = spaces.Box(0.0, np.pi, (1,), np.float64)
+    reward_feature_dim = 2
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 10}  # noqa: RUF012
+    _window: ImageWindow | None = None
+
+    def __init__(
+        self,
+        *,
+        step_length: float = 0.05,
+        reset_noise_scale: float = 0.02,
+        width: int = 480,
+        height: int = 480,
+        **kwargs: Any,
+    ) -> None:
+        self.step_length = step_length
+        self.reset_noise_scale = reset_noise_scale
+        self.width, self.height = width, height
+        super().__init__(**kwargs)
+
+    def _allocate(self, n: int) -> None:
+        self._positions = np.zeros((n, 2))
+
+    def _begin_episodes(self, copies: np.ndarray, rngs: Sequence[np.random.Generator]) -> None:
+        for copy, rng in zip(copies, rngs, strict=True):
+            self._positions[copy] = self.reset_noise_scale * rng.standard_normal(2)
+
+    def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        self._positions += self.step_length * actions
+        return self._positions.copy(), np.zeros(len(actions), dtype=bool)
+
+    def _observations(self) -> np.ndarray:
+        return self._positions.copy()
+
+    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
+        angle = np.array(tasks[..., 0])  # contiguous: strided input may be rounded differently
+        x = features[..., 0] - np.cos(angle)
+        y = features[..., 1] - np.sin(angle)
+        return -np.sqrt(x * x + y * y)
+
+    def _potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
+        return self._reward(tasks, observations)  # the position is seen, and it earns
+
+    def _render_copy(self, copy: int, render_mode: str, task: np.ndarray | None) -> Any:
+        canvas = Canvas(self.width, self.height, centre=(0.0, 0.4), extent=2.7)
+        canvas.upper_half_circle(1.0, 0.015, (190, 190, 190))
+        canvas.disc(0.0, 0.0, 0.02, (190, 190, 190))
+        if task is not None:
+            canvas.disc(np.cos(task[0]), np.sin(task[0]), 0.07, (60, 160, 75))
+        canvas.disc(self._positions[copy, 0], self._positions[copy, 1], 0.045, (31, 90, 180))
+        image = canvas.image()
+        if render_mode == "rgb_array":
+            return image
+        if self._window is None:
+            self._window = ImageWindow(self.width, self.height, "PointGoal")
+        self._window.show(image)
+        time.sleep(1.0 / self.metadata["render_fps"])
+        return None
+
+    def _release(self) -> None:
+        if self._window is not None:
+            self._window.close()
+            self._window = None
 
 
-class PointGoalVectorEnv(_PointGoal, TaskFamilyVector):
-    """The vectorised :class:`PointGoalEnv`."""
-
-    metadata = {**PointGoalEnv.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+PointGoalVectorEnv = functools.partial(TaskFamilyVector, PointGoalEnv)

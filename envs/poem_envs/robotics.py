@@ -6,7 +6,7 @@ import functools
 from typing import Any
 
 from poem_envs.goal_family import GoalFamily
-from poem_envs.process_vector import ProcessFamilyVector
+from poem_envs.vector import TaskFamilyVector
 
 
 class _RoboticsFamily(GoalFamily):
@@ -127,7 +127,7 @@ class AntMazeEnv(_RoboticsFamily):
 
 
 #: The vectorised families: same arguments, and those of
-#: :class:`~poem_envs.process_vector.ProcessFamilyVector`.
-FetchReachVectorEnv = functools.partial(ProcessFamilyVector, FetchReachEnv)
-FetchPushVectorEnv = functools.partial(ProcessFamilyVector, FetchPushEnv)
-AntMazeVectorEnv = functools.partial(ProcessFamilyVector, AntMazeEnv)
+#: :class:`~poem_envs.TaskFamilyVector`.
+FetchReachVectorEnv = functools.partial(TaskFamilyVector, FetchReachEnv)
+FetchPushVectorEnv = functools.partial(TaskFamilyVector, FetchPushEnv)
+AntMazeVectorEnv = functools.partial(TaskFamilyVector, AntMazeEnv)

@@ -151,24 +151,6 @@ class Sawyer:
             self._fast_renderer.close()
             self._fast_renderer = None
 
-    def get_state(self) -> np.ndarray:
-        """All that determines how the episode goes on, besides the placement, ``(state_dim,)``."""
-        env, spec = self.env, mujoco.mjtState.mjSTATE_INTEGRATION
-        state = np.empty(mujoco.mj_stateSize(env.model, spec))
-        mujoco.mj_getState(env.model, env.data, state, spec)
-        return np.concatenate([state, env._prev_obs])
-
-    def set_state(self, state: np.ndarray) -> None:
-        """Put the simulator into a state of :meth:`get_state`, within an episode of the same
-        placement.
-        """
-        env, spec = self.env, mujoco.mjtState.mjSTATE_INTEGRATION
-        physics, env._prev_obs = np.split(state.copy(), [-len(env._prev_obs)])
-        mujoco.mj_setState(env.model, env.data, physics, spec)
-        # brings positions up to date, and changes the solver's warm start
-        mujoco.mj_forward(env.model, env.data)
-        mujoco.mj_setState(env.model, env.data, physics, spec)
-
     def _take_placement(self) -> np.ndarray:
         if self._placement is None:
             raise PlacementRefusedError(

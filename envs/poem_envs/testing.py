@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 
 from poem_envs.family import TaskFamily, definition_problem
 from poem_envs.registration import plain_id
@@ -28,8 +27,8 @@ def check_task_family(
 ) -> None:
     """Check that an environment keeps the contract of a task family: the spaces, the drawing of
     tasks, seeds, when a task takes effect, that the task is hidden, that relabelling is exact, the
-    potential and the symmetries (of a family that has them), the vectorised version (of a
-    registered id that has one), rendering and closing, in this order.
+    potential (of a family that has one), the vectorised version (of a registered id that has one),
+    rendering and closing, in this order.
 
     >>> check_task_family("poem_envs:poem/PointGoal-v0")  # it keeps the contract
 
@@ -53,7 +52,6 @@ def check_task_family(
     check_hidden_task(case)
     check_relabelling(case)
     check_potential(case)
-    check_symmetries(case)
     if isinstance(env, str):
         assert gym.spec(env).max_episode_steps is not None, (
             f"{env} must have a time limit, the horizon of training: register it with "
@@ -293,32 +291,6 @@ def check_potential(case: Case) -> None:
     )
 
 
-def check_symmetries(case: Case) -> None:
-    """Symmetries fit the spaces. Whether the dynamics have them is for a test of your own."""
-    env = case.player
-    given: dict[str, spaces.Box] = {
-        "observations": env.observation_space,
-        "actions": env.action_space,
-        "features": spaces.Box(-np.inf, np.inf, (env.reward_feature_dim,)),
-    }
-    for number, symmetry in enumerate(env.symmetries):
-        for (name, space), permutation in zip(given.items(), symmetry, strict=True):
-            what, width = f"symmetries[{number}].{name}", space.shape[0]
-            order, signs = permutation
-            assert sorted(order) == list(range(width)), (
-                f"{what}.order must hold each of the indices 0 to {width - 1} once, but is {order}"
-            )
-            assert [abs(sign) for sign in signs] == [1] * width, (
-                f"{what}.signs must be {width} of 1 and -1, but is {signs}"
-            )
-            bounds = [space.low, space.high]
-            mirrored = np.sort([permutation(bound) for bound in bounds], axis=0)
-            assert np.array_equal(mirrored, bounds), (
-                f"{what} must leave the bounds of the space as they are, but makes "
-                f"{mirrored.tolist()} of {np.array(bounds).tolist()}"
-            )
-
-
 def check_vector_parity(case: Case, env_id: str, env_kwargs: dict[str, Any]) -> None:
     """The vectorised version equals single environments bit for bit, over ends and other tasks."""
     n, horizon = 3, max(2, case.n_steps // 2)
@@ -326,7 +298,7 @@ def check_vector_parity(case: Case, env_id: str, env_kwargs: dict[str, Any]) -> 
     vector_env = gym.make_vec(env_id, n, vectorization_mode="vector_entry_point", **arguments)
     assert isinstance(vector_env, TaskFamilyVector), (
         f"the vector_entry_point of {env_id} must make a poem_envs.TaskFamilyVector, but makes a "
-        f"{type(vector_env).__name__}; use functools.partial(poem_envs.ProcessFamilyVector, "
+        f"{type(vector_env).__name__}; use functools.partial(poem_envs.TaskFamilyVector, "
         "YourFamily)"
     )
 

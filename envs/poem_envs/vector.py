@@ -1,13 +1,14 @@
-"""Families that simulate many copies at once: write the dynamics of a batch, get a single and a
-vectorised environment, whose results agree bit for bit.
+"""Many copies of a task family at once, whose results are those of single environments bit for
+bit.
 """
 
 from __future__ import annotations
 
+import functools
 import os
 from abc import abstractmethod
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -18,37 +19,40 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from poem_envs.family import (
-    TaskDefinition,
-    TaskFamily,
-    check_options,
-    check_render_mode,
-    checked_actions,
-    checked_state,
-    task_stream,
-)
+from poem_envs.family import TaskFamily, check_options, checked_actions, task_stream
+from poem_envs.processes import EpisodeStart, ProcessCopies
 
 NO_RENDER_MODE = "without a render_mode; pass one to the constructor, say 'rgb_array'"
+#: What a family has for its one copy, and a vectorised one has not.
+OF_ONE_COPY = frozenset({"task", "set_task"})
 
 
-class BatchFamily(TaskDefinition):
-    """The dynamics of ``n`` independent copies of an environment, written once and combined twice::
+class DivergenceError(Exception):
+    """The simulation of a copy, by number, blew up; the message is what was seen of it."""
 
-        class _Walk1D(BatchFamily): ...  # the methods below, and those of TaskDefinition
-        class Walk1DEnv(_Walk1D, BatchTaskFamily): ...  # one copy, a Gymnasium environment
-        class Walk1DVectorEnv(_Walk1D, TaskFamilyVector): ...  # n copies, a vector environment
+    def __init__(self, copy: int, what: str) -> None:
+        super().__init__(what)
+        self.copy = copy
 
-    Its constructor hands ``observation_space`` and ``action_space`` (of one copy) and all that it
-    does not know to ``super().__init__``.
+
+class BatchFamily(TaskFamily):
+    """A family whose simulator steps any number of copies at once. By itself it is an environment
+    of one copy; :class:`TaskFamilyVector` makes room for more.
+
+    A subclass defines the methods below, and ``_reward``. Its constructor sets what
+    :class:`TaskFamily` asks for, and hands all that it does not know to ``super().__init__``.
     """
 
-    if TYPE_CHECKING:  # the constructor of either class below
+    #: How many threads may step the copies.
+    nthread: int = 1
 
-        def __init__(self, **kwargs: Any) -> None: ...
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self._allocate(1)
 
     @abstractmethod
     def _allocate(self, n: int) -> None:
-        """Make room for the states of ``n`` copies. Called once, by the constructor."""
+        """Make room for the states of ``n`` copies, before the first episode."""
 
     @abstractmethod
     def _begin_episodes(self, copies: np.ndarray, rngs: Sequence[np.random.Generator]) -> None:
@@ -58,6 +62,8 @@ class BatchFamily(TaskDefinition):
     def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Step all copies by valid actions ``(n, action_dim)`` float64; return new arrays of reward
         features ``(n, reward_feature_dim)`` and of early ends ``(n,)``.
+
+        :raises DivergenceError: if the simulation of a copy blows up
         """
 
     def _step_infos(self) -> dict[str, np.ndarray]:
@@ -75,24 +81,24 @@ class BatchFamily(TaskDefinition):
     def _release(self) -> None:
         """Free threads, windows and the like. Called by ``close``, possibly more than once."""
 
-
-class BatchTaskFamily(BatchFamily, TaskFamily):
-    """A single environment: a batch of one copy."""
-
-    def __init__(
-        self, *, observation_space: spaces.Box, action_space: spaces.Box, **kwargs: Any
-    ) -> None:
-        super().__init__(**kwargs)
-        self.observation_space = observation_space
-        self.action_space = action_space
-        self._allocate(1)
+    def advance(
+        self, actions: np.ndarray, describe: Callable[[int], str]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """:meth:`_advance`, whose errors say where a copy's episode is."""
+        try:
+            return self._advance(actions)
+        except DivergenceError as error:
+            raise RuntimeError(
+                f"the simulation of {type(self).__name__} diverged at {describe(error.copy)}: "
+                f"{error}"
+            ) from error
 
     def _begin_episode(self, rng: np.random.Generator) -> np.ndarray:
         self._begin_episodes(np.zeros(1, dtype=np.intp), [rng])
         return self._observations()[0]
 
     def _simulate(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
-        features, terminated = self._advance(action[None])
+        features, terminated = self.advance(action[None], lambda _: self._describe_episode())
         return self._observations()[0], features[0], bool(terminated[0])
 
     def _step_info(self) -> dict[str, Any]:
@@ -124,8 +130,14 @@ def checked_nthread(nthread: int | None) -> int:
     return available_cores() if nthread is None else nthread
 
 
-class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """A vectorised task family, each copy with a task of its own.
+
+    Copies of a :class:`BatchFamily` are stepped at once; those of any other family share the work
+    of ``nthread`` processes, this one among them. Register a family with it::
+
+        vector = functools.partial(TaskFamilyVector, Walk1D)
+        gym.register("my/Walk-v0", Walk1D, vector_entry_point=vector, max_episode_steps=50)
 
     - A copy whose episode ends is reset in the same step (``AutoresetMode.SAME_STEP``). Then
       ``infos["final_obs"]`` holds ``(num_envs, obs_dim)`` that each copy's step led to, and
@@ -133,52 +145,66 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
     - ``infos["reward_features"]``, ``(num_envs, reward_feature_dim)``, and a family's ``"success"``
       and ``"is_success"``, ``(num_envs,)``, are always those of the step just taken.
     - ``reset(seed=s)`` seeds copy ``i`` with ``s + i``; results equal those of single environments
-      bit for bit.
+      bit for bit, whatever ``nthread``.
+    - What else a family has, its attributes and methods, the vectorised one has too.
 
-    Its arguments are those of :class:`BatchTaskFamily`, and
-
-    :param max_episode_steps: episodes are truncated after so many steps; None for never
+    :param family: a :class:`~poem_envs.TaskFamily` class, or a function that makes such an
+        environment; ``family_kwargs`` are its arguments
+    :param nthread: number of threads, or processes; None for as many as this process may use cores
+    :param max_episode_steps: episodes are truncated after so many steps; None for as many as a
+        :class:`GoalFamily`'s environment has, or no limit
     """
 
-    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
     _reset_options: ClassVar[frozenset[str]] = frozenset({"tasks"})
 
     def __init__(
         self,
+        family: Callable[..., TaskFamily],
         *,
-        observation_space: spaces.Box,
-        action_space: spaces.Box,
         num_envs: int = 1,
+        nthread: int | None = None,
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
-        render_task: bool = False,
-        split: str = "train",
+        **family_kwargs: Any,
     ) -> None:
         super().__init__()
-        self._choose_split(split)
+        self.closed = True  # until there is something to close
         if num_envs < 1:
             raise ValueError(f"num_envs={num_envs!r} must be at least 1")
         if max_episode_steps is not None and max_episode_steps < 1:
             raise ValueError(
                 f"max_episode_steps={max_episode_steps!r} must be at least 1, or None for no limit"
             )
-        check_render_mode(render_mode, self.metadata)
+        nthread = checked_nthread(nthread)
+        if render_mode is not None:
+            family_kwargs["render_mode"] = render_mode
+        make = functools.partial(family, **family_kwargs)
+        #: A single environment of the family, of whose class and arguments the copies are.
+        self.family = one = make()
+        if not isinstance(one, TaskFamily):
+            raise TypeError(
+                f"family={family!r} makes a {type(one).__name__}, but it must make a "
+                "poem_envs.TaskFamily"
+            )
         if render_mode == "human" and num_envs > 1:
             raise ValueError(
                 f"render_mode='human' shows one environment, but num_envs={num_envs}; use "
                 "'rgb_array'"
             )
+        assert isinstance(one.observation_space, spaces.Box)
+        assert isinstance(one.action_space, spaces.Box)
+        self.metadata = {**one.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}
         self.num_envs = num_envs
-        self.max_episode_steps = max_episode_steps
+        limit = getattr(one, "max_episode_steps", None)
+        self.max_episode_steps = limit if max_episode_steps is None else max_episode_steps
         self.render_mode = render_mode
-        self.render_task = render_task
-        self.single_observation_space = observation_space
-        self.single_action_space = action_space
-        self.observation_space = batch_space(observation_space, num_envs)
-        self.action_space = batch_space(action_space, num_envs)
+        self.single_observation_space = one.observation_space
+        self.single_action_space = one.action_space
+        self.observation_space = batch_space(one.observation_space, num_envs)
+        self.action_space = batch_space(one.action_space, num_envs)
 
         self._tasks: np.ndarray | None = None  # (num_envs, task_dim)
-        self._next_tasks = np.full((num_envs, *self.task_space.shape), np.nan)
+        self._next_tasks = np.full((num_envs, *one.task_space.shape), np.nan)
         self._task_chosen = np.zeros(num_envs, dtype=bool)
         self._tasks_kept = np.zeros(num_envs, dtype=bool)
         self._rngs: list[np.random.Generator] = []
@@ -186,7 +212,18 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         self._elapsed_steps = np.zeros(num_envs, dtype=np.int64)
         self._episodes = np.zeros(num_envs, dtype=np.int64)
         self._succeeded = np.zeros(num_envs, dtype=bool)
-        self._allocate(num_envs)
+        self._copies: BatchFamily | ProcessCopies
+        if isinstance(one, BatchFamily):
+            self._copies, one.nthread = one, nthread
+            one._allocate(num_envs)
+        else:
+            self._copies = ProcessCopies(make, num_envs, nthread, one.observation_space)
+        self.closed = False
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name == "family" or name in OF_ONE_COPY:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        return getattr(self.family, name)
 
     @property
     def tasks(self) -> np.ndarray | None:
@@ -202,8 +239,8 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         :param tasks: ``(num_envs, task_dim)``, or one row for each of ``copies``
         """
         index = np.arange(self.num_envs) if copies is None else np.asarray(copies, dtype=np.intp)
-        shape = (len(index), *self.task_space.shape)
-        self._next_tasks[index] = self._checked_tasks(tasks, shape, "tasks")
+        shape = (len(index), *self.family.task_space.shape)
+        self._next_tasks[index] = self.family._checked_tasks(tasks, shape, "tasks")
         self._task_chosen[index] = True
 
     def keep_tasks(self) -> None:
@@ -214,7 +251,11 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
 
     def set_attribute(self, name: str, value: Any) -> None:
         """Set an attribute of the family, as if on each copy."""
-        setattr(self, name, value)
+        setattr(self.family, name, value)
+        if isinstance(self._copies, ProcessCopies):
+            self._copies.set_attribute(name, value)
+        if name in self.__dict__:
+            setattr(self, name, value)
 
     def reset(
         self,
@@ -246,11 +287,11 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         else:
             undecided &= seeded & ~self._tasks_kept
         for copy in np.flatnonzero(undecided):
-            self._tasks[copy] = self.sample_tasks(1, task_stream(self._rngs[copy]))[0]
+            self._tasks[copy] = self.family.sample_tasks(1, task_stream(self._rngs[copy]))[0]
         self._begin(np.arange(self.num_envs))
         if self.render_mode == "human":
             self.render()
-        return self._observations(), {}
+        return self._copies._observations(), {}
 
     def step(
         self, actions: npt.ArrayLike
@@ -261,12 +302,12 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         assert isinstance(self.single_action_space, spaces.Box)
         checked = checked_actions(actions, self.single_action_space, self.num_envs)
         self._elapsed_steps += 1
-        features, terminations = self._advance(checked)
-        rewards = self.compute_rewards(self._tasks, features)
-        observations = self._observations()
+        features, terminations = self._copies.advance(checked, self._describe_episode)
+        rewards = self.family.compute_rewards(self._tasks, features)
+        observations = self._copies._observations()
         limit = np.inf if self.max_episode_steps is None else self.max_episode_steps
         truncations = self._elapsed_steps >= limit
-        infos: dict[str, Any] = {"reward_features": features, **self._step_infos()}
+        infos: dict[str, Any] = {"reward_features": features, **self._copies._step_infos()}
         if "success" in infos:
             self._succeeded |= infos["success"].astype(bool)
             infos["is_success"] = self._succeeded.copy()
@@ -274,18 +315,10 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         if done.any():
             infos["final_obs"], infos["_final_obs"] = observations, done
             self._begin(np.flatnonzero(done))
-            observations = self._observations()
+            observations = self._copies._observations()
         if self.render_mode == "human":
             self.render()
         return observations, rewards, terminations, truncations, infos
-
-    def get_physics_state(self, copy: int) -> np.ndarray:
-        """The simulator's state of one copy, ``(state_dim,)``, as of a single environment."""
-        return self._physics_state(copy)
-
-    def set_physics_state(self, copy: int, state: npt.ArrayLike) -> None:
-        """Put one copy into a state of :meth:`get_physics_state`; task and time stay."""
-        self._set_physics_state(copy, checked_state(state, self._physics_state(copy).shape))
 
     def render(self) -> tuple[Any, ...] | None:
         """Render every copy as ``render_mode`` says, and return the images."""
@@ -298,11 +331,13 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         """What :meth:`render` would hold for one copy, by number."""
         if self.render_mode is None:
             raise ValueError(f"render_copy() was called {NO_RENDER_MODE}")
-        task = self._tasks[copy] if self.render_task and self._tasks is not None else None
-        return self._render_copy(copy, self.render_mode, task)
+        shown = self._tasks if self.family.render_task else None
+        task = None if shown is None else shown[copy]
+        return self._copies._render_copy(copy, self.render_mode, task)
 
     def close_extras(self, **kwargs: Any) -> None:
-        self._release()
+        self._copies._release()
+        self.family.close()
 
     @property  # type: ignore[misc]
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
@@ -334,7 +369,17 @@ class TaskFamilyVector(BatchFamily, gym.vector.VectorEnv[np.ndarray, np.ndarray,
         self._elapsed_steps[copies] = 0
         self._succeeded[copies] = False
         self._episodes[copies] += 1
-        self._begin_episodes(copies, [self._rngs[copy] for copy in copies])
+        rngs = [self._rngs[copy] for copy in copies]
+        if isinstance(self._copies, BatchFamily):
+            self._copies._begin_episodes(copies, rngs)
+            return
+        tasks, episodes = self._tasks.copy(), self._episodes.tolist()
+        starts = [
+            EpisodeStart(copy, rng, tasks[copy], self._seeds[copy], episodes[copy])
+            for copy, rng in zip(copies.tolist(), rngs, strict=True)
+        ]
+        for copy, rng in self._copies.begin(starts).items():
+            self._rngs[copy] = rng  # which has drawn, in another process
 
     def _describe_episode(self, copy: int) -> str:
         return (

@@ -11,7 +11,7 @@ from typing import Any
 
 import cloudpickle
 
-from poem_envs.process_vector import CopyGroup
+from poem_envs.processes import CopyGroup
 
 
 def serve(connection: Connection) -> None:

@@ -14,7 +14,7 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
-from poem_envs.family import Symmetry, definition_problem
+from poem_envs.family import definition_problem
 from sb3_poem.common.wrappers import CHANGING, CHANGING_KINDS, HARMLESS, WrapperError
 
 if TYPE_CHECKING:
@@ -60,7 +60,6 @@ class FamilyView:
         self.reward_feature_dim: int = self._get("reward_feature_dim")
         self.all_tasks: np.ndarray | None = self._get("all_tasks")
         self.shared_dynamics = bool(self._get("shared_dynamics"))
-        self.symmetries: tuple[Symmetry, ...] = self._get("symmetries", ())
         #: Whether the family has :meth:`compute_potential`
         self.has_potential = bool(self._get("has_potential", False))
         self.spec: EnvSpec | None = self._get("spec")

@@ -76,7 +76,7 @@ class TaskVecEnv(VecEnv):
         self.vector_env = vector_env
         self._wrapper_types = tuple(type(wrapper) for wrapper in wrappers)
         self._monitor = next((each for each in wrappers if isinstance(each, Monitor)), None)
-        self._views = [_CopyView(vector_env, index) for index in range(vector_env.num_envs)]
+        self._views = [_Copy(vector_env, index) for index in range(vector_env.num_envs)]
         observation_space = vector_env.single_observation_space
         super().__init__(vector_env.num_envs, observation_space, vector_env.single_action_space)
         self.metadata = vector_env.metadata
@@ -255,23 +255,18 @@ def make_shown_env(env_id: str, render_mode: str | None, **env_kwargs: Any) -> g
     return env
 
 
-class _CopyView:
-    """One copy of a vectorised task family, with the attributes and methods of a single one."""
+class _Copy:
+    """One copy of a vectorised task family, as a single environment is seen."""
 
-    # What a vectorised environment has for all copies together is no attribute of one copy.
-    _HIDDEN = frozenset(
-        {
-            *("tasks", "set_tasks", "keep_tasks", "set_attribute", "num_envs", "reset", "step"),
-            *("close", "closed", "close_extras", "render_copy", "_vector_env"),
-        }
-    )
+    # what a step or a reset of one copy alone would put out of step with the others
+    _HIDDEN = frozenset({"reset", "step", "close", "advance"})
 
     def __init__(self, vector_env: TaskFamilyVector, index: int) -> None:
-        self._vector_env = vector_env
-        self._index = index
+        self._vector_env, self._index = vector_env, index
+        self.spec, self.max_episode_steps = vector_env.spec, vector_env.max_episode_steps
 
     @property
-    def unwrapped(self) -> _CopyView:
+    def unwrapped(self) -> _Copy:
         return self
 
     @property
@@ -279,14 +274,12 @@ class _CopyView:
         tasks = self._vector_env.tasks
         return None if tasks is None else tasks[self._index]
 
+    @property
+    def np_random(self) -> np.random.Generator:
+        return self._vector_env.np_random[self._index]
+
     def set_task(self, task: npt.ArrayLike) -> None:
         self._vector_env.set_tasks([np.asarray(task)], copies=[self._index])
-
-    def get_physics_state(self) -> np.ndarray:
-        return self._vector_env.get_physics_state(self._index)
-
-    def set_physics_state(self, state: npt.ArrayLike) -> None:
-        self._vector_env.set_physics_state(self._index, state)
 
     def render(self) -> Any:
         return self._vector_env.render_copy(self._index)
@@ -295,15 +288,12 @@ class _CopyView:
         return getattr(self, name)
 
     def __str__(self) -> str:
-        return f"<{type(self._vector_env).__name__} instance>"
+        return f"<{type(self._vector_env.family).__name__} instance>"
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") or name in self._HIDDEN:
             raise AttributeError(f"a copy of a vectorised task family has no attribute {name!r}")
-        if name in ("observation_space", "action_space"):
-            return getattr(self._vector_env, f"single_{name}")
-        value = getattr(self._vector_env, name)
-        return value[self._index] if name in ("np_random", "np_random_seed") else value
+        return getattr(self._vector_env.family, name)
 
 
 def _wrappers(env: gym.Env) -> list[gym.Wrapper]:

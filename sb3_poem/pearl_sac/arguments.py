@@ -29,7 +29,7 @@ OPTIONAL = ("n_train_tasks", "seed")
 #: The most of arguments that are numbers from 0 on
 MOST = {
     **dict.fromkeys(("kl_coef", "reward_coef", "policy_coef", "noise_color"), np.inf),
-    **dict.fromkeys(("gamma", "tau", "shaping_coef", "mirror_fraction"), 1.0),
+    **dict.fromkeys(("gamma", "tau", "shaping_coef"), 1.0),
     **dict.fromkeys(("relabel_fraction", "context_relabel_fraction"), 1.0),
 }
 

@@ -104,10 +104,6 @@ class PEARLSAC(SAC):
         action changes values by a small part of their spread, as on the way to a place, they are
         learned sooner. Action values, those in POEM's contexts too, are then without that share.
         Needs a family with a potential
-    :param mirror_fraction: Share of each task's batch that is seen in a symmetry of the family's
-        dynamics, drawn among those that it names, with rewards computed for what is then seen. What
-        a robot learned to do in one direction, it then has examples of in others. Needs a family
-        with symmetries, and with shared dynamics
     :param noise_color: Exponent b of the power spectrum 1 / f^b of the policy's noise in training
         rollouts: 0 white, as in SAC; 1 pink, 2 red (Eberhard et al., ICLR 2023). Noise that keeps a
         direction for some steps moves a robot farther
@@ -168,7 +164,6 @@ class PEARLSAC(SAC):
         reward_scale: float | str = "auto",
         n_steps: int = 1,
         shaping_coef: float = 0.0,
-        mirror_fraction: float = 0.0,
         noise_color: float = 0.0,
         policy_delay: int = 1,
         horizon: int | None = None,
@@ -196,7 +191,6 @@ class PEARLSAC(SAC):
         self.context_relabel_fraction = context_relabel_fraction
         self.reward_scale = reward_scale
         self.shaping_coef = shaping_coef
-        self.mirror_fraction = mirror_fraction
         self.noise_color = noise_color
         self.policy_delay = policy_delay
         self.horizon = horizon
@@ -602,7 +596,7 @@ class PEARLSAC(SAC):
 
     def _check_family(self, family: FamilyView) -> None:
         """:raises ValueError: if the model's arguments need what the family does not have"""
-        for name in ("relabel_fraction", "context_relabel_fraction", "mirror_fraction"):
+        for name in ("relabel_fraction", "context_relabel_fraction"):
             if getattr(self, name) > 0 and not family.shared_dynamics:
                 raise ValueError(
                     f"{name} must be 0: the tasks of {family.env_id} do not share dynamics"
@@ -611,11 +605,6 @@ class PEARLSAC(SAC):
             raise ValueError(
                 f"shaping_coef must be 0: {family.env_id} has no potential; a family defines one "
                 "by _potential(tasks, observations)"
-            )
-        if self.mirror_fraction > 0 and not family.symmetries:
-            raise ValueError(
-                f"mirror_fraction must be 0: {family.env_id} names no symmetries; a family of them "
-                "sets `symmetries`, a tuple of poem_envs.Symmetry"
             )
 
     def set_env(self, env: GivenEnv, force_reset: bool = True) -> None:

@@ -1,6 +1,6 @@
 """Meta-batches: what gradient steps see of the tasks' experience."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any, NamedTuple
@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 
-from poem_envs import SignedPermutation
 from sb3_poem.common.buffers import ContextStore, TaskBatch, TaskReplayBuffer
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.random import Generators
@@ -68,7 +67,6 @@ class MetaBatchSampler:
     relabel_fraction: float
     context_relabel_fraction: float
     shaping_coef: float
-    mirror_fraction: float
 
     @property
     def device(self) -> th.device:
@@ -111,8 +109,8 @@ class MetaBatchSampler:
     def _transitions(
         self, task_ids: th.Tensor, chosen: np.ndarray, batch_size: int
     ) -> tuple[TaskBatch, Bootstraps | None]:
-        """``batch_size`` transitions a task, ``relabel_fraction`` of them relabelled,
-        ``mirror_fraction`` seen in a symmetry; and what targets need beyond these.
+        """``batch_size`` transitions a task, ``relabel_fraction`` of them relabelled; and what
+        targets need beyond these.
         """
         generator, buffer = self.generators.torch, self.replay_buffer
         sources = task_ids[:, None].expand(-1, batch_size)
@@ -122,13 +120,9 @@ class MetaBatchSampler:
             foreign = th.randint(buffer.n_tasks, shape, generator=generator, device=self.device)
             sources = th.cat([sources[:, n_foreign:], foreign], dim=1)
         slots = buffer.draw_slots(sources, generator)
-        mirrored = self._draw_mirror(sources.shape) if self.mirror_fraction > 0 else None
 
         def seen(slots: th.Tensor) -> TaskBatch:
-            stored = buffer.at(sources, slots)
-            if mirrored is None:
-                return self._relabelled(stored, chosen, n_foreign)
-            return self._relabelled(mirrored(stored), chosen, batch_size)
+            return self._relabelled(buffer.at(sources, slots), chosen, n_foreign)
 
         transitions = seen(slots)
         if self.n_steps == 1 and self.shaping_coef == 0:
@@ -146,28 +140,6 @@ class MetaBatchSampler:
             potential = self._potential(transitions.observations, chosen)
             rewards += discounts * self._potential(last.next_observations, chosen) - potential
         return transitions, Bootstraps(rewards, last.next_observations, discounts)
-
-    def _draw_mirror(self, shape: th.Size) -> Callable[[TaskBatch], TaskBatch]:
-        """A function that sees ``mirror_fraction`` of transitions (tasks, batch) in a symmetry."""
-        generator, device, symmetries = self.generators.torch, self.device, self.family.symmetries
-        which = th.randint(1, len(symmetries) + 1, shape, generator=generator, device=device)
-        # 0 is no symmetry
-        which *= th.rand(shape, generator=generator, device=device) < self.mirror_fraction
-
-        def mirror(permutations: Sequence[SignedPermutation]) -> Callable[[th.Tensor], th.Tensor]:
-            width = len(permutations[0].order)
-            orders = th.tensor([[*range(width)], *(p.order for p in permutations)], device=device)
-            signs = th.tensor([[1.0] * width, *(p.signs for p in permutations)], device=device)
-            order, sign = orders[which], signs[which]
-            return lambda values: values.gather(-1, order) * sign
-
-        observations, actions, features = map(mirror, zip(*symmetries, strict=True))
-        return lambda transitions: transitions._replace(
-            observations=observations(transitions.observations),
-            actions=actions(transitions.actions),
-            next_observations=observations(transitions.next_observations),
-            features=features(transitions.features),
-        )
 
     def _potential(self, observations: th.Tensor, chosen: np.ndarray) -> th.Tensor:
         """What staying at observations (tasks, batch, obs_dim) would be worth, (tasks, batch)."""

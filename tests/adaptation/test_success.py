@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from worlds import Walk1D
 
-from poem_envs import ProcessFamilyVector
+from poem_envs import TaskFamilyVector
 from sb3_poem import POEMSAC, AdaptationEvalCallback
 from sb3_poem.adaptation import evaluate_adaptation, evaluate_episodes, known_task_return
 from sb3_poem.cli import main
@@ -28,7 +28,7 @@ class Walk(Walk1D):
 def env_id():
     for name, vectorised in (("test/WalkToSuccess-v0", True), ("test/WalkOneByOne-v0", False)):
         vector = (
-            {"vector_entry_point": functools.partial(ProcessFamilyVector, Walk, nthread=1)}
+            {"vector_entry_point": functools.partial(TaskFamilyVector, Walk, nthread=1)}
             if vectorised
             else {}
         )

@@ -116,11 +116,6 @@ def test_a_copy_looks_like_a_single_environment(env_id):
         relabel(ours, tasks=task, features=features)[0],
         theirs.env_method("compute_rewards", task, features, indices=[0])[0],
     )
-    ours.env_method(
-        "set_physics_state", ours.env_method("get_physics_state", indices=[0])[0], indices=[2]
-    )
-    states = ours.env_method("get_physics_state")
-    assert np.array_equal(states[0], states[2])
     assert ours.has_attr("task")
     for hidden in ("tasks", "num_envs", "step", "set_tasks"):
         assert not ours.has_attr(hidden)

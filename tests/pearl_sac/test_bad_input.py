@@ -39,7 +39,7 @@ from sb3_poem.pearl_sac.arguments import UNSUPPORTED
 from sb3_poem.pearl_sac.policies import LatentPolicy
 
 NAN = float("nan")
-FRACTIONS = ("gamma", "tau", "relabel_fraction", "shaping_coef", "mirror_fraction")
+FRACTIONS = ("gamma", "tau", "relabel_fraction", "shaping_coef")
 
 
 @pytest.mark.parametrize(

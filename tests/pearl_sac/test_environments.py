@@ -26,7 +26,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 
-from poem_envs import ProcessFamilyVector
+from poem_envs import TaskFamilyVector
 from sb3_poem import PEARLSAC, POEMSAC, AdaptationEvalCallback
 from sb3_poem.common.vec_env import TaskVecEnv, make_task_vec_env
 
@@ -105,7 +105,7 @@ def test_gymnasiums_vectorised_environment(algorithm: type[PEARLSAC], mode: str)
 
 
 def test_a_vectorised_environment_that_is_not_registered() -> None:
-    env = ProcessFamilyVector(Walk, num_envs=2, nthread=1, max_episode_steps=9)
+    env = TaskFamilyVector(Walk, num_envs=2, nthread=1, max_episode_steps=9)
     assert small(POEMSAC, env, horizon=9).learn(1).num_timesteps == N_TASKS * 9
 
 

@@ -19,7 +19,6 @@ def test_arguments_come_back(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
         "noise_color": 1.0,
         "policy_delay": 2,
         "shaping_coef": 0.5,
-        "mirror_fraction": 0.25,
     }
     model = small(algorithm, ANT_GOAL, n_train_tasks=4, meta_batch_size=4, **arguments).learn(800)
     model.save_pretrained(tmp_path)

@@ -1,12 +1,9 @@
-"""Targets some steps ahead, as they were and in a symmetry, against sums over the recorded
-episodes.
-"""
+"""Targets some steps ahead, against sums over the recorded episodes."""
 
 import numpy as np
 import pytest
-from meta_toys import EvenWalk, Walk, WindyWalk, small, walks
+from meta_toys import Walk, small, walks
 
-from poem_envs import Symmetry
 from sb3_poem import PEARLSAC
 from sb3_poem.common.buffers import Segment
 
@@ -14,14 +11,14 @@ GAMMA = 0.9
 
 
 def collected(
-    monkeypatch: pytest.MonkeyPatch, family: type[Walk] = Walk, **arguments: float
+    monkeypatch: pytest.MonkeyPatch, **arguments: float
 ) -> tuple[PEARLSAC, list[Segment]]:
     """A model whose episodes end early, are cut off, and have partly been overwritten; and all that
     it has seen.
     """
     model = small(
         PEARLSAC,
-        walks(6, family, edge=0.6),
+        walks(6, Walk, edge=0.6),
         horizon=10,
         n_train_tasks=6,
         buffer_size=35,
@@ -51,29 +48,21 @@ def ahead(
     task: int,
     obs: np.ndarray,
     n_steps: int,
-    symmetry: Symmetry | None = None,
 ) -> tuple[float, np.ndarray, float]:
     """Step by step: the discounted rewards of ``task``, the observation after them, and the
     discount of its value.
-
-    :param symmetry: of which the observation, and all that follows, is a mirror image
     """
-    [(segment, copy, step)] = places(
-        segments, obs if symmetry is None else symmetry.observations(obs)
-    )
+    [(segment, copy, step)] = places(segments, obs)
     total, horizon = 0.0, segment.observations.shape[1]
     for k in range(n_steps):
         features = segment.features[copy, step].astype(np.float64)
-        if symmetry is not None:
-            features = symmetry.features(features)
         total += GAMMA**k * float(
             model.family.compute_rewards(model.train_tasks.tasks[task], features)
         )
         over, after = segment.terminated[copy, step] > 0, segment.next_observations[copy, step]
         cut = step + 1 == horizon or not (segment.observations[copy, step + 1] == after).all()
         if over or cut or k + 1 == n_steps:
-            seen = after if symmetry is None else symmetry.observations(after)
-            return total, seen, 0.0 if over else GAMMA ** (k + 1)
+            return total, after, 0.0 if over else GAMMA ** (k + 1)
         step += 1
     raise AssertionError
 
@@ -102,56 +91,6 @@ def test_rewards_values_and_discounts(
         round(GAMMA, 6),
         round(GAMMA**n_steps, 6),
     } <= lengths  # all kinds of ends were seen
-
-
-@pytest.mark.parametrize("relabel_fraction", [0.0, 0.5])
-@pytest.mark.parametrize("n_steps", [1, 3])
-def test_mirror_images_have_the_rewards_of_what_is_seen(
-    monkeypatch: pytest.MonkeyPatch, n_steps: int, relabel_fraction: float
-) -> None:
-    model, segments = collected(
-        monkeypatch,
-        EvenWalk,
-        n_steps=n_steps,
-        relabel_fraction=relabel_fraction,
-        mirror_fraction=0.3,
-    )
-    [batch] = model.make_sampler().sample(1, 60)
-    transitions, n_mirrored = batch.transitions, 0
-    rewards, observations, discounts = batch.bootstraps or (
-        transitions.rewards,
-        transitions.next_observations,
-        GAMMA * (1 - transitions.terminated),
-    )
-    for row, task in enumerate(batch.task_ids.tolist()):
-        for column in range(60):
-            obs = transitions.observations[row, column].numpy()
-            symmetry = None if places(segments, obs) else EvenWalk.symmetries[0]
-            n_mirrored += symmetry is not None
-            total, after, discount = ahead(model, segments, task, obs, n_steps, symmetry)
-            assert rewards[row, column].item() == pytest.approx(total, abs=1e-4)
-            np.testing.assert_array_equal(observations[row, column], after)
-            assert discounts[row, column].item() == pytest.approx(discount, abs=1e-6)
-            moved = transitions.next_observations[row, column, 0].item() - obs[0]
-            assert 0.1 * 3.0 * transitions.actions[row, column, 0].item() == pytest.approx(
-                moved, abs=1e-4
-            )
-    assert 0.2 < n_mirrored / (60 * len(batch.task_ids)) < 0.4
-
-
-@pytest.mark.parametrize(
-    ("family", "message"),
-    [
-        (
-            Walk,
-            r"mirror_fraction must be 0: .* names no symmetries; a family of them sets `symmetries`",
-        ),
-        (WindyWalk, r"mirror_fraction must be 0: .* do not share dynamics"),
-    ],
-)
-def test_mirroring_needs_symmetries_and_shared_dynamics(family: type[Walk], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        small(PEARLSAC, walks(6, family), horizon=10, n_train_tasks=6, mirror_fraction=0.5)
 
 
 def test_one_step_is_what_it_was() -> None:

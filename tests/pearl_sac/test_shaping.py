@@ -10,7 +10,7 @@ import pytest
 import torch as th
 from meta_toys import Walk, small, walks
 
-from poem_envs import ProcessFamilyVector
+from poem_envs import TaskFamilyVector
 from sb3_poem import PEARLSAC
 from sb3_poem.common.vec_env import make_task_vec_env
 
@@ -80,12 +80,12 @@ def test_the_vectorised_and_the_process_family_have_the_potential_of_the_single_
     np.testing.assert_allclose(
         vec_env.env_method("compute_potential", tasks, observations, indices=[0])[0], [-3.0, -1.5]
     )
-    processes = ProcessFamilyVector(Shaped, num_envs=2, nthread=1)
+    processes = TaskFamilyVector(Shaped, num_envs=2, nthread=1)
     assert processes.has_potential
     np.testing.assert_allclose(
         processes.compute_potential([[2.0]], [[0.5]]), [6.0 * np.sin(0.5) + 1.0]
     )
-    assert not ProcessFamilyVector(Walk, num_envs=2, nthread=1).has_potential
+    assert not TaskFamilyVector(Walk, num_envs=2, nthread=1).has_potential
 
 
 def test_it_needs_a_potential_and_a_discount() -> None:

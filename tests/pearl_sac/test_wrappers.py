@@ -9,8 +9,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium import wrappers
-from meta_toys import EPOCH, POINT_GOAL, EvenWalk, Walk, assert_same_model, small
+from gymnasium import spaces, wrappers
+from meta_toys import EPOCH, POINT_GOAL, Walk, assert_same_model, small
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import (
@@ -35,6 +35,12 @@ class Wet(gym.ActionWrapper):
 
     def action(self, action: np.ndarray) -> np.ndarray:
         return 0.5 * action
+
+
+class EvenWalk(Walk):
+    """The opposite of an action is one too."""
+
+    action_space = spaces.Box(-3.0, 3.0, (1,), np.float32)
 
 
 class Own(gym.Wrapper):

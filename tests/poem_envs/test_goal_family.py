@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from poem_envs import GoalFamily, ProcessFamilyVector
+from poem_envs import GoalFamily, TaskFamilyVector
 
 gym.register_envs(gymnasium_robotics)
 FETCH = [("poem/FetchReach-v0", "FetchReach-v4"), ("poem/FetchPush-v0", "FetchPush-v4")]
@@ -193,7 +193,7 @@ def reach_id():
     gym.register(
         "test/ReachFamily-v0",
         family,
-        vector_entry_point=functools.partial(ProcessFamilyVector, family),
+        vector_entry_point=functools.partial(TaskFamilyVector, family),
     )
     gym.register("test/LongReachFamily-v0", family, max_episode_steps=11)
     yield "test/ReachFamily-v0"

@@ -235,24 +235,6 @@ def test_a_simulation_that_diverges_says_where():
         env.step(np.zeros(4))
 
 
-def test_a_state_can_be_restored(rng):
-    env = make(env_name="push")
-    actions = rng.uniform(-1, 1, (12, 4))
-    env.reset(seed=0)
-    states, rewards = [env.get_physics_state()], []
-    for action in actions:
-        rewards.append(env.step(action)[1])
-        states.append(env.get_physics_state())
-    other = make(env_name="push")
-    other.reset(options={"task": env.task})
-    for before, after, action, reward in zip(states, states[1:], actions, rewards, strict=False):
-        other.set_physics_state(before)
-        assert other.step(action)[1] == reward
-        assert np.array_equal(other.get_physics_state(), after)
-    with pytest.raises(ValueError, match="state="):
-        env.set_physics_state(states[0][1:])
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("env_name", sawyer.manipulation_names())
 def test_every_manipulation_keeps_the_contract(env_name):

@@ -35,9 +35,9 @@ def transitions(env, actions, **reset_arguments):
     """Physics state before and after, action, reward and end of each step."""
     env.reset(**reset_arguments)
     for action in actions:
-        before = env.get_physics_state()
+        before = env.states[0].copy()
         _, reward, terminated, _, _ = env.step(action)
-        yield before, env.get_physics_state(), action.astype(np.float64), reward, terminated
+        yield before, env.states[0].copy(), action.astype(np.float64), reward, terminated
         if terminated:
             return
 
@@ -128,9 +128,9 @@ def test_every_weight_is_an_argument(env_id, weights, rng):
 def ends_at(env, height):
     """Whether a step ends the episode that begins with the robot at rest, its torso at a height."""
     env.reset(seed=0)
-    state = env.get_physics_state()
+    state = env.states[0].copy()
     state[3], state[1 + env.model.nq :] = height, 0.0
-    env.set_physics_state(state)
+    env.states[0] = state
     return env.step(np.zeros(env.action_space.shape))[2]
 
 
@@ -167,9 +167,9 @@ def test_early_ends(env_id, default):
 def test_families_without_an_early_end(env_id, rng):
     env = make(env_id)
     env.reset(seed=0)
-    state = env.get_physics_state()
+    state = env.states[0].copy()
     state[2 if "Cheetah" in env_id else 3] = 3.0
-    env.set_physics_state(state)
+    env.states[0] = state
     assert not any(env.step(action)[2] for action in random_actions(env, 20, rng))
 
 
@@ -218,7 +218,7 @@ def test_humanoid_dynamics_are_gymnasiums(rng):
         env.step(action)
         other.data.qacc_warmstart[:] = 0.0
         other.step(action)
-        _, qpos, qvel = split(env, env.get_physics_state())
+        _, qpos, qvel = split(env, env.states[0].copy())
         assert np.array_equal(qpos, other.data.qpos)
         assert np.array_equal(qvel, other.data.qvel)
 
@@ -231,7 +231,7 @@ def test_humanoid_observations_are_gymnasiums_at_the_same_state(rng):
     for action in [None, *random_actions(env, 60, rng)]:
         if action is not None:
             observation = env.step(action)[0]
-        _, qpos, qvel = split(env, env.get_physics_state())
+        _, qpos, qvel = split(env, env.states[0].copy())
         other.data.ctrl[:] = 0.0 if action is None else action
         other.data.qacc_warmstart[:] = 0.0
         other.set_state(qpos, qvel)
@@ -251,10 +251,10 @@ def test_the_warm_start_matters_little(env_id, rng):
     other.reset(seed=0)
     worst = 0.0
     for action in random_actions(env, 100, rng):
-        env.set_physics_state(np.concatenate([[0.0], other.data.qpos, other.data.qvel]))
+        env.states[0] = np.concatenate([[0.0], other.data.qpos, other.data.qvel])
         other.step(action)
         env.step(action)
-        _, qpos, qvel = split(env, env.get_physics_state())
+        _, qpos, qvel = split(env, env.states[0].copy())
         worst = max(
             worst, np.abs(qpos - other.data.qpos).max(), np.abs(qvel - other.data.qvel).max()
         )
@@ -266,17 +266,17 @@ def test_divergence_is_an_error_that_names_the_episode(num_envs, tmp_path, monke
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its warning to a file there
     env_id = "poem/HalfCheetahVel-v0"
     env = make(env_id) if num_envs is None else gym.make_vec(env_id, num_envs=num_envs)
-    which = () if num_envs is None else (1,)
+    copy = 0 if num_envs is None else 1
     actions = np.zeros(env.action_space.shape)
     env.reset(seed=40)
     env.reset()
     env.step(actions)
-    state = env.get_physics_state(*which)
+    state = env.states[copy].copy()
     state[1 + 9 :] = 1e9
-    env.set_physics_state(*which, state)
-    seed, copy = (40, "") if num_envs is None else (41, " in environment copy 1")
+    env.states[copy] = state
+    seed, where = (40, "") if num_envs is None else (41, " in environment copy 1")
     with pytest.raises(
-        RuntimeError, match=rf"step 2 of episode 2 since reset\(seed={seed}\){copy}"
+        RuntimeError, match=rf"step 2 of episode 2 since reset\(seed={seed}\){where}"
     ):
         env.step(actions)
     env.reset(seed=0)

@@ -1,14 +1,13 @@
-"""Any task family, vectorised over processes: for simulators whose steps spend their time in
-Python, where threads would wait.
+"""Copies of a task family in processes: for simulators whose steps spend their time in Python,
+where threads would wait.
 
 A worker process starts with :mod:`poem_envs.worker` alone, so that user scripts need no ``if
-__name__ == "__main__"`` and no worker loads torch. What a worker does is in :class:`CopyGroup`; the
-vectorised environment steps a group of its own meanwhile.
+__name__ == "__main__"`` and no worker loads torch. What a worker does is in :class:`CopyGroup`;
+this process steps a group of its own meanwhile.
 """
 
 from __future__ import annotations
 
-import functools
 import os
 import pickle
 import subprocess
@@ -20,17 +19,14 @@ from typing import Any, NamedTuple
 
 import cloudpickle
 import numpy as np
-import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
-from gymnasium.vector import AutoresetMode
 
 from poem_envs.family import TaskFamily
-from poem_envs.vector import TaskFamilyVector, checked_nthread
 
 
 class EpisodeStart(NamedTuple):
-    """What a copy, by its number within its group, needs to begin an episode."""
+    """What a copy, by its number, needs to begin an episode, which is the copy's how-manieth."""
 
     copy: int
     rng: np.random.Generator
@@ -167,120 +163,44 @@ def _end_worker(connection: Connection, process: subprocess.Popen[bytes]) -> Non
         process.wait()
 
 
-class ProcessFamilyVector(TaskFamilyVector):
-    """The vectorised version of any task family: its copies share the work of ``nthread``
-    processes, this one among them.
+class ProcessCopies:
+    """What :class:`~poem_envs.TaskFamilyVector` asks of copies, of ``n`` in ``nthread`` processes.
 
-    Results equal those of single environments bit for bit, whatever the number of processes.
-    Register a family with it::
-
-        vector = functools.partial(ProcessFamilyVector, Walk1D)
-        gym.register("my/Walk-v0", Walk1D, vector_entry_point=vector, max_episode_steps=50)
-
-    :param family: a :class:`~poem_envs.TaskFamily` class, or a function that makes such an
-        environment; ``family_kwargs`` are its arguments
-    :param nthread: number of processes; None for as many as this process may use cores
-    :param max_episode_steps: None for as many as a :class:`GoalFamily`'s environment has, or no
-        limit
+    :param space: of their observations
     """
 
     def __init__(
-        self,
-        family: Callable[..., TaskFamily],
-        *,
-        num_envs: int = 1,
-        nthread: int | None = None,
-        max_episode_steps: int | None = None,
-        render_mode: str | None = None,
-        render_task: bool = False,
-        **family_kwargs: Any,
+        self, make: Callable[[], TaskFamily], n: int, nthread: int, space: spaces.Box
     ) -> None:
-        self._nthread = checked_nthread(nthread)
-        if render_mode is not None:
-            family_kwargs["render_mode"] = render_mode
-        if render_task:
-            family_kwargs["render_task"] = render_task
-        self._make = functools.partial(family, **family_kwargs)
-        self._groups: list[CopyGroup | RemoteGroup] = []
-        self._interrupted = False
-        self._attributes: dict[str, Any] = {}
-        self._template = template = self._make()
-        if not isinstance(template, TaskFamily):
-            raise TypeError(
-                f"family={family!r} makes a {type(template).__name__}, but it must make a "
-                "poem_envs.TaskFamily"
-            )
-        self.metadata = {**template.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}
-        if max_episode_steps is None:
-            max_episode_steps = getattr(template, "max_episode_steps", None)
-        self.task_space, self.all_tasks = template.task_space, template.all_tasks
-        self.reward_feature_dim = template.reward_feature_dim
-        self.shared_dynamics = template.shared_dynamics
-        self.symmetries, self.splits = template.symmetries, template.splits
-        assert isinstance(template.observation_space, spaces.Box)
-        assert isinstance(template.action_space, spaces.Box)
-        super().__init__(
-            observation_space=template.observation_space,
-            action_space=template.action_space,
-            num_envs=num_envs,
-            max_episode_steps=max_episode_steps,
-            render_mode=render_mode,
-            render_task=render_task,
-            split=template.split,
-        )
-
-    def __getattr__(self, name: str) -> Any:
-        """What a family has of its own, as a single environment does."""
-        if name.startswith("_"):
-            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        return getattr(self._template, name)
-
-    def set_attribute(self, name: str, value: Any) -> None:
-        setattr(self._template, name, value)
-        self._attributes[name] = value  # for copies that are made anew
-        self._call("set_attribute", dict.fromkeys(range(len(self._firsts)), (name, value)))
-        if hasattr(type(self), name) or name in self.__dict__:
-            setattr(self, name, value)
-
-    def sample_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        return self._template.sample_tasks(n, rng)
-
-    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
-        return self._template._reward(tasks, features)
-
-    @property
-    def has_potential(self) -> bool:
-        return self._template.has_potential
-
-    def _potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
-        return self._template._potential(tasks, observations)
-
-    def _checked_tasks(self, tasks: npt.ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:
-        return self._template._checked_tasks(tasks, shape, name)
-
-    def _allocate(self, n: int) -> None:
-        groups = np.array_split(np.arange(n), min(self._nthread, n))
+        self._make, self._n = make, n
+        groups = np.array_split(np.arange(n), min(nthread, n))
         self._firsts = [int(copies[0]) for copies in groups]
         # Where each copy is: its group, and its number there.
         self._places = [
             (group, k) for group, copies in enumerate(groups) for k in range(len(copies))
         ]
-        space = self.single_observation_space
-        assert space.shape is not None
+        self._groups: list[CopyGroup | RemoteGroup] = []
+        self._interrupted = False
+        self._attributes: dict[str, Any] = {}
         self._last_observations = np.zeros((n, *space.shape), dtype=space.dtype)
         self._last_infos: dict[str, np.ndarray] = {}
 
+    def set_attribute(self, name: str, value: Any) -> None:
+        """Set an attribute of every copy."""
+        self._attributes[name] = value  # for copies that are made anew
+        self._call("set_attribute", dict.fromkeys(range(len(self._firsts)), (name, value)))
+
     def _start(self) -> None:
         """Start the workers; this process has the last, smallest group."""
-        ends = [*self._firsts[1:], self.num_envs]
+        ends = [*self._firsts[1:], self._n]
         try:
             for first, end in zip(self._firsts, ends, strict=True):
-                group = CopyGroup if end == self.num_envs else RemoteGroup
+                group = CopyGroup if end == self._n else RemoteGroup
                 self._groups.append(group(self._make, end - first, first, self._attributes))
             for remote in self._groups[:-1]:
                 remote.receive()
         except BaseException:  # the next call tries again, rather than to use what is half made
-            self._end_groups()
+            self._release()
             raise
 
     def _call(self, method: str, arguments: dict[int, tuple[Any, ...]]) -> dict[int, Any]:
@@ -304,7 +224,7 @@ class ProcessFamilyVector(TaskFamilyVector):
                     failure = failure or problem
         except BaseException as error:
             if not isinstance(error, Exception):  # answers under way would be taken for later ones
-                self._end_groups()
+                self._release()
                 self._interrupted = True
             raise
         if failure is not None:
@@ -312,26 +232,24 @@ class ProcessFamilyVector(TaskFamilyVector):
         self._interrupted = False
         return results
 
-    def _call_copy(self, copy: int, method: str, *arguments: Any) -> Any:
-        group, place = self._places[copy]
-        return self._call("call", {group: (place, method, *arguments)})[group]
-
-    def _begin_episodes(self, copies: np.ndarray, rngs: Sequence[np.random.Generator]) -> None:
-        assert self._tasks is not None
-        starts: dict[int, list[EpisodeStart]] = {}
-        for copy, rng in zip(copies.tolist(), rngs, strict=True):
-            group, place = self._places[copy]
-            task, seed, episode = self._tasks[copy].copy(), self._seeds[copy], self._episodes[copy]
-            start = EpisodeStart(place, rng, task, seed, int(episode))
-            starts.setdefault(group, []).append(start)
-        results = self._call("begin", {group: (own,) for group, own in starts.items()})
+    def begin(self, starts: Sequence[EpisodeStart]) -> dict[int, np.random.Generator]:
+        """Begin episodes of some copies, and return their generators after all draws."""
+        by_group: dict[int, list[EpisodeStart]] = {}
+        for start in starts:
+            group, place = self._places[start.copy]
+            by_group.setdefault(group, []).append(start._replace(copy=place))
+        results = self._call("begin", {group: (own,) for group, own in by_group.items()})
+        drawn: dict[int, np.random.Generator] = {}
         for group, answer in results.items():
-            for start, observation, rng in zip(starts[group], *answer, strict=True):
+            for start, observation, rng in zip(by_group[group], *answer, strict=True):
                 copy = self._firsts[group] + start.copy
-                self._last_observations[copy] = observation
-                self._rngs[copy] = rng  # which has drawn, in another process
+                self._last_observations[copy], drawn[copy] = observation, rng
+        return drawn
 
-    def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def advance(
+        self, actions: np.ndarray, describe: Callable[[int], str]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Step all copies; returns reward features and early ends."""
         chunks = np.split(actions, self._firsts[1:])
         results = self._call("step", {index: (chunk,) for index, chunk in enumerate(chunks)})
         observations, features, terminated, infos = zip(*results.values(), strict=True)
@@ -345,20 +263,11 @@ class ProcessFamilyVector(TaskFamilyVector):
     def _observations(self) -> np.ndarray:
         return self._last_observations.copy()
 
-    def _physics_state(self, copy: int) -> np.ndarray:
-        return self._call_copy(copy, "get_physics_state")
-
-    def _set_physics_state(self, copy: int, state: np.ndarray) -> None:
-        self._call_copy(copy, "set_physics_state", state)
-
     def _render_copy(self, copy: int, render_mode: str, task: np.ndarray | None) -> Any:
-        return self._call_copy(copy, "render")
+        group, place = self._places[copy]
+        return self._call("call", {group: (place, "render")})[group]
 
     def _release(self) -> None:
-        self._end_groups()
-        self._template.close()
-
-    def _end_groups(self) -> None:
         for group in self._groups:
             group.close()
         self._groups = []
