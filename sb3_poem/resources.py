@@ -39,19 +39,19 @@ def config_file(algorithm: str) -> Path:
 
 
 def zoo_entry(file: Path, env_id: str, **changes: Any) -> dict[str, Any]:
-    """An environment's entry of a file of hyperparameters.
+    """An environment's entry of a file of hyperparameters, or its ``default`` entry.
 
     :param file: YAML in rl_zoo3's syntax; as there, Python in ``policy_kwargs`` is evaluated
     :param changes: what shall differ
-    :raises ValueError: if the file has no entry for it; the message lists those that there are
+    :raises ValueError: if the file has neither; the message lists those that there are
     """
     import yaml
     from torch import nn
 
     entries = yaml.safe_load(file.read_text())
-    if env_id not in entries:
+    if env_id not in entries and "default" not in entries:
         raise ValueError(f"{file.name} has no entry {env_id!r}; there are: {', '.join(entries)}")
-    entry = {**entries[env_id], **changes}
+    entry = {**entries.get(env_id, entries.get("default")), **changes}
     if isinstance(entry.get("policy_kwargs"), str):
         entry["policy_kwargs"] = eval(entry["policy_kwargs"], {"nn": nn})
     return entry

@@ -23,7 +23,7 @@ PAPER_FAMILIES = (
 )
 CHEETAHS = PAPER_FAMILIES[:2]
 RECORD_AT = (0, 1, 2, 3, 5, 7, 10)
-REVISION = 1
+REVISION = 2
 """Of the code that trains, adapts and measures: part of every cell's identity. Raise it with each
 change after which the same cell may come to another figure (a loss, a default of an algorithm or a
 rule, how tasks and seeds are drawn), not for what only takes less time, nor for ``zoo_configs/``,

@@ -29,6 +29,7 @@ from sb3_poem.common.vec_env import TaskVecEnv
 from sb3_poem.loading import ALGORITHMS
 from sb3_poem.pearl_sac import PEARLSAC
 from sb3_poem.pearl_sac.callbacks import TrainingCheckpointCallback
+from sb3_poem.pearl_sac.environments import default_copies
 from sb3_poem.pearl_sac.saving import is_checkpoint
 from sb3_poem.resources import config_file
 
@@ -136,6 +137,9 @@ class PoemExperiment(FamilyExperiment):
         for key in ("n_timesteps", "policy"):
             if key not in hyperparams:
                 raise ValueError(f"{source} has no {key!r}")
+        if "n_envs" not in hyperparams:
+            sizes = hyperparams.get("n_train_tasks"), hyperparams.get("trajectories_per_task", 1)
+            hyperparams["n_envs"] = default_copies(self.env_name.gym_id, *sizes)
         return hyperparams, saved
 
     def create_envs(self, *args: Any, **kwargs: Any) -> VecEnv:

@@ -25,7 +25,7 @@ LEAST = {
     **{"n_train_tasks": 1, "seed": 0},
 }
 #: Those of them that may be None
-OPTIONAL = ("n_train_tasks", "seed")
+OPTIONAL = ("n_train_tasks", "seed", "relabel_fraction", "context_relabel_fraction")
 #: The most of arguments that are numbers from 0 on
 MOST = {
     **dict.fromkeys(("kl_coef", "reward_coef", "policy_coef", "noise_color"), np.inf),
@@ -100,7 +100,8 @@ def check_arguments(given: Mapping[str, Any], algorithm: type) -> None:
     if not callable(given["learning_rate"]):
         check_number("learning_rate", given["learning_rate"], 0.0)
     for name, most in MOST.items():
-        check_number(name, given[name], 0.0, most)
+        if not (given[name] is None and name in OPTIONAL):
+            check_number(name, given[name], 0.0, most)
     check_number_or_auto("ent_coef", given["ent_coef"], 0.0)
     check_number_or_auto("target_entropy", given["target_entropy"])
     if scale != "auto" and not (isinstance(scale, int | float) and scale > 0):

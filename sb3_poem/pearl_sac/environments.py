@@ -19,10 +19,9 @@ def vectorise(
     n_train_tasks: int | None = None,
     trajectories_per_task: int = 1,
 ) -> GymEnv | None:
-    """An environment as SB3 takes it. A registered id becomes ``n_copies``: unless given, one for
-    each trajectory of an epoch, up to one per task or :data:`DEFAULT_TRAIN_TASKS`, whichever is
-    more; of a family without a vectorised version, as many as :func:`make_task_vec_env` steps in
-    turn.
+    """An environment as SB3 takes it. A registered id becomes ``n_copies``: unless given,
+    :func:`default_copies`; of a family without a vectorised version, as many as
+    :func:`make_task_vec_env` steps in turn.
     """
     if isinstance(env, gym.vector.VectorEnv):
         return as_task_vec_env(env)
@@ -37,8 +36,14 @@ def vectorise(
     env = plain_id(env)
     if n_copies is not None:
         return make_task_vec_env(env, n_copies, max_sequential=n_copies)
+    return make_task_vec_env(env, default_copies(env, n_train_tasks, trajectories_per_task))
+
+
+def default_copies(env_id: str, n_train_tasks: int | None, trajectories_per_task: int) -> int:
+    """How many copies of an environment to step unless told: one for each trajectory of an epoch,
+    up to one per task or :data:`DEFAULT_TRAIN_TASKS`, whichever is more.
+    """
     if n_train_tasks is None:
-        with contextlib.closing(gym.make(env)) as probe:
+        with contextlib.closing(gym.make(env_id)) as probe:
             n_train_tasks = default_train_tasks(getattr(probe.unwrapped, "all_tasks", None))
-    copies = min(n_train_tasks * trajectories_per_task, max(n_train_tasks, DEFAULT_TRAIN_TASKS))
-    return make_task_vec_env(env, copies)
+    return min(n_train_tasks * trajectories_per_task, max(n_train_tasks, DEFAULT_TRAIN_TASKS))

@@ -88,11 +88,11 @@ class PEARLSAC(SAC):
     :param reward_coef: Weight of the decoder's loss (eq. 4)
     :param policy_coef: Weight of the actor's loss
     :param relabel_fraction: Share of each task's batch that comes from other tasks' buffers, with
-        rewards relabelled. Needs a family with shared dynamics
+        rewards relabelled. Needs a family with shared dynamics; None: 0.5 of those, else 0
     :param context_relabel_fraction: Share of the contexts in a gradient step that hold other tasks'
         transitions, with rewards relabelled. Without any, the encoder may read a task from what its
         policy does rather than from the rewards, and is then at a loss when it sees a new task's
-        first rollouts. Needs a family with shared dynamics
+        first rollouts. Needs a family with shared dynamics; None: 0.5 of those, else 0
     :param reward_scale: Factor on the rewards that the critics learn; "auto" divides by the
         deviation of the first epoch's
     :param n_steps: Steps of rewards in the critics' targets before the value takes over; more carry
@@ -141,31 +141,31 @@ class PEARLSAC(SAC):
         self,
         policy: str | type[LatentPolicy],
         env: GivenEnv | None,
-        learning_rate: float | Schedule = 3e-4,
+        learning_rate: float | Schedule = 1e-3,
         buffer_size: int = 100_000,
         learning_starts: int = 0,
-        batch_size: int = 128,
-        tau: float = 0.005,
-        gamma: float = 0.99,
+        batch_size: int = 32,
+        tau: float = 0.01,
+        gamma: float = 0.97,
         gradient_steps: int = 1000,
-        ent_coef: str | float = "auto",
+        ent_coef: str | float = "auto_0.1",
         target_update_interval: int = 1,
         target_entropy: str | float = "auto",
         n_train_tasks: int | None = None,
-        meta_batch_size: int = 16,
-        context_size: int = 128,
+        meta_batch_size: int = 20,
+        context_size: int = 32,
         trajectories_per_task: int = 1,
         latent_dim: int = 5,
         kl_coef: float = 0.1,
         reward_coef: float = 1.0,
         policy_coef: float = 1.0,
-        relabel_fraction: float = 0.0,
-        context_relabel_fraction: float = 0.0,
+        relabel_fraction: float | None = None,
+        context_relabel_fraction: float | None = None,
         reward_scale: float | str = "auto",
-        n_steps: int = 1,
+        n_steps: int = 3,
         shaping_coef: float = 0.0,
         noise_color: float = 0.0,
-        policy_delay: int = 1,
+        policy_delay: int = 2,
         horizon: int | None = None,
         precision: str = "auto",
         stats_window_size: int = 100,
@@ -295,10 +295,10 @@ class PEARLSAC(SAC):
 
         :param arguments: What shall differ: arguments of the constructor, ``n_envs`` (copies of the
             environment) and ``n_timesteps``. With ``env``, another family is trained by this entry
-        :raises ValueError: if there is no entry; the message lists those that there are
+        :raises ValueError: if its file has no entry for it, nor a default one
         """
         entry = zoo_entry(config_file(cls.zoo_name), plain_id(env_id), **arguments)
-        timesteps, n_envs = int(entry.pop("n_timesteps")), entry.pop("n_envs")
+        timesteps, n_envs = int(entry.pop("n_timesteps")), entry.pop("n_envs", None)
         rate = entry.get("learning_rate")
         if isinstance(rate, str):  # rl_zoo3's syntax
             entry["learning_rate"] = LinearSchedule(float(rate.removeprefix("lin_")), 0.0, 1.0)
@@ -596,6 +596,9 @@ class PEARLSAC(SAC):
 
     def _check_family(self, family: FamilyView) -> None:
         """:raises ValueError: if the model's arguments need what the family does not have"""
+        for name in ("relabel_fraction", "context_relabel_fraction"):
+            if getattr(self, name) is None:
+                setattr(self, name, 0.5 if family.shared_dynamics else 0.0)
         for name in ("relabel_fraction", "context_relabel_fraction"):
             if getattr(self, name) > 0 and not family.shared_dynamics:
                 raise ValueError(

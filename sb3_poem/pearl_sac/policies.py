@@ -28,7 +28,7 @@ OBSERVATION_CLIP = 10.0
 DEFAULT_NET_ARCH: dict[str, Sequence[int]] = {
     "pi": (256, 256),
     "qf": (256, 256),
-    "encoder": (200, 200, 200),
+    "encoder": (128, 128),
     "decoder": (128, 128),
     "embedding": (64,),
 }

@@ -65,7 +65,7 @@ class POEMSAC(PEARLSAC):
         policy: str | type[POEMPolicy],
         env: GivenEnv | None,
         *args: Any,
-        kl_coef: float = 1.0,
+        kl_coef: float = 0.02,
         reward_coef: float = 0.2,
         policy_coef: float = 0.5,
         preference_coef: float = 6.0,
@@ -94,6 +94,7 @@ class POEMSAC(PEARLSAC):
         #: Tasks whose policies were run on each other's in the last epoch, with returns by rollouts
         self.groups: list[np.ndarray] = []
         kwargs |= {"kl_coef": kl_coef, "reward_coef": reward_coef, "policy_coef": policy_coef}
+        kwargs["context_relabel_fraction"] = 0.0
         super().__init__(policy, env, *args, **kwargs)
 
     def _complete_policy_kwargs(self) -> None:

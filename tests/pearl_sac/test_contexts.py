@@ -74,4 +74,4 @@ def test_the_argument_is_kept_with_the_model(tmp_path) -> None:
     model.save_pretrained(tmp_path)
     assert read_config(tmp_path)["arguments"]["context_relabel_fraction"] == 0.25
     assert PEARLSAC.from_pretrained(tmp_path, POINT_GOAL).context_relabel_fraction == 0.25
-    assert PEARLSAC("MlpPolicy", POINT_GOAL, n_train_tasks=2).context_relabel_fraction == 0.0
+    assert PEARLSAC("MlpPolicy", POINT_GOAL, n_train_tasks=2).context_relabel_fraction == 0.5

@@ -22,17 +22,17 @@ from sb3_poem.resources import config_file
 def test_arguments_are_those_of_the_entry(algorithm: type[PEARLSAC]) -> None:
     entry = yaml.safe_load(config_file(algorithm.zoo_name).read_text())[POINT_GOAL]
     model = algorithm.from_zoo(POINT_GOAL, seed=3, device="cpu", gamma=0.8)
-    for name in entry.keys() & set(kept_arguments(algorithm)) - {"gamma"}:
+    for name in entry.keys() & set(kept_arguments(algorithm)) - {"policy_kwargs", "learning_rate"}:
         assert getattr(model, name) == entry[name], name
     assert (model.gamma, model.seed) == (0.8, 3)
-    assert (model.n_envs, model.n_timesteps) == (entry["n_envs"], int(entry["n_timesteps"]))
+    assert (model.n_envs, model.n_timesteps) == (120, int(entry["n_timesteps"]))
     assert model.policy.net_arch["pi"] == [64, 64]
 
 
 def test_schedules_and_python_are_read_as_rl_zoo3_reads_them(algorithm: type[PEARLSAC]) -> None:
     from rl_zoo3.exp_manager import ExperimentManager
 
-    env_id = "poem/HalfCheetahFwdBack-v0"
+    env_id = "poem/PointGoal-v0"
     entry = yaml.safe_load(config_file(algorithm.zoo_name).read_text())[env_id]
     expected: Any = ExperimentManager._preprocess_schedules(
         {"learning_rate": entry["learning_rate"]}
@@ -47,7 +47,8 @@ def test_schedules_and_python_are_read_as_rl_zoo3_reads_them(algorithm: type[PEA
 
 
 def test_every_entry_makes_a_model(algorithm: type[PEARLSAC]) -> None:
-    for env_id in yaml.safe_load(config_file(algorithm.zoo_name).read_text()):
+    entries = yaml.safe_load(config_file(algorithm.zoo_name).read_text())
+    for env_id in entries.keys() - {"default"}:
         model = algorithm.from_zoo(env_id, n_envs=1, env=POINT_GOAL, _init_setup_model=False)
         assert model.n_timesteps > 0
 
@@ -56,7 +57,7 @@ def test_learn_takes_the_entrys_steps(algorithm: type[PEARLSAC], tmp_path: Path)
     model = algorithm.from_zoo(
         POINT_GOAL, seed=0, n_timesteps=3000, gradient_steps=1, device="cpu"
     ).learn()
-    assert model.num_timesteps == 3000  # two epochs of 60 tasks and 25 steps
+    assert model.num_timesteps == 3000  # an epoch of 120 tasks and 25 steps
     model.save(tmp_path / "model")
     assert (
         algorithm.load(tmp_path / "model", POINT_GOAL)
@@ -64,7 +65,7 @@ def test_learn_takes_the_entrys_steps(algorithm: type[PEARLSAC], tmp_path: Path)
         .num_timesteps
         == 6000
     )
-    assert model.learn(1500).num_timesteps == 1500
+    assert model.learn(6000).num_timesteps == 6000
 
 
 def test_learn_does_not_guess_how_long(algorithm: type[PEARLSAC]) -> None:
@@ -87,7 +88,7 @@ def test_another_family_by_an_entry() -> None:
 def test_it_is_what_the_constructor_makes() -> None:
     """With the same arguments, the same model."""
     of_zoo = POEMSAC.from_zoo(
-        POINT_GOAL, seed=0, n_timesteps=1500, gradient_steps=2, learning_rate=5e-3
+        POINT_GOAL, seed=0, n_timesteps=3000, gradient_steps=2, learning_rate=5e-3
     ).learn()
     entry = yaml.safe_load(config_file("poem_sac").read_text())[POINT_GOAL]
     arguments = {
@@ -97,18 +98,22 @@ def test_it_is_what_the_constructor_makes() -> None:
         "seed": 0,
         "gradient_steps": 2,
         "learning_rate": 5e-3,
-        "env": make_task_vec_env(POINT_GOAL, 60),
+        "env": make_task_vec_env(POINT_GOAL, 120),
     }
     policy_kwargs = eval(entry["policy_kwargs"])
-    by_hand = POEMSAC(**{**arguments, **changed, "policy_kwargs": policy_kwargs}).learn(1500)
+    by_hand = POEMSAC(**{**arguments, **changed, "policy_kwargs": policy_kwargs}).learn(3000)
     assert not differing(parameters(of_zoo), parameters(by_hand))
 
 
-def test_no_entry(algorithm: type[PEARLSAC]) -> None:
-    with pytest.raises(
-        ValueError,
-        match=rf"{algorithm.zoo_name}.yml has no entry 'Pendulum-v1'; there are: poem/PointGoal-v0, ",
-    ):
+def test_a_family_without_an_entry_takes_the_default_one(algorithm: type[PEARLSAC]) -> None:
+    entries = yaml.safe_load(config_file(algorithm.zoo_name).read_text())
+    gym.register("test/Walk-v0", Walk, max_episode_steps=10)
+    try:
+        model = algorithm.from_zoo("test/Walk-v0", n_envs=3, device="cpu")
+    finally:
+        del gym.registry["test/Walk-v0"]
+    assert (model.env_id, model.n_timesteps) == ("test/Walk-v0", int(entries["default"]["n_timesteps"]))
+    with pytest.raises(ValueError, match="Pendulum"):
         algorithm.from_zoo("Pendulum-v1")
     with pytest.raises(gym.error.NameNotFound, match="did you mean 'poem/PointGoal-v0'"):
         algorithm.from_zoo("poem/PointGoal")

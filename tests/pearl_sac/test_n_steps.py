@@ -93,8 +93,8 @@ def test_rewards_values_and_discounts(
     } <= lengths  # all kinds of ends were seen
 
 
-def test_one_step_is_what_it_was() -> None:
-    model = small(PEARLSAC).learn(300)
+def test_one_step_needs_no_bootstraps() -> None:
+    model = small(PEARLSAC, n_steps=1).learn(300)
     [batch] = model.make_sampler().sample(1, 16)
     assert batch.bootstraps is None
 

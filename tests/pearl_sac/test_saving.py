@@ -337,6 +337,6 @@ def test_arguments_that_the_family_cannot_have(algorithm: type[PEARLSAC], tmp_pa
     with pytest.raises(ValueError, match=r"n_train_tasks is 4 in .*calm\.zip, and cannot become 2"):
         algorithm.load(tmp_path / "calm.zip", n_train_tasks=2)
     with pytest.raises(
-        ValueError, match=r"ent_coef is 'auto' in .*calm\.zip, and cannot become 0\.1"
+        ValueError, match=r"ent_coef is 'auto_0.1' in .*calm\.zip, and cannot become 0\.1"
     ):
         algorithm.load(tmp_path / "calm.zip", ent_coef=0.1)

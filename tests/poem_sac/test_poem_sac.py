@@ -379,7 +379,7 @@ def test_without_its_parts_poem_is_pearl(monkeypatch: pytest.MonkeyPatch) -> Non
     the encoder.
     """
     arguments = {"kl_coef": 0.3, "reward_coef": 0.7, "policy_coef": 1.0}
-    pearl = small(PEARLSAC, **arguments)
+    pearl = small(PEARLSAC, context_relabel_fraction=0.0, **arguments)
     poem = small(POEMSAC, similarity="inner", context="pearl", preference_coef=0.0, **arguments)
     assert parameters(pearl).keys() == parameters(poem).keys()
     monkeypatch.setattr(
@@ -486,7 +486,7 @@ def test_targets_are_bootstrapped_except_at_an_early_end() -> None:
     """The critics' loss against soft Bellman targets computed here, with gamma and alpha far from
     trivial.
     """
-    model = small(POEMSAC, walks(4, edge=0.4), horizon=10, gamma=0.9, ent_coef=0.3).learn(120)
+    model = small(POEMSAC, walks(4, edge=0.4), horizon=10, gamma=0.9, ent_coef=0.3, n_steps=1).learn(120)
     meta_batch = model.make_sampler().sample(1, 16)[0]
     batch, noise = meta_batch.transitions, meta_batch.next_action_noise
     assert 0 < batch.terminated.sum() < batch.terminated.numel()
