@@ -133,7 +133,7 @@ CONSTRUCTOR = [
     works(
         "gradient_steps", lambda _: made(gradient_steps=-1, n_train_tasks=2).learn(1)._n_updates, 50
     ),
-    works("n_steps", lambda _: changed(n_steps=3)),
+    works("n_steps", lambda _: changed(n_steps=2)),
     works("ent_coef auto", lambda _: 0.09 < learned(ent_coef="auto_0.1").log_ent_coef.exp() < 0.11),
     works("ent_coef", lambda _: learned(ent_coef=0.25).ent_coef_tensor.item(), 0.25),
     works("target_update_interval", lambda _: changed(target_update_interval=3)),

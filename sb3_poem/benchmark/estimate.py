@@ -53,10 +53,7 @@ def measure_pace(env_id: str, device: str = "cpu", num_threads: int = 1) -> Pace
     with contextlib.closing(make_task_vec_env(env_id, COPIES, max_episode_steps=steps)) as env:
         changes: dict[str, Any] = {"env": env, "gradient_steps": UPDATES, "device": device}
         changes |= {"n_train_tasks": tasks, "trajectories_per_task": COPIES // tasks}
-        try:
-            model = POEMSAC.from_zoo(env_id, **changes)
-        except ValueError:  # there is no entry for it
-            model = POEMSAC("MlpPolicy", **changes)
+        model = POEMSAC.from_zoo(env_id, **changes)
         model.learn(2 * COPIES * steps, log_interval=None)
     log = model.logger.name_to_value
     return Pace(1.0 / log["time/collection_fps"], 1.0 / log["time/updates_per_second"])

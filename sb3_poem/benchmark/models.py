@@ -29,8 +29,8 @@ from sb3_poem.benchmark.training import (
     CHECKPOINT,
     LOG,
     SESSIONS,
-    MissingEntryError,
     TrainingError,
+    overrides,
     run_training,
     train_arguments,
     training_plan,
@@ -39,6 +39,7 @@ from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.loading import ALGORITHMS
 from sb3_poem.pearl_sac import PEARLSAC
 from sb3_poem.pearl_sac.saving import CONFIG, WEIGHTS, is_checkpoint, read_config
+from sb3_poem.resources import config_file, zoo_entry
 
 MODEL, BEGUN, FINISHED, REWARD = "model.zip", "begun.json", "trained.json", "reward"
 
@@ -358,12 +359,10 @@ def _check_variant(model: Any, key: ModelKey, path: Path) -> None:
 
 def _expected(key: ModelKey) -> tuple[str, int, tuple[str | None, str | None, int]]:
     """Environment, seed, and (similarity, context, latent dimension) of a model: as its family's
-    entry would make it, or as the algorithm's defaults do without one.
+    entry makes it.
     """
     variant = VARIANTS[key.variant]
-    given = variant.hyperparameters
-    with contextlib.suppress(MissingEntryError):  # a family that nothing is trained on here
-        given = training_plan(key).hyperparameters
+    given = zoo_entry(config_file(variant.algorithm), key.env_id, **overrides(key))
     kinds = given.get("similarity", "two-encoder"), given.get("context", "optimal")
     similarity, context = (None, None) if variant.algorithm == "pearl_sac" else kinds
     return key.env_id, key.seed, (similarity, context, int(given.get("latent_dim", 5)))

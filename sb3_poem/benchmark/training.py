@@ -43,10 +43,6 @@ class TrainingError(RuntimeError):
     """A training that did not end well; the message has the end of its log."""
 
 
-class MissingEntryError(ValueError):
-    """There are no hyperparameters for a family."""
-
-
 @dataclass(frozen=True)
 class FamilyFacts:
     """What must be known of a family before anything starts; ``n_tasks`` None: infinitely many."""
@@ -94,21 +90,19 @@ class TrainingPlan:
         return max(1, round(self.timesteps / SAVES / self.epoch_steps)) * self.epoch_steps
 
 
+def overrides(key: ModelKey) -> dict[str, Any]:
+    """Where a variant, and this run's ``--params``, differ from the family's entry."""
+    return {**VARIANTS[key.variant].hyperparameters, **dict(key.training.hyperparameters)}
+
+
 def training_plan(key: ModelKey) -> TrainingPlan:
-    """How a model is trained; a :class:`MissingEntryError` if its family has no entry."""
+    """How a model is trained: by its family's entry, or the file's default."""
     from sb3_poem.pearl_sac.train_tasks import DEFAULT_TRAIN_TASKS
 
     variant = VARIANTS[key.variant]
-    file = config_file(variant.algorithm)
-    entries = yaml.safe_load(file.read_text())
-    entry = entries.get(key.env_id, entries.get("default"))
-    if entry is None:
-        raise MissingEntryError(
-            f"{file} has no entry for {key.env_id}, which says how to train {variant.name} on it: "
-            "add one, or hand over a model by --models or --model"
-        )
-    overrides = {**variant.hyperparameters, **dict(key.training.hyperparameters)}
-    hyperparameters = {**entry, **overrides}
+    entries = yaml.safe_load(config_file(variant.algorithm).read_text())
+    changes = overrides(key)
+    hyperparameters = {**entries.get(key.env_id, entries["default"]), **changes}
     timesteps = int(key.training.timesteps or hyperparameters["n_timesteps"])
     hyperparameters["n_timesteps"] = timesteps
     facts, tasks = family_facts(key.env_id), hyperparameters.get("n_train_tasks")
@@ -118,7 +112,7 @@ def training_plan(key: ModelKey) -> TrainingPlan:
     per_epoch = int(hyperparameters.get("gradient_steps", 1000))
     updates = -(-timesteps // epoch_steps) * (epoch_steps if per_epoch < 0 else per_epoch)
     return TrainingPlan(
-        variant.algorithm, hyperparameters, overrides, timesteps, int(epoch_steps), updates
+        variant.algorithm, hyperparameters, changes, timesteps, int(epoch_steps), updates
     )
 
 

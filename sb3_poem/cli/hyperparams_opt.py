@@ -25,7 +25,7 @@ LINEAR = "lin_learning_rate"
 
 def entry_params(algorithm: str, entry: dict[str, Any]) -> dict[str, Any]:
     """The trial that is an entry itself, by Optuna's names and with schedules of learning rates,
-    without what cannot be searched around it: 0, and gradient steps of -1.
+    without what cannot be searched around it: None, 0, and gradient steps of -1.
     """
     parameters = inspect.signature(ALGORITHMS[algorithm]).parameters
     values = {name: parameter.default for name, parameter in parameters.items()} | entry
@@ -33,11 +33,11 @@ def entry_params(algorithm: str, entry: dict[str, Any]) -> dict[str, Any]:
     rate = values["learning_rate"]
     if callable(rate):
         values["learning_rate"] = rate(1.0)
-    params = {name: float(values[name]) for name in (*SCALES, *FRACTIONS) if name in values}
-    params |= {name: int(values[name]) for name in COUNTS}
+    params = {name: float(values[name]) for name in (*SCALES, *FRACTIONS) if values.get(name)}
+    params |= {name: int(values[name]) for name in COUNTS if values[name] > 0}
     if isinstance(rate, SimpleLinearSchedule):
         params[LINEAR] = params.pop("learning_rate")
-    return {name: value for name, value in params.items() if value > 0 or name in FRACTIONS}
+    return params
 
 
 def convert_params(sampled_params: dict[str, Any]) -> dict[str, Any]:

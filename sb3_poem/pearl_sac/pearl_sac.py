@@ -425,7 +425,7 @@ class PEARLSAC(SAC):
                 values = policy.action_values(obs, actions, epoch.latents)
             parts.append(_standardised(values)[..., None])
         transitions, features = th.cat(parts, dim=-1), None
-        if self.context_relabel_fraction > 0:
+        if self.context_relabel_fraction:
             features = th.as_tensor(epoch.features, device=self.device)
             features = features.reshape(n_tasks, -1, features.shape[-1])
         self.epoch_context = ContextStore(

@@ -203,8 +203,16 @@ def test_target_entropy(algorithm: type[PEARLSAC]) -> None:
     assert small(algorithm).target_entropy == -2.0
     assert small(algorithm, target_entropy=-0.5).target_entropy == -0.5
     # far below the policy's entropy alpha falls, far above it rises
-    falling = small(algorithm, target_entropy=-50.0, ent_coef="auto").learn(EPOCH).entropy_coefficient.value.item()
-    rising = small(algorithm, target_entropy=50.0, ent_coef="auto").learn(EPOCH).entropy_coefficient.value.item()
+    falling = (
+        small(algorithm, target_entropy=-50.0, ent_coef="auto")
+        .learn(EPOCH)
+        .entropy_coefficient.value.item()
+    )
+    rising = (
+        small(algorithm, target_entropy=50.0, ent_coef="auto")
+        .learn(EPOCH)
+        .entropy_coefficient.value.item()
+    )
     assert falling < 1.0 < rising
 
 

@@ -112,7 +112,10 @@ def test_a_family_without_an_entry_takes_the_default_one(algorithm: type[PEARLSA
         model = algorithm.from_zoo("test/Walk-v0", n_envs=3, device="cpu")
     finally:
         del gym.registry["test/Walk-v0"]
-    assert (model.env_id, model.n_timesteps) == ("test/Walk-v0", int(entries["default"]["n_timesteps"]))
+    assert (model.env_id, model.n_timesteps) == (
+        "test/Walk-v0",
+        int(entries["default"]["n_timesteps"]),
+    )
     with pytest.raises(ValueError, match="Pendulum"):
         algorithm.from_zoo("Pendulum-v1")
     with pytest.raises(gym.error.NameNotFound, match="did you mean 'poem/PointGoal-v0'"):

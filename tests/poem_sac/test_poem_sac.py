@@ -486,7 +486,9 @@ def test_targets_are_bootstrapped_except_at_an_early_end() -> None:
     """The critics' loss against soft Bellman targets computed here, with gamma and alpha far from
     trivial.
     """
-    model = small(POEMSAC, walks(4, edge=0.4), horizon=10, gamma=0.9, ent_coef=0.3, n_steps=1).learn(120)
+    model = small(
+        POEMSAC, walks(4, edge=0.4), horizon=10, gamma=0.9, ent_coef=0.3, n_steps=1
+    ).learn(120)
     meta_batch = model.make_sampler().sample(1, 16)[0]
     batch, noise = meta_batch.transitions, meta_batch.next_action_noise
     assert 0 < batch.terminated.sum() < batch.terminated.numel()
