@@ -18,6 +18,7 @@ from sybil import Document
 from sybil.evaluators.python import PythonEvaluator
 from sybil.parsers.markdown import CodeBlockParser
 
+from poem_envs.testing import check_task_family
 from sb3_poem import PEARLSAC, POEMSAC, PreferenceAdapter, cli
 from sb3_poem.cli import experiment
 from sb3_poem.resources import config_file, shipped_folder
@@ -206,3 +207,10 @@ def test_readme_is_two_screens() -> None:
 @pytest.mark.parametrize("page", [*PAGES, "CHANGELOG.md"])
 def test_lines_fit_a_screen(page: str) -> None:
     assert max(map(len, (TOP / page).read_text().splitlines())) <= 120
+
+
+def test_families_around_gymnasium_s_robots(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(TOP / "docs" / "examples"))
+    importlib.import_module("gymnasium_robots")
+    for name in ("example/Walker2dVel-v0", "example/ReacherGoal-v0"):
+        check_task_family(name)
