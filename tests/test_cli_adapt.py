@@ -15,6 +15,7 @@ from rl_zoo3.utils import SimpleLinearSchedule
 from sb3_poem import (
     PEARLSAC,
     POEMSAC,
+    Bayes,
     MistakeOracle,
     Preference,
     PreferenceAdapter,
@@ -295,6 +296,44 @@ def test_a_person_answers_by_their_own_wish(
     adapter = PreferenceAdapter.load(state, model[0], ENV_ID)
     assert adapter.done
     assert [answer.preference.value for answer in adapter.answers] == ["left"]
+
+
+def test_a_person_says_how_much_better(
+    model: tuple[POEMSAC, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    answer_by(monkeypatch, tmp_path, "1\n3\n4\n5\n")
+    graded = ["--question", "graded", "--infer-noise", "--queries", 4, "--n-candidates", 20]
+    assert adapt(model[1], "--oracle", "human", *graded, "--json", "state.json", *TINY) == 0
+    words = ["much left", "equal", "right", "much right"]
+    kept = PreferenceAdapter.load("state.json", model[0], ENV_ID)
+    assert [answer.preference.value for answer in kept.answers] == words
+    assert kept.rule == Bayes(20, question="graded", noise_model="infer")
+    label = ["label", "--store", "label_data"]
+    assert cli.main([*label, "export", "--out", "a.jsonl"]) == 0
+    lines = [json.loads(line) for line in Path("a.jsonl").read_text().splitlines()]
+    assert [line["preference"] for line in lines] == words
+    assert {line["question"] for line in lines} == {"graded"}
+    capsys.readouterr()
+    for rule in ("bayes", "paper"):  # the latter reads "much better" as better
+        assert cli.main([*label, "replay", "--model", model[1], "--inference", rule]) == 0
+        assert " of 3" in capsys.readouterr().out  # those of "equal" are not foretold
+
+
+def test_a_program_says_how_much_better(model: tuple[POEMSAC, str], tmp_path: Path) -> None:
+    file = tmp_path / "result.json"
+    flags = ["--oracle", "mistake", "--question", "graded", "--infer-noise", "--queries", 3]
+    flags += ["--thresholds", 0.0, 0.01, "--tasks", 3, "--episodes", 1, "--n-candidates", 20]
+    assert adapt(model[1], *flags, "--seed", 5, "--json", file) == 0
+    result = json.loads(file.read_text())
+    answers = {word for answers in result["answers"] for word in answers}
+    assert answers <= {"much left", "left", "right", "much right"}
+    assert answers & {"much left", "much right"}
+    assert result["thresholds"] == [0.0, 0.01]
+    assert result["noise_model"] == "infer"
+    assert result["limit"][1] == pytest.approx(result["limit"][3])  # five policies for three tasks
 
 
 def answer_by(monkeypatch: pytest.MonkeyPatch, folder: Path, answers: str | None) -> None:

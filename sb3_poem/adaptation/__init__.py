@@ -10,7 +10,12 @@ from sb3_poem.adaptation.evaluation import (
     evaluate_episodes,
 )
 from sb3_poem.adaptation.human import HumanOracle
-from sb3_poem.adaptation.known_task import KnownTaskReturn, known_task_return, property_one
+from sb3_poem.adaptation.known_task import (
+    KnownTaskReturn,
+    known_task_return,
+    property_one,
+    return_spread,
+)
 from sb3_poem.adaptation.limits import (
     answer_capacity,
     best_codebook,

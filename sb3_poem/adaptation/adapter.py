@@ -167,15 +167,17 @@ class PreferenceAdapter:
     def tell(self, preference: Preference | str) -> None:
         """Answer the pending question.
 
-        :param preference: A :class:`Preference`, or "left", "right" or "equal".
+        :param preference: A :class:`Preference`, or "left", "right" or "equal"; to a graded
+            question "much left" and "much right", too.
         :raises RuntimeError: If no question waits for an answer.
-        :raises TypeError, ValueError: If it is no answer; the question goes on waiting.
+        :raises TypeError, ValueError: If it is no answer to such a question, which goes on waiting.
         """
         if self._pending is None:
             answered = "the last question has its answer already"
             state = answered if self.n_answers else "no question has been asked"
             raise RuntimeError(f"tell() without a pending question: {state}; call ask() first")
-        answer, query = as_preference(preference), self._pending
+        query = self._pending
+        answer = as_preference(preference, query.kind)
         before = self.inference.snapshot()
         self.inference.tell(answer, query.left, query.right)
         self._pending, self._previous = None, (before, query)
@@ -210,6 +212,7 @@ class PreferenceAdapter:
                 "adapt() needs an oracle: pass it here or at construction, or use ask() and tell()"
             )
         _check_oracle(oracle)
+        self.rule.answered_by(oracle)  # refuses one that answers other questions
         self._take_oracle(oracle)
         n, shows = self.n_queries, not progress_bar
         with tqdm(total=n, initial=self.n_answers, unit="query", disable=shows) as bar:
@@ -239,15 +242,15 @@ class PreferenceAdapter:
         other tasks.
         """
         if isinstance(left, Trajectory) and isinstance(right, Trajectory):
-            return Query(left, right)
+            return Query(left, right, self.rule.question)
         seed, frames = rollout_seed(self.seed, self.n_answers), self._needs_frames
         by_mode = self.deterministic and not self.rule.explores
         # Each fills a wave of its own; copies beyond the first repeat it and are not read.
-        trajectories = [
+        first, second = (
             rollout_latents(self.model, self.env, z[None], None, [seed], by_mode, frames=frames)[0]
             for z in (latent_of(left), latent_of(right))
-        ]
-        return Query(*trajectories)
+        )
+        return Query(first, second, self.rule.question)
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as JSON-ready data, for :meth:`from_dict`: rule, answers with their
@@ -334,7 +337,8 @@ class PreferenceAdapter:
                 Answer(Preference(item["preference"]), *_pair_from_dict(item))
                 for item in data["answers"]
             ]
-            pending = None if data["pending"] is None else Query(*_pair_from_dict(data["pending"]))
+            waits, kind = data["pending"], self.rule.question
+            pending = None if waits is None else Query(*_pair_from_dict(waits), kind=kind)
             self.inference.restore(Snapshot.from_dict(data["inference"]), answers)
         self._pending, self._previous = pending, None
 

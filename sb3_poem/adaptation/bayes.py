@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import log_softmax, logsumexp
 
 from sb3_poem.adaptation import queries
 from sb3_poem.adaptation.decisions import DECISIONS, decide
@@ -28,7 +29,8 @@ from sb3_poem.adaptation.particles import (
     kernel_neighbours,
     systematic_resample,
 )
-from sb3_poem.adaptation.preference import Preference, preference_log_likelihood
+from sb3_poem.adaptation.people import INFER, People
+from sb3_poem.adaptation.preference import ANSWERS, Preference, preference_log_likelihood
 from sb3_poem.adaptation.priors import SOURCES, make_prior
 from sb3_poem.adaptation.rule import (
     Answer,
@@ -78,6 +80,8 @@ DECODER_MOVE_STEPS = 2_500
 # robot, so it is measured for each answer, by particles whose returns are predicted from all steps.
 DECODED_STEPS = 25
 FULLY_DECODED = 8
+# The prior's latents by which the spread of returns is told where S does not tell it.
+SPREAD_LATENTS = 32
 # Width of the kernel that replaces a copy of a particle by a neighbour, as a share of the
 # particles' own spread.
 KERNEL_WIDTH = 0.3
@@ -130,6 +134,13 @@ class Bayes(Rule):
     would be empty after a few answers; this one has as many different particles after fifty, in any
     dimension.
 
+    *Who answers*: how an oracle errs can be told (``noise_model``) or inferred with the task: the
+    posterior is then one of latent and person together, of whom there is a grid in the place of
+    each particle (:class:`~sb3_poem.adaptation.people.People` states the prior), and both answers
+    and questions are averaged over it. What a person calls equal and much better, which graded
+    answers depend on, is always inferred. Widths and doubts are in units of the family's spread of
+    returns, which S gives, in returns by the slope between S and the decoder's.
+
     >>> from sb3_poem import PreferenceAdapter
     >>> rule = Bayes(n_particles=100)
     >>> adapter = PreferenceAdapter("PointGoal", "poem/PointGoal-v0", rule=rule, seed=0)
@@ -145,9 +156,10 @@ class Bayes(Rule):
         knows its error, which takes tasks that share their dynamics.
     :param decision: "expected-fitness", "posterior-mean" or "most-likely", see
         :func:`sb3_poem.adaptation.decisions.decide`.
-    :param noise_model: How the oracle errs; None takes ``oracle.noise_model`` where there is one,
-        else no error.
+    :param noise_model: How the oracle errs, or "infer"; None takes ``oracle.noise_model`` where
+        there is one, else no error.
     :param epsilon: Tolerated error of eq. 9, in [0, 0.5), for ``query_rule="worst-case"``.
+    :param question: "pair" (left, right or equal), or "graded" (much better, too).
     :raises ValueError: If an option is out of its range.
     """
 
@@ -156,8 +168,9 @@ class Bayes(Rule):
     candidates: str | None = None
     likelihood: str | None = None
     decision: str = "expected-fitness"
-    noise_model: NoiseModel | None = None
+    noise_model: NoiseModel | str | None = None
     epsilon: float = 0.1
+    question: str = "pair"
 
     def __post_init__(self) -> None:
         check_whole("n_particles", self.n_particles, 2)  # a question compares two
@@ -166,14 +179,17 @@ class Bayes(Rule):
         check_choice("likelihood", self.likelihood, (*LIKELIHOODS, None))
         check_choice("decision", self.decision, DECISIONS)
         queries.check_epsilon(self.epsilon)
-        if self.noise_model is not None and not hasattr(self.noise_model, "probability_left"):
+        check_choice("question", self.question, tuple(ANSWERS))
+        needed = "probability_left" if self.question == "pair" else "probability_above"
+        if self.noise_model not in (None, INFER) and not hasattr(self.noise_model, needed):
             raise ValueError(
-                "`noise_model` must be None or an object as MistakeNoise(0.2), "
+                '`noise_model` must be None, "infer" or an object as MistakeNoise(0.2), '
                 f"but is {self.noise_model!r}"
             )
 
     def answered_by(self, oracle: Any) -> Bayes:
         """See :class:`Rule`: with the oracle's own noise model, unless one was chosen."""
+        super().answered_by(oracle)
         noise_model = self.noise_model or getattr(oracle, "noise_model", None) or ExactNoise()
         return replace(self, noise_model=noise_model)
 
@@ -223,20 +239,21 @@ class Bayes(Rule):
 
     def to_dict(self) -> dict[str, Any]:
         data, noise = super().to_dict(), self.noise_model
-        data["options"]["noise_model"] = None if noise is None else noise.to_dict()
+        if noise is not None and not isinstance(noise, str):
+            data["options"]["noise_model"] = noise.to_dict()
         return data
 
     @classmethod
     def _of_options(cls, options: dict[str, Any]) -> Bayes:
         noise = options["noise_model"]
-        noise_model = None if noise is None else noise_model_from_dict(noise)
+        noise_model = noise_model_from_dict(noise) if isinstance(noise, dict) else noise
         return cls(**{**options, "noise_model": noise_model})
 
 
 class BayesInference(Inference):
     """See :class:`Bayes`."""
 
-    state = ("particles", "log_weights", "scale", "calibration", "thinning")
+    state: tuple[str, ...] = ("particles", "log_weights", "scale", "calibration", "thinning")
 
     def __init__(
         self,
@@ -249,12 +266,21 @@ class BayesInference(Inference):
         self.rule, self.model = rule, model
         self.has_similarity = isinstance(model, HasSimilarity)
         self.likelihood = rule.likelihood_with(model)
-        self.noise_model: NoiseModel = rule.noise_model or ExactNoise()
+        noise: Any = rule.noise_model or ExactNoise()
+        #: How the oracle errs, if that is told
+        self.noise_model: NoiseModel | None = None if noise == INFER else noise
+        grid = noise == INFER or rule.question == "graded"
+        self.people = People(rule.question, self.noise_model) if grid else None
         self.library = None if library is None else list(library)
         far = model.aggregate_to_prior_kl > PRIOR_COVERS
         self.prior = make_prior(model, rule.candidates or ("aggregate" if far else "prior"), rng)
         self.particles = self.prior.balanced_sample(rule.n_particles, rng)
         self.log_weights = np.zeros(rule.n_particles)
+        if self.people is not None:
+            # (n, G) the posterior of who answers if this particle is the task's latent
+            shares = np.tile(self.people.log_prior, (rule.n_particles, 1))
+            self.people_log_shares = shares.astype(np.float16)
+            self.state = (*self.state, "people_log_shares")
         # Of a generator of its own, which does not move the particles' and begins alike every time.
         self._reference = self.prior.balanced_sample(REFERENCE_POLICIES, np.random.default_rng(0))
         self.scale = self._similarity_scale()
@@ -262,6 +288,7 @@ class BayesInference(Inference):
         self.calibration = np.zeros(4)
         self.thinning = np.zeros((0, 3))  # a Thinning of each answer
         self._library_returns: np.ndarray | None = None
+        self._library_spread: float | None = None
 
     @property
     def weights(self) -> np.ndarray:
@@ -272,6 +299,11 @@ class BayesInference(Inference):
     def effective_size(self) -> float:
         """How many equally weighted particles the weighted ones are worth."""
         return float(1.0 / np.square(self.weights).sum())
+
+    @property
+    def people_shares(self) -> np.ndarray:
+        """(G,) the posterior of which of :attr:`people` answers."""
+        return self.weights @ np.exp(self.people_log_shares.astype(np.float64))
 
     def ask(self) -> tuple[Shown, Shown]:
         if self.library is not None:
@@ -287,10 +319,29 @@ class BayesInference(Inference):
             first, second = queries.worst_case_pair(similarities, self.rule.epsilon, weights)
         else:
             slope, magnitude, noise = self._return_unit()
-            error = slope * (QUERY_RESOLUTION * self._spread)
+            unit = slope * (QUERY_RESOLUTION * self._spread), magnitude, slope * self._spread
             values = slope * similarities
-            first, second = queries.most_informative_pair(values, weights, noise, error, magnitude)
+            first, second = self._most_informative(values, weights, noise, *unit)
         return policies[first], policies[second]
+
+    def _most_informative(
+        self,
+        values: np.ndarray,
+        weights: np.ndarray,
+        noise: Any,
+        error: float,
+        magnitude: float,
+        spread: float,
+    ) -> tuple[int, int]:
+        """See :func:`queries.most_informative_pair`; and :meth:`People.probabilities`."""
+        if self.people is None:
+            return queries.most_informative_pair(values, weights, noise, error, magnitude)
+        people = self.people
+        if noise is not self.noise_model:
+            people = People(self.rule.question, noise)
+        largest = float(np.ptp(values, axis=1).max())
+        table = people.table(self.people_shares, largest, error, magnitude, spread)
+        return queries.most_telling_pair(values, weights, *table)
 
     def _ask_about(self, library: list[Trajectory]) -> tuple[int, int]:
         if self.rule.query_rule == "random":
@@ -301,15 +352,19 @@ class BayesInference(Inference):
         returns = self._library_returns
         error = self._decoder_error(2.0 * float(np.mean([len(item) for item in library])))
         magnitude = float(2.0 * np.abs(returns).mean())
-        return queries.most_informative_pair(
-            returns, self.weights, self.noise_model, error, magnitude
-        )
+        unit = error, magnitude, self._return_spread(library)
+        return self._most_informative(returns, self.weights, self.noise_model, *unit)
 
     def tell(self, preference: Preference, left: Shown, right: Shown) -> None:
         if self.likelihood == "decoder":
             trajectories_of('likelihood="decoder"', left, right)
         answer = Answer(preference, left, right)
-        told = self._answer_log_likelihoods(self.particles, [answer], new=True)
+        told = self._log_likelihoods(self.particles, [answer], new=True)
+        if self.people is not None:
+            before = self.people_log_shares.astype(np.float64)
+            joint = before + told
+            told = logsumexp(joint, axis=1) - logsumexp(before, axis=1)
+            self.people_log_shares = log_softmax(joint, axis=1).astype(np.float16)
         self.log_weights = self.log_weights + told
         self.answers.append(answer)
         if self.effective_size < len(self.particles) / 2:
@@ -342,7 +397,24 @@ class BayesInference(Inference):
     def _spread(self) -> float:
         return float(self.scale[0])
 
-    def _return_unit(self) -> tuple[float, float, NoiseModel]:
+    def _return_spread(self, shown: Sequence[Shown]) -> float:
+        """The family's spread of returns (see :class:`People`), by the decoder: from S, once it is
+        tied to returns, else from what was shown. 1, of no effect, without people.
+        """
+        if self.people is None:
+            return 1.0
+        cross, square = self.calibration[:2]
+        if self.library is None and cross > 0:
+            return float(cross / square) * self._spread
+        if self.library is None or self._library_spread is None:
+            returns = self.model.predicted_returns(
+                self._reference[:SPREAD_LATENTS], self.library or shown, DECODED_STEPS
+            )
+            spread = float(np.sqrt(2.0 * returns.var(axis=1, ddof=1).mean()))
+            self._library_spread = max(spread, 1e-12)
+        return self._library_spread
+
+    def _return_unit(self) -> tuple[float, float, NoiseModel | None]:
         """Slope from S to returns, the returns' typical magnitude, and the noise model that fits
         this unit.
         """
@@ -358,10 +430,12 @@ class BayesInference(Inference):
     def _decoder_error(self, steps: Values) -> Any:
         return self.model.predicted_rewards_error * np.sqrt(steps * ERROR_CORRELATION)
 
-    def _answer_log_likelihoods(
+    def _log_likelihoods(
         self, latents: np.ndarray, answers: Sequence[Answer], new: bool = False
     ) -> np.ndarray:
-        """(m,) log P(answers | latent) of (m, d); what else a new answer tells is noted."""
+        """(m,) log P(answers | latent) of (m, d), or (m, G) for each of the people; what else a new
+        answer tells is noted.
+        """
         shown = [item for answer in answers for item in (answer.left, answer.right)]
         error: Values
         magnitude: Values
@@ -379,13 +453,27 @@ class BayesInference(Inference):
             difference = difference + intercepts + slopes * difference
             if new and self.has_similarity:
                 self._calibrate(latents, shown, values)
+            spread = self._return_spread(shown)
         else:
             values = self.model.similarities(latents, np.stack([latent_of(item) for item in shown]))
             difference = values[:, 0::2] - values[:, 1::2]
             error, magnitude = float(self.scale[1]) * PROBIT_SLOPE, 2.0 * self._spread
-        probability = self.noise_model.probability_left(difference, error, magnitude)
-        told = [answer.preference for answer in answers]
-        return preference_log_likelihood(np.log(probability), np.log1p(-probability), told)
+            spread = self._spread
+        if self.people is None:
+            assert self.noise_model is not None
+            probability = self.noise_model.probability_left(difference, error, magnitude)
+            told = [answer.preference for answer in answers]
+            return preference_log_likelihood(np.log(probability), np.log1p(-probability), told)
+        sums = np.zeros((len(latents), len(self.people)))
+        columns = [np.broadcast_to(x, difference.shape).T for x in (difference, error, magnitude)]
+        for answer, d, e, m in zip(answers, *columns, strict=True):
+            sums += self.people.log_likelihoods(answer.preference, d, e, m, spread)
+        return sums
+
+    def _answer_log_likelihoods(self, latents: np.ndarray) -> np.ndarray:
+        """(m,) log P(all answers | latent) of (m, d), whoever answers."""
+        told = self._log_likelihoods(latents, self.answers)
+        return told if self.people is None else logsumexp(told + self.people.log_prior, axis=1)
 
     def _measure_thinning(self, shown: Sequence[Shown], thin: np.ndarray) -> Thinning:
         if max(map(len, shown)) <= DECODED_STEPS:
@@ -419,15 +507,19 @@ class BayesInference(Inference):
         chosen = systematic_resample(self.weights, len(self.particles), self.rng)
         copies = np.flatnonzero(np.concatenate([[False], chosen[1:] == chosen[:-1]]))
         self.particles = self.particles[chosen]
+        if self.people is not None:
+            self.people_log_shares = self.people_log_shares[chosen]
         self.log_weights = np.zeros(len(self.particles))
         self._library_returns = None
         if self.likelihood == "similarity":
             self._move(np.arange(len(self.particles)), MOVE_SWEEPS, MOVE_TRIES, mean, factor)
             return
-        # One evaluation more than tries: where a particle stands now has to be weighed, too.
+        # One evaluation more than tries: where a particle stands now has to be weighed, too; and
+        # another for who answers.
+        evaluations = DECODER_TRIES + (1 if self.people is None else 2)
         shown = [item for answer in self.answers for item in (answer.left, answer.right)]
         steps = sum(min(len(item), DECODED_STEPS) for item in shown)
-        affordable = DECODER_MOVE_STEPS // (steps * (DECODER_TRIES + 1))
+        affordable = DECODER_MOVE_STEPS // (steps * evaluations)
         order = self.rng.permutation(len(copies))
         self._move(copies[order[:affordable]], 1, DECODER_TRIES, mean, factor)
         left_over = copies[order[affordable:]]
@@ -442,12 +534,12 @@ class BayesInference(Inference):
         if not len(moved):
             return
         particles = self.particles[moved]
-        log_likelihoods = self._answer_log_likelihoods(particles, self.answers)
+        log_likelihoods = self._answer_log_likelihoods(particles)
         for _ in range(sweeps):
             particles, log_likelihoods = elliptical_slice_moves(
                 particles,
                 log_likelihoods,
-                lambda latents: self._answer_log_likelihoods(latents, self.answers),
+                self._answer_log_likelihoods,
                 self.prior.log_density,
                 mean,
                 WIDENING * factor,
@@ -455,6 +547,9 @@ class BayesInference(Inference):
                 self.rng,
             )
         self.particles[moved] = particles
+        if self.people is not None:
+            told = self._log_likelihoods(particles, self.answers) + self.people.log_prior
+            self.people_log_shares[moved] = log_softmax(told, axis=1)
 
     def restore(self, snapshot: Snapshot, answers: list[Answer]) -> None:
         super().restore(snapshot, answers)

@@ -9,13 +9,29 @@ from pathlib import Path
 
 from sb3_poem.adaptation.noise import MistakeNoise, NoiseModel
 from sb3_poem.adaptation.preference import Preference, Query
+from sb3_poem.adaptation.rule import check_choice
 from sb3_poem.common.trajectory import Trajectory
 
-PROMPT = "Which is better? [l]eft, [r]ight, or [e]qual (can't tell): "
-ANSWERS = {
-    **dict.fromkeys(("l", "left", "1"), Preference.LEFT),
-    **dict.fromkeys(("r", "right", "2"), Preference.RIGHT),
+PROMPTS = {
+    "pair": "Which is better? [l]eft, [r]ight, or [e]qual (can't tell): ",
+    "graded": "Which is better? 1 left, much; 2 left, a bit; 3 can't tell; 4 right, a bit; "
+    "5 right, much: ",
+}
+WORDS = {
+    **dict.fromkeys(("l", "left"), Preference.LEFT),
+    **dict.fromkeys(("r", "right"), Preference.RIGHT),
     **dict.fromkeys(("e", "equal", "=", "can't tell", "cant tell", "?"), Preference.EQUAL),
+}
+READ = {
+    "pair": {**WORDS, "1": Preference.LEFT, "2": Preference.RIGHT},
+    "graded": {
+        **WORDS,
+        **dict.fromkeys(("1", "ll", "much left"), Preference.MUCH_LEFT),
+        "2": Preference.LEFT,
+        "3": Preference.EQUAL,
+        "4": Preference.RIGHT,
+        **dict.fromkeys(("5", "rr", "much right"), Preference.MUCH_RIGHT),
+    },
 }
 
 
@@ -36,12 +52,14 @@ class HumanOracle:
     """Shows both trajectories side by side in a video file, and asks at the terminal.
 
     The n-th question's file is ``query-001.gif`` and so on (or ``.mp4``) within the folder. The
-    prompt takes l, left or 1; r, right or 2; e, equal, = or ?; upper or lower case; anything else
-    is asked again.
+    prompt takes l or left, r or right, and e, equal, = or ?, in upper or lower case; or a number,
+    1 (left) and 2 (right) of a pair, and 1 (left is much better) to 5 (right is much better) of a
+    graded question; anything else is asked again.
 
     :param folder: Where the videos go; it is made if missing.
     :param video_format: "gif" (any viewer plays it) or "mp4" (smaller).
     :param mistake_rate: How often a person is taken to err, for the Bayesian rule.
+    :param question: "pair" or "graded", as the rule's.
     :param read: Reads a line after showing a prompt; ``input`` by default.
     :param write: Shows a line; ``print`` by default.
     :param record: Called with each :class:`HumanAnswer` as soon as it is understood;
@@ -59,9 +77,12 @@ class HumanOracle:
         read: Callable[[str], str] = input,
         write: Callable[[str], None] = print,
         record: Callable[[HumanAnswer], None] | None = None,
+        question: str = "pair",
     ) -> None:
         if video_format not in ("gif", "mp4"):
             raise ValueError(f'`video_format` must be "gif" or "mp4", but is {video_format!r}')
+        check_choice("question", question, tuple(PROMPTS))
+        self.question = question
         self.folder, self.video_format, self.fps = Path(folder), video_format, fps
         self.noise_model: NoiseModel = MistakeNoise(mistake_rate)
         self.n_asked = 0
@@ -82,12 +103,13 @@ class HumanOracle:
         self._write(f"Query {self.n_asked}: {path}")
         while True:
             try:
-                line = self._read(PROMPT)
+                line = self._read(PROMPTS[self.question])
             except EOFError:
                 raise EOFError("no answer can be read: standard input is closed") from None
-            answer = ANSWERS.get(line.strip().lower())
+            answer = READ[self.question].get(line.strip().lower())
             if answer is not None:
                 if self._record is not None:
                     self._record(HumanAnswer(answer, left, right, path, self.fps, asked, shown))
                 return answer
-            self._write(f"{line.strip()!r} is no answer; type l, r or e.")
+            keys = "l, r or e" if self.question == "pair" else "a number from 1 to 5"
+            self._write(f"{line.strip()!r} is no answer; type {keys}.")

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 # Latents to try for each task, where every one must be rolled out in every task, and where one
 # rollout serves all of them.
 LATENTS_WITH_OWN_DYNAMICS, LATENTS_WITH_SHARED_DYNAMICS = 30, 300
+SPREAD_TASKS = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,22 +52,26 @@ class KnownTaskReturn(EpisodeOutcomes):
         found = f"mean return {self.mean_return:.1f} of {latents}"
         return f"KnownTaskReturn({len(self.tasks)} tasks, {found})"
 
-    def limit(self, k: int, noise_model: NoiseModel | None = None) -> float:
-        return repertoire_limit(self.tasks, self.candidate_returns, k, noise_model)
+    def limit(self, k: int, noise_model: NoiseModel | None = None, n_answers: int = 2) -> float:
+        return repertoire_limit(self.tasks, self.candidate_returns, k, noise_model, n_answers)
 
 
 def repertoire_limit(
-    tasks: np.ndarray, returns: np.ndarray, k: int, noise_model: NoiseModel | None = None
+    tasks: np.ndarray,
+    returns: np.ndarray,
+    k: int,
+    noise_model: NoiseModel | None = None,
+    n_answers: int = 2,
 ) -> float:
-    """The :func:`information_limit` of a matrix (n_tasks, n_latents) of returns on tasks (n_tasks,
-    task_dim), which lie on a line if they are numbers.
-
-    :param noise_model: How the oracle errs; None is an oracle that does not.
+    """The :func:`information_limit`, with its arguments, of a matrix (n_tasks, n_latents) of
+    returns on tasks (n_tasks, task_dim), which lie on a line if they are numbers.
     """
     ordered = tasks.shape[1] == 1
     if ordered:
         returns = returns[np.argsort(tasks[:, 0])]
-    return information_limit(returns, k, noise_model=noise_model, ordered=ordered)
+    return information_limit(
+        returns, k, noise_model=noise_model, ordered=ordered, n_answers=n_answers
+    )
 
 
 def known_task_return(
@@ -116,6 +121,25 @@ def known_task_return(
     fresh = evaluate_episodes(model, vec_env, best, tasks, n_episodes, start, deterministic)
     own = {"tasks": tasks, "latents": best, "candidate_latents": candidates}
     return KnownTaskReturn(**vars(fresh), **own, candidate_returns=returns)
+
+
+def return_spread(model: MetaModel | str | Path, env: Env, seed: int = 0) -> float:
+    """The family's spread of returns: the root mean square difference of the returns of two random
+    policies of a model on a random task, which thresholds of graded answers are shares of.
+
+    :param model: And ``env``: see :func:`adapt_tasks`.
+    """
+    model, vec_env = model_and_env(model, env)
+    tasks = choose_test_tasks(model, vec_env, SPREAD_TASKS, seed)
+    rng, start = np.random.default_rng([seed, 4]), evaluation_seed(seed, 2)
+    if FamilyView(vec_env).shared_dynamics:
+        latents = _draw_latents(model, SPREAD_TASKS, "both", rng)
+        returns = return_matrix(model, vec_env, tasks, latents, seed=start)
+    else:
+        latents = _draw_latents(model, 2 * SPREAD_TASKS, "both", rng)
+        outcomes = evaluate_episodes(model, vec_env, latents, np.tile(tasks, (2, 1)), 1, start)
+        returns = outcomes.returns.reshape(2, SPREAD_TASKS).T
+    return float(np.sqrt(2.0 * returns.var(axis=1, ddof=1).mean()))
 
 
 def return_matrix(

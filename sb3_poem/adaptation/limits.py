@@ -16,21 +16,27 @@ EXACT_CODEBOOKS = 5000
 MAX_SWAP_ROUNDS = 50
 MAX_ITERATIONS = 1000
 TOLERANCE = 1e-4  # nats
+CHANNEL_INPUTS, CHANNEL_OUTPUTS = 81, 400
 
 
 def information_limit(
-    returns: np.ndarray, k: int, *, noise_model: NoiseModel | None = None, ordered: bool = False
+    returns: np.ndarray,
+    k: int,
+    *,
+    noise_model: NoiseModel | None = None,
+    ordered: bool = False,
+    n_answers: int = 2,
 ) -> float:
-    """The highest mean return that any method can reach with k binary answers.
+    """The highest mean return that any method can reach with k answers.
 
-    k answers tell at most 2^k tasks apart, so a method ends in one of at most 2^k policies; the
-    best choice of those and, for every task, the best of them, bounds it (:func:`best_codebook`).
-    Answers of an oracle that errs tell less than a bit each: then the rate-distortion bound at the
-    bits that they do tell applies (:func:`rate_distortion_limit`).
+    k answers of m kinds tell at most m^k tasks apart, so a method ends in one of at most m^k
+    policies; the best choice of those and, for every task, the best of them, bounds it
+    (:func:`best_codebook`). Answers of an oracle that errs tell less than log2(m) bits each: then
+    the rate-distortion bound at the bits that they do tell applies
+    (:func:`rate_distortion_limit`).
 
     The bound holds for the tasks that are given: with 30 test tasks it ends at the known-task
-    return after five answers. For a bound on the family take a dense grid of tasks. An answer of
-    EQUAL, which tells a little more than LEFT or RIGHT alone, is not provided for.
+    return after five answers to pairs. For a bound on the family take a dense grid of tasks.
 
     >>> speeds = np.linspace(0, 3, 61)
     >>> returns = -np.abs(speeds[:, None] - speeds)  # of policies that run at some speed
@@ -39,19 +45,23 @@ def information_limit(
 
     :param returns: (n_tasks, n_policies) return of each policy on each task (J).
     :param noise_model: How the oracle errs; None is an oracle that does not.
+    :param n_answers: Kinds of answers to a question: 2 where left or right is better, 3 with EQUAL
+        beside them, 5 where questions are graded.
     :raises ValueError: If the matrix is empty or not finite, k is negative, or the noise model is
         of an unknown kind.
     """
     if k < 0:
         raise ValueError(f"`k` must not be negative, but is {k}")
     returns = _check_returns(returns)
-    capacity = answer_capacity(noise_model, returns)
+    capacity = answer_capacity(noise_model, returns, n_answers)
     n_tasks, n_policies = returns.shape
-    if k >= 63 or 2**k >= min(n_tasks, n_policies):
+    if k >= 63 or n_answers**k >= min(n_tasks, n_policies):
         limit = float(returns.max(axis=1).mean())
     else:
-        limit = _value(returns, best_codebook(returns, 2**k, ordered=ordered))
-    return limit if capacity == 1.0 else min(limit, rate_distortion_limit(returns, k * capacity))
+        limit = _value(returns, best_codebook(returns, n_answers**k, ordered=ordered))
+    if capacity == np.log2(n_answers):
+        return limit
+    return min(limit, rate_distortion_limit(returns, k * capacity))
 
 
 def best_codebook(returns: np.ndarray, size: int, *, ordered: bool = False) -> np.ndarray:
@@ -112,13 +122,16 @@ def best_intervals(returns: np.ndarray, size: int) -> np.ndarray:
     return np.array(sorted(chosen))
 
 
-def answer_capacity(noise: NoiseModel | None, returns: np.ndarray) -> float:
-    """The most that one answer (left or right) can tell, whatever is asked: bits, in [0, 1].
+def answer_capacity(noise: NoiseModel | None, returns: np.ndarray, n_answers: int = 2) -> float:
+    """The most that one answer can tell, whatever is asked: bits, in [0, log2(n_answers)].
 
-    It is the capacity of the binary symmetric channel at the oracle's smallest probability of a
-    mistake. Of the probabilities of LEFT that questions can bring about only the extremes matter,
-    since the information is convex in them; and asking in the light of earlier answers adds nothing
-    (Cover & Thomas, Elements of Information Theory, 7.12).
+    Where an answer is left or right it is the capacity of the binary symmetric channel at the
+    oracle's smallest probability of a mistake. Of the probabilities of LEFT that questions can
+    bring about only the extremes matter, since the information is convex in them; and asking in
+    the light of earlier answers adds nothing (Cover & Thomas, Elements of Information Theory,
+    7.12). Of more answers a mistake exchanges each with its opposite: a sum of such channels
+    (ibid., problem 7.28). A Boltzmann oracle's grades tell no more than the difference that it
+    perceives, whose capacity is found by the algorithm of Blahut and Arimoto.
 
     >>> from sb3_poem.adaptation import MistakeNoise
     >>> round(answer_capacity(MistakeNoise(0.1), np.zeros((1, 1))), 2)  # a tenth is wrong
@@ -128,19 +141,25 @@ def answer_capacity(noise: NoiseModel | None, returns: np.ndarray) -> float:
     :param returns: (n_tasks, n_policies). With a fixed ``beta`` an answer is the surer the larger
         the difference of returns, and no question is supposed to show a larger one than there is
         between two policies here.
+    :param n_answers: See :func:`information_limit`.
     """
+    if n_answers < 2:
+        raise ValueError(f"`n_answers` must be at least 2, but is {n_answers}")
     if noise is None or isinstance(noise, ExactNoise):
-        return 1.0
+        return float(np.log2(n_answers))
     if isinstance(noise, MistakeNoise):
         mistake = noise.rate
     elif isinstance(noise, BoltzmannNoise):
         # The paper's exponent, |R_left - R_right| / (|R_left| + |R_right|), is at most 1.
         exponent = 1.0 if noise.beta is None else noise.beta * float(np.ptp(returns, axis=1).max())
+        if n_answers > 2:
+            return min(float(np.log2(n_answers)), _logistic_capacity(exponent))
         mistake = float(0.5 * (1.0 - np.tanh(0.5 * exponent)))
     else:
         known, name = "ExactNoise, MistakeNoise or BoltzmannNoise", type(noise).__name__
         raise ValueError(f"`noise_model` must be {known}, but is of type {name}")
-    return 1.0 - _binary_entropy(mistake)
+    told = 1.0 - _binary_entropy(mistake)
+    return float(np.log2(n_answers // 2 * 2.0**told + n_answers % 2))
 
 
 def rate_distortion_limit(returns: np.ndarray, bits: float) -> float:
@@ -237,6 +256,25 @@ def _log_partition(returns: np.ndarray, slope: float) -> float:
         # No policy may vanish for good by rounding: its task would then have none.
         marginal = np.maximum(marginal * growth, 1e-200)
     return smallest + slope * float(best.mean())
+
+
+def _logistic_capacity(amplitude: float) -> float:
+    """Bits, an upper bound, tight within ``TOLERANCE``: what a number in [-amplitude, amplitude]
+    with a logistic error of scale 1 can tell.
+    """
+    inputs = np.linspace(-amplitude, amplitude, CHANNEL_INPUTS)
+    edges = np.linspace(-amplitude - 12.0, amplitude + 12.0, CHANNEL_OUTPUTS - 1)
+    below = 1.0 / (1.0 + np.exp(inputs[:, None] - edges))
+    channel = np.diff(below, prepend=0.0, append=1.0, axis=1)  # (inputs, outputs)
+    entropy = np.sum(channel * np.log(channel), axis=1)
+    shares = np.full(CHANNEL_INPUTS, 1.0 / CHANNEL_INPUTS)
+    for _ in range(MAX_ITERATIONS):
+        told = entropy - channel @ np.log(shares @ channel)
+        if told.max() - shares @ told < TOLERANCE:
+            break
+        shares = shares * np.exp(told - told.max())
+        shares /= shares.sum()
+    return float(told.max() / np.log(2.0))
 
 
 def _binary_entropy(p: float) -> float:

@@ -125,7 +125,7 @@ def adapt_tasks(
             )
         for i, (inference, oracle) in enumerate(zip(inferences, oracles, strict=True)):
             left, right = shown[2 * i], shown[2 * i + 1]
-            answer = as_preference(oracle(left, right))
+            answer = as_preference(oracle(left, right), rule.question)
             inference.tell(answer, left, right)
             preferences[i].append(answer)
     return TaskAdaptations(tasks, kept, latents, preferences)

@@ -22,16 +22,20 @@ def named_rule(
     Paper(n_candidates=50)
 
     :param n_candidates: Of Algorithm 2, or particles.
-    :param mistake_rate: How often who answers errs, which Algorithm 2 takes no notice of.
-    :param options: Others of the rule.
+    :param mistake_rate: How often who answers errs, unless ``noise_model`` says how; Algorithm 2
+        takes no notice of it.
+    :param options: Others of the rule; ``noise_model``, too, is nothing to Algorithm 2.
     """
     check_choice("inference", inference, ("bayes", "paper"))
     if inference == "paper":
+        if options.pop("question", "pair") != "pair":
+            raise ValueError('inference="paper" asks about pairs: leave out question="graded"')
+        options.pop("noise_model", None)
         if n_candidates is not None:
             options["n_candidates"] = n_candidates
         return Paper(**options)
     if n_candidates is not None:
         options["n_particles"] = n_candidates
     if mistake_rate is not None:
-        options["noise_model"] = MistakeNoise(mistake_rate)
+        options.setdefault("noise_model", MistakeNoise(mistake_rate))
     return Bayes(**options)

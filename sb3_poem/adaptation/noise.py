@@ -38,6 +38,21 @@ class NoiseModel(Protocol):
         """JSON-ready; :func:`noise_model_from_dict` reads it."""
 
 
+class GradedNoiseModel(NoiseModel, Protocol):
+    """One that also knows answers of degrees: what somebody says follows from a difference that
+    they perceive, and some say the opposite of that.
+    """
+
+    @property
+    def mistakes(self) -> float:
+        """The share of answers that are turned round."""
+
+    def probability_above(self, difference: Values, error: Values, magnitude: Values) -> Any:
+        """P(the perceived difference is positive), slips aside; arguments as in
+        :meth:`NoiseModel.probability_left`.
+        """
+
+
 def _logistic(x: Values, slope: Values) -> np.ndarray:
     # It stays float32 if it is; whole numbers would cut the slope off.
     x = np.asarray(x)
@@ -68,9 +83,13 @@ class ExactNoise(_Serialisable):
     """The larger return always wins; what doubt there is comes from the prediction."""
 
     kind = "exact"
+    mistakes = 0.0
+
+    def probability_above(self, difference: Values, error: Values, magnitude: Values) -> Any:
+        return _logistic(difference, PROBIT_SLOPE / np.maximum(error, 1e-12))
 
     def probability_left(self, difference: Values, error: Values, magnitude: Values) -> Any:
-        return _with_lapse(_logistic(difference, PROBIT_SLOPE / np.maximum(error, 1e-12)))
+        return _with_lapse(self.probability_above(difference, error, magnitude))
 
 
 @dataclass(frozen=True)
@@ -89,6 +108,13 @@ class MistakeNoise(_Serialisable):
         if not 0.0 <= self.rate <= 0.5:
             raise ValueError(f"`rate` must lie in [0, 0.5], but is {self.rate}")
 
+    @property
+    def mistakes(self) -> float:
+        return self.rate
+
+    def probability_above(self, difference: Values, error: Values, magnitude: Values) -> Any:
+        return ExactNoise().probability_above(difference, error, magnitude)
+
     def probability_left(self, difference: Values, error: Values, magnitude: Values) -> Any:
         right = ExactNoise().probability_left(difference, error, magnitude)
         return self.rate + (1.0 - 2.0 * self.rate) * right
@@ -106,15 +132,19 @@ class BoltzmannNoise(_Serialisable):
 
     beta: float | None = None
     kind = "boltzmann"
+    mistakes = 0.0
 
     def __post_init__(self) -> None:
         if self.beta is not None and not (np.isfinite(self.beta) and self.beta > 0):
             raise ValueError(f"`beta` must be positive and finite, or None, but is {self.beta}")
 
-    def probability_left(self, difference: Values, error: Values, magnitude: Values) -> Any:
+    def probability_above(self, difference: Values, error: Values, magnitude: Values) -> Any:
         beta = 1.0 / np.maximum(magnitude, 1e-12) if self.beta is None else self.beta
         shrink = np.sqrt(1.0 + np.pi / 8.0 * (beta * np.asarray(error)) ** 2)
-        return _with_lapse(_logistic(difference, beta / shrink))
+        return _logistic(difference, beta / shrink)
+
+    def probability_left(self, difference: Values, error: Values, magnitude: Values) -> Any:
+        return _with_lapse(self.probability_above(difference, error, magnitude))
 
 
 _KINDS: dict[str, type] = {cls.kind: cls for cls in (ExactNoise, MistakeNoise, BoltzmannNoise)}

@@ -28,9 +28,15 @@ class TaskOracle(ABC):
     :param task: (task_dim,) the task by whose reward to judge; None takes the one in effect in
         ``env`` (in a ``VecEnv``, in its first copy) whenever a question is asked.
     :param seed: Seeds the oracle's own noise, if it has any.
+    :param thresholds: Answers are graded: EQUAL up to the first difference of returns, MUCH_LEFT or
+        MUCH_RIGHT beyond the second; None compares, and nothing but a difference of 0 is EQUAL. See
+        :func:`~sb3_poem.adaptation.known_task.return_spread` for what is much in a family.
     """
 
     needs_frames = False
+    #: In returns: from what difference on one side is better, and from what on much better; None
+    #: answers pairs, in which any difference counts.
+    thresholds: tuple[float, float] | None = None
     #: How this oracle errs, for the Bayesian rule.
     noise_model: NoiseModel = ExactNoise()
 
@@ -39,7 +45,16 @@ class TaskOracle(ABC):
         env: gym.Env | VecEnv | None = None,
         task: np.ndarray | None = None,
         seed: int | None = None,
+        thresholds: tuple[float, float] | None = None,
     ) -> None:
+        if thresholds is not None:
+            equal, much = thresholds
+            if not 0.0 <= equal <= much < np.inf:
+                raise ValueError(
+                    "`thresholds` must be two finite differences of returns, the first not the "
+                    f"larger, but is {thresholds!r}"
+                )
+            self.thresholds = (float(equal), float(much))
         self.env = env
         self.task = None if task is None else np.asarray(task, dtype=np.float64)
         # A stream of its own: an adaptation's inference with the same seed draws from another.
@@ -52,8 +67,13 @@ class TaskOracle(ABC):
         return f"{type(self).__name__}({own}task={task})"
 
     @abstractmethod
-    def _compare(self, left: float, right: float) -> Preference:
-        """Answer from the two true returns."""
+    def _perceive(self, left: float, right: float) -> float:
+        """The difference of two true returns by which to answer."""
+
+    @property
+    def question(self) -> str:
+        """The kind of questions that it answers, see :class:`Query`."""
+        return "pair" if self.thresholds is None else "graded"
 
     def bind(self, env: gym.Env | VecEnv, task: np.ndarray | None = None) -> TaskOracle:
         """Give the oracle its environment, and its task unless that is None; returns itself."""
@@ -64,7 +84,13 @@ class TaskOracle(ABC):
 
     def __call__(self, left: Trajectory, right: Trajectory) -> Preference:
         """Compare two trajectories with reward features."""
-        return self._compare(self.true_return(left), self.true_return(right))
+        perceived = self._perceive(self.true_return(left), self.true_return(right))
+        equal, much = self.thresholds or (0.0, np.inf)
+        if abs(perceived) <= equal:
+            return Preference.EQUAL
+        if abs(perceived) > much:
+            return Preference.MUCH_LEFT if perceived > 0 else Preference.MUCH_RIGHT
+        return Preference.LEFT if perceived > 0 else Preference.RIGHT
 
     def true_return(self, trajectory: Trajectory) -> float:
         """The undiscounted return of a trajectory under the task, from its reward features."""
@@ -92,12 +118,13 @@ class ReturnOracle(TaskOracle):
     >>> policy = adapter.adapt()
     """
 
-    def _compare(self, left: float, right: float) -> Preference:
-        return _better(left, right)
+    def _perceive(self, left: float, right: float) -> float:
+        return left - right
 
 
 class BoltzmannOracle(TaskOracle):
-    """Left wins with probability 1 / (1 + exp(-beta (R_left - R_right))) (C.6 of Xu & Zhu 2025).
+    """Left wins with probability 1 / (1 + exp(-beta (R_left - R_right))) (C.6 of Xu & Zhu 2025): it
+    perceives the difference with a logistic error of scale 1 / beta.
 
     With the paper's beta (None), ``1 / (|R_left| + |R_right|)``, an answer is right at most 73 % of
     the time, and ten answers carry less than two bits. For the other arguments see
@@ -110,17 +137,15 @@ class BoltzmannOracle(TaskOracle):
         env: gym.Env | VecEnv | None = None,
         task: np.ndarray | None = None,
         seed: int | None = None,
+        thresholds: tuple[float, float] | None = None,
     ) -> None:
-        super().__init__(env, task, seed)
+        super().__init__(env, task, seed, thresholds)
         self.beta, self.noise_model = beta, BoltzmannNoise(beta)
 
-    def _compare(self, left: float, right: float) -> Preference:
-        beta = self.beta
-        if beta is None:
-            magnitude = abs(left) + abs(right)
-            beta = 1.0 / magnitude if magnitude > 0 else 0.0
-        probability = 0.5 * (1.0 + np.tanh(0.5 * beta * (left - right)))
-        return Preference.LEFT if self.rng.random() < probability else Preference.RIGHT
+    def _perceive(self, left: float, right: float) -> float:
+        scale = (abs(left) + abs(right) or 1.0) if self.beta is None else 1.0 / self.beta
+        drawn = self.rng.random()
+        return left - right - scale * float(np.log(drawn / (1.0 - drawn)))
 
 
 class MistakeOracle(TaskOracle):
@@ -137,16 +162,15 @@ class MistakeOracle(TaskOracle):
         env: gym.Env | VecEnv | None = None,
         task: np.ndarray | None = None,
         seed: int | None = None,
+        thresholds: tuple[float, float] | None = None,
     ) -> None:
         if not 0.0 <= rate <= 1.0:
             raise ValueError(f"`rate` must lie in [0, 1], but is {rate}")
-        super().__init__(env, task, seed)
+        super().__init__(env, task, seed, thresholds)
         self.rate, self.noise_model = rate, MistakeNoise(min(rate, 0.5))
 
-    def _compare(self, left: float, right: float) -> Preference:
-        if self.rng.random() < self.rate:
-            left, right = right, left
-        return _better(left, right)
+    def _perceive(self, left: float, right: float) -> float:
+        return right - left if self.rng.random() < self.rate else left - right
 
 
 def step_rewards(
@@ -158,9 +182,3 @@ def step_rewards(
         raise ValueError(f"the trajectory has no reward features: {gave}")
     family = FamilyView(vectorised(env))
     return family.compute_rewards(family.task if task is None else task, trajectory.reward_features)
-
-
-def _better(left: float, right: float) -> Preference:
-    if left == right:
-        return Preference.EQUAL
-    return Preference.LEFT if left > right else Preference.RIGHT

@@ -15,12 +15,20 @@ from sb3_poem.common.trajectory import Trajectory
 class Preference(Enum):
     """The answer to "which of the two trajectories is better?"."""
 
+    MUCH_LEFT = "much left"
     LEFT = "left"
-    RIGHT = "right"
     EQUAL = "equal"
+    RIGHT = "right"
+    MUCH_RIGHT = "much right"
 
 
-SIGNS = {Preference.LEFT: 1.0, Preference.RIGHT: -1.0, Preference.EQUAL: 0.0}
+#: What an answer says to a rule that knows no degrees.
+SIGNS = dict(zip(Preference, (1.0, 1.0, 0.0, -1.0, -1.0), strict=True))
+#: The answers that each kind of question has, from right to left.
+ANSWERS = {
+    "pair": (Preference.RIGHT, Preference.EQUAL, Preference.LEFT),
+    "graded": tuple(reversed(Preference)),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,10 +39,17 @@ class Query:
     >>> query = PreferenceAdapter("PointGoal", "poem/PointGoal-v0", seed=0).ask()
     >>> query.left.observations.shape, query.right.actions.shape
     ((26, 2), (25, 2))
+
+    :param kind: "pair" (left, right or equal), or "graded" (much better, too).
     """
 
     left: Trajectory
     right: Trajectory
+    kind: str = "pair"
+
+    def __post_init__(self) -> None:
+        if self.kind not in ANSWERS:
+            raise ValueError(f"`kind` must be one of {tuple(ANSWERS)}, but is {self.kind!r}")
 
     def to_video(self, path: str | Path, fps: float = 20.0) -> Path:
         """Write both side by side, as MP4 or GIF by the file's suffix, and return its path; missing
@@ -52,23 +67,26 @@ class Query:
         return write_video(frames, path, fps)
 
 
-def as_preference(answer: Any) -> Preference:
-    """Read an answer: a :class:`Preference`, or one of the words "left", "right" and "equal"; else
-    a ``ValueError`` or ``TypeError``. Numbers and booleans are refused: their meaning differs
+def as_preference(answer: Any, kind: str = "pair") -> Preference:
+    """Read the answer to a question of this kind: a :class:`Preference` that it has, or its word;
+    else a ``ValueError`` or ``TypeError``. Numbers and booleans are refused: their meaning differs
     between programs, and a preference read the wrong way round is worse than none.
     """
-    if isinstance(answer, Preference):
-        return answer
     if isinstance(answer, str):
-        try:
-            return Preference(answer)
-        except ValueError:
-            words = '"left", "right" or "equal"'
-            raise ValueError(f"an answer must be {words}, but is {answer!r}") from None
-    raise TypeError(
-        "an answer must be Preference.LEFT, Preference.RIGHT or Preference.EQUAL (or the word), "
-        f"but is {answer!r} of type {type(answer).__name__}"
-    )
+        answer = next((each for each in Preference if each.value == answer), answer)
+    if isinstance(answer, Preference) and answer in ANSWERS[kind]:
+        return answer
+    if isinstance(answer, Preference):
+        given = f"{answer.value!r}, which only graded questions have"
+    elif isinstance(answer, str):
+        given = repr(answer)
+    else:
+        raise TypeError(
+            "an answer must be Preference.LEFT, Preference.RIGHT or Preference.EQUAL (or the "
+            f"word), but is {answer!r} of type {type(answer).__name__}"
+        )
+    words = ", ".join(f'"{each.value}"' for each in reversed(ANSWERS[kind]))
+    raise ValueError(f"an answer to a {kind} question must be one of {words}, but is {given}")
 
 
 def preference_log_likelihood(

@@ -90,6 +90,28 @@ def most_informative_pair(
     return pair_at(int(np.argmax(information_gains(probabilities, weights))), values.shape[1])
 
 
+def most_telling_pair(
+    values: np.ndarray, weights: np.ndarray, differences: np.ndarray, probabilities: np.ndarray
+) -> tuple[int, int]:
+    """The pair of n policies of whose comparison the answer, one of several, is expected to tell
+    most about m latents: its entropy minus its mean entropy under each of them.
+
+    :param values: (m, n) predicted fitness.
+    :param weights: (m,) summing to one.
+    :param differences: (t,) evenly spaced, ascending, over all that two values can differ by.
+    :param probabilities: (answers, t) of each answer at these differences.
+    """
+    step = differences[1] - differences[0]
+    places = pair_differences(values / step)
+    places -= np.float32(differences[0] / step)
+    nearest = np.rint(places, out=places).astype(np.intp).clip(0, len(differences) - 1)
+    table, weights = probabilities.astype(np.float32), weights.astype(np.float32)
+    gains = -(_self_information(table).sum(axis=0)[nearest] @ weights)
+    for each in table:
+        gains += _self_information(each[nearest] @ weights)
+    return pair_at(int(np.argmax(gains)), values.shape[1])
+
+
 def random_pair(n: int, rng: np.random.Generator) -> tuple[int, int]:
     """Two different ones of n policies, uniformly."""
     first, second = rng.choice(n, size=2, replace=False)
@@ -122,6 +144,11 @@ def _policy_rows(values: np.ndarray) -> np.ndarray:
 @lru_cache(maxsize=16)
 def _pairs(n: int) -> tuple[np.ndarray, np.ndarray]:
     return np.triu_indices(n, 1)
+
+
+def _self_information(probability: np.ndarray) -> np.ndarray:
+    """-p log p."""
+    return -probability * np.log(np.maximum(probability, np.finfo(probability.dtype).tiny))
 
 
 def _entropy(probability: np.ndarray) -> np.ndarray:

@@ -60,7 +60,7 @@ class Inference(ABC):
 
     #: Names of the attributes, arrays, that change while answers come in, beside the answers and
     #: the generator.
-    state: ClassVar[tuple[str, ...]] = ()
+    state: tuple[str, ...] = ()
     #: Trajectories to ask about; None where questions are new rollouts.
     library: list[Trajectory] | None = None
 
@@ -142,6 +142,11 @@ class Rule(ABC):
         options = ", ".join(f"{name}={value!r}" for name, value, usual in chosen if value != usual)
         return f"{type(self).__name__}({options})"
 
+    @property
+    def question(self) -> str:
+        """The kind of the questions, see :class:`Query`."""
+        return "pair"
+
     def check(self, model: MetaModel, setting: Setting) -> None:
         """Refuse, by a ``ValueError``, what the rule cannot run with, before anything starts."""
         if setting.env is not None:
@@ -157,7 +162,16 @@ class Rule(ABC):
         """Begin with a task, with what :meth:`check` has accepted."""
 
     def answered_by(self: SelfRule, oracle: Any) -> SelfRule:
-        """The rule for the answers of this oracle: itself, where it makes no difference."""
+        """The rule for the answers of this oracle: itself, where it makes no difference. An oracle
+        that says of itself that it answers questions of another kind is refused.
+        """
+        kind = getattr(oracle, "question", self.question)
+        if kind != self.question:
+            raise ValueError(
+                f'the oracle answers "{kind}" questions, but the rule asks "{self.question}" ones: '
+                'Bayes(question="graded") goes with ReturnOracle(thresholds=(20, 100)) or '
+                f'HumanOracle(question="graded"), say; the oracle is {oracle!r}'
+            )
         return self
 
     def to_dict(self) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from sb3_poem.adaptation import (
     evaluate_adaptation,
     evaluate_episodes,
     named_rule,
+    return_spread,
 )
 from sb3_poem.adaptation.evaluation import evaluation_seed
 from sb3_poem.cli.arguments import DEFAULT_STORE
@@ -96,9 +97,11 @@ class Adaptation:
         self.arguments = arguments
         self.subject = subject
         self.seed = subject.seed
-        names = ("inference", "query_rule", "candidates", "n_candidates")
+        names = ("inference", "query_rule", "candidates", "n_candidates", "question")
         chosen = {name: getattr(arguments, name) for name in names}
         self.options = {name: value for name, value in chosen.items() if value is not None}
+        if arguments.infer_noise:
+            self.options["noise_model"] = "infer"
         self.rule = named_rule(**self.options)
 
     def ask_oracle(self) -> int:
@@ -109,6 +112,11 @@ class Adaptation:
             "boltzmann": partial(BoltzmannOracle, arguments.beta),
             "mistake": partial(MistakeOracle, arguments.mistake_rate),
         }
+        factory = factories[arguments.oracle]
+        if self.rule.question == "graded":
+            spread = return_spread(subject.model, subject.env, self.seed)
+            equal, much = arguments.thresholds
+            factory = partial(factory, thresholds=(equal * spread, much * spread))
         measured: list[AdaptationEvaluation] = []
         record_at = tuple(sorted({*(arguments.record or range(arguments.queries + 1))}))
 
@@ -119,7 +127,7 @@ class Adaptation:
 
         known = None
         try:
-            about = (subject.model, subject.env, subject.tasks, factories[arguments.oracle])
+            about = (subject.model, subject.env, subject.tasks, factory)
             how: dict[str, Any] = {"n_episodes": arguments.episodes, "seed": self.seed}
             how |= {"rule": self.rule, "record_at": record_at, "progress_bar": True}
             evaluate_adaptation(*about, on_record=show, **how)
@@ -152,7 +160,7 @@ class Adaptation:
             nothing = "There is nothing to go on with; beginning"
             found = "Going on with" if recorder.resumed else nothing
             say(f"{found} session {recorder.session.id} of {folder}")
-        oracle = HumanOracle(record=recorder)
+        oracle = HumanOracle(record=recorder, question=self.rule.question)
         env = subject.make_env("rgb_array", show_task=False)
         how: dict[str, Any] = {"oracle": oracle, "n_queries": n_queries, "seed": self.seed}
         adapter = PreferenceAdapter(subject.model, env, rule=self.rule, **how)
@@ -254,6 +262,7 @@ class Adaptation:
             "oracle": arguments.oracle,
             "beta": arguments.beta if arguments.oracle == "boltzmann" else None,
             "mistake_rate": arguments.mistake_rate if arguments.oracle == "mistake" else None,
+            "thresholds": arguments.thresholds if self.rule.question == "graded" else None,
             **self.options,
             "episodes": arguments.episodes,
             "seed": self.seed,

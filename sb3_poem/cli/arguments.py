@@ -196,6 +196,13 @@ def _add_adapt_arguments(parser: argparse.ArgumentParser) -> None:
     beta = "inverse temperature of --oracle boltzmann (default: the paper's)"
     _option(questions, "--beta", beta, float)
     _option(questions, "--mistake-rate", "of --oracle mistake", float, 0.2)
+    told = "left, right or equal; or graded: much better, too (default: pair)"
+    _option(questions, "--question", told, choices=("pair", "graded"))
+    told = "from what differences on an oracle says better and much better, as shares of the spread"
+    thresholds: dict[str, Any] = {"nargs": 2, "metavar": ("BETTER", "MUCH")}
+    _option(questions, "--thresholds", f"{told} of returns", float, [0.1, 0.7], **thresholds)
+    told = "infer how often who answers errs, rather than be told it (bayes)"
+    _switch(questions, "--infer-noise", told)
     _option(questions, "--queries", "questions per task", _count(1), 10)
     _option(questions, "--inference", "", default="bayes", choices=INFERENCES)
     told = "how questions are chosen (default: the inference rule's own)"

@@ -32,10 +32,17 @@ class Report:
 
     @property
     def limits(self) -> list[float] | None:
-        """What the best 2^k of the policies that were tried earn on these tasks, (n_records,)."""
-        return (
-            None if self.known is None else [self.known.limit(n) for n in self.evaluation.record_at]
-        )
+        """What the best 2^k of the policies that were tried (5^k where answers are graded) earn on
+        these tasks, (n_records,).
+        """
+        if self.known is None:
+            return None
+        kinds = self._kinds_of_answers
+        return [self.known.limit(n, n_answers=kinds) for n in self.evaluation.record_at]
+
+    @property
+    def _kinds_of_answers(self) -> int:
+        return 5 if self.settings.get("question") == "graded" else 2
 
     def table(self) -> Table:
         """Return, its standard error over tasks, limit and success rate after each answer."""
@@ -64,9 +71,9 @@ class Report:
         return (
             f"task known: the best of {n} policies for each task, measured anew on {episodes} "
             "episodes.\n"
-            f"limit: the best 2^answers of those {n} for these very tasks, chosen with the tasks "
-            "in sight: an optimistic bound for error-free answers that choose among these "
-            "policies, not for any method."
+            f"limit: the best {self._kinds_of_answers}^answers of those {n} for these very tasks, "
+            "chosen with the tasks in sight: an optimistic bound for error-free answers that "
+            "choose among these policies, not for any method."
         )
 
     def to_dict(self) -> dict[str, Any]:

@@ -17,10 +17,10 @@ from sb3_poem.label.store import Session, Store
 #: of its columns in Parquet.
 FIELDS = {
     **{"session": "int64", "source": "string", "model": "string", "env_id": "string"},
-    **{"seed": "int64", "number": "int64", "preference": "string", "undone": "bool"},
-    **{"wish": "string", "verdict": "string", "asked": "string", "shown": "string"},
-    **{"answered": "string", "seconds": "float64", "video": "string", "fps": "float64"},
-    **{"frames": "int64", "left_latent": "list", "right_latent": "list"},
+    **{"seed": "int64", "number": "int64", "question": "string", "preference": "string"},
+    **{"undone": "bool", "wish": "string", "verdict": "string", "asked": "string"},
+    **{"shown": "string", "answered": "string", "seconds": "float64", "video": "string"},
+    **{"fps": "float64", "frames": "int64", "left_latent": "list", "right_latent": "list"},
 }
 # What one session's records have in common.
 COMMON = ("model", "env_id", "seed", "options", "wish")
@@ -47,6 +47,7 @@ def answer_record(row: sqlite3.Row, videos: Path, trajectories: bool = False) ->
         for side in ("left", "right")
     }
     own = {
+        "question": json.loads(row["options"]).get("question", "pair"),
         "undone": row["undone"] is not None,
         "asked": _time(row["asked"]),
         "shown": None if row["shown"] is None else _time(row["shown"]),

@@ -33,6 +33,7 @@ def replay(
 
     :param model: A model whose observations and actions are those of the recorded trajectories.
     :param options: Of the adaptation, as a session's; ``mistake_rate`` stands for the noise model.
+        Bayes' rule reads answers as those to the session's kind of question.
     :param is_own: Whether the session was recorded with this very model. If not, the latents that
         were shown are replaced by those of its own latents that act most alike.
     :return: JSON-ready: ``session``, ``foretold`` of ``decided`` answers (those that are not
@@ -41,7 +42,10 @@ def replay(
         recorded (None where no latents had to be replaced).
     :raises ValueError: If the model does not fit the recorded trajectories.
     """
-    rule = session_rule(options or {})
+    options = dict(options or {})
+    if options.get("inference", "bayes") == "bayes":
+        options["question"] = session.question
+    rule = session_rule(options)
     rule.check(model, Setting())
     inference = rule.start(model, inference_rng(seed), Setting())
     translator = None if is_own else _Translator(model, np.random.default_rng([seed, 1]))

@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sb3_poem.adaptation.adapter import OtherModelError
+from sb3_poem.adaptation.preference import ANSWERS, Preference
 from sb3_poem.label.families import ModelInfo
 from sb3_poem.label.render_queue import Job, Priority, RenderQueue
 from sb3_poem.label.rendering import StorageError, TurnRequest, load_shown_model
-from sb3_poem.label.store import PREFERENCES, RefusedError, Session, Store
+from sb3_poem.label.store import RefusedError, Session, Store
 
 _logger = logging.getLogger(__name__)
 
@@ -120,6 +121,7 @@ class SessionManager:
         session, answered, kind, turn, shown = await asyncio.to_thread(self._look, session.id)
         view: dict[str, Any] = {
             "phase": "preparing",
+            "question": session.question,
             "model": session.model,
             "answered": answered,
             "target": session.target,
@@ -238,19 +240,20 @@ class SessionManager:
             active.failed, active.failed_at = error, time.monotonic()
 
     def _render_ahead(self, session: Session, answered: int, question: int) -> None:
-        """Begin what follows from each of the three answers."""
+        """Begin what follows from each of the question's answers."""
         active = self._active[session.id]
         kind = "result" if answered + 1 >= session.target else "question"
         self._keep_only(active, question)
-        for preference in PREFERENCES:
-            key = _Key(question, preference, kind)
+        for preference in reversed(ANSWERS[session.question]):
+            key = _Key(question, preference.value, kind)
             if key in active.jobs:
                 continue
             try:
                 request = self._request(session, key)
             except RefusedError:  # the page says so when the turn is due
                 return
-            priority = Priority.POSSIBLE if preference == "equal" else Priority.LIKELY
+            likely = preference in (Preference.LEFT, Preference.RIGHT)
+            priority = Priority.LIKELY if likely else Priority.POSSIBLE
             active.jobs[key] = self.queue.submit(request, priority)
 
     def _keep_only(self, active: _Active, question: int | None, due: _Key | None = None) -> None:

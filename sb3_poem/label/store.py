@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from sb3_poem.adaptation.human import HumanAnswer
+from sb3_poem.adaptation.preference import Preference, as_preference
 from sb3_poem.label.rendering import StorageError, Turn
 
-PREFERENCES = ("left", "right", "equal")
 VERDICTS = ("yes", "not quite")
 MAX_WISH = 2000  # characters
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 SCHEMA = """
 CREATE TABLE sessions (
     id INTEGER PRIMARY KEY,
@@ -57,16 +57,26 @@ CREATE TABLE turns (
     dropped REAL                     -- when an undo made it void
 );
 CREATE UNIQUE INDEX one_turn ON turns(session, kind, number) WHERE dropped IS NULL;
+"""
+ANSWERS_SCHEMA = f"""
 CREATE TABLE answers (
     id INTEGER PRIMARY KEY,
     session INTEGER NOT NULL REFERENCES sessions(id),
     question INTEGER NOT NULL REFERENCES turns(id),
     number INTEGER NOT NULL,         -- answers before it
-    preference TEXT NOT NULL CHECK (preference IN ('left', 'right', 'equal')),
+    preference TEXT NOT NULL CHECK (preference IN {tuple(each.value for each in Preference)}),
     created REAL NOT NULL,
     undone REAL
 );
 CREATE UNIQUE INDEX one_answer ON answers(session, number) WHERE undone IS NULL;
+"""
+# Version 1 takes three answers.
+FROM_VERSION_1 = f"""
+DROP INDEX one_answer;
+ALTER TABLE answers RENAME TO answers_1;
+{ANSWERS_SCHEMA}
+INSERT INTO answers SELECT * FROM answers_1;
+DROP TABLE answers_1;
 """
 
 
@@ -89,6 +99,11 @@ class Session:
     stopped: bool
     wish: str
     created: float
+
+    @property
+    def question(self) -> str:
+        """The kind of its questions: "pair" or "graded"."""
+        return str(self.options.get("question", "pair"))
 
 
 class Store:
@@ -254,10 +269,10 @@ class Store:
         """Keep an answer to a question's turn, if that one waits: once this returns, it is on the
         disk. The same answer again is no second one.
         """
-        if preference not in PREFERENCES:
-            raise RefusedError(
-                f'an answer must be "left", "right" or "equal", but is {preference[:20]!r}'
-            )
+        try:
+            as_preference(preference[:20], self.session(session).question)
+        except ValueError as error:
+            raise RefusedError(str(error)) from None
         with self._transaction():
             answers = self.answers(session)
             for answer in answers:
@@ -379,15 +394,15 @@ class Store:
     def _make_tables(self) -> None:
         with self._transaction() as execute:
             version = execute("PRAGMA user_version").fetchone()[0]
-            if version not in (0, SCHEMA_VERSION):
+            scripts = {0: SCHEMA + ANSWERS_SCHEMA, 1: FROM_VERSION_1, SCHEMA_VERSION: ""}
+            if version not in scripts:
                 raise ValueError(
                     f"{self.path} is a store of version {version}; "
                     f"this program reads {SCHEMA_VERSION}"
                 )
-            if version == 0:
-                for statement in SCHEMA.split(";"):
-                    execute(statement)
-                execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+            for statement in scripts[version].split(";"):
+                execute(statement)
+            execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
 
     def _insert(self, table: str, **values: Any) -> int:
         """Within a transaction; the row's number."""

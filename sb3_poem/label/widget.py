@@ -79,7 +79,7 @@ class LabelWidget:
         self._thread = ThreadPoolExecutor(1)
         queue = RenderQueue(1, lambda: self._thread, make)
         info = ModelInfo("notebook", Path(), env_id)
-        options = {**adapter.rule.to_dict(), "notebook": True}
+        options = {**adapter.rule.to_dict(), "question": adapter.rule.question}
         n_queries = adapter.n_queries
         sessions = SessionManager(
             self._store, queue, [info], options, n_queries, 1, load=lambda _: adapter.model

@@ -16,7 +16,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
-from worlds import Blinded, SpeedEnv, SpeedModel
+from worlds import Blinded, SpeedEnv, SpeedModel, SpeedVecEnv
 
 from sb3_poem import ANOLE, POEMSAC, Bayes, MAMLReward, Paper, set_task
 from sb3_poem.adaptation import (
@@ -47,8 +47,13 @@ SMALL = Bayes(n_particles=20)
 RULES = [
     Bayes(),
     Bayes(likelihood="similarity"),
+    Bayes(question="graded", noise_model="infer"),
     Paper(),
 ]
+
+
+def thresholds_of(rule):
+    return (20, 200) if rule.question == "graded" else None
 
 
 def make_env(goal=GOAL, **kwargs):
@@ -171,7 +176,7 @@ def test_without_a_seed_one_is_drawn_and_kept():
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("pending", [False, True])
 def test_a_saved_adaptation_continues_exactly(tmp_path, rule, pending):
-    rule = rule.answered_by(MistakeOracle(0.1))
+    rule = rule.answered_by(MistakeOracle(0.1, thresholds=thresholds_of(rule)))
     whole = adapter(rule=rule)
     answer(whole, 8)
 
@@ -366,7 +371,7 @@ def test_what_a_notebook_shows(point_goal):
         rf"AdaptedPolicy\(POEMSAC on poem/PointGoal-v0, 0 answers, latent={latent}\)": policy,
         r"PreferenceAdapter\(POEMSAC on poem/PointGoal-v0, Bayes\(n_particles=20, noise_model=ExactNoise\(\)\), 0 of 2 answers\)": one,
         r"PreferenceAdapter\(SpeedModel, Paper\(\), 0 of 10 answers\)": adapter(rule=Paper()),
-        rf"Query\(left={trajectory}, right={trajectory}\)": query,
+        rf"Query\(left={trajectory}, right={trajectory}, kind='pair'\)": query,
         r"ReturnOracle\(task=the environment's\)": ReturnOracle(),
         r"MistakeOracle\(rate=0.7, task=\[1.0\]\)": MistakeOracle(0.7, task=[1.0]),
         r"BoltzmannOracle\(beta=2, task=the environment's\)": BoltzmannOracle(2),
@@ -417,7 +422,7 @@ def test_the_protocol_is_kept():
         a.tell("left")
     query = a.ask()
     assert a.ask() is query  # the pending question, not another
-    with pytest.raises(ValueError, match='"left", "right" or "equal", but is \'better\''):
+    with pytest.raises(ValueError, match='"left", "equal", "right", but is \'better\''):
         a.tell("better")
     for nonsense in (None, 0, True, 1.0, ["left"]):
         with pytest.raises(TypeError, match="an answer must be Preference"):
@@ -488,6 +493,11 @@ def test_the_short_form():
     assert named_rule("bayes", 7, query_rule="random") == Bayes(7, query_rule="random")
     assert named_rule("paper", 7, 0.1) == Paper(7)
     assert named_rule(mistake_rate=0.1) == Bayes(noise_model=MistakeNoise(0.1))
+    assert named_rule("paper", question="pair", noise_model="infer") == Paper()
+    graded = Bayes(question="graded", noise_model="infer")
+    assert named_rule(question="graded", noise_model="infer") == graded
+    with pytest.raises(ValueError, match='leave out question="graded"'):
+        named_rule("paper", question="graded")
 
 
 def test_a_rule_shows_what_was_chosen():
@@ -705,6 +715,61 @@ def test_the_oracles_noise_model_is_taken():
     assert adapter(oracle=outside_oracle).inference.noise_model == ExactNoise()
 
 
+def test_graded_questions_are_asked_kept_and_answered_by_five_words():
+    words = ["much left", "left", "equal", "right", "much right"]
+    rule = Bayes(n_particles=20, question="graded", noise_model="infer")
+    a = adapter(rule=rule)
+    for word in words:
+        assert a.ask().kind == "graded"
+        a.tell(word)
+    a.ask()
+    again = PreferenceAdapter.from_json(a.to_json(), SpeedModel(), make_env())
+    assert again.rule == rule
+    assert again.pending.kind == "graded"
+    assert [answer.preference.value for answer in again.answers] == words
+    np.testing.assert_array_equal(again.policy().latent, a.policy().latent)
+    assert adapter().ask().kind == "pair"
+
+
+@pytest.mark.parametrize("rule", [Bayes(), Bayes(noise_model="infer"), Paper()])
+@pytest.mark.parametrize("graded", ["much left", Preference.MUCH_LEFT])
+def test_a_pair_takes_no_graded_answer(rule, graded):
+    a = adapter(rule=rule)
+    query = a.ask()
+    with pytest.raises(ValueError, match=r"a pair question .* 'much left', which only graded"):
+        a.tell(graded)
+    assert a.pending is query
+    with pytest.raises(ValueError, match=r"a pair question .* 'much left', which only graded"):
+        a.adapt(lambda left, right: graded)
+
+
+def test_who_answers_must_know_the_kind_of_the_questions():
+    graded, exact = Bayes(question="graded"), ReturnOracle(thresholds=(20, 200))
+    for rule, oracle in ((graded, ReturnOracle()), (Bayes(), exact), (Paper(), exact)):
+        words = f'answers "{oracle.question}" questions, but the rule asks "{rule.question}" ones'
+        with pytest.raises(ValueError, match=words):
+            adapter(rule=rule, oracle=oracle)
+        with pytest.raises(ValueError, match=words):
+            adapter(rule=rule).adapt(oracle)
+        how = {"rule": rule, "n_queries": 1}
+        with pytest.raises(ValueError, match=words):
+            adapt_tasks(SpeedModel(), SpeedVecEnv(2), [[1.0]], lambda **_: oracle, **how)  # noqa: B023
+    assert adapter(rule=graded, oracle=exact).rule.question == "graded"
+
+
+def test_graded_answers_find_a_task_in_fewer_questions():
+    def misses(oracle, **options):
+        tasks = np.linspace(0.3, 2.7, 12)[:, None]
+        how = {"rule": Bayes(100, **options), "n_queries": 3}
+        found = adapt_tasks(SpeedModel(), SpeedVecEnv(24), tasks, oracle, **how)
+        return np.abs(SpeedModel.speed(found.latents[:, -1]) - tasks[:, 0]).mean()
+
+    graded = partial(ReturnOracle, thresholds=(30, 180))
+    pairs = misses(ReturnOracle)
+    assert misses(graded, question="graded") < 0.7 * pairs
+    assert misses(graded, question="graded", noise_model="infer") < pairs
+
+
 def test_numbers_of_numpy_can_be_saved():
     adapter = PreferenceAdapter(
         SpeedModel(),
@@ -772,7 +837,7 @@ def test_many_tasks_in_lockstep_as_each_alone(rule):
         model,
         DummyVecEnv([SpeedEnv] * 4),
         tasks,
-        partial(MistakeOracle, 0.2),
+        partial(MistakeOracle, 0.2, thresholds=thresholds_of(rule)),
         n_queries=5,
         seed=7,
         rule=rule,
@@ -780,7 +845,7 @@ def test_many_tasks_in_lockstep_as_each_alone(rule):
     assert together.latents.shape == (3, 6, 5)
     assert together.record_at == (0, 1, 2, 3, 4, 5)
     for i, task in enumerate(tasks):
-        oracle = MistakeOracle(0.2, task=task, seed=7 + i)
+        oracle = MistakeOracle(0.2, task=task, seed=7 + i, thresholds=thresholds_of(rule))
         alone = PreferenceAdapter(
             model, make_env(task), oracle=oracle, seed=7 + i, n_queries=5, rule=rule
         )

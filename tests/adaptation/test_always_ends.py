@@ -22,7 +22,7 @@ from sb3_poem.adaptation.bayes import DECODER_MOVE_STEPS
 from sb3_poem.adaptation.rule import Setting
 from sb3_poem.common.trajectory import Trajectory
 
-LEFT, RIGHT, EQUAL = Preference
+LEFT, RIGHT, EQUAL = Preference.LEFT, Preference.RIGHT, Preference.EQUAL
 
 
 class RandomModel(SpeedModel):
@@ -85,6 +85,8 @@ rules = st.sampled_from(
         Paper(query_rule="information-gain", candidates="aggregate"),
         Bayes(),
         Bayes(likelihood="similarity"),
+        Bayes(question="graded"),
+        Bayes(question="graded", noise_model="infer", likelihood="similarity"),
         Bayes(candidates="aggregate", query_rule="worst-case"),
         Bayes(candidates="aggregate", likelihood="similarity", decision="posterior-mean"),
         Bayes(query_rule="random", decision="most-likely"),
@@ -147,7 +149,7 @@ def test_a_usable_policy_comes_out(oracle, rule):
 def test_a_random_oracle_over_many_queries():
     rng = np.random.default_rng(0)
     adapter = PreferenceAdapter(SpeedModel(), DummyVecEnv([SpeedEnv]), seed=0, n_queries=50)
-    policy = adapter.adapt(lambda left, right: list(Preference)[rng.integers(3)])
+    policy = adapter.adapt(lambda left, right: (LEFT, RIGHT, EQUAL)[rng.integers(3)])
     assert np.all(np.isfinite(policy.latent))
 
 

@@ -1,12 +1,14 @@
 """The Bayesian rule against the posterior on a grid."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
-from scipy.special import ndtr
-from worlds import HORIZON, STEP_WEIGHT, SpeedModel
+from scipy.special import ndtr, ndtri
+from worlds import HORIZON, STEP_WEIGHT, SpeedEnv, SpeedModel
 
+from sb3_poem.adaptation import MistakeOracle, PreferenceAdapter, ReturnOracle
 from sb3_poem.adaptation.bayes import (
     DECODED_STEPS,
     ERROR_CORRELATION,
@@ -28,7 +30,7 @@ from sb3_poem.adaptation.priors import AggregatePrior, GaussianPrior
 from sb3_poem.adaptation.rule import Setting, Snapshot
 from sb3_poem.common.trajectory import Trajectory
 
-LEFT, RIGHT, EQUAL = Preference
+LEFT, RIGHT, EQUAL = Preference.LEFT, Preference.RIGHT, Preference.EQUAL
 
 
 def at_speed(model, speed, latent=None):
@@ -92,6 +94,89 @@ def test_the_decoders_likelihood_is_the_direct_formula(noise, probability):
     assert inference.weights.sum() == pytest.approx(1.0)
 
 
+MUCH_LEFT = Preference.MUCH_LEFT
+
+
+@pytest.mark.parametrize(
+    ("question", "noise"), [("graded", "infer"), ("graded", MistakeNoise(0.1)), ("pair", "infer")]
+)
+@pytest.mark.parametrize("likelihood", ["decoder", "similarity"])
+def test_latent_and_person_have_a_joint_posterior(question, noise, likelihood):
+    """Against the sum over all people of the product of their answers' probabilities."""
+    model = SpeedModel()
+    options = {"question": question, "noise_model": noise, "likelihood": likelihood}
+    inference = make(model, n_particles=30, **options)
+    inference._rejuvenate = lambda: None  # the weights alone
+    strongest = MUCH_LEFT if question == "graded" else LEFT
+    told = [(strongest, 1.9, 0.3), (RIGHT, 2.6, 1.4), (EQUAL, 2.5, 1.9), (LEFT, 1.5, 2.9)]
+    shown = []
+    for preference, *speeds in told:
+        pair = [at_speed(model, v, np.full(5, ndtri(v / 3))) for v in speeds]
+        inference.tell(preference, *pair)
+        shown.append(pair)
+    people, spread = inference.people, inference._spread
+    if likelihood == "decoder":
+        cross, square = inference.calibration[:2]
+        spread *= cross / square
+    expected = np.zeros((30, len(people)))
+    for i, z in enumerate(inference.particles):
+        for (preference, *_), pair in zip(told, shown, strict=True):
+            if likelihood == "decoder":
+                left, right = model.predicted_returns(z[None], pair)[0]
+                error = model.predicted_rewards_error * math.sqrt(2 * HORIZON * ERROR_CORRELATION)
+            else:
+                left, right = model.similarities(z[None], np.stack([t.latent for t in pair]))[0]
+                error = inference.scale[1] * 1.702
+            doubts = np.hypot(error, spread * people.doubts)
+
+            def above(cut, difference=left - right, doubts=doubts):
+                return logistic(1.702 * (difference - spread * cut) / doubts)
+
+            equal = people.thresholds[:, people.thresholds.shape[1] // 2]
+            much = people.thresholds[:, -1] if question == "graded" else np.inf
+            of_left = above(equal) - above(much), 1 - above(-equal) - (1 - above(-much))
+            straight, turned = {
+                MUCH_LEFT: (above(much), 1 - above(-much)),
+                LEFT: of_left,
+                RIGHT: of_left[::-1],
+                EQUAL: (above(-equal) - above(equal),) * 2,
+            }[preference]
+            p = (1 - people.mistakes) * straight + people.mistakes * turned
+            kinds = 5 if question == "graded" else 3
+            expected[i] += np.log((1 - LAPSE) * p + LAPSE / kinds)
+    joint = np.exp(expected + people.log_prior)
+    if likelihood == "similarity":
+        weights = joint.sum(axis=1)
+        np.testing.assert_allclose(inference.weights, weights / weights.sum(), rtol=5e-3)
+        shares = joint.sum(axis=0) / joint.sum()
+        np.testing.assert_allclose(inference.people_shares, shares, atol=1e-3)
+    else:  # S was tied to returns anew by each answer, so the spread differed a little
+        weights = joint.sum(axis=1)
+        assert np.corrcoef(np.log(weights), inference.log_weights)[0, 1] > 0.98
+
+
+@pytest.mark.parametrize("question", ["pair", "graded"])
+def test_who_answers_is_found_out(question):
+    thresholds = {"thresholds": (20.0, 200.0)} if question == "graded" else {}
+
+    def mistakes(oracle):
+        rates = []
+        for seed in range(2):
+            rule = Bayes(50, question=question, noise_model="infer")
+            env = SpeedEnv()
+            adapter = PreferenceAdapter(
+                SpeedModel(), env, rule=rule, n_queries=20, oracle=oracle(seed=seed), seed=seed
+            )
+            adapter.adapt()
+            inference = adapter.inference
+            rates.append(inference.people_shares @ inference.people.mistakes)
+        return np.mean(rates)
+
+    exact = mistakes(partial(ReturnOracle, **thresholds))
+    often = mistakes(partial(MistakeOracle, 0.25, **thresholds))
+    assert exact < 0.02 < 0.05 < often  # 0.05 before the first answer
+
+
 def test_the_likelihood_from_s_is_the_direct_formula():
     model = SpeedModel()
     inference = make(model, likelihood="similarity", n_particles=50)
@@ -145,7 +230,7 @@ def test_the_posterior_agrees_with_a_grid(likelihood, candidates):
         if likelihood == "decoder":
             pair = [at_speed(model, model.speed(z), z) for z in pair]
         inference.tell(preference, *pair)
-    log_posterior = log_posterior + inference._answer_log_likelihoods(grid, inference.answers)
+    log_posterior = log_posterior + inference._answer_log_likelihoods(grid)
     posterior = np.exp(log_posterior - log_posterior.max())
     posterior /= posterior.sum()
     mean = posterior @ grid[:, 0]
@@ -492,7 +577,7 @@ def test_what_some_steps_alone_mislead_to_is_put_right():
         np.testing.assert_allclose(inference.particles, truth.particles)
         latents = truth.particles[:20]
         np.testing.assert_allclose(
-            *(each._answer_log_likelihoods(latents, each.answers) for each in (inference, truth))
+            *(each._answer_log_likelihoods(latents) for each in (inference, truth))
         )
     prior = make()
     assert (

@@ -249,7 +249,7 @@ def test_random_answers_find_nothing():
             self.rng = np.random.default_rng(seed)
 
         def __call__(self, left, right):
-            return list(Preference)[self.rng.integers(2)]
+            return (Preference.LEFT, Preference.RIGHT)[self.rng.integers(2)]
 
     result = evaluate_adaptation(
         MODEL, SpeedVecEnv(60), GOALS, Coin, record_at=(5, 10), n_episodes=1, seed=1

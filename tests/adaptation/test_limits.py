@@ -199,6 +199,39 @@ def test_majority_votes_stay_below_the_noisy_limit():
         assert right < information_limit(np.eye(2), 3, noise_model=MistakeNoise(rate)) + 1e-9
 
 
+def test_more_kinds_of_answers_raise_the_limit():
+    returns = SPEEDS[::8, ::8]
+    assert answer_capacity(None, returns, 5) == pytest.approx(np.log2(5))
+    assert answer_capacity(MistakeNoise(0.0), returns, 5) == pytest.approx(np.log2(5))
+    # Always random between opposites: the size alone is told, of three.
+    assert answer_capacity(MistakeNoise(0.5), returns, 5) == pytest.approx(np.log2(3))
+    best = returns[:, best_codebook(returns, 5, ordered=True)].max(axis=1).mean()
+    assert information_limit(returns, 1, n_answers=5, ordered=True) == pytest.approx(best)
+    for noise in (None, MistakeNoise(0.2), BoltzmannNoise()):
+        limits = [information_limit(returns, 2, noise_model=noise, n_answers=n) for n in (2, 3, 5)]
+        assert limits == sorted(limits)
+        assert limits[0] < limits[2]
+    with pytest.raises(ValueError, match="`n_answers` must be at least 2"):
+        answer_capacity(None, SPEEDS, 1)
+
+
+@pytest.mark.parametrize("beta", [0.02, 0.2])
+def test_boltzmann_grades_tell_no_more_than_their_bound(beta):
+    returns = np.array([[0.0, 30.0]])
+    bound = answer_capacity(BoltzmannNoise(beta), returns, 5)
+    assert bound >= answer_capacity(BoltzmannNoise(beta), returns)
+    inputs = np.linspace(-30, 30, 7)
+    for equal, much in ((5.0, 15.0), (10.0, 25.0)):
+        cuts = np.array([-much, -equal, equal, much])
+        above = 1 / (1 + np.exp(beta * (cuts - inputs[:, None])))
+        ends = np.ones((7, 1)), np.zeros((7, 1))
+        channel = -np.diff(np.hstack([ends[0], above, ends[1]]), axis=1)
+        for shares in (np.full(7, 1 / 7), np.array([0.35, 0, 0, 0.3, 0, 0, 0.35])):
+            marginal = shares @ channel
+            told = shares @ np.sum(channel * np.log2(channel / marginal), axis=1)
+            assert told < bound < np.log2(5)
+
+
 class OtherNoise:
     pass
 

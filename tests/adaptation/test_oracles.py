@@ -19,11 +19,11 @@ from sb3_poem.adaptation import (
     PreferenceAdapter,
     ReturnOracle,
 )
-from sb3_poem.adaptation.human import PROMPT
+from sb3_poem.adaptation.human import PROMPTS
 from sb3_poem.adaptation.rule import inference_rng
 from sb3_poem.common.trajectory import Trajectory
 
-LEFT, RIGHT, EQUAL = Preference
+LEFT, RIGHT, EQUAL = Preference.LEFT, Preference.RIGHT, Preference.EQUAL
 
 
 def at_speed(speed, steps=HORIZON, frames=None):
@@ -90,6 +90,37 @@ def test_boltzmann_with_two_returns_of_zero():
     assert answers == {LEFT, RIGHT}
 
 
+@pytest.mark.parametrize("kind", [ReturnOracle, partial(MistakeOracle, 0.0)])
+def test_graded_answers_follow_the_thresholds(kind):
+    # At goal 2 a step's return is -10 |speed - 2|, of 20 steps.
+    oracle = kind(env=env_with_goal(2.0), thresholds=(10.0, 100.0), seed=0)
+    assert oracle.question == "graded"
+    speeds = [1.0, 1.6, 1.96, 2.0]  # 200, 80 and 8 less than the last
+    much, better, equal, _ = (oracle(at_speed(2.0), at_speed(speed)) for speed in speeds)
+    assert (much, better, equal) == (Preference.MUCH_LEFT, LEFT, EQUAL)
+    assert oracle(at_speed(1.0), at_speed(2.0)) is Preference.MUCH_RIGHT
+    assert oracle(at_speed(1.6), at_speed(2.0)) is RIGHT
+    assert ReturnOracle().question == "pair"
+
+
+def test_graded_answers_with_mistakes_and_doubts():
+    env, near, far = env_with_goal(2.0), at_speed(1.9), at_speed(1.0)  # -20 and -200
+    always = MistakeOracle(1.0, env, thresholds=(10.0, 100.0))
+    assert always(near, far) is Preference.MUCH_RIGHT
+    unsure = BoltzmannOracle(0.02, env, seed=0, thresholds=(10.0, 100.0))
+    answers = [unsure(near, far) for _ in range(4000)]
+    much = 1 / (1 + np.exp(-0.02 * (180 - 100)))
+    assert answers.count(Preference.MUCH_LEFT) / 4000 == pytest.approx(much, abs=0.025)
+    equal = 1 / (1 + np.exp(-0.02 * (180 + 10))) - 1 / (1 + np.exp(-0.02 * (180 - 10)))
+    assert answers.count(EQUAL) / 4000 == pytest.approx(equal, abs=0.01)
+
+
+@pytest.mark.parametrize("thresholds", [(20.0, 10.0), (-1.0, 10.0), (1.0, np.inf), (0.0, np.nan)])
+def test_bad_thresholds(thresholds):
+    with pytest.raises(ValueError, match="`thresholds` must be two finite differences"):
+        ReturnOracle(thresholds=thresholds)
+
+
 @pytest.mark.parametrize("kind", [partial(MistakeOracle, 0.4), BoltzmannOracle])
 def test_noise_follows_the_seed(kind):
     def answers(seed):
@@ -137,7 +168,7 @@ def test_a_person_sees_both_side_by_side(tmp_path, video_format):
     )
     left, right = at_speed(1.0, 4, frames(4, 30)), at_speed(2.0, 6, frames(6, 220))
     assert oracle(left, right) is RIGHT
-    assert terminal.prompts == [PROMPT] * 3
+    assert terminal.prompts == [PROMPTS["pair"]] * 3
     assert "'both?' is no answer" in terminal.shown[1]
     assert oracle(left, right) is EQUAL
     files = sorted(path.name for path in (tmp_path / "videos").iterdir())
@@ -171,6 +202,20 @@ def test_a_person_through_the_adapter(tmp_path):
     adapter.adapt()
     assert [a.preference for a in adapter.answers] == [LEFT] * 3
     assert adapter.rule.noise_model == MistakeNoise(0.05)
+
+
+def test_a_person_says_how_much_better(tmp_path):
+    terminal = Terminal("1", "2", "3", "4", "5", "ll", "much right", "e", "6", "L")
+    shown = []
+    oracle = HumanOracle(tmp_path, read=terminal.read, write=shown.append, question="graded")
+    left, right = at_speed(1.0, 2, frames(2, 30)), at_speed(2.0, 2, frames(2, 220))
+    words = [oracle(left, right).value for _ in range(9)]
+    five = ["much left", "left", "equal", "right", "much right"]
+    assert words == [*five, "much left", "much right", "equal", "left"]
+    assert "'6' is no answer; type a number from 1 to 5." in shown
+    assert set(terminal.prompts) == {PROMPTS["graded"]}
+    with pytest.raises(ValueError, match="`question` must be one of"):
+        HumanOracle(tmp_path, question="numbers")
 
 
 def test_a_persons_terminal_and_frames_are_needed(tmp_path):

@@ -10,7 +10,7 @@ from sb3_poem.adaptation.paper import Paper
 from sb3_poem.adaptation.preference import Preference
 from sb3_poem.adaptation.rule import Setting, Snapshot
 
-LEFT, RIGHT, EQUAL = Preference
+LEFT, RIGHT, EQUAL = Preference.LEFT, Preference.RIGHT, Preference.EQUAL
 
 
 def latent(first, dim=5):

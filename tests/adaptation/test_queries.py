@@ -16,9 +16,11 @@ from sb3_poem.adaptation.noise import (
     MistakeNoise,
     noise_model_from_dict,
 )
+from sb3_poem.adaptation.people import People
 from sb3_poem.adaptation.queries import (
     information_gains,
     most_informative_pair,
+    most_telling_pair,
     random_pair,
     tolerance,
     worst_case_pair,
@@ -87,6 +89,43 @@ def test_the_most_informative_pair_splits_and_can_be_told_apart():
     assert most_informative_pair(values, weights, ExactNoise(), error=0.1, magnitude=1.0) == (0, 3)
     gains = information_gains(np.full((1, 101), 0.5), weights)
     assert gains[0] == pytest.approx(0.0, abs=1e-12)  # two policies that do the same
+
+
+def test_the_most_telling_pair_is_that_of_the_most_mutual_information():
+    rng = np.random.default_rng(1)
+    differences = np.linspace(-8, 8, 2001)
+    cuts = np.array([-3.0, -1.0, 1.0, 3.0])
+    above = norm.sf((cuts[:, None] - differences) / 0.3)
+    probabilities = -np.diff(np.vstack([np.ones(2001), above, np.zeros(2001)]), axis=0)
+    for _ in range(5):
+        values, weights = rng.normal(scale=2.0, size=(40, 6)).clip(-4, 4), rng.dirichlet([1] * 40)
+        gains = {}
+        for i, j in itertools.combinations(range(6), 2):
+            places = np.rint((values[:, i] - values[:, j] + 8) / 0.008).astype(int)
+            joint = weights * probabilities[:, places] + 1e-30  # (answers, latents)
+            independent = joint.sum(axis=1, keepdims=True) * joint.sum(axis=0, keepdims=True)
+            gains[i, j] = np.sum(joint * np.log(joint / independent))
+        found = most_telling_pair(values, weights, differences, probabilities)
+        assert gains[found] == pytest.approx(max(gains.values()), rel=1e-4)
+
+
+@pytest.mark.parametrize("noise", [None, MistakeNoise(0.2), BoltzmannNoise(0.3)])
+def test_people_answer_as_they_are_simulated(noise):
+    people = People("graded", noise)
+    assert people.log_prior.size == len(people)
+    assert np.exp(people.log_prior).sum() == pytest.approx(1.0)
+    g, d, spread = len(people) // 2 + 1, 9.0, 10.0
+    said = people.probabilities(np.array([d, -d]), 1e-6, 1.0, spread)[:, :, g]
+    np.testing.assert_allclose(said.sum(axis=0), 1.0)
+    np.testing.assert_allclose(said[:, 0], said[::-1, 1])
+    rng = np.random.default_rng(0)
+    if isinstance(noise, BoltzmannNoise):
+        perceived = d + rng.logistic(scale=1 / 0.3, size=100_000)
+    else:
+        perceived = d + spread * people.doubts[g] * rng.logistic(scale=1 / 1.702, size=100_000)
+    perceived *= np.where(rng.random(100_000) < people.mistakes[g], -1.0, 1.0)
+    counts = np.bincount(np.digitize(perceived, spread * people.thresholds[g]), minlength=5)
+    np.testing.assert_allclose(said[:, 0], 0.99 * counts / 100_000 + 0.002, atol=0.006)
 
 
 def test_random_pairs_differ_and_cover():

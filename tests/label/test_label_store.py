@@ -21,8 +21,8 @@ def turn() -> Turn:
     return Turn({"n": 1}, dict(TRAJECTORY), dict(TRAJECTORY), {"sentence": "x"}, [0.0], 20.0, 5)
 
 
-def begin(store: Store, step: int = 10) -> tuple[int, str]:
-    session, token = store.create_session("M", "poem/PointGoal-v0", 1, {}, step)
+def begin(store: Store, step: int = 10, **options: str) -> tuple[int, str]:
+    session, token = store.create_session("M", "poem/PointGoal-v0", 1, options, step)
     assert store.add_turn(session.id, "question", 0, None, turn(), "0.mp4")
     return session.id, token
 
@@ -70,6 +70,57 @@ def test_repeated_answers_count_once_and_late_ones_are_refused(store: Store) -> 
     with pytest.raises(RefusedError):
         store.add_answer(session, 10**9, "left")
     assert preferences(store, session) == ["left"]
+
+
+def test_graded_questions_take_five_answers_and_pairs_three(store: Store) -> None:
+    session, _ = begin(store, question="graded")
+    words = ["much left", "left", "equal", "right", "much right"]
+    for word in words:
+        answer(store, session, word)
+    assert preferences(store, session) == words
+    pairs, _ = begin(store)
+    with pytest.raises(RefusedError, match=r"graded question .*\"much right\", but is 'better'"):
+        answer(store, session, "better")
+    with pytest.raises(RefusedError, match=r"a pair question .* 'much left', which only graded"):
+        answer(store, pairs, "much left")
+
+
+def test_a_store_of_version_1_is_read_and_takes_graded_answers(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    session, _ = begin(store)
+    for word in ("left", "equal"):
+        answer(store, session, word)
+    store.undo(session, 2)
+    store.close()
+    connection = sqlite3.connect(tmp_path / "answers.sqlite")
+    connection.executescript(
+        """ALTER TABLE answers RENAME TO newer; DROP INDEX one_answer;
+        CREATE TABLE answers (
+            id INTEGER PRIMARY KEY,
+            session INTEGER NOT NULL REFERENCES sessions(id),
+            question INTEGER NOT NULL REFERENCES turns(id),
+            number INTEGER NOT NULL,
+            preference TEXT NOT NULL CHECK (preference IN ('left', 'right', 'equal')),
+            created REAL NOT NULL,
+            undone REAL
+        );
+        CREATE UNIQUE INDEX one_answer ON answers(session, number) WHERE undone IS NULL;
+        INSERT INTO answers SELECT * FROM newer; DROP TABLE newer; PRAGMA user_version = 1;"""
+    )
+    kept = connection.execute("SELECT * FROM answers ORDER BY id").fetchall()
+    connection.close()
+    for _ in range(2):  # read, and read again
+        store = Store(tmp_path)
+        assert preferences(store, session) == ["left"]
+        store.close()
+    connection = sqlite3.connect(tmp_path / "answers.sqlite")
+    assert connection.execute("SELECT * FROM answers ORDER BY id").fetchall() == kept
+    connection.close()
+    store = Store(tmp_path)
+    graded, _ = begin(store, question="graded")
+    answer(store, graded, "much left")
+    assert preferences(store, graded) == ["much left"]
+    store.close()
 
 
 def test_undo_goes_back_to_the_first_question_and_keeps_a_record(store: Store) -> None:

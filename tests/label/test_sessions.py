@@ -78,6 +78,33 @@ def test_the_page_asks_what_an_adapter_asks(
     assert json.loads(contents(store, session, len(ANSWERS))[4]) == adapter.policy().latent.tolist()
 
 
+def test_graded_questions_are_asked_and_what_follows_from_all_five_answers_rendered_ahead(
+    run_server: Callable[..., Any], store: Store, point_goal: ModelInfo
+) -> None:
+    async def life(sessions: SessionManager) -> Session:
+        session, _ = await begin(sessions)
+        view = await settled(sessions, session)
+        assert view["question"] == "graded"
+        first = store.videos / store.turn(session.id, "question", 0)["video"]
+        ahead: set[Path] = set()
+        while len(ahead) < 5:
+            await asyncio.sleep(0.02)
+            ahead = set(store.videos.glob("[0-9]*.mp4")) - {first}
+        store.add_answer(session.id, view["turn"]["id"], "much left")
+        await settled(sessions, session)
+        assert store.videos / store.turn(session.id, "question", 1)["video"] in ahead
+        return session
+
+    options = {"question": "graded", "noise_model": "infer"}
+    session = run_server(life, render_ahead=True, options=options)
+    adapter = PreferenceAdapter(
+        load_shown_model(point_goal), "poem/PointGoal-v0", seed=5, rule=Bayes(**options)
+    )
+    adapter.ask()
+    adapter.tell("much left")
+    assert json.loads(contents(store, session, 1)[4]) == adapter.policy().latent.tolist()
+
+
 def test_a_new_server_continues_at_the_same_question_with_the_same_posterior(
     run_server: Callable[..., Any], store: Store
 ) -> None:

@@ -1,0 +1,108 @@
+"""Who answers: a grid of people, told apart by how often they err and by what they call better and
+much better. Which of them it is is inferred with the task.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+
+from sb3_poem.adaptation.noise import LAPSE, ExactNoise, GradedNoiseModel, Values
+from sb3_poem.adaptation.preference import ANSWERS, Preference
+
+INFER = "infer"
+
+# What people may be like, and how many of them are so before the first answer. Differences are in
+# units of the family's spread of returns (root mean square between two random policies).
+MISTAKES = {0.0: 0.8, 0.25: 0.2}
+DOUBTS = {0.0: 0.8, 2.0: 0.2}
+INDIFFERENCES = {0.0: 0.4, 0.12: 0.4, 0.4: 0.2}
+MUCH = {0.45: 0.3, 1.0: 0.5, 2.0: 0.2}
+# Differences at which the answers' probabilities are tabulated for choosing a question.
+TABLE_POINTS = 1025
+
+
+class People:
+    """A prior over people, each with a number g of G, who answer questions of one kind.
+
+    Somebody perceives the difference of the two returns with a doubt of their own, says EQUAL if it
+    is smaller than their width of indifference, MUCH_LEFT or MUCH_RIGHT if it exceeds what they
+    call much, and LEFT or RIGHT else; that is turned round with their rate of mistakes. This is an
+    ordered logistic regression (McCullagh 1980) on the predicted difference, whose error is folded
+    into the doubt.
+
+    The prior is a product of independent ones: rates of mistakes of 0 and 0.25 with 0.8 and 0.2;
+    doubts, standard deviations, of 0 and 2 with 0.8 and 0.2; widths of indifference of 0, 0.12
+    and 0.4 with 0.4, 0.4 and 0.2; and "much" from 0.45, 1 and 2 on with 0.3, 0.5 and 0.2. All but
+    rates are in units of the family's spread of returns, the root mean square difference of two
+    random policies' returns on a random task. A width of 0 is that of somebody who never says
+    EQUAL. One answer in a hundred is a slip, which may be any.
+
+    :param kind: Of the questions: "pair" or "graded".
+    :param noise: How they err, if that is known: then only their widths are not.
+    """
+
+    def __init__(self, kind: str, noise: GradedNoiseModel | None) -> None:
+        self.answers = ANSWERS[kind]
+        self.noise = noise
+        known = {0.0: 1.0}
+        priors = (
+            known if noise is not None else MISTAKES,
+            known if noise is not None else DOUBTS,
+            INDIFFERENCES,
+            MUCH if kind == "graded" else known,
+        )
+        grid = list(product(*(prior.items() for prior in priors)))
+        values, shares = np.moveaxis(np.array(grid), 2, 0)  # (G, 4) each
+        self.mistakes, self.doubts, indifferences, much = values.T
+        if noise is not None:
+            self.mistakes = np.full(len(grid), noise.mistakes)
+        self.log_prior = np.log(shares).sum(axis=1)
+        inner = (-indifferences, indifferences)
+        # (G, answers - 1), ascending: what the perceived difference must exceed for the next answer
+        self.thresholds = np.stack((-much, *inner, much) if kind == "graded" else inner, axis=1)
+
+    def __len__(self) -> int:
+        return len(self.log_prior)
+
+    def probabilities(
+        self, difference: np.ndarray, error: Values, magnitude: Values, spread: float
+    ) -> np.ndarray:
+        """P(answer), (answers, m, G), of differences (m,) of predicted returns; ``error`` and
+        ``magnitude``, numbers or (m,), as in :meth:`NoiseModel.probability_left`, in their unit as
+        is the family's ``spread``.
+        """
+        error, magnitude = (np.asarray(value)[..., None] for value in (error, magnitude))
+        beyond = difference[:, None] - spread * self.thresholds.T[:, None, :]  # (answers - 1, m, G)
+        if self.noise is None:
+            above = ExactNoise().probability_above(
+                beyond, np.hypot(error, spread * self.doubts), magnitude
+            )
+        else:
+            above = self.noise.probability_above(beyond, error, magnitude)
+        ends = np.ones((1, *above.shape[1:])), np.zeros((1, *above.shape[1:]))
+        perceived = -np.diff(np.concatenate([ends[0], above, ends[1]]), axis=0)
+        said = perceived + self.mistakes * (perceived[::-1] - perceived)
+        return (1.0 - LAPSE) * said + LAPSE / len(self.answers)
+
+    def log_likelihoods(
+        self,
+        answer: Preference,
+        difference: np.ndarray,
+        error: Values,
+        magnitude: Values,
+        spread: float,
+    ) -> np.ndarray:
+        """(m, G) log P(answer); see :meth:`probabilities`."""
+        said = self.probabilities(difference, error, magnitude, spread)
+        return np.log(said[self.answers.index(answer)])
+
+    def table(
+        self, shares: np.ndarray, largest: float, error: float, magnitude: float, spread: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Differences (t,) from -largest to largest, evenly, and P(answer), (answers, t), at each
+        of them when people are mixed by these shares (G,).
+        """
+        differences = np.linspace(-largest, largest, TABLE_POINTS)
+        return differences, self.probabilities(differences, error, magnitude, spread) @ shares
