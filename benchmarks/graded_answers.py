@@ -1,0 +1,81 @@
+"""What graded answers and an inferred person are worth: returns after some answers, by how is asked
+and by who answers.
+
+    python benchmarks/graded_answers.py --models HalfCheetahVel.zip AntDir2D.zip
+
+Each model adapts to 30 tasks that no table uses. Questions are pairs or graded ("much better",
+too); the rule is told how the oracle errs, or infers it with the task. Graded oracles call equal
+what differs by less than 0.12, and much better what differs by more than 1 of the family's spread
+of returns ("other thresholds": 0.3 and 1.6). Writes ``<OUT>/answers.md`` and ``answers.json``.
+"""
+
+import json
+from functools import partial
+from pathlib import Path
+
+from common import RESULTS, arguments, table, write
+
+from sb3_poem import Bayes, BoltzmannOracle, MistakeOracle, ReturnOracle
+from sb3_poem.adaptation import evaluate_adaptation, return_spread
+from sb3_poem.common.vec_env import make_task_vec_env
+from sb3_poem.loading import load_model
+
+ORACLES = {
+    "exact": ReturnOracle,
+    "10 % mistakes": partial(MistakeOracle, 0.1),
+    "20 % mistakes": partial(MistakeOracle, 0.2),
+    "Boltzmann": BoltzmannOracle,
+}
+USUAL, OTHER = (0.12, 1.0), (0.3, 1.6)
+ANSWERS = (0, 1, 2, 5, 10)
+KINDS = (("pair", False), ("pair", True), ("graded", False), ("graded", True))
+
+
+def main() -> None:
+    args = arguments(
+        __doc__,
+        models=[""],
+        tasks=30,
+        episodes=5,
+        seed=300,
+        out={"type": Path, "default": RESULTS / "answers"},
+    )
+    file = args.out / "cells.json"
+    record = json.loads(file.read_text()) if file.exists() else {}
+    args.out.mkdir(parents=True, exist_ok=True)
+    for path in args.models:
+        model = load_model(path)
+        env = make_task_vec_env(model.env_id, 30)
+        spread = return_spread(model, env)
+        cells = [(who, kind, infer, USUAL) for who in ORACLES for kind, infer in KINDS]
+        cells += [("exact", "graded", infer, OTHER) for infer in (False, True)]
+        for who, kind, infer, shares in cells:
+            name = who + (", other thresholds" if shares is OTHER else "")
+            key = f"{model.env_id} | {name} | {kind} | {'inferred' if infer else 'told'}"
+            if key in record:
+                continue
+            graded = kind == "graded"
+            thresholds = tuple(spread * share for share in shares) if graded else None
+            evaluation = evaluate_adaptation(
+                model,
+                env,
+                args.tasks,
+                partial(ORACLES[who], thresholds=thresholds),
+                rule=Bayes(question=kind, noise_model="infer" if infer else None),
+                record_at=ANSWERS,
+                n_episodes=args.episodes,
+                seed=args.seed,
+            )
+            record[key] = [round(float(value), 2) for value in evaluation.mean_returns]
+            print(key, record[key], flush=True)
+            file.write_text(json.dumps(record, indent=1))
+        env.close()
+    rows = [[*key.split(" | "), *values] for key, values in record.items()]
+    head = ["family", "oracle", "question", "how it errs", *(f"{n} answers" for n in ANSWERS)]
+    settings = {"tasks": args.tasks, "episodes": args.episodes, "seed": args.seed}
+    title = "Graded answers and an inferred person"
+    write("answers", title, [table(head, rows)], record, args.out, settings)
+
+
+if __name__ == "__main__":
+    main()
