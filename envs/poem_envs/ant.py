@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from poem_envs.films import Look
 from poem_envs.legged import DirectionFamily, LeggedFamily
 from poem_envs.mujoco_rendering import arrow, pole
 from poem_envs.vector import TaskFamilyVector
@@ -16,6 +17,7 @@ from poem_envs.vector import TaskFamilyVector
 class _Ant(LeggedFamily):
     marker_height = 1.3
     camera_config = {"distance": 5.0, "elevation": -30.0, "lookat": np.array([0.0, 0.0, 0.5])}  # noqa: RUF012
+    look = Look(elevation=-25.0, distance=4.0, lookat=(0.0, 0.0, 0.4), marks="metres")
 
     def __init__(
         self,
@@ -192,6 +194,7 @@ class AntDir2DEnv(_Ant, DirectionFamily):
     As :class:`AntFwdBackEnv`.
     """
 
+    look = Look(0.0, -50.0, 5.0, marks="compass")
     task_space = spaces.Box(-np.pi / 2, np.pi / 2, (1,), np.float64)
 
 
@@ -239,6 +242,8 @@ class AntGoalEnv(_Ant):
     hidden_qpos = 0
     camera_config = {**_Ant.camera_config, "distance": 9.0, "elevation": -45.0}  # noqa: RUF012
     goal_radius = 3.0
+    # From above; a little more than the places that may be meant.
+    look = Look(0.0, -90.0, 8.5, (0.0, 0.0, 0.0), "circles", follows=False)
     task_space = spaces.Box(-goal_radius, goal_radius, (2,), np.float64)
 
     def __init__(

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from poem_envs.films import Look
 from poem_envs.mujoco_family import MujocoFamily
 from poem_envs.mujoco_rendering import arrow
 from poem_envs.vector import TaskFamilyVector
@@ -17,6 +18,7 @@ class _HalfCheetah(MujocoFamily):
     hidden_qpos = 1
     reward_feature_dim = 2
     camera_config = {"distance": 4.0, "elevation": -20.0, "lookat": np.array([0.0, 0.0, 0.6])}  # noqa: RUF012
+    look = Look(distance=3.8, lookat=(0.0, 0.0, 0.4), marks="metres")
 
     def __init__(
         self,

@@ -5,13 +5,16 @@ of ten (ML10).
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from typing import Any
 
+import mujoco
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
 from poem_envs.family import TaskFamily
+from poem_envs.films import Look, MujocoFilms
 from poem_envs.mujoco_rendering import renders_fast
 from poem_envs.sawyer import (
     PlacementRefusedError,
@@ -32,7 +35,7 @@ TARGET_RADIUS = 0.05
 PUCK_TO_GOAL = 0.15
 
 
-class MetaWorldEnv(TaskFamily):
+class MetaWorldEnv(MujocoFilms, TaskFamily):
     """What ML1 and ML10 have in common: observations, actions, simulators and their rendering.
 
     :param width: of rendered images, pixels
@@ -42,6 +45,7 @@ class MetaWorldEnv(TaskFamily):
     """
 
     metadata = {"render_modes": ["human", "rgb_array", "depth_array"], "render_fps": 80}  # noqa: RUF012
+    look = Look(145.0, -25.0, 1.0, (0.0, 0.68, 0.16), body="hand", follows=False, on_floor=False)
 
     def __init__(
         self,
@@ -115,8 +119,13 @@ class MetaWorldEnv(TaskFamily):
         turn = self._upside_down and isinstance(image, np.ndarray)
         return image[::-1, ::-1].copy() if turn else image
 
+    def _simulation(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        env = self._begun("film").env
+        return env.model, env.data
+
     def close(self) -> None:
         """Free what rendering and simulation hold."""
+        self._close_films()
         if self._sawyer is not None:
             self._sawyer.close()
         self._release_sawyer()
@@ -215,6 +224,8 @@ class MetaWorldML1Env(MetaWorldEnv):
         placements = placements_of(self.env_name)
         low, high = placements.low, placements.high
         self._reaching = self.shared_dynamics = self.env_name in REACHING
+        if self._reaching:
+            self.look = replace(self.look, hidden=("obj",))
         self.reward_feature_dim = 3 if self._reaching else 1
         if self._reaching:
             self._puck_low, self._puck_high = low[:3].copy(), high[:3].copy()

@@ -12,13 +12,14 @@ import numpy as np
 from gymnasium import spaces
 from mujoco.rollout import Rollout
 
+from poem_envs.films import MujocoFilms
 from poem_envs.mujoco_rendering import FastRenderer, StateRenderer, renders_fast
 from poem_envs.vector import BatchFamily, DivergenceError
 
 RENDER_MODES = ["human", "rgb_array", "depth_array", "rgbd_tuple"]
 
 
-class MujocoFamily(BatchFamily):
+class MujocoFamily(MujocoFilms, BatchFamily):
     """Base class of the families of MuJoCo robots.
 
     A robot sets the class attributes and defines :meth:`_reward_features`, :meth:`_draw_start`
@@ -207,7 +208,15 @@ class MujocoFamily(BatchFamily):
             self._renderer = renderer(self.model, **self._render_arguments)
         return self._renderer.render(self.states[copy], render_mode, markers)
 
+    def film_state(self) -> np.ndarray:
+        """See :class:`~poem_envs.films.Filmed`; of the first copy."""
+        return self.states[0].copy()
+
+    def _film_model(self) -> mujoco.MjModel:
+        return self.model
+
     def _release(self) -> None:
+        self._close_films()
         for held in (self._rollout, self._renderer):
             if held is not None:
                 held.close()

@@ -17,7 +17,7 @@ RENDER_QUALITIES = ("full", "fast")
 TASK_COLOUR = (0.16, 0.65, 0.27, 1.0)
 # Slices and stacks of a sphere, and quads of a plane: at the size of a web page nobody sees the
 # difference.
-COARSE = (12, 6, 1)
+SLICES, COARSE = 12, (6, 1)
 
 
 class _Renderer:
@@ -95,11 +95,12 @@ class FastRenderer(_Renderer):
         default_cam_config: dict[str, Any] | None = None,
         max_geom: int = 1000,
         visual_options: dict[int, bool] | None = None,
+        slices: int = SLICES,
     ) -> None:
         super().__init__(model, width, height)
         quality = model.vis.quality
         quality.offsamples = 0
-        quality.numslices, quality.numstacks, quality.numquads = COARSE
+        quality.numslices, quality.numstacks, quality.numquads = slices, *COARSE
         self._context = _make_context(width, height)
         self._context.make_current()
         self._scene = mujoco.MjvScene(model, max_geom)

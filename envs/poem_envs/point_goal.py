@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from poem_envs.drawing import Canvas, ImageWindow
+from poem_envs.drawing import Canvas, Colour, ImageWindow
+from poem_envs.films import PATH_COLOURS, moments_of
 from poem_envs.vector import BatchFamily, TaskFamilyVector
 
 
@@ -103,9 +104,7 @@ class PointGoalEnv(BatchFamily):
         return self._reward(tasks, observations)  # the position is seen, and it earns
 
     def _render_copy(self, copy: int, render_mode: str, task: np.ndarray | None) -> Any:
-        canvas = Canvas(self.width, self.height, centre=(0.0, 0.4), extent=2.7)
-        canvas.upper_half_circle(1.0, 0.015, (190, 190, 190))
-        canvas.disc(0.0, 0.0, 0.02, (190, 190, 190))
+        canvas = _background(self.width, self.height)
         if task is not None:
             canvas.disc(np.cos(task[0]), np.sin(task[0]), 0.07, (60, 160, 75))
         canvas.disc(self._positions[copy, 0], self._positions[copy, 1], 0.045, (31, 90, 180))
@@ -118,10 +117,42 @@ class PointGoalEnv(BatchFamily):
         time.sleep(1.0 / self.metadata["render_fps"])
         return None
 
+    def film_state(self) -> np.ndarray:
+        """See :class:`~poem_envs.films.Filmed`: the position of the first copy, ``(2,)``."""
+        return self._positions[0].copy()
+
+    def film(
+        self, paths: Sequence[np.ndarray], shown: Sequence[int], size: tuple[int, int]
+    ) -> list[np.ndarray]:
+        """See :class:`~poem_envs.films.Filmed`."""
+        images, chosen = [], [paths[i] for i in shown]
+        for moments in moments_of(chosen):
+            canvas = _background(*size)
+            for i, path, now in zip(shown, chosen, moments, strict=True):
+                colour = _COLOURS[i]
+                for x, y in path[:now]:
+                    canvas.disc(x, y, 0.02, colour)
+                canvas.disc(path[now][0], path[now][1], 0.07, colour)
+            images.append(canvas.image())
+        return images
+
     def _release(self) -> None:
         if self._window is not None:
             self._window.close()
             self._window = None
+
+
+# Of the first path and of the second.
+_COLOURS: list[Colour] = [
+    (round(255 * r), round(255 * g), round(255 * b)) for r, g, b in PATH_COLOURS
+]
+
+
+def _background(width: int, height: int) -> Canvas:
+    canvas = Canvas(width, height, centre=(0.0, 0.4), extent=2.7)
+    canvas.upper_half_circle(1.0, 0.015, (190, 190, 190))
+    canvas.disc(0.0, 0.0, 0.02, (190, 190, 190))
+    return canvas
 
 
 PointGoalVectorEnv = functools.partial(TaskFamilyVector, PointGoalEnv)

@@ -5,17 +5,29 @@ from __future__ import annotations
 import functools
 from typing import Any
 
+import mujoco
+
+from poem_envs.films import Look, MujocoFilms
 from poem_envs.goal_family import GoalFamily
 from poem_envs.vector import TaskFamilyVector
 
 
-class _RoboticsFamily(GoalFamily):
+class _RoboticsFamily(MujocoFilms, GoalFamily):
     """A goal-conditioned environment whose reward is dense or sparse."""
 
     def __init__(self, env: str, *, reward_type: str = "dense", **kwargs: Any) -> None:
         if reward_type not in ("dense", "sparse"):
             raise ValueError(f"reward_type={reward_type!r} must be 'dense' or 'sparse'")
         super().__init__(f"gymnasium_robotics:{env}", reward_type=reward_type, **kwargs)
+
+    def _simulation(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        robot: Any = getattr(self.env, "ant_env", self.env).unwrapped  # a maze's is one deeper
+        return robot.model, robot.data
+
+    def close(self) -> None:
+        """Close the environment."""
+        self._close_films()
+        super().close()
 
 
 class FetchReachEnv(_RoboticsFamily):
@@ -48,6 +60,16 @@ class FetchReachEnv(_RoboticsFamily):
     `reward_type` (`"dense"` or `"sparse"`), `render_mode`, `render_task`, and those of
     `FetchReach-v4`, such as `width`.
     """
+
+    look = Look(
+        132.0,
+        -14.0,
+        0.8,
+        (1.342, 0.749, 0.56),
+        body="robot0:gripper_link",
+        follows=False,
+        on_floor=False,
+    )
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(
@@ -82,6 +104,10 @@ class FetchPushEnv(_RoboticsFamily):
     it, else -1. The reward features are the box's position, and `success` of the info is whether it
     is within 0.05.
     """
+
+    look = Look(
+        132.0, -35.0, 1.0, (1.342, 0.749, 0.45), body="object0", follows=False, on_floor=False
+    )
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(
@@ -121,6 +147,8 @@ class AntMazeEnv(_RoboticsFamily):
     ## Arguments
     As :class:`FetchReachEnv`; further ones are those of `AntMaze_UMaze-v5`.
     """
+
+    look = Look(90.0, -90.0, 25.0, (0.0, 0.0, 0.0), body="torso", follows=False)
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("AntMaze_UMaze-v5", goal_low=-6.0, goal_high=6.0, **kwargs)

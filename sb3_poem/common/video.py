@@ -70,10 +70,7 @@ def _with_captions(clips: Sequence[Sequence[Frame]], captions: Sequence[str]) ->
 
 
 def side_by_side(
-    left: Sequence[Frame],
-    right: Sequence[Frame],
-    captions: tuple[str, str] | None = None,
-    gap: int = GAP,
+    left: Sequence[Frame], right: Sequence[Frame], captions: tuple[str, str] | None = None
 ) -> list[Frame]:
     """Two clips beside each other, under captions if any; the shorter one holds its last frame."""
     if len(left) == 0 or len(right) == 0:
@@ -83,7 +80,7 @@ def side_by_side(
         raise ValueError(f"both clips need the same height, got {heights[0]} and {heights[1]}")
     if captions is not None:
         left, right = _with_captions((left, right), captions)
-    bar = np.full((left[0].shape[0], gap, 3), 255, dtype=np.uint8)
+    bar = np.full((left[0].shape[0], GAP, 3), 255, dtype=np.uint8)
     n = max(len(left), len(right))
     lefts, rights = ([*clip, *[clip[-1]] * (n - len(clip))] for clip in (left, right))
     return [np.concatenate([a, bar, b], axis=1) for a, b in zip(lefts, rights, strict=True)]

@@ -11,12 +11,13 @@ import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
 from sb3_poem.adaptation.adapter import PreferenceAdapter
 from sb3_poem.adaptation.named_rule import named_rule
@@ -26,7 +27,6 @@ from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.common.vec_env import make_shown_env
-from sb3_poem.common.video import side_by_side
 from sb3_poem.label.beliefs import belief
 from sb3_poem.label.families import ModelInfo
 from sb3_poem.loading import BY_CLASS_NAME
@@ -37,8 +37,12 @@ from sb3_poem.poem_sac import POEMSAC
 RESULT_ROLLOUT = 1_000_000
 # Of the hidden task of the environment, of which the person knows nothing.
 TASK_STREAM = 0x1ABE1
-# Frames per second of a film: at least, and where a family is drawn more often, about.
-SMOOTH_FPS, FILM_FPS = 8.0, 20.0
+# Frames per second of a film: at least, and where a family moves faster, about.
+SMOOTH_FPS, FILM_FPS = 8.0, 15.0
+# Seconds that a film lasts: what is over sooner is shown slower.
+SHORTEST_FILM = 5.0
+# The race is drawn for every second frame of the films beside it.
+RACE_EVERY = 2
 #: Models that a process keeps.
 MAX_RENDERERS = 4
 #: What an adapter's dictionary holds of its conversation; the rest is the ``state`` of a turn.
@@ -109,36 +113,77 @@ class _Watches:
         raise RuntimeError("a person answers on the page; adapt() cannot ask")
 
 
+class FilmedVecEnv(VecEnvWrapper):
+    """An environment whose rollouts are filmed while the turn is wanted. Where its family films
+    states (:class:`poem_envs.films.Filmed`), these take the place of images.
+    """
+
+    #: A file without which filming raises RenderCancelledError; None films always.
+    marker: Path | None = None
+
+    def __init__(self, venv: VecEnv) -> None:
+        super().__init__(venv)
+        self.films_states = venv.has_attr("film_state")
+
+    def reset(self) -> Any:
+        return self.venv.reset()
+
+    def step_wait(self) -> Any:
+        return self.venv.step_wait()
+
+    def get_images(self) -> Any:
+        self._check_wanted()
+        return self.env_method("film_state") if self.films_states else self.venv.get_images()
+
+    def films(self, *clips: Trajectory) -> list[np.ndarray]:
+        """Frames that show every clip, and a race of several, beside each other."""
+        if not self.films_states:
+            return beside(*([*map(fit, clip.frames or ())] for clip in clips))
+        paths = [np.array(clip.frames) for clip in clips]
+        parts = [self._film(paths, [i]) for i in range(len(paths))]
+        if len(paths) > 1:
+            race = self._film([path[::RACE_EVERY] for path in paths], range(len(paths)))
+            parts.append([frame for frame in race for _ in range(RACE_EVERY)])
+        return beside(*parts)
+
+    def _film(self, paths: list[np.ndarray], shown: Sequence[int]) -> list[np.ndarray]:
+        self._check_wanted()
+        return self.env_method("film", paths, shown, (WIDTH, HEIGHT), indices=[0])[0]
+
+    def _check_wanted(self) -> None:
+        if self.marker is not None and not self.marker.exists():
+            raise RenderCancelledError
+
+
 class Renderer:
     """A model and its environment, an SB3 ``VecEnv`` that renders RGB images."""
 
-    def __init__(self, model: Any, env: Any, env_id: str) -> None:
+    def __init__(self, model: Any, env: VecEnv, env_id: str) -> None:
         if env.render_mode != "rgb_array":
             raise ValueError(
                 '`env` must be made with render_mode="rgb_array" to be shown, but has '
                 f"{env.render_mode!r}"
             )
         self.model = model
-        self.env = env
+        self.env = FilmedVecEnv(env)
         self.env_id = env_id
         self.fps = FamilyView(env).render_fps
 
     def turn(self, request: TurnRequest) -> Turn:
         """Make a turn, and write its video."""
-        every = film_every(self.fps, request.film_every)
+        every, fps = film_rate(self.fps, self.model.horizon, request.film_every)
         adapter = self._adapter(request, every)
         if request.preference is not None:
             adapter.tell(request.preference)
         believed, latent = belief(adapter, self.env_id), adapter.policy().latent
         if request.kind == "question":
             query = adapter.ask()
-            frames = pair(query.left.frames or (), query.right.frames or ())
+            clips = [query.left, query.right]
         else:
             seeds = [rollout_seed(adapter.seed, RESULT_ROLLOUT)]
             about = (self.model, self.env, latent[None], None, seeds, adapter.deterministic)
-            (clip,) = rollout_latents(*about, frames=every)
-            frames = [*map(fit, clip.frames or ())]
-        fps = self.fps / every
+            clips = rollout_latents(*about, frames=every)
+        frames = self.env.films(*clips)
         write_clip(frames, request.video, fps)
         data = adapter.to_dict()
         sides = data["pending"] or {"left": None, "right": None}
@@ -149,7 +194,9 @@ class Renderer:
     def warm_up(self) -> None:
         """Do once what only the first time is slow: the first image, the first action."""
         latent = np.zeros((1, self.model.latent_dim))
-        rollout_latents(self.model, self.env, latent, None, [0], frames=True, max_steps=2)
+        self.env.films(
+            *rollout_latents(self.model, self.env, latent, None, [0], frames=True, max_steps=2)
+        )
 
     def _adapter(self, request: TurnRequest, every: int) -> PreferenceAdapter:
         """The adapter as it was before the answer."""
@@ -163,14 +210,18 @@ class Renderer:
         return PreferenceAdapter.from_dict({**request.state, **more}, model, env, oracle=oracle)
 
 
-def film_every(fps: float, wanted: int) -> int:
-    """How many steps lie between two frames of a film.
+def film_rate(fps: float, horizon: int, wanted: int) -> tuple[int, float]:
+    """How many steps lie between two frames of a film, and its frames per second.
 
     :param fps: Steps per second.
+    :param horizon: Steps of an episode.
     :param wanted: How many times fewer frames there should be, unless it would move in jerks then.
     """
-    every = max(1, int(fps / FILM_FPS))  # what moves faster than films do is not filmed whole
-    return every * wanted if fps / (every * wanted) >= SMOOTH_FPS else every
+    fps = min(fps, horizon / SHORTEST_FILM)
+    every = max(1, round(fps / FILM_FPS))  # what moves faster than films do is not filmed whole
+    if fps / (every * wanted) >= SMOOTH_FPS:
+        every *= wanted
+    return every, max(fps / every, SMOOTH_FPS)
 
 
 def session_rule(options: dict[str, Any]) -> Rule:
@@ -181,7 +232,7 @@ def session_rule(options: dict[str, Any]) -> Rule:
 def make_turn(request: TurnRequest) -> Turn:
     """Make a turn, by models and environments that the process keeps, while it is wanted."""
     renderer = renderer_of(request.model)
-    renderer.env.env_method("render_while", request.marker if request.marker.exists() else None)
+    renderer.env.marker = request.marker if request.marker.exists() else None
     family = FamilyView(renderer.env)
     family.set_tasks(family.sample_tasks(1, np.random.default_rng([TASK_STREAM, request.seed])))
     return renderer.turn(request)
@@ -191,23 +242,7 @@ def make_turn(request: TurnRequest) -> Turn:
 def renderer_of(info: ModelInfo) -> Renderer:
     """Load a model and make its environment."""
     make = partial(make_env, info.env_id, **dict(info.env_kwargs))
-    env = DummyVecEnv([lambda: CancellableRendering(make())])
-    return Renderer(load_shown_model(info), env, info.env_id)
-
-
-class CancellableRendering(gym.Wrapper):
-    """Rendering is what takes long in a turn: there it is seen whether the turn is still wanted."""
-
-    _marker: Path | None = None
-
-    def render_while(self, marker: Path | None) -> None:
-        """A file without which rendering raises RenderCancelledError; None renders always."""
-        self._marker = marker
-
-    def render(self) -> Any:
-        if self._marker is not None and not self._marker.exists():
-            raise RenderCancelledError
-        return super().render()
+    return Renderer(load_shown_model(info), DummyVecEnv([make]), info.env_id)
 
 
 def load_shown_model(info: ModelInfo) -> Any:
@@ -250,9 +285,13 @@ def write_clip(frames: Sequence[np.ndarray], path: Path, fps: float) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def pair(left: Sequence[np.ndarray], right: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Two clips beside each other in the page's size: in one file they cannot fall out of step."""
-    return side_by_side([*map(fit, left)], [*map(fit, right)], gap=0)
+def beside(*clips: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Clips of one size beside each other, as long as the first two: in one file they cannot fall
+    out of step. What is shorter holds its last frame.
+    """
+    longest = max(map(len, clips[:2]))
+    held = [[*clip, *repeat(clip[-1], longest - len(clip))][:longest] for clip in clips]
+    return [np.concatenate(frames, axis=1) for frames in zip(*held, strict=True)]
 
 
 def fit(frame: np.ndarray) -> np.ndarray:

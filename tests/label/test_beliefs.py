@@ -12,7 +12,7 @@ import pytest
 
 from sb3_poem.label.beliefs import belief, posterior, sentence, weighted_quantiles
 from sb3_poem.label.families import as_points, describe
-from sb3_poem.label.rendering import HEIGHT, WIDTH, fit, pair
+from sb3_poem.label.rendering import HEIGHT, WIDTH, beside, fit
 from sb3_poem.pearl_sac.train_tasks import TrainTasks
 
 
@@ -126,11 +126,12 @@ def test_the_papers_candidates_weigh_the_same() -> None:
     np.testing.assert_allclose(weights, 0.25)
 
 
-def test_clips_side_by_side_last_as_long_as_the_longer() -> None:
+def test_clips_beside_each_other_last_as_long_as_the_longer() -> None:
     left = [np.full((HEIGHT, WIDTH, 3), value, dtype=np.uint8) for value in (10, 20)]
     right = [np.full((HEIGHT, WIDTH, 3), 99, dtype=np.uint8)] * 5
-    both = pair(left, right)
+    both = beside(left, right, [*right, right[0]])
     assert len(both) == 5
+    assert both[0].shape == (HEIGHT, 3 * WIDTH, 3)
     assert [int(frame[0, 0, 0]) for frame in both] == [10, 20, 20, 20, 20]
     assert {int(frame[0, WIDTH, 0]) for frame in both} == {99}
     square = np.zeros((480, 480, 3), dtype=np.uint8)

@@ -10,18 +10,20 @@ from pathlib import Path
 from typing import cast
 
 import gymnasium
+import numpy as np
 import pytest
 
+from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.label.families import ModelInfo
 from sb3_poem.label.render_queue import Priority, RenderQueue, process_pool
 from sb3_poem.label.rendering import (
-    CancellableRendering,
+    FilmedVecEnv,
     RenderCancelledError,
     Turn,
     TurnRequest,
-    film_every,
-    make_env,
+    film_rate,
     make_turn,
+    renderer_of,
 )
 
 TURN = Turn(None, None, None, None, None, 20.0, 1)
@@ -64,17 +66,19 @@ def test_a_turn_that_nobody_wants_any_more_is_stopped_for_the_next(
 def test_rendering_ends_when_the_marker_is_taken_away(
     point_goal: ModelInfo, tmp_path: Path
 ) -> None:
-    env = CancellableRendering(make_env(point_goal.env_id))
-    env.reset(seed=0)
+    env = renderer_of(point_goal).env
+    env.reset()
     marker = tmp_path / "turn.wanted"
     marker.touch()
-    env.render_while(marker)
-    assert env.render().ndim == 3
+    env.marker = marker
+    clip = Trajectory(np.zeros((2, 2)), np.zeros((1, 2)), np.zeros(1), frames=env.get_images() * 2)
+    assert len(env.films(clip)) == 2
     marker.unlink()
-    with pytest.raises(RenderCancelledError):
-        env.render()
-    env.render_while(None)
-    assert env.render().ndim == 3
+    for film in (env.get_images, lambda: env.films(clip)):
+        with pytest.raises(RenderCancelledError):
+            film()
+    env.marker = None
+    assert len(env.films(clip)) == 2
 
 
 def test_a_worker_leaves_a_turn_whose_marker_goes(
@@ -82,16 +86,16 @@ def test_a_worker_leaves_a_turn_whose_marker_goes(
 ) -> None:
     wanted = request(point_goal, tmp_path, "turn")
     images = 0
-    render = CancellableRendering.render
+    record = FilmedVecEnv.get_images
 
-    def render_and_lose_interest(env: CancellableRendering) -> object:
+    def record_and_lose_interest(env: FilmedVecEnv) -> object:
         nonlocal images
         images += 1
         if images == 3:
             wanted.marker.unlink()
-        return render(env)
+        return record(env)
 
-    monkeypatch.setattr(CancellableRendering, "render", render_and_lose_interest)
+    monkeypatch.setattr(FilmedVecEnv, "get_images", record_and_lose_interest)
     wanted.marker.touch()
     with pytest.raises(RenderCancelledError):
         make_turn(wanted)
@@ -103,10 +107,20 @@ def test_a_worker_leaves_a_turn_whose_marker_goes(
 
 
 @pytest.mark.parametrize(
-    ("fps", "alone", "crowded"), [(10, 1, 1), (20, 1, 2), (25, 1, 2), (80, 4, 8)]
+    ("fps", "steps", "alone", "crowded"),
+    [
+        (10, 25, (1, 8.0), (1, 8.0)),  # PointGoal
+        (20, 200, (1, 20.0), (2, 10.0)),  # Ant and HalfCheetah, as fast as they are
+        (25, 50, (1, 10.0), (1, 10.0)),  # Fetch
+        (67, 200, (3, 40 / 3), (3, 40 / 3)),  # Humanoid, which else were over in three seconds
+        (80, 200, (3, 40 / 3), (3, 40 / 3)),  # Meta-World
+        (80, 2000, (5, 16.0), (10, 8.0)),
+    ],
 )
-def test_films_show_about_twenty_frames_a_second(fps: int, alone: int, crowded: int) -> None:
-    assert [film_every(fps, wanted) for wanted in (1, 2)] == [alone, crowded]
+def test_films_last_five_seconds_and_show_enough_frames_a_second(
+    fps: int, steps: int, alone: tuple[int, float], crowded: tuple[int, float]
+) -> None:
+    assert [film_rate(fps, steps, wanted) for wanted in (1, 2)] == [alone, crowded]
 
 
 def test_workers_know_the_packages_that_register_environments(
