@@ -8,7 +8,7 @@ import copy
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import mujoco
 import numpy as np
@@ -23,8 +23,8 @@ SKY, GREY, INK = (226, 231, 240), (0.45, 0.47, 0.52), (0.10, 0.12, 0.18)
 OWN_COLOUR, SOLIDITY = 0.3, 0.85
 # Field of view of the camera, degrees, and half the height that it sees at distance one.
 FIELD_OF_VIEW, HALF_HEIGHT = 45.0, 0.4142
-# Of half the picture, that stays free around paths.
-MARGIN = 0.35
+# Of half the picture, that stays free around paths, for robots that are drawn larger, and else.
+MARGIN, LEAST_MARGIN = 0.35, 0.05
 # In a picture of whole paths a robot is as large as in a film of its own, times this, or larger.
 LEAST_SIZE = 0.5
 TRAIL_PIECES, TRAIL_PIXELS = 16, 3.0
@@ -57,8 +57,9 @@ class Look:
     #: What tells directions and distances: "metres" (lines across the x axis), "compass" (words,
     #: and circles around the start), "circles" (the same without the words), or nothing
     marks: str = ""
-    #: The body whose way is drawn
+    #: The body whose way is drawn, or the site
     body: str | int = 1
+    site: str | None = None
     #: Whether the camera goes along with the robot
     follows: bool = True
     #: Whether the way is drawn on the floor, or where the body was
@@ -223,7 +224,9 @@ class FilmRenderer(FastRenderer):
         mujoco.mj_setState(self._model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         mujoco.mj_kinematics(self._model, data)
         mujoco.mj_camlight(self._model, data)
-        return np.array(data.body(self.look.body).xpos)
+        site = self.look.site
+        place = data.body(self.look.body) if site is None else data.site(site)
+        return np.array(place.xpos)
 
     def _places(self, path: np.ndarray) -> np.ndarray:
         places = np.stack([self._pose(self._data, state) for state in path])
@@ -238,7 +241,7 @@ class FilmRenderer(FastRenderer):
             camera.lookat[:2] = (places.min(axis=0) + places.max(axis=0))[:2] / 2
         axes = np.stack([look.right, look.up, np.cross(look.up, look.right)], axis=1)
         aside, upwards, beyond = ((places - camera.lookat) @ axes).T
-        half = HALF_HEIGHT * (1 - MARGIN)
+        half = HALF_HEIGHT * (1 - (MARGIN if look.follows else LEAST_MARGIN))
         aspect = self._viewport.width / self._viewport.height
         needed = np.maximum(np.abs(aside) / (half * aspect), np.abs(upwards) / half) - beyond
         camera.distance = max(look.distance, needed.max())

@@ -66,7 +66,7 @@ class FetchReachEnv(_RoboticsFamily):
         -14.0,
         0.8,
         (1.342, 0.749, 0.56),
-        body="robot0:gripper_link",
+        site="robot0:grip",
         follows=False,
         on_floor=False,
     )

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from sb3_poem.label.families import as_points, describe
+from sb3_poem.label.families import Description, as_points, describe
 
 # Training tasks from which the task of a latent is read.
 NEIGHBOURS = 5
 # The sentence names the range that holds so much of the posterior.
 SHARE = 0.8
-# Of the eighths of a circle, in a video that looks at the robot from its right side.
-WAYS = (
-    *("right", "far right", "away from you", "far left"),
-    *("left", "near left", "towards you", "near right"),
-)
+# Speeds, m/s, that are one to who watches; what is no faster stands still.
+ONE_SPEED, STILL = 0.3, 0.1
+# Degrees from a word up to which people say "straight", and up to which "a bit".
+STRAIGHT, BIT = 8.0, 30.0
+# Half the width of a picture, m, up to which distances in it are told in centimetres.
+NEARBY = 0.5
 
 
 def belief(adapter: Any, env_id: str) -> dict[str, Any]:
@@ -26,7 +28,8 @@ def belief(adapter: Any, env_id: str) -> dict[str, Any]:
     :param env_id: The environment's id, which says how tasks are drawn.
     :return: JSON-ready: ``picture`` ("place", "speed", "direction" or "projection"), ``points`` (n,
         1 or 2), ``weights`` (n,) summing to one, ``estimate`` (the point of the policy that would
-        be taken now), ``extent``, ``unit`` and ``sentence``.
+        be taken now), ``extent``, ``unit``, ``words`` (what is to the right, upwards, to the left
+        and downwards) and ``sentence``.
     """
     latents, weights = posterior(adapter.inference)
     everything = np.concatenate([latents, adapter.inference.estimate()[None, :]])
@@ -45,7 +48,8 @@ def belief(adapter: Any, env_id: str) -> dict[str, Any]:
         "estimate": np.round(estimate, 4).tolist(),
         "extent": float(extent),
         "unit": unit,
-        "sentence": sentence(picture, points, weights, estimate, unit),
+        "words": list(description.words),
+        "sentence": sentence(description, points, weights, estimate),
     }
 
 
@@ -58,24 +62,63 @@ def posterior(inference: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def sentence(
-    picture: str, points: np.ndarray, weights: np.ndarray, estimate: np.ndarray, unit: str
+    description: Description, points: np.ndarray, weights: np.ndarray, estimate: np.ndarray
 ) -> str:
     """The posterior in words: points (n, 1 or 2), weights (n,), the estimate's point."""
+    picture, words = description.picture, description.words
     if picture == "speed":
-        low, high = weighted_quantiles(points[:, 0], weights, ((1 - SHARE) / 2, (1 + SHARE) / 2))
-        return f"It believes that you want between {max(low, 0.0):.1f} and {high:.1f} {unit}."
+        return f"It believes that you want {_speed(description, points, weights, estimate)}."
     if picture == "direction":
-        return _direction_sentence(points, weights)
+        return _direction_sentence(words, points, weights)
     if picture == "place":
-        distances = np.linalg.norm(points - estimate, axis=1)
-        radius = weighted_quantiles(distances, weights, (SHARE,))[0]
-        across, upwards, about = (f"{round(value, 2):.2g}" for value in (*estimate, radius))
-        where = f"near {across} across and {upwards} up, give or take {about} {unit}".strip()
+        distance = float(np.linalg.norm(estimate))
+        away = np.linalg.norm(points - estimate, axis=1)
+        radius = weighted_quantiles(away, weights, (SHARE,))[0]
+        if radius >= distance:
+            far = _length(description, distance + radius)
+            within = f"within about {far} of" if description.unit else "not far from"
+            return f"It believes that you mean a place {within} where it begins."
+        where = way(words, estimate)
+        if description.unit:
+            far, about = (_length(description, length) for length in (distance, radius))
+            where += f", about {far} away, give or take {about}"
         return f"It believes that you mean a place {where}."
     return (
         "Each dot is a behaviour that still fits your answers; the closer together they lie, the "
         "surer it is."
     )
+
+
+def way(words: Sequence[str], point: np.ndarray) -> str:
+    """The direction of a point (2,), by the words for right, upwards, left and downwards."""
+    degrees = float(np.degrees(np.arctan2(point[1], point[0])))
+    nearest = round(degrees / 90)
+    off = degrees - 90 * nearest
+    word, other = words[nearest % 4], words[(nearest + (1 if off > 0 else -1)) % 4]
+    if abs(off) <= STRAIGHT:
+        return f"straight {word}"
+    if abs(off) <= BIT:
+        return f"a bit {other} of straight {word}"
+    first, second = (word, other) if nearest % 2 else (other, word)  # ahead or back, then aside
+    return f"between {first} and {second}"
+
+
+def _speed(
+    description: Description, points: np.ndarray, weights: np.ndarray, estimate: np.ndarray
+) -> str:
+    low, high = weighted_quantiles(points[:, 0], weights, ((1 - SHARE) / 2, (1 + SHARE) / 2))
+    if high <= STILL:
+        return "it to stand still, or nearly"
+    if high - low < ONE_SPEED:
+        return f"about {max(estimate[0], 0.0):.1f} {description.unit}"
+    return f"between {max(low, 0.0):.1f} and {high:.1f} {description.unit}"
+
+
+def _length(description: Description, length: float) -> str:
+    if description.extent <= NEARBY:
+        return f"{max(round(100 * length), 1)} cm"
+    rounded = round(2 * length) / 2 if length >= 1 else max(round(length, 1), 0.1)
+    return f"{rounded:g} {description.unit}"
 
 
 def weighted_quantiles(
@@ -88,20 +131,17 @@ def weighted_quantiles(
     return values[order[np.minimum(places, len(order) - 1)]].tolist()
 
 
-def _direction_sentence(points: np.ndarray, weights: np.ndarray) -> str:
+def _direction_sentence(words: Sequence[str], points: np.ndarray, weights: np.ndarray) -> str:
     if np.abs(points[:, 1]).max() < 1e-9:  # one line: forward or backward
         forward = float(weights[points[:, 0] >= 0].sum())
-        way, share = ("right", forward) if forward >= 0.5 else ("left", 1.0 - forward)
-        return f"It is {100 * share:.0f} % sure that you want it to run to the {way} in the video."
+        side, share = ("right", forward) if forward >= 0.5 else ("left", 1.0 - forward)
+        return f"It is {100 * share:.0f} % sure that you want it to run to the {side} in the film."
     x, y = weights @ points
     angle = np.arctan2(y, x)
     away = np.abs(np.angle(np.exp(1j * (np.arctan2(points[:, 1], points[:, 0]) - angle))))
     spread = np.degrees(weighted_quantiles(away, weights, (SHARE,))[0])
-    way = WAYS[round(angle / (np.pi / 4)) % 8]
-    return (
-        f"It believes that you mean the direction {way} in the video, give or take "
-        f"{spread:.0f} degrees."
-    )
+    where = way(words, np.array([x, y]))
+    return f"It believes that you mean {where}, give or take {spread:.0f} degrees."
 
 
 def _points_of(model: Any, latents: np.ndarray, train_points: np.ndarray) -> np.ndarray:

@@ -8,18 +8,16 @@ from typing import Any
 
 import numpy as np
 
+from poem_envs.ant import AntDir2DEnv, AntGoalEnv
+from poem_envs.films import Look
+from poem_envs.humanoid import HumanoidDir2DEnv
+from poem_envs.meta_world import MetaWorldEnv
+from poem_envs.robotics import AntMazeEnv, FetchPushEnv, FetchReachEnv
 from sb3_poem.common.foreign import environment_of
 from sb3_poem.pearl_sac.saving import CONFIG, read_config
 from sb3_poem.resources import find_folder, shipped_folder
 
-
-@dataclass(frozen=True)
-class View:
-    """Where a camera sees places in space."""
-
-    origin: tuple[float, float, float]  # in the middle of the picture: where the hand begins
-    right: tuple[float, float, float]  # unit vectors in the video
-    up: tuple[float, float, float]
+FROM_THE_SIDE = Look()
 
 
 @dataclass(frozen=True)
@@ -31,7 +29,22 @@ class Description:
     picture: str  # of tasks: "place", "speed", "direction", or "projection" of the latent
     unit: str = ""  # of the numbers in the picture
     extent: float = 1.0  # half the width of a "place" picture, or the largest speed
-    view: View | None = None  # of places in space; None for places in the plane
+    look: Look = FROM_THE_SIDE  # of the films, whose directions are those of the picture
+    origin: tuple[float, float, float] | None = None  # of places in space; None for the plane
+
+    @property
+    def words(self) -> tuple[str, str, str, str]:
+        """What people call right, upwards, left and downwards in the films."""
+        if self.look.marks in ("compass", "circles"):
+            return ("right", "ahead", "left", "back")
+        return ("right", "up", "left", "down")
+
+    @property
+    def group(self) -> str:
+        """What can be taught, as a question."""
+        if self.picture == "place":
+            return "Where should it go?" if self.origin is None else "Where should its hand go?"
+        return GROUPS[self.picture]
 
 
 BLIND = "It cannot see the place; your answers show the way."
@@ -44,30 +57,47 @@ BOX_HINT = f"Think of a place where the box should lie in the end. {BLIND}"
 ARM_HINT = "Think of what its hand should do, and where."
 OTHER_HINT = "Think of what it should do. Your answers show it."
 
-# The cameras of gymnasium-robotics' Fetch (azimuth 132 and elevation -14 degrees) and of Meta-World
-# ("corner2").
-FETCH_VIEW = View((1.342, 0.749, 0.535), (0.743, 0.669, 0.0), (-0.162, 0.180, 0.970))
-SAWYER_VIEW = View((0.0, 0.6, 0.2), (0.550, 0.833, -0.058), (-0.376, 0.310, 0.873))
+# Where hands begin.
+FETCH_HAND, SAWYER_HAND = (1.342, 0.749, 0.535), (0.0, 0.6, 0.2)
 
 ANT, CHEETAH, ARM = "A four-legged robot", "A running cheetah", "A robot arm"
+GROUPS = {
+    "speed": "How fast should it run?",
+    "direction": "Which way should it go?",
+    "projection": "What should it do?",
+}
 DESCRIPTIONS = {
     "PointGoal": Description("A dot that goes to a place", PLACE_HINT, "place", extent=1.35),
     "HalfCheetahVel": Description(f"{CHEETAH}: how fast?", SPEED_HINT, "speed", "m/s", 3.0),
     "HalfCheetahFwdBack": Description(f"{CHEETAH}: which way?", WAY_HINT, "direction"),
     "AntVel": Description(f"{ANT}: how fast?", SPEED_HINT, "speed", "m/s", 3.0),
     "AntFwdBack": Description(f"{ANT}: which way?", WAY_HINT, "direction"),
-    "AntDir2D": Description(f"{ANT}: in which direction?", DIRECTION_HINT, "direction"),
-    "HumanoidDir2D": Description("A humanoid: in which direction?", DIRECTION_HINT, "direction"),
-    "AntGoal": Description(f"{ANT} that goes to a place", PLACE_HINT, "place", "m", 3.5),
-    "FetchReach": Description(
-        f"{ARM} that reaches for a place", REACH_HINT, "place", "m", 0.3, FETCH_VIEW
+    "AntDir2D": Description(
+        f"{ANT}: in which direction?", DIRECTION_HINT, "direction", look=AntDir2DEnv.look
     ),
-    "FetchPush": Description(f"{ARM} that pushes a box", BOX_HINT, "place", "m", 0.3, FETCH_VIEW),
+    "HumanoidDir2D": Description(
+        "A humanoid: in which direction?", DIRECTION_HINT, "direction", look=HumanoidDir2DEnv.look
+    ),
+    "AntGoal": Description(
+        f"{ANT} that goes to a place", PLACE_HINT, "place", "m", 3.5, AntGoalEnv.look
+    ),
+    "FetchReach": Description(
+        f"{ARM} that reaches for a place",
+        REACH_HINT,
+        "place",
+        "m",
+        0.3,
+        FetchReachEnv.look,
+        FETCH_HAND,
+    ),
+    "FetchPush": Description(
+        f"{ARM} that pushes a box", BOX_HINT, "place", "m", 0.3, FetchPushEnv.look, FETCH_HAND
+    ),
     "MetaWorldML1": Description(
-        f"{ARM} at a table: where?", REACH_HINT, "place", "m", 0.4, SAWYER_VIEW
+        f"{ARM} at a table: where?", REACH_HINT, "place", "m", 0.4, MetaWorldEnv.look, SAWYER_HAND
     ),
     "MetaWorldML10": Description(f"{ARM} at a table: what, and where?", ARM_HINT, "projection"),
-    "AntMaze": Description(f"{ANT} in a maze", PLACE_HINT, "place", "m", 6.5),
+    "AntMaze": Description(f"{ANT} in a maze", PLACE_HINT, "place", "m", 6.5, AntMazeEnv.look),
 }
 
 
@@ -77,26 +107,28 @@ def describe(env_id: str, task_dim: int | None = None) -> Description:
     """
     name = env_id.rpartition("/")[2].rpartition("-v")[0] or env_id
     description = DESCRIPTIONS.get(name, Description(name, OTHER_HINT, "projection"))
-    if description.view is not None and task_dim not in (None, 3):
+    if description.origin is not None and task_dim not in (None, 3):
         return Description(description.title, ARM_HINT, "projection")
     return description
 
 
 def as_points(env_id: str, tasks: np.ndarray) -> np.ndarray:
     """Tasks (n, task_dim) as points that may be averaged: (n, 1) speeds, or (n, 2) places or unit
-    vectors, x to the right and y upwards in the videos.
+    vectors, x to the right and y upwards in the films.
     """
     description = describe(env_id, tasks.shape[1])
-    picture, view = description.picture, description.view
-    if view is not None:
-        return (tasks - view.origin) @ np.array([view.right, view.up]).T
+    picture, look = description.picture, description.look
     if picture == "speed":
         return tasks[:, :1]
+    if description.origin is not None:
+        return (tasks - description.origin) @ np.array([look.right, look.up]).T
     if picture == "place" and tasks.shape[1] >= 2:
-        return tasks[:, :2]
-    if env_id.rpartition("/")[2].startswith(("HalfCheetahFwdBack", "AntFwdBack")):
-        return np.stack([tasks[:, 0], np.zeros(len(tasks))], axis=1)
-    return np.stack([np.cos(tasks[:, 0]), np.sin(tasks[:, 0])], axis=1)
+        points = tasks[:, :2]
+    elif env_id.rpartition("/")[2].startswith("HalfCheetahFwdBack"):
+        points = np.stack([tasks[:, 0], np.zeros(len(tasks))], axis=1)
+    else:
+        points = np.stack([np.cos(tasks[:, 0]), np.sin(tasks[:, 0])], axis=1)
+    return points @ np.array([look.right[:2], look.ahead[:2]]).T
 
 
 @dataclass(frozen=True)

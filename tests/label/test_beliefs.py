@@ -5,7 +5,6 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
@@ -47,52 +46,50 @@ def test_directions_are_averaged_around_the_circle() -> None:
     tasks = np.array([[np.pi - 0.05], [-np.pi + 0.05], [0.0]])
     means = np.array([[1.0], [1.0], [-5.0]])
     drawn = belief(adapter(np.array([[1.0]]), np.ones(1), tasks, means), "poem/AntDir2D-v0")
-    assert np.arctan2(*drawn["points"][0][::-1]) == pytest.approx(np.pi, abs=0.01)
+    assert np.arctan2(*drawn["points"][0][::-1]) == pytest.approx(-np.pi / 2, abs=0.01)  # back
 
 
 def test_tasks_as_points() -> None:
     np.testing.assert_allclose(
         as_points("poem/PointGoal-v0", np.array([[np.pi / 2]])), [[0.0, 1.0]], atol=1e-12
     )
-    np.testing.assert_allclose(as_points("poem/AntGoal-v0", np.array([[1.0, -2.0]])), [[1.0, -2.0]])
     np.testing.assert_allclose(
-        as_points("poem/HalfCheetahFwdBack-v0", np.array([[-1.0]])), [[-1.0, 0.0]]
+        as_points("poem/AntGoal-v0", np.array([[1.0, -2.0]])), [[2.0, 1.0]], atol=1e-12
+    )
+    np.testing.assert_allclose(
+        as_points("poem/HalfCheetahFwdBack-v0", np.array([[-1.0]])), [[-1.0, 0.0]], atol=1e-12
     )
     assert describe("Walk1D-v0").picture == "projection"
     assert describe("Walk1D-v0").title == "Walk1D"
 
 
-def test_places_in_space_are_drawn_as_the_camera_sees_them() -> None:
-    fetch = gym.make("poem/FetchReach-v0")
-    fetch.reset(seed=0)
-    robot = fetch.unwrapped.env.unwrapped
-    config, camera = robot.mujoco_renderer.default_cam_config, mujoco.MjvCamera()
-    camera.distance, camera.azimuth, camera.elevation = (
-        config["distance"],
-        config["azimuth"],
-        config["elevation"],
-    )
-    camera.lookat[:] = config["lookat"]
-    scene = mujoco.MjvScene(robot.model, 1000)
-    mujoco.mjv_updateScene(
-        robot.model, robot.data, mujoco.MjvOption(), None, camera, mujoco.mjtCatBit.mjCAT_ALL, scene
-    )
+@pytest.mark.parametrize(
+    ("env_id", "hand"),
+    [
+        ("poem/FetchReach-v0", (1.342, 0.749, 0.535)),
+        pytest.param("poem/MetaWorldML1-v0", (0.0, 0.6, 0.2), marks=pytest.mark.metaworld),
+        ("poem/AntGoal-v0", (0.0, 0.0, 0.0)),
+        ("poem/AntMaze-v0", (0.0, 0.0, 0.0)),
+    ],
+)
+def test_places_are_drawn_as_the_films_camera_sees_them(
+    env_id: str, hand: tuple[float, float, float]
+) -> None:
+    look = describe(env_id).look
+    camera, model = mujoco.MjvCamera(), mujoco.MjModel.from_xml_string("<mujoco/>")
+    camera.distance, camera.azimuth, camera.elevation = look.distance, look.azimuth, look.elevation
+    scene, options = mujoco.MjvScene(model, 10), mujoco.MjvOption()
+    everything = mujoco.mjtCatBit.mjCAT_ALL
+    mujoco.mjv_updateScene(model, mujoco.MjData(model), options, None, camera, everything, scene)
     forward, up = scene.camera[0].forward, scene.camera[0].up
-    hand = robot.initial_gripper_xpos
-    places = hand + np.random.default_rng(0).uniform(-0.15, 0.15, size=(20, 3))
-    expected = (places - hand) @ np.stack([np.cross(forward, up), up], axis=1)
-    np.testing.assert_allclose(as_points("poem/FetchReach-v0", places), expected, atol=2e-3)
+    dim = 2 if env_id.startswith("poem/Ant") else 3
+    offsets = np.random.default_rng(0).uniform(-0.15, 0.15, size=(20, 3)) * (np.arange(3) < dim)
+    expected = offsets @ np.stack([np.cross(forward, up), up], axis=1)
+    places = (np.array(hand) + offsets)[:, :dim]
+    np.testing.assert_allclose(as_points(env_id, places), expected, atol=2e-3)
 
-    sawyer = gym.make("poem/MetaWorldML1-v0")
-    sawyer.reset(seed=0)
-    arm = sawyer.unwrapped._sawyer.env
-    axes = arm.model.cam("corner2").mat0.reshape(3, 3)
-    places = arm.hand_init_pos + np.random.default_rng(1).uniform(-0.3, 0.3, size=(20, 3))
-    expected = (
-        -(places - arm.hand_init_pos) @ axes[:, :2]
-    )  # videos show this camera's image turned by half a turn
-    np.testing.assert_allclose(as_points("poem/MetaWorldML1-v0", places), expected, atol=2e-3)
-    # Placements of an object and a goal are more than a place.
+
+def test_placements_of_an_object_and_a_goal_are_more_than_a_place() -> None:
     assert describe("poem/MetaWorldML1-v0", 6).picture == "projection"
 
 
@@ -107,17 +104,54 @@ def test_weighted_quantiles_are_those_of_the_repeated_sample() -> None:
         ]
 
 
-def test_sentences() -> None:
-    speeds = np.linspace(1.0, 2.0, 101)[:, None]
-    even = np.full(101, 1 / 101)
-    assert "between 1.1 and 1.9 m/s" in sentence("speed", speeds, even, speeds.mean(axis=0), "m/s")
-    ways = np.array([[1.0, 0.0], [-1.0, 0.0]])
-    assert "25 % sure" not in sentence("direction", ways, np.array([0.25, 0.75]), ways[1], "")
-    assert "75 % sure that you want it to run to the left" in sentence(
-        "direction", ways, np.array([0.25, 0.75]), ways[1], ""
+def say(env_id: str, points: Any, weights: Any = None) -> str:
+    points = np.array(points, dtype=np.float64)
+    weights = np.full(len(points), 1 / len(points)) if weights is None else np.array(weights)
+    return sentence(describe(env_id), points, weights, weights @ points)
+
+
+def test_sentences_that_people_say() -> None:
+    def speed(*values: float) -> str:
+        return say("poem/HalfCheetahVel-v0", np.linspace(*values, 101)[:, None])
+
+    assert "you want between 1.1 and 1.9 m/s." in speed(1.0, 2.0)
+    assert "you want about 0.7 m/s." in speed(0.66, 0.74)
+    assert "stand still" in speed(0.0, 0.05)
+    ways = [[1.0, 0.0], [-1.0, 0.0]]
+    assert "75 % sure that you want it to run to the left" in say(
+        "poem/HalfCheetahFwdBack-v0", ways, [0.25, 0.75]
     )
-    up = np.array([[0.0, 1.0], [0.1, 0.99]])
-    assert "away from you" in sentence("direction", up, np.full(2, 0.5), up[0], "")
+    # What the robot's angle means, by the family's own words.
+    for degrees, words in [
+        (0, "straight ahead"),
+        (20, "a bit left of straight ahead"),
+        (-45, "between ahead and right"),
+        (75, "a bit ahead of straight left"),
+        (178, "straight back"),
+        (-160, "a bit right of straight back"),
+        (-130, "between back and right"),
+    ]:
+        points = as_points("poem/AntDir2D-v0", np.radians([[degrees - 3.0], [degrees + 3.0]]))
+        assert f"you mean {words}, give or take" in say("poem/AntDir2D-v0", points)
+    places = as_points("poem/AntGoal-v0", np.array([[1.8, 0.6], [2.2, 0.6], [1.8, 0.8]]))
+    assert "a place a bit left of straight ahead, about 2 m away, give or take 0.3 m." in say(
+        "poem/AntGoal-v0", places
+    )
+    unsure = as_points("poem/AntGoal-v0", np.array([[2.0, 0.0], [-2.0, 0.1], [0.0, 2.0]]))
+    assert "within about 3 m of where it begins" in say("poem/AntGoal-v0", unsure)
+    assert "a place straight up, about 10 cm away, give or take 1 cm." in say(
+        "poem/FetchReach-v0", [[0.0, 0.1], [0.0, 0.1]]
+    )
+    assert "a place between up and left." in say("poem/PointGoal-v0", [[-0.7, 0.7], [-0.7, 0.7]])
+
+
+def test_forward_and_backward_are_told_apart() -> None:
+    for env_id, tasks in (
+        ("AntFwdBack", [[0.0], [np.pi]]),
+        ("HalfCheetahFwdBack", [[1.0], [-1.0]]),
+    ):
+        points = as_points(f"poem/{env_id}-v0", np.array(tasks))
+        np.testing.assert_allclose(points, [[1.0, 0.0], [-1.0, 0.0]], atol=1e-12)
 
 
 def test_the_papers_candidates_weigh_the_same() -> None:

@@ -72,8 +72,10 @@ function drawDirection(svg, belief) {
     });
     return;
   }
+  svg.setAttribute("viewBox", "-140 -114 280 228");
   const bins = 48;
   shape(svg, "circle", { cx: 0, cy: 0, r: 78, class: "track" });
+  name(svg, belief.words, 94);
   const angles = belief.points.map((p) => Math.atan2(p[1], p[0]));
   histogram(angles, belief.weights, -Math.PI, Math.PI, bins, true).forEach((height, i) => {
     if (height < 0.02) return;
@@ -85,6 +87,15 @@ function drawDirection(svg, belief) {
   shape(svg, "circle", { cx: 0, cy: 0, r: 5, class: "hub" });
 }
 
+// The words for right, upwards, left and downwards, as far from the middle; the films have the same directions.
+function name(svg, words, far) {
+  const inside = far < 90; // the words at the sides end there
+  [[far, 5], [0, 4 - far], [-far, 5], [0, far + 8]].forEach(([x, y], i) => {
+    const anchor = x === 0 ? "middle" : (x > 0) === inside ? "end" : "start";
+    shape(svg, "text", { x, y: x && inside ? y - 9 : y, class: "tick", style: `text-anchor: ${anchor}` }, words[i]);
+  });
+}
+
 function drawPlane(svg, belief) {
   svg.setAttribute("viewBox", "-110 -110 220 220");
   const scale = 100 / belief.extent;
@@ -93,6 +104,7 @@ function drawPlane(svg, belief) {
     shape(svg, "path", { d: "M-104 0H104M0 -104V104", class: "grid" });
     shape(svg, "circle", { cx: 0, cy: 0, r: 3, class: "start" });
     shape(svg, "text", { x: 6, y: 14, class: "small" }, "start");
+    name(svg, belief.words, 88);
   }
   const heaviest = Math.max(...belief.weights);
   belief.points.forEach((point, i) => {

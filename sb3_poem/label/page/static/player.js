@@ -1,5 +1,8 @@
-// One video file holds both clips side by side, and two canvases show its halves: they cannot fall out of step.
+// One video file holds both clips side by side, and perhaps a race of them: they cannot fall out of step. Each part has
+// a canvas; all parts are as large as each other.
 "use strict";
+
+const SHAPE = 4 / 3; // width by height
 
 class Player {
   constructor(canvases, controls, onError) {
@@ -12,7 +15,7 @@ class Player {
     this.video.preload = "auto";
     this.fps = 20;
     this.frames = 1;
-    this.halves = 2;
+    this.parts = 2;
     this.wantsToPlay = !window.matchMedia("(prefers-reduced-motion: reduce)").matches;
     this.drawn = -1;
     this.loading = 0;
@@ -31,7 +34,7 @@ class Player {
   }
 
   // Resolves once the first frame is on the screen.
-  async load(url, fps, frames, halves) {
+  async load(url, fps, frames) {
     const mine = ++this.loading;
     const response = await fetch(url);
     if (!response.ok) throw new Error("The video could not be loaded.");
@@ -40,7 +43,6 @@ class Player {
     if (this.video.src) URL.revokeObjectURL(this.video.src);
     this.fps = fps;
     this.frames = frames;
-    this.halves = halves;
     this.controls.frame.max = String(frames - 1);
     await new Promise((resolve, reject) => {
       this.video.addEventListener("loadeddata", resolve, { once: true });
@@ -94,8 +96,9 @@ class Player {
   draw() {
     const { videoWidth: width, videoHeight: height } = this.video;
     if (!width) return;
-    const part = width / this.halves;
-    this.canvases.slice(0, this.halves).forEach((canvas, index) => {
+    this.parts = Math.round(width / (height * SHAPE));
+    const part = width / this.parts;
+    this.canvases.slice(0, this.parts).forEach((canvas, index) => {
       if (canvas.width !== part || canvas.height !== height) {
         canvas.width = part;
         canvas.height = height;

@@ -7,7 +7,7 @@ const SLOW_AFTER_MILLISECONDS = 4000;
 const base = window.location.pathname.replace(/\/+$/, "");
 const byId = (id) => document.getElementById(id);
 const player = new Player(
-  [byId("left-screen"), byId("right-screen")],
+  [byId("left-screen"), byId("right-screen"), byId("race-screen")],
   { play: byId("play"), frame: byId("frame"), speed: byId("speed"), moment: byId("moment"), icon: byId("play-icon") },
   showError,
 );
@@ -145,12 +145,13 @@ async function show(next) {
   for (const button of document.querySelectorAll(".answer")) button.setAttribute("aria-disabled", String(waiting));
   if (waiting) return;
   if (next.turn.id !== shownTurn) {
-    await player.load(`${base}/video/${next.turn.id}`, next.turn.fps, next.turn.frames, phase === "question" ? 2 : 1);
+    await player.load(`${base}/video/${next.turn.id}`, next.turn.fps, next.turn.frames);
     shownTurn = next.turn.id;
     if (phase === "question") say(`Question ${answered + 1} of ${target}.`);
     else say("This is what it learned. Is this what you meant?");
   }
   byId("board").classList.toggle("single", phase === "result");
+  showRace();
   byId("answers").hidden = phase !== "question";
   byId("result").hidden = phase !== "result";
   byId("hint").hidden = phase !== "question" || answered > 2;
@@ -166,6 +167,25 @@ async function show(next) {
     byId("get-policy").href = `${base}/policy.safetensors`;
   }
 }
+
+// Both robots in one picture, instead of the two, where the video has one and it is wanted.
+let wantsRace = localStorage.getItem("race") === "on";
+
+function showRace() {
+  const has = player.parts > 2;
+  byId("race").hidden = !has;
+  byId("race").setAttribute("aria-pressed", String(wantsRace));
+  byId("board").classList.toggle("racing", has && wantsRace);
+}
+
+function race() {
+  if (player.parts < 3) return;
+  wantsRace = !wantsRace;
+  localStorage.setItem("race", wantsRace ? "on" : "off");
+  showRace();
+  say(wantsRace ? "Both in one picture." : "Two pictures.");
+}
+byId("race").addEventListener("click", race);
 
 function showProgress(waiting, answered, result) {
   if (!waiting) waitingSince = null;
@@ -214,6 +234,8 @@ const KEYS = {
   3: () => answer("right"),
   u: undo,
   U: undo,
+  r: race,
+  R: race,
   ",": () => player.step(-1),
   ".": () => player.step(1),
 };
