@@ -1,4 +1,5 @@
-"""Makes the pictures of README and of the families' pages anew: ``python docs/pictures.py``.
+"""Makes the pictures of README, of the families' pages and of the page's choice of robots anew:
+``python docs/pictures.py``.
 
 They are films of the models that ship, so they change with them. Needs off-screen rendering.
 """
@@ -8,11 +9,16 @@ from pathlib import Path
 
 import gymnasium as gym
 import imageio.v3 as iio
+import numpy as np
 from PIL import Image
 
 import sb3_poem
 from sb3_poem import cli
 from sb3_poem.adaptation import AdaptedPolicy
+from sb3_poem.common.rollouts import rollout_latents
+from sb3_poem.label.families import find_models
+from sb3_poem.label.rendering import WIDTH, renderer_of
+from sb3_poem.label.server import ROBOTS
 from sb3_poem.resources import shipped_folder
 
 STATIC = Path(__file__).with_name("_static")
@@ -43,6 +49,17 @@ def still(env_id: str, path: Path, size: int = 360, steps: int = 60) -> None:
     env.close()
 
 
+def both(model: str, folder: Path) -> None:
+    """Where two training tasks' policies end, in one picture, for the choice of robots."""
+    info = find_models(model)[0]
+    renderer, means = renderer_of(info), renderer_of(info).model.train_tasks.latent_means
+    apart = np.linalg.norm(means - means[0], axis=1).argmax()
+    latents, seeds = means[[0, apart]], [2, 2]
+    clips = rollout_latents(renderer.model, renderer.env, latents, None, seeds, frames=True)
+    race = renderer.env.films(*clips)[-1][:, 2 * WIDTH :]
+    Image.fromarray(race).save(folder / f"{info.family}.webp", quality=70)
+
+
 def adapted(env: gym.Env) -> AdaptedPolicy:
     """The policy of the family's model after ten answers."""
     oracle = sb3_poem.ReturnOracle()
@@ -50,6 +67,9 @@ def adapted(env: gym.Env) -> AdaptedPolicy:
 
 
 if __name__ == "__main__":
+    ROBOTS.mkdir(exist_ok=True)
+    for name in sorted(model.name for model in find_models()):
+        both(name, ROBOTS)
     before_and_after("AntGoal", STATIC / "before-and-after.webp", task="-2.1 -2")
     families = STATIC / "environments"
     families.mkdir(exist_ok=True)

@@ -52,7 +52,8 @@ def answer_record(row: sqlite3.Row, videos: Path, trajectories: bool = False) ->
         "asked": _time(row["asked"]),
         "shown": None if row["shown"] is None else _time(row["shown"]),
         "answered": _time(row["answered"]),
-        "seconds": round(row["answered"] - (row["shown"] or row["asked"]), 3),
+        # A clock may be set back meanwhile.
+        "seconds": max(round(row["answered"] - (row["shown"] or row["asked"]), 3), 0.0),
         "video": str(videos / row["video"]),
         **{f"{side}_latent": shown.latent.tolist() for side, shown in sides.items()},
     }

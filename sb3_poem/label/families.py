@@ -17,6 +17,11 @@ from sb3_poem.common.foreign import environment_of
 from sb3_poem.pearl_sac.saving import CONFIG, read_config
 from sb3_poem.resources import find_folder, shipped_folder
 
+#: What can be taught.
+GROUPS = (
+    *("How fast should it run?", "Which way should it go?", "Where should it go?"),
+    *("Where should its hand go?", "What should it do?"),
+)
 FROM_THE_SIDE = Look()
 
 
@@ -41,10 +46,10 @@ class Description:
 
     @property
     def group(self) -> str:
-        """What can be taught, as a question."""
+        """What can be taught, one of :data:`GROUPS`."""
         if self.picture == "place":
-            return "Where should it go?" if self.origin is None else "Where should its hand go?"
-        return GROUPS[self.picture]
+            return GROUPS[2 if self.origin is None else 3]
+        return GROUPS[{"speed": 0, "direction": 1}.get(self.picture, 4)]
 
 
 BLIND = "It cannot see the place; your answers show the way."
@@ -61,11 +66,6 @@ OTHER_HINT = "Think of what it should do. Your answers show it."
 FETCH_HAND, SAWYER_HAND = (1.342, 0.749, 0.535), (0.0, 0.6, 0.2)
 
 ANT, CHEETAH, ARM = "A four-legged robot", "A running cheetah", "A robot arm"
-GROUPS = {
-    "speed": "How fast should it run?",
-    "direction": "Which way should it go?",
-    "projection": "What should it do?",
-}
 DESCRIPTIONS = {
     "PointGoal": Description("A dot that goes to a place", PLACE_HINT, "place", extent=1.35),
     "HalfCheetahVel": Description(f"{CHEETAH}: how fast?", SPEED_HINT, "speed", "m/s", 3.0),
@@ -105,11 +105,16 @@ def describe(env_id: str, task_dim: int | None = None) -> Description:
     """The description of a family, of which one that is not known here gets a general one, as do
     those of Meta-World whose tasks (task_dim,) are more than a place.
     """
-    name = env_id.rpartition("/")[2].rpartition("-v")[0] or env_id
+    name = family_of(env_id)
     description = DESCRIPTIONS.get(name, Description(name, OTHER_HINT, "projection"))
     if description.origin is not None and task_dim not in (None, 3):
         return Description(description.title, ARM_HINT, "projection")
     return description
+
+
+def family_of(env_id: str) -> str:
+    """The name of an environment, without namespace and version."""
+    return env_id.rpartition("/")[2].rpartition("-v")[0] or env_id
 
 
 def as_points(env_id: str, tasks: np.ndarray) -> np.ndarray:
@@ -124,7 +129,7 @@ def as_points(env_id: str, tasks: np.ndarray) -> np.ndarray:
         return (tasks - description.origin) @ np.array([look.right, look.up]).T
     if picture == "place" and tasks.shape[1] >= 2:
         points = tasks[:, :2]
-    elif env_id.rpartition("/")[2].startswith("HalfCheetahFwdBack"):
+    elif family_of(env_id) == "HalfCheetahFwdBack":
         points = np.stack([tasks[:, 0], np.zeros(len(tasks))], axis=1)
     else:
         points = np.stack([np.cos(tasks[:, 0]), np.sin(tasks[:, 0])], axis=1)
@@ -144,6 +149,11 @@ class ModelInfo:
     def description(self) -> Description:
         """The family in words."""
         return describe(self.env_id)
+
+    @property
+    def family(self) -> str:
+        """The environment's name, without namespace and version."""
+        return family_of(self.env_id)
 
 
 def find_models(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import faulthandler
 import importlib
 import logging
 import multiprocessing
@@ -14,6 +15,7 @@ from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import partial
 
 import torch as th
 
@@ -31,6 +33,9 @@ _logger = logging.getLogger(__name__)
 
 # A worker that dies (say the system ran out of memory) is replaced, and its turn made once more.
 ATTEMPTS = 2
+# So long a worker process may take for a turn, many times what any needs, before it counts as hung
+# and ends.
+LONGEST_SECONDS = 180.0
 
 
 class Priority(IntEnum):
@@ -141,9 +146,11 @@ class RenderQueue:
             job.done.set_result(turn)
 
     async def _attempt(self, request: TurnRequest, attempts: int = ATTEMPTS) -> Turn:
-        executor = self._executor
+        executor, make = self._executor, self._make
+        if isinstance(executor, ProcessPoolExecutor):
+            make = partial(make_or_end, make, LONGEST_SECONDS)
         try:
-            return await asyncio.get_running_loop().run_in_executor(executor, self._make, request)
+            return await asyncio.get_running_loop().run_in_executor(executor, make, request)
         except BrokenProcessPool:
             if self._executor is executor:
                 self._executor = self._make_executor()
@@ -151,6 +158,15 @@ class RenderQueue:
                 raise
         _logger.warning("a worker process ended unexpectedly; starting another")
         return await self._attempt(request, attempts - 1)
+
+
+def make_or_end(make: Callable[[TurnRequest], Turn], seconds: float, request: TurnRequest) -> Turn:
+    """Make a turn, or end this process, whatever it hangs in, and say where."""
+    faulthandler.dump_traceback_later(seconds, exit=True)
+    try:
+        return make(request)
+    finally:
+        faulthandler.cancel_dump_traceback_later()
 
 
 def process_pool(

@@ -36,7 +36,7 @@ from starlette.staticfiles import StaticFiles
 from sb3_poem.adaptation.policy import AdaptedPolicy
 from sb3_poem.label.access import DEADLINE, Access, AccessMiddleware, Connection
 from sb3_poem.label.export import session_record
-from sb3_poem.label.families import describe
+from sb3_poem.label.families import GROUPS, ModelInfo, describe
 from sb3_poem.label.rendering import StorageError
 from sb3_poem.label.sessions import FullError, SessionManager
 from sb3_poem.label.store import MAX_WISH, RefusedError, Session
@@ -44,6 +44,8 @@ from sb3_poem.label.store import MAX_WISH, RefusedError, Session
 _logger = logging.getLogger(__name__)
 
 PAGE = Path(__file__).with_name("page")
+#: Pictures of families, which docs/pictures.py makes
+ROBOTS = PAGE / "static" / "robots"
 LONGEST_TOKEN = 64
 DISK_FULL = (
     "This could not be kept: the disk of this server is full, or cannot be written. What you "
@@ -130,8 +132,12 @@ class _Pages:
         await self.sessions.queue.close()
 
     async def start_page(self, _: Request) -> Response:
-        models, n_queries = list(self.sessions.models.values()), self.sessions.n_queries
-        return self._html("start.html", models=models, n_queries=n_queries)
+        groups: dict[str, list[ModelInfo]] = {group: [] for group in GROUPS}
+        for model in self.sessions.models.values():
+            groups[model.description.group].append(model)
+        pictures = {file.stem for file in ROBOTS.iterdir()}
+        n_queries = self.sessions.n_queries
+        return self._html("start.html", groups=groups, pictures=pictures, n_queries=n_queries)
 
     async def start(self, request: Request) -> Response:
         fields = parse_qs((await request.body()).decode("utf-8", "replace"))

@@ -385,17 +385,67 @@ def test_both_halves_of_the_film_are_in_step(
     page.wait_for_function(
         "() => !player.video.seeking && document.querySelector('#frame').value === '24'"
     )
-    spread = page.evaluate(
-        """() => ['left', 'right'].map(side => {
+    left, right, race = (coloured(page, side) for side in ("left", "right", "race"))
+    # The dot of either side is on its own screen, and both are in the race.
+    assert min(left["blue"], right["orange"]) > 20
+    assert left["orange"] == right["blue"] == 0
+    assert min(race.values()) > 20
+    assert sum(race.values()) > 0.9 * max(left["blue"], right["orange"])  # one may hide the other
+
+
+def coloured(page: Any, side: str) -> dict[str, int]:
+    """How many pixels of a screen have the left path's colour, and the right one's."""
+    return page.evaluate(
+        """side => {
             const canvas = document.getElementById(side + '-screen');
             const context = canvas.getContext('2d');
             const data = context.getImageData(0, 0, canvas.width, canvas.height).data;
-            let blue = 0;
-            for (let i = 0; i < data.length; i += 4) blue += data[i + 2] - data[i] > 60;
-            return blue;
-        })"""
+            const count = { blue: 0, orange: 0 };
+            for (let i = 0; i < data.length; i += 4) {
+                count.blue += data[i + 2] - data[i] > 90;
+                count.orange += data[i] - data[i + 2] > 110;
+            }
+            return count;
+        }""",
+        side,
     )
-    assert min(spread) > 20  # the dot is on either screen
+
+
+def test_both_robots_in_one_picture(
+    open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
+) -> None:
+    person = begin(open_page, server, point_goal, 1.0)
+    page = person.page
+
+    def seen() -> list[bool]:
+        return [page.is_visible(f"#{side}-screen") for side in ("left", "right", "race")]
+
+    assert seen() == [True, True, False]
+    page.keyboard.press("r")
+    assert seen() == [False, False, True]
+    assert page.get_attribute("#race", "aria-pressed") == "true"
+    page.evaluate("() => player.seek(player.frames - 1)")
+    page.wait_for_function("() => player.drawn === player.frames - 1")
+    assert min(coloured(page, "race").values()) > 20
+    person.answer(1)  # and it stays so, in the next question and when they come back
+    assert seen() == [False, False, True]
+    page.reload()
+    page.wait_for_function(SHOWN)
+    assert seen() == [False, False, True]
+    page.click("#race")
+    assert seen() == [True, True, False]
+    page.click("#race")
+    page.click("#stop")
+    page.wait_for_selector("#result:visible")
+    assert seen() == [True, False, False]  # a result is one robot
+    assert page.is_hidden("#race")
+
+
+def test_the_choice_of_robots(open_page: Callable[..., Any], server: Server) -> None:
+    page = open_page(server.url)
+    assert page.text_content("h2") == "Where should it go?"
+    picture = page.locator("button[value=PointGoal] img")
+    assert picture.evaluate("image => [image.complete, image.naturalWidth]") == [True, 320]
 
 
 def test_a_phone(open_page: Callable[..., Any], server: Server, point_goal: ModelInfo) -> None:

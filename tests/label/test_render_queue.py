@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 from typing import cast
 
@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from sb3_poem.common.trajectory import Trajectory
+from sb3_poem.label import render_queue
 from sb3_poem.label.families import ModelInfo
 from sb3_poem.label.render_queue import Priority, RenderQueue, process_pool
 from sb3_poem.label.rendering import (
@@ -61,6 +62,30 @@ def test_a_turn_that_nobody_wants_any_more_is_stopped_for_the_next(
 
     asyncio.run(life())
     assert not list(tmp_path.iterdir())
+
+
+def hang_the_first_time(wanted: TurnRequest) -> Turn:
+    """Made in a worker process."""
+    tried = wanted.video.with_suffix(".tried")
+    if not tried.exists():
+        tried.touch()
+        time.sleep(60.0)
+    return TURN
+
+
+def test_a_worker_that_hangs_is_replaced(
+    point_goal: ModelInfo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(render_queue, "LONGEST_SECONDS", 0.3)
+
+    async def life() -> None:
+        queue = RenderQueue(1, lambda: ProcessPoolExecutor(1), hang_the_first_time)
+        job = queue.submit(request(point_goal, tmp_path, "turn"), Priority.WAITED_FOR)
+        assert await asyncio.wait_for(job.done, 20.0) == TURN
+        await queue.close()
+
+    asyncio.run(life())
+    assert (tmp_path / "turn.tried").exists()
 
 
 def test_rendering_ends_when_the_marker_is_taken_away(

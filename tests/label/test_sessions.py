@@ -19,6 +19,7 @@ from label_world import make_sessions, settled
 from sb3_poem import Bayes
 from sb3_poem.adaptation.adapter import PreferenceAdapter
 from sb3_poem.adaptation.noise import MistakeNoise
+from sb3_poem.label import rendering
 from sb3_poem.label.families import ModelInfo
 from sb3_poem.label.rendering import load_shown_model
 from sb3_poem.label.sessions import UNWORDED, FullError, SessionManager
@@ -269,12 +270,13 @@ def test_no_more_people_than_the_server_takes(run_server: Callable[..., Any]) ->
 
 
 @pytest.fixture
-def fast_point_goal(point_goal: ModelInfo) -> Iterator[ModelInfo]:
-    """One that is drawn forty times a second."""
+def fast_point_goal(point_goal: ModelInfo, monkeypatch: pytest.MonkeyPatch) -> Iterator[ModelInfo]:
+    """One that is drawn twenty times a second, whose films may be as short."""
+    monkeypatch.setattr(rendering, "SHORTEST_FILM", 0.1)
     spec = gym.spec(point_goal.env_id)
     assert isinstance(spec.entry_point, str)
     family = load_env_creator(spec.entry_point)
-    metadata = {**family.metadata, "render_fps": 40}
+    metadata = {**family.metadata, "render_fps": 20}
     entry_point = type("FastPointGoal", (family,), {"metadata": metadata})
     gym.register("test/Fast-v0", entry_point, max_episode_steps=spec.max_episode_steps)
     yield replace(point_goal, env_id="test/Fast-v0")
