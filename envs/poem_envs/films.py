@@ -28,6 +28,8 @@ MARGIN, LEAST_MARGIN = 0.35, 0.05
 # In a picture of whole paths a robot is as large as in a film of its own, times this, or larger.
 LEAST_SIZE = 0.5
 TRAIL_PIECES, TRAIL_PIXELS = 16, 3.0
+# Of the distance from the camera, at which ways in space are drawn: in front of what hides them.
+IN_FRONT = 0.5
 # Height of what is drawn on the floor, and between things that lie on each other there, m.
 LAYER = 0.004
 SLICES, MAX_SHAPES = 24, 2000
@@ -37,7 +39,8 @@ MARK_DISTANCES, MOST_MARKS = (1, 2, 5, 10, 20, 50, 100), 8
 # Size, position and orientation of a shape that gets others.
 ANYWHERE = (np.ones(3), np.zeros(3), np.eye(3).ravel())
 LINE, CYLINDER = mujoco.mjtGeom.mjGEOM_LINE, mujoco.mjtGeom.mjGEOM_CYLINDER
-PLANE, SKYBOX = mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtTexture.mjTEXTURE_SKYBOX
+SPHERE, PLANE = mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_PLANE
+SKYBOX = mujoco.mjtTexture.mjTEXTURE_SKYBOX
 PRIMITIVES = tuple(
     getattr(mujoco.mjtGeom, f"mjGEOM_{kind}") for kind in ("SPHERE", "CAPSULE", "CYLINDER", "BOX")
 )
@@ -301,12 +304,17 @@ class FilmRenderer(FastRenderer):
             shape.pos[:] += lane
 
     def _add_way(self, places: np.ndarray, colour: Sequence[float]) -> None:
-        """A line along places ``(moments, 3)``, and a disc where it begins."""
-        step = max(1, len(places) // TRAIL_PIECES)
-        above = places + np.array([0.0, 0.0, 2 * LAYER])
-        self._add_lines(np.concatenate([above[:-1:step], above[-1:]]), colour, TRAIL_PIXELS)
-        radius = 0.012 * self._camera.distance
-        self._add_shape(CYLINDER, above[0], np.array([radius, LAYER / 4, 0.0]), colour)
+        """A line along places ``(moments, 3)``, and a dot where it begins."""
+        step, radius = max(1, len(places) // TRAIL_PIECES), 0.012 * self._camera.distance
+        if self.look.on_floor:
+            drawn = places + np.array([0.0, 0.0, 2 * LAYER])
+            begin, size = CYLINDER, np.array([radius, LAYER / 4, 0.0])
+        else:
+            eye = np.mean([one.pos for one in self._scene.camera], axis=0)
+            drawn = eye + IN_FRONT * (places - eye)
+            begin, size = SPHERE, np.full(3, IN_FRONT * radius)
+        self._add_lines(np.concatenate([drawn[:-1:step], drawn[-1:]]), colour, TRAIL_PIXELS)
+        self._add_shape(begin, drawn[0], size, colour)
 
     def _add_marks(self, start: np.ndarray, robots: int) -> list[tuple[str, float, float]]:
         """What tells distances and directions; the words, and where they are in the picture."""

@@ -17,6 +17,8 @@ SHARE = 0.8
 ONE_SPEED, STILL = 0.3, 0.1
 # Degrees from a word up to which people say "straight", and up to which "a bit".
 STRAIGHT, BIT = 8.0, 30.0
+# Degrees to either side that say nothing about a direction.
+ANY_WAY = 60.0
 # Half the width of a picture, m, up to which distances in it are told in centimetres.
 NEARBY = 0.5
 
@@ -67,9 +69,9 @@ def sentence(
     """The posterior in words: points (n, 1 or 2), weights (n,), the estimate's point."""
     picture, words = description.picture, description.words
     if picture == "speed":
-        return f"It believes that you want {_speed(description, points, weights, estimate)}."
+        return f"It believes that you want it to {_speed(description, points, weights, estimate)}."
     if picture == "direction":
-        return _direction_sentence(words, points, weights)
+        return _direction_sentence(words, points, weights, estimate)
     if picture == "place":
         distance = float(np.linalg.norm(estimate))
         away = np.linalg.norm(points - estimate, axis=1)
@@ -95,12 +97,12 @@ def way(words: Sequence[str], point: np.ndarray) -> str:
     nearest = round(degrees / 90)
     off = degrees - 90 * nearest
     word, other = words[nearest % 4], words[(nearest + (1 if off > 0 else -1)) % 4]
+    aside = nearest % 2 == 0
     if abs(off) <= STRAIGHT:
-        return f"straight {word}"
+        return f"straight to the {word}" if aside else f"straight {word}"
     if abs(off) <= BIT:
-        return f"a bit {other} of straight {word}"
-    first, second = (word, other) if nearest % 2 else (other, word)  # ahead or back, then aside
-    return f"between {first} and {second}"
+        return f"to the {word} and a bit {other}" if aside else f"a bit {other} of straight {word}"
+    return f"{other} and to the {word}" if aside else f"{word} and to the {other}"
 
 
 def _speed(
@@ -108,10 +110,12 @@ def _speed(
 ) -> str:
     low, high = weighted_quantiles(points[:, 0], weights, ((1 - SHARE) / 2, (1 + SHARE) / 2))
     if high <= STILL:
-        return "it to stand still, or nearly"
+        return "stand still, or nearly"
     if high - low < ONE_SPEED:
-        return f"about {max(estimate[0], 0.0):.1f} {description.unit}"
-    return f"between {max(low, 0.0):.1f} and {high:.1f} {description.unit}"
+        return f"run at about {max(estimate[0], STILL):.1f} {description.unit}"
+    if low <= STILL:
+        return f"run at {high:.1f} {description.unit} or less"
+    return f"run at between {low:.1f} and {high:.1f} {description.unit}"
 
 
 def _length(description: Description, length: float) -> str:
@@ -131,17 +135,20 @@ def weighted_quantiles(
     return values[order[np.minimum(places, len(order) - 1)]].tolist()
 
 
-def _direction_sentence(words: Sequence[str], points: np.ndarray, weights: np.ndarray) -> str:
+def _direction_sentence(
+    words: Sequence[str], points: np.ndarray, weights: np.ndarray, estimate: np.ndarray
+) -> str:
     if np.abs(points[:, 1]).max() < 1e-9:  # one line: forward or backward
         forward = float(weights[points[:, 0] >= 0].sum())
         side, share = ("right", forward) if forward >= 0.5 else ("left", 1.0 - forward)
         return f"It is {100 * share:.0f} % sure that you want it to run to the {side} in the film."
-    x, y = weights @ points
-    angle = np.arctan2(y, x)
-    away = np.abs(np.angle(np.exp(1j * (np.arctan2(points[:, 1], points[:, 0]) - angle))))
+    angles = np.arctan2(points[:, 1], points[:, 0]) - np.arctan2(estimate[1], estimate[0])
+    away = np.abs(np.angle(np.exp(1j * angles)))
     spread = np.degrees(weighted_quantiles(away, weights, (SHARE,))[0])
-    where = way(words, np.array([x, y]))
-    return f"It believes that you mean {where}, give or take {spread:.0f} degrees."
+    if spread > ANY_WAY:
+        return "It does not know yet which way you want it to go."
+    where, about = way(words, estimate), max(round(spread), 1)
+    return f"It believes that you want it to go {where}, give or take {about} degrees."
 
 
 def _points_of(model: Any, latents: np.ndarray, train_points: np.ndarray) -> np.ndarray:

@@ -45,6 +45,11 @@ class Description:
         return ("right", "up", "left", "down")
 
     @property
+    def race(self) -> bool:
+        """Whether one picture of both robots tells more than two: on the floor, not in space."""
+        return self.picture != "projection" and self.origin is None
+
+    @property
     def group(self) -> str:
         """What can be taught, one of :data:`GROUPS`."""
         if self.picture == "place":

@@ -110,39 +110,97 @@ def say(env_id: str, points: Any, weights: Any = None) -> str:
     return sentence(describe(env_id), points, weights, weights @ points)
 
 
-def test_sentences_that_people_say() -> None:
-    def speed(*values: float) -> str:
-        return say("poem/HalfCheetahVel-v0", np.linspace(*values, 101)[:, None])
+@pytest.mark.parametrize(
+    ("low", "high", "words"),
+    [
+        (1.0, 2.0, "run at between 1.1 and 1.9 m/s"),
+        (0.66, 0.74, "run at about 0.7 m/s"),
+        (0.5, 0.85, "run at about 0.7 m/s"),
+        (-0.2, 1.2, "run at 1.1 m/s or less"),
+        (-0.15, 0.18, "run at about 0.1 m/s"),
+        (-0.04, 0.05, "stand still, or nearly"),
+    ],
+)
+def test_speeds_that_people_say(low: float, high: float, words: str) -> None:
+    speeds = np.linspace(low, high, 101)[:, None]
+    said = say("poem/HalfCheetahVel-v0", speeds)
+    assert said == f"It believes that you want it to {words}."
 
-    assert "you want between 1.1 and 1.9 m/s." in speed(1.0, 2.0)
-    assert "you want about 0.7 m/s." in speed(0.66, 0.74)
-    assert "stand still" in speed(0.0, 0.05)
-    ways = [[1.0, 0.0], [-1.0, 0.0]]
-    assert "75 % sure that you want it to run to the left" in say(
-        "poem/HalfCheetahFwdBack-v0", ways, [0.25, 0.75]
-    )
-    # What the robot's angle means, by the family's own words.
-    for degrees, words in [
+
+def test_how_sure_it_is_of_one_of_two_ways() -> None:
+    said = say("poem/HalfCheetahFwdBack-v0", [[1.0, 0.0], [-1.0, 0.0]], [0.25, 0.75])
+    assert "75 % sure that you want it to run to the left" in said
+
+
+@pytest.mark.parametrize(
+    ("degrees", "words"),
+    [
         (0, "straight ahead"),
         (20, "a bit left of straight ahead"),
-        (-45, "between ahead and right"),
-        (75, "a bit ahead of straight left"),
+        (-25, "a bit right of straight ahead"),
+        (-45, "ahead and to the right"),
+        (50, "ahead and to the left"),
+        (75, "to the left and a bit ahead"),
+        (-92, "straight to the right"),
+        (-110, "to the right and a bit back"),
         (178, "straight back"),
         (-160, "a bit right of straight back"),
-        (-130, "between back and right"),
-    ]:
-        points = as_points("poem/AntDir2D-v0", np.radians([[degrees - 3.0], [degrees + 3.0]]))
-        assert f"you mean {words}, give or take" in say("poem/AntDir2D-v0", points)
-    places = as_points("poem/AntGoal-v0", np.array([[1.8, 0.6], [2.2, 0.6], [1.8, 0.8]]))
-    assert "a place a bit left of straight ahead, about 2 m away, give or take 0.3 m." in say(
-        "poem/AntGoal-v0", places
-    )
-    unsure = as_points("poem/AntGoal-v0", np.array([[2.0, 0.0], [-2.0, 0.1], [0.0, 2.0]]))
-    assert "within about 3 m of where it begins" in say("poem/AntGoal-v0", unsure)
-    assert "a place straight up, about 10 cm away, give or take 1 cm." in say(
-        "poem/FetchReach-v0", [[0.0, 0.1], [0.0, 0.1]]
-    )
-    assert "a place between up and left." in say("poem/PointGoal-v0", [[-0.7, 0.7], [-0.7, 0.7]])
+        (-130, "back and to the right"),
+    ],
+)
+def test_directions_that_people_say(degrees: float, words: str) -> None:
+    """Degrees are the robot's, counted to its left."""
+    points = as_points("poem/AntDir2D-v0", np.radians([[degrees - 3.0], [degrees + 3.0]]))
+    said = say("poem/AntDir2D-v0", points)
+    assert said == f"It believes that you want it to go {words}, give or take 3 degrees."
+
+
+def test_a_direction_that_may_be_any_is_not_named() -> None:
+    points = as_points("poem/AntDir2D-v0", np.linspace(-np.pi / 2, np.pi / 2, 91)[:, None])
+    assert "does not know yet which way" in say("poem/AntDir2D-v0", points)
+
+
+def test_the_sentence_says_what_the_needle_shows() -> None:
+    """The policy that would be taken, which is not the middle of what is believed."""
+    points = as_points("poem/AntDir2D-v0", np.radians([[0.0], [0.0], [60.0]]))
+    said = sentence(describe("poem/AntDir2D-v0"), points, np.full(3, 1 / 3), points[0])
+    assert "go straight ahead, give or take 60 degrees" in said
+
+
+@pytest.mark.parametrize(
+    ("env_id", "places", "words"),
+    [
+        (
+            "poem/AntGoal-v0",
+            [[1.8, 0.6], [2.2, 0.6], [1.8, 0.8]],
+            "a bit left of straight ahead, about 2 m away, give or take 0.3 m",
+        ),
+        (
+            "poem/AntGoal-v0",
+            [[-0.02, 0.9], [0.02, 0.9]],
+            "straight to the left, about 0.9 m away, give or take 0.1 m",
+        ),
+        ("poem/AntGoal-v0", [[2, 0], [-2, 0.1], [0, 2]], "within about 3 m of where it begins"),
+        ("poem/AntGoal-v0", [[0, 0], [0, 0]], "within about 0.1 m of where it begins"),
+        ("poem/PointGoal-v0", [[2.4], [2.3]], "up and to the left"),
+    ],
+)
+def test_places_that_people_say(env_id: str, places: Any, words: str) -> None:
+    said = say(env_id, as_points(env_id, np.array(places, dtype=np.float64)))
+    assert said == f"It believes that you mean a place {words}."
+
+
+@pytest.mark.parametrize(
+    ("point", "words"),
+    [
+        ((0.0, 0.1), "straight up, about 10 cm away, give or take 1 cm"),
+        ((0.2, 0.05), "to the right and a bit up, about 21 cm away, give or take 1 cm"),
+        ((-0.1, -0.1), "down and to the left, about 14 cm away, give or take 1 cm"),
+    ],
+)
+def test_places_in_space_that_people_say(point: tuple[float, float], words: str) -> None:
+    said = say("poem/FetchReach-v0", [point, point])
+    assert said == f"It believes that you mean a place {words}."
 
 
 def test_forward_and_backward_are_told_apart() -> None:

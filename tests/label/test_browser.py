@@ -420,21 +420,20 @@ def test_both_robots_in_one_picture(
     def seen() -> list[bool]:
         return [page.is_visible(f"#{side}-screen") for side in ("left", "right", "race")]
 
-    assert seen() == [True, True, False]
-    page.keyboard.press("r")
-    assert seen() == [False, False, True]
+    assert seen() == [False, False, True]  # which tells more where robots go to places
     assert page.get_attribute("#race", "aria-pressed") == "true"
     page.evaluate("() => player.seek(player.frames - 1)")
     page.wait_for_function("() => player.drawn === player.frames - 1")
     assert min(coloured(page, "race").values()) > 20
+    page.keyboard.press("r")
+    assert seen() == [True, True, False]
     person.answer(1)  # and it stays so, in the next question and when they come back
-    assert seen() == [False, False, True]
+    assert seen() == [True, True, False]
     page.reload()
     page.wait_for_function(SHOWN)
-    assert seen() == [False, False, True]
-    page.click("#race")
     assert seen() == [True, True, False]
     page.click("#race")
+    assert seen() == [False, False, True]
     page.click("#stop")
     page.wait_for_selector("#result:visible")
     assert seen() == [True, False, False]  # a result is one robot
@@ -460,9 +459,13 @@ def test_a_phone(open_page: Callable[..., Any], server: Server, point_goal: Mode
         "[data-preference=right]",
         "[data-preference=equal]",
         "#play",
+        "#race",
+        ".speed",
     ):
         box = page.locator(selector).bounding_box()
-        assert box["height"] >= 44
+        stage = page.locator(".stage").bounding_box()
+        assert box["x"] + box["width"] <= stage["x"] + stage["width"]
+        assert box["height"] >= 44 or selector == ".speed"
         assert box["y"] + box["height"] <= PHONE["height"]  # all that is needed is in sight
 
 
@@ -470,11 +473,14 @@ def test_a_phone_on_its_side(
     open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
 ) -> None:
     person = begin(open_page, server, point_goal, 2.0, viewport=LANDSCAPE, has_touch=True)
-    for selector in ("#left-screen", "#play", "[data-preference=left]", "[data-preference=equal]"):
-        box = person.page.locator(selector).bounding_box()
-        assert box["y"] >= 0
-        assert box["y"] + box["height"] <= LANDSCAPE["height"], selector
-    assert person.page.locator("#left-screen").bounding_box()["height"] >= 120
+    needed = ["#play", "[data-preference=left]", "[data-preference=equal]"]
+    for screen in ("#race-screen", "#left-screen"):
+        for selector in (screen, *needed):
+            box = person.page.locator(selector).bounding_box()
+            assert box["y"] >= 0
+            assert box["y"] + box["height"] <= LANDSCAPE["height"], selector
+        assert person.page.locator(screen).bounding_box()["height"] >= 120
+        person.page.click("#race")
 
 
 def test_what_is_said_offline_is_sent_later(

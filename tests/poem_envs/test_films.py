@@ -184,7 +184,7 @@ def test_a_hands_way_is_drawn_in_space(env_id: str) -> None:
     marked = [
         is_marked(sides[0][-1], 0, *seen_at(env.unwrapped.look, place, place)) for place in places
     ]
-    assert np.mean(marked) > 0.5  # the arm may hide the rest
+    assert np.mean(marked) > 0.9  # whatever is in front of it
     assert np.ptp(places, axis=0).max() > 0.03
     env.close()
 

@@ -92,7 +92,7 @@ function name(svg, words, far) {
   const inside = far < 90; // the words at the sides end there
   [[far, 5], [0, 4 - far], [-far, 5], [0, far + 8]].forEach(([x, y], i) => {
     const anchor = x === 0 ? "middle" : (x > 0) === inside ? "end" : "start";
-    shape(svg, "text", { x, y: x && inside ? y - 9 : y, class: "tick", style: `text-anchor: ${anchor}` }, words[i]);
+    shape(svg, "text", { x, y: x && inside ? y - 9 : y, class: `tick ${anchor}` }, words[i]);
   });
 }
 

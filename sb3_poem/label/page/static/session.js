@@ -169,7 +169,7 @@ async function show(next) {
 }
 
 // Both robots in one picture, instead of the two, where the video has one and it is wanted.
-let wantsRace = localStorage.getItem("race") === "on";
+let wantsRace = (localStorage.getItem("race") ?? byId("board").dataset.race) === "on";
 
 function showRace() {
   const has = player.parts > 2;
