@@ -273,7 +273,7 @@ class FilmRenderer(FastRenderer):
                 self._recolour(first, PATH_COLOURS[i], places[i][now], growth, lane)
             self._add_way(places[i][: now + 1] + lane, PATH_COLOURS[i])
         start = places[next(iter(shown))][0]
-        labels = self._add_marks(start, len(shown))
+        labels = self._add_marks(start)
         mujoco.mjr_render(viewport, scene, self._resources)
         for text, x, y in labels:
             self._write(text, x, y)
@@ -310,61 +310,76 @@ class FilmRenderer(FastRenderer):
             drawn = places + np.array([0.0, 0.0, 2 * LAYER])
             begin, size = CYLINDER, np.array([radius, LAYER / 4, 0.0])
         else:
-            eye = np.mean([one.pos for one in self._scene.camera], axis=0)
+            eye = self._eye()
             drawn = eye + IN_FRONT * (places - eye)
             begin, size = SPHERE, np.full(3, IN_FRONT * radius)
         self._add_lines(np.concatenate([drawn[:-1:step], drawn[-1:]]), colour, TRAIL_PIXELS)
         self._add_shape(begin, drawn[0], size, colour)
 
-    def _add_marks(self, start: np.ndarray, robots: int) -> list[tuple[str, float, float]]:
+    def _add_marks(self, start: np.ndarray) -> list[tuple[str, float, float]]:
         """What tells distances and directions; the words, and where they are in the picture."""
         marks, camera = self.look.marks, self._camera
+        if not marks:
+            return []
         width = 2 * HALF_HEIGHT * camera.distance * self._viewport.width / self._viewport.height
         apart = next((far for far in MARK_DISTANCES if width / far <= MOST_MARKS), 100)
-        words: list[str] = []
-        places: list[np.ndarray] = []
-        if marks == "metres":
-            middle = round((camera.lookat[0] - start[0]) / apart)
-            reach = MOST_MARKS // 2 + 2
-            near, far = camera.lookat[1] - 0.3 * width, camera.lookat[1] + 0.6 * width
-            for number in range(middle - reach, middle + reach + 1):
-                x = start[0] + apart * number
-                ends = np.array([[x, near, LAYER], [x, far, LAYER]])
-                self._add_lines(ends, GREY, 2.0 if number % 5 == 0 else 1.0)
-                words.append(f"{apart * number} m")
-                places.append(np.array([x, 0.6 * near + 0.4 * camera.lookat[1], LAYER]))
-        if marks in ("compass", "circles"):
-            apart, way = (1, -1.0) if marks == "circles" else (max(apart, 2), 1.0)
-            seen = np.linalg.norm(camera.lookat[:2] - start[:2]) + 0.7 * np.array([-width, width])
-            first, last = 1 + np.maximum(seen // apart, 0).astype(int)
-            last = min(last, 3) if marks == "circles" else last
-            # Discs upon discs, the uppermost first: what is under them need not be drawn.
-            for number in range(first, last + 1):
-                radius = apart * number
-                height = LAYER * (last - number + 1) / last
-                place = np.array([start[0], start[1], height])
-                size = np.array([radius, height / 4, 0.0])
-                self._add_shape(CYLINDER, place, size, BANDS[number % 2])
-                words.append(f"{radius} m")
-                places.append(place + 0.7 * radius * (self.look.right + way * self.look.ahead))
-        labels = self._labels(words, places) if words else []
+        add = self._add_metres if marks == "metres" else self._add_circles
+        labels = self._labels(add(start, width, apart))
         return labels + (list(COMPASS) if marks == "compass" else [])
 
-    def _labels(self, words: list[str], places: list[np.ndarray]) -> list[tuple[str, float, float]]:
+    def _add_metres(
+        self, start: np.ndarray, width: float, apart: int
+    ) -> list[tuple[str, np.ndarray]]:
+        """Lines across the x axis; their words and where these stand."""
+        x, y = self._camera.lookat[:2]
+        near, far, reach = y - 0.3 * width, y + 0.6 * width, MOST_MARKS // 2 + 2
+        middle, labels = round((x - start[0]) / apart), []
+        for number in range(middle - reach, middle + reach + 1):
+            x = start[0] + apart * number
+            ends = np.array([[x, near, LAYER], [x, far, LAYER]])
+            self._add_lines(ends, GREY, 2.0 if number % 5 == 0 else 1.0)
+            labels.append((f"{apart * number} m", np.array([x, 0.6 * near + 0.4 * y, LAYER])))
+        return labels
+
+    def _add_circles(
+        self, start: np.ndarray, width: float, apart: int
+    ) -> list[tuple[str, np.ndarray]]:
+        """Circles around the start; their words and where these stand."""
+        look, away = self.look, np.linalg.norm(self._camera.lookat[:2] - start[:2])
+        if look.marks == "circles":
+            apart, first, last, beside = 1, 1, 3, look.right - look.ahead
+        else:
+            apart, beside = max(apart, 2), look.right + look.ahead
+            first, last = (
+                1 + int(max(away + side, 0.0) // apart) for side in (-0.7 * width, 0.7 * width)
+            )
+        labels = []
+        # Discs upon discs, the uppermost first: what is under them need not be drawn.
+        for number in range(first, last + 1):
+            height = LAYER * (last - number + 1) / last
+            place = np.array([start[0], start[1], height])
+            size = np.array([apart * number, height / 4, 0.0])
+            self._add_shape(CYLINDER, place, size, BANDS[number % 2])
+            labels.append((f"{apart * number} m", place + 0.7 * apart * number * beside))
+        return labels
+
+    def _labels(self, labels: list[tuple[str, np.ndarray]]) -> list[tuple[str, float, float]]:
         """Where in the picture words are whose places are in it."""
-        eyes, viewport = self._scene.camera, self._viewport
-        eye, forward, up = (
-            np.mean([getattr(one, name) for one in eyes], axis=0)
-            for name in ("pos", "forward", "up")
+        forward, up = (
+            np.mean([getattr(one, name) for one in self._scene.camera], axis=0)
+            for name in ("forward", "up")
         )
-        away = np.array(places) - eye
+        away = np.array([place for _, place in labels]) - self._eye()
         depth = np.maximum(away @ forward, 1e-6)
-        x = away @ np.cross(forward, up) / depth / HALF_HEIGHT
-        y = away @ up / depth / HALF_HEIGHT
-        x = (1 + x * viewport.height / viewport.width) / 2
-        y = (1 + y) / 2
+        aspect = self._viewport.width / self._viewport.height
+        x = (1 + away @ np.cross(forward, up) / depth / HALF_HEIGHT / aspect) / 2
+        y = (1 + away @ up / depth / HALF_HEIGHT) / 2
         inside = (depth > 1e-3) & (np.abs(x - 0.5) < 0.4) & (np.abs(y - 0.5) < 0.42)
-        return [(words[i], x[i], y[i]) for i in np.flatnonzero(inside)]
+        return [(labels[i][0], x[i], y[i]) for i in np.flatnonzero(inside)]
+
+    def _eye(self) -> np.ndarray:
+        """Where the camera is, ``(3,)``."""
+        return np.mean([one.pos for one in self._scene.camera], axis=0)
 
     def _write(self, text: str, x: float, y: float) -> None:
         """Write a word around a point of the picture."""
