@@ -33,7 +33,9 @@ IN_FRONT = 0.5
 # Height of what is drawn on the floor, and between things that lie on each other there, m.
 LAYER = 0.004
 SLICES, MAX_SHAPES = 24, 2000
-FLOOR_SIZE = 400.0  # to either side, m; one without an end takes longer to draw
+# To either side, m: seen from cameras over a hundred away its end is at the horizon. One without an
+# end takes longer to draw.
+FLOOR_SIZE, FARTHEST = 2000.0, 3000.0
 # Distances between marks, m, of which a picture takes the first that gives it few enough.
 MARK_DISTANCES, MOST_MARKS = (1, 2, 5, 10, 20, 50, 100), 8
 # Size, position and orientation of a shape that gets others.
@@ -209,7 +211,7 @@ class FilmRenderer(FastRenderer):
         visual.headlight.ambient[:], visual.headlight.diffuse[:] = 0.65, 0.33
         visual.headlight.specular[:] = 0.1
         visual.global_.fovy = FIELD_OF_VIEW
-        visual.map.znear, visual.map.zfar = 0.1 / model.stat.extent, 500.0 / model.stat.extent
+        visual.map.znear, visual.map.zfar = 0.1 / model.stat.extent, FARTHEST / model.stat.extent
         for texture in np.flatnonzero(model.tex_type == SKYBOX):
             start, channels = model.tex_adr[texture], model.tex_nchannel[texture]
             pixels = model.tex_width[texture] * model.tex_height[texture]
@@ -345,7 +347,7 @@ class FilmRenderer(FastRenderer):
         self, start: np.ndarray, width: float, apart: int
     ) -> list[tuple[str, np.ndarray]]:
         """Circles around the start; their words and where these stand."""
-        look, away = self.look, np.linalg.norm(self._camera.lookat[:2] - start[:2])
+        look, away = self.look, float(np.linalg.norm(self._camera.lookat[:2] - start[:2]))
         if look.marks == "circles":
             apart, first, last, beside = 1, 1, 3, look.right - look.ahead
         else:

@@ -145,6 +145,15 @@ def test_a_race_over_thirty_metres_shows_both_whole_ways_and_robots(env_id: str)
     env.close()
 
 
+def test_no_edge_of_the_floor_is_seen_in_a_long_race() -> None:
+    env = gym.make("poem/AntFwdBack-v0")
+    race = env.unwrapped.film([walk(env, (60.0, 0.0)), walk(env, (-60.0, 0.0))], [0, 1], SIZE)
+    top = race[-1][:10].astype(int)
+    assert np.ptp(top, axis=1).max() < 10  # floor or sky, in one line with the horizon
+    assert top.min() > 100
+    env.close()
+
+
 def test_a_humanoid_fills_a_third_of_the_picture() -> None:
     env = gym.make("poem/HumanoidDir2D-v0")
     image = env.unwrapped.film([walk(env, (0.0, 0.0))], [0], SIZE)[0].astype(int)
