@@ -245,6 +245,8 @@ def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
     _option(model, "--inference", "", default="bayes", choices=INFERENCES)
     _option(model, "--mistake-rate", "how often people are taken to err", float, 0.05)
     _option(model, "--seed", "of every session (default: each has its own)", _count(0))
+    told = "text or Markdown that people read before their first question"
+    _file(model, "--instructions", told)
 
     server = parser.add_argument_group("the server")
     host = "default: %(default)s, which only this machine reaches"

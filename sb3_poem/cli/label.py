@@ -25,7 +25,7 @@ def run_label(arguments: argparse.Namespace) -> None:
 
 def run_page(arguments: argparse.Namespace) -> None:
     """Serve the page until it is stopped."""
-    for package in ("jinja2", "starlette", "uvicorn"):
+    for package in ("jinja2", "markdown_it", "starlette", "uvicorn"):
         if find_spec(package) is None:
             raise ValueError(f"the page needs {package}: pip install 'sb3_poem[label]'")
     from sb3_poem.label.access import LOOPBACK, Access, is_loopback
@@ -37,6 +37,7 @@ def run_page(arguments: argparse.Namespace) -> None:
     from sb3_poem.label.store import Store
 
     user, password = read_password(arguments.auth, arguments.auth_file)
+    instructions = read_instructions(arguments.instructions)
     token = secrets.token_urlsafe(24) if arguments.token else None
     is_open = not is_loopback(arguments.host)
     if is_open and password is None and token is None:
@@ -57,7 +58,7 @@ def run_page(arguments: argparse.Namespace) -> None:
     limits = (arguments.queries, arguments.max_sessions, arguments.seed)
     sessions = SessionManager(store, queue, models, options, *limits)
     hosts = LOOPBACK | {name.lower() for name in (arguments.host, *arguments.allow_host)}
-    app = make_app(sessions, Access(user, password, token, hosts))
+    app = make_app(sessions, Access(user, password, token, hosts), instructions)
     name = link_host(listener, arguments.host)
     name = f"[{name}]" if ":" in name else name
     query = "" if token is None else f"/?token={token}"
@@ -94,6 +95,19 @@ def read_password(auth: str | None, file: Path | None) -> tuple[str | None, str 
             f"but has {len(password)}"
         )
     return user, password
+
+
+def read_instructions(file: Path | None) -> str:
+    """Read what people are told first."""
+    if file is None:
+        return ""
+    try:
+        text = file.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"--instructions {file}: must be a text in UTF-8 ({error})") from None
+    if not text.strip():
+        raise ValueError(f"--instructions {file}: must be a text or Markdown, but is empty")
+    return text
 
 
 def run_export(arguments: argparse.Namespace) -> None:

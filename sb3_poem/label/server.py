@@ -19,6 +19,8 @@ from urllib.parse import parse_qs
 
 import jinja2
 import uvicorn
+from markdown_it import MarkdownIt
+from markupsafe import Markup
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
@@ -64,14 +66,21 @@ ELSEWHERE = {socket.AF_INET: "192.0.2.1", socket.AF_INET6: "2001:db8::1"}
 SessionEndpoint = Callable[[Request, Session], Awaitable[Response]]
 
 
-def make_app(sessions: SessionManager, access: Access | None = None) -> Starlette:
-    """The ASGI application, which closes the sessions' queue; by default for this machine alone."""
-    return _Pages(sessions).application(access or Access())
+def make_app(
+    sessions: SessionManager, access: Access | None = None, instructions: str = ""
+) -> Starlette:
+    """The ASGI application, which closes the sessions' queue; by default for this machine alone.
+
+    :param instructions: Markdown, which people read before their first question; HTML in it is
+        shown as it is written.
+    """
+    return _Pages(sessions, instructions).application(access or Access())
 
 
 class _Pages:
-    def __init__(self, sessions: SessionManager) -> None:
+    def __init__(self, sessions: SessionManager, instructions: str) -> None:
         self.sessions = sessions
+        self.instructions = Markup(MarkdownIt("commonmark", {"html": False}).render(instructions))
         self.store = sessions.store
         self.templates = jinja2.Environment(loader=jinja2.FileSystemLoader(PAGE), autoescape=True)
 
@@ -82,6 +91,7 @@ class _Pages:
                 Route("/", self.start_page),
                 Route("/start", self.start, methods=["POST"]),
                 self.route("", self.page),
+                self.route("/instructions", self.read),
                 self.route("/state", self.state),
                 post("/answer", store.add_answer, question=int, preference=str),
                 post("/undo", store.undo, answered=int),
@@ -142,13 +152,18 @@ class _Pages:
     async def start(self, request: Request) -> Response:
         fields = parse_qs((await request.body()).decode("utf-8", "replace"))
         token = await self.sessions.begin(fields.get("model", [""])[0])
-        return RedirectResponse(f"/s/{token}", 303)
+        return RedirectResponse(f"/s/{token}{'/instructions' if self.instructions else ''}", 303)
 
-    async def page(self, _: Request, session: Session) -> Response:
-        description = describe(session.env_id)
-        return self._html(
-            "session.html", session=session, description=description, max_wish=MAX_WISH
-        )
+    async def read(self, request: Request, _: Session) -> Response:
+        if not self.instructions:
+            raise HTTPException(404, "There are no instructions.")
+        values = {"instructions": self.instructions, "token": request.path_params["token"]}
+        return self._html("instructions.html", **values)
+
+    async def page(self, request: Request, session: Session) -> Response:
+        values = {"session": session, "description": describe(session.env_id)}
+        values |= {"instructions": self.instructions, "token": request.path_params["token"]}
+        return self._html("session.html", **values, max_wish=MAX_WISH)
 
     async def state(self, _: Request, session: Session) -> Response:
         return JSONResponse(await self.sessions.view(session))

@@ -424,6 +424,9 @@ def test_the_printed_links_host_can_be_reached(host: str) -> None:
         ),
         ([], "", "SB3_POEM_AUTH must have the form USER:PASSWORD"),
         (["--auth", "nobody"], f"ann:{PASSWORD}", "--auth must have the form USER:PASSWORD"),
+        (["--instructions", "missing"], None, "No such file or directory: 'missing'"),
+        (["--instructions", "empty"], None, "--instructions empty: must be a text or Markdown"),
+        (["--instructions", "picture"], None, "--instructions picture: must be a text in UTF-8"),
     ],
 )
 def test_wrong_doors_are_named(
@@ -436,6 +439,8 @@ def test_wrong_doors_are_named(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("short").write_text("ann:short\n")
+    Path("empty").write_text("\n")
+    Path("picture").write_bytes(b"\x89PNG")
     if environment is not None:
         monkeypatch.setenv("SB3_POEM_AUTH", environment)
     assert cli.main(["label", *arguments]) == 1

@@ -297,6 +297,30 @@ def test_unknown_models_are_refused_and_no_path_is_one(served: tuple[TestClient,
         assert client.post("/start", data={"model": name}).status_code == 409
 
 
+def test_instructions_come_before_the_first_question(store: Store, point_goal: ModelInfo) -> None:
+    text = "# Before you begin\n\nThink of *one* place. <script>alert(1)</script>"
+    app = make_app(make_sessions(store, point_goal), instructions=text)
+    with TestClient(app, base_url=HOST, follow_redirects=False) as client:
+        page = begin(client)
+        session = page.removesuffix("/instructions")
+        assert page != session
+        told = client.get(page).text
+        assert "<h1>Before you begin</h1>" in told
+        assert "Think of <em>one</em> place." in told
+        assert "<script" not in told
+        assert f'href="{session}"' in told  # onwards
+        assert f'href="{page}"' in client.get(session).text  # and back to read again
+
+
+def test_without_instructions_the_first_question_comes_at_once(
+    served: tuple[TestClient, Store],
+) -> None:
+    client, _ = served
+    session = begin(client)
+    assert "nstructions" not in client.get(session).text
+    assert client.get(f"{session}/instructions").status_code == 404
+
+
 def test_pages_load_nothing_from_elsewhere(served: tuple[TestClient, Store]) -> None:
     client, _ = served
     static = Path(__file__).parents[2] / "sb3_poem/label/page"
