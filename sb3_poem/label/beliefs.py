@@ -115,7 +115,7 @@ def _speed(
         return f"run at about {max(estimate[0], STILL):.1f} {description.unit}"
     if low <= STILL:
         return f"run at {high:.1f} {description.unit} or less"
-    return f"run at between {low:.1f} and {high:.1f} {description.unit}"
+    return f"run at {low:.1f} to {high:.1f} {description.unit}"
 
 
 def _length(description: Description, length: float) -> str:

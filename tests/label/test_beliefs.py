@@ -113,7 +113,7 @@ def say(env_id: str, points: Any, weights: Any = None) -> str:
 @pytest.mark.parametrize(
     ("low", "high", "words"),
     [
-        (1.0, 2.0, "run at between 1.1 and 1.9 m/s"),
+        (1.0, 2.0, "run at 1.1 to 1.9 m/s"),
         (0.66, 0.74, "run at about 0.7 m/s"),
         (0.5, 0.85, "run at about 0.7 m/s"),
         (-0.2, 1.2, "run at 1.1 m/s or less"),
