@@ -24,9 +24,9 @@ OWN_COLOUR, SOLIDITY = 0.3, 0.85
 # Field of view of the camera, degrees, and half the height that it sees at distance one.
 FIELD_OF_VIEW, HALF_HEIGHT = 45.0, 0.4142
 # Of half the picture, that stays free around paths, for robots that are drawn larger, and else.
-MARGIN, LEAST_MARGIN = 0.35, 0.05
+MARGIN, LEAST_MARGIN = 0.42, 0.05
 # In a picture of whole paths a robot is as large as in a film of its own, times this, or larger.
-LEAST_SIZE = 0.5
+LEAST_SIZE = 0.6
 TRAIL_PIECES, TRAIL_PIXELS = 16, 3.0
 # Of the distance from the camera, at which ways in space are drawn: in front of what hides them.
 IN_FRONT = 0.5

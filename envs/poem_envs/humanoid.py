@@ -96,7 +96,7 @@ class HumanoidDir2DEnv(DirectionFamily):
     within = np.less
     marker_height = 2.0
     camera_config = {"distance": 5.0, "elevation": -20.0, "lookat": np.array([0.0, 0.0, 1.2])}  # noqa: RUF012
-    look = Look(0.0, -25.0, 4.0, (0.0, 0.0, 0.8), "compass")
+    look = Look(0.0, -25.0, 3.4, (0.0, 0.0, 0.8), "compass")
     task_space = spaces.Box(-np.pi / 2, np.pi / 2, (1,), np.float64)
     _forward_data: mujoco.MjData | None = None
 

@@ -99,7 +99,7 @@ def check_sides(env: gym.Env, paths: list[np.ndarray]) -> tuple[list[list[np.nda
 def test_walkers_are_seen_where_they_went(env_id: str) -> None:
     env = gym.make(env_id)
     look = env.unwrapped.look
-    ahead, aside = np.array([1.4, 0.2]), np.array([0.3, 1.3])
+    ahead, aside = np.array([0.9, 0.2]), np.array([0.3, 1.3])
     paths = [walk(env, tuple(ahead)), walk(env, tuple(aside), 5)]
     sides, race = check_sides(env, paths)
     for side, end in enumerate((ahead, aside)):
@@ -159,6 +159,16 @@ def test_a_humanoid_fills_a_third_of_the_picture() -> None:
     image = env.unwrapped.film([walk(env, (0.0, 0.0))], [0], SIZE)[0].astype(int)
     rows = np.flatnonzero((image[..., 0] - image[..., 2] > 30).any(axis=1))
     assert np.ptp(rows) > HEIGHT / 3
+    # In a race over all that it walks in an episode, nearly, and nothing is cut off.
+    paths = [walk(env, (8.0, 0.0)), walk(env, (5.0, 5.0))]
+    race = env.unwrapped.film(paths, [0, 1], SIZE)[-1].astype(int)
+    for side in (0, 1):
+        rows, columns = np.nonzero(mask(race, side))
+        assert rows.min() > 0
+        assert columns.min() > 0
+        assert columns.max() < WIDTH - 1
+        robot = columns < columns.min() + 20  # the rest is its way
+        assert np.ptp(rows[robot]) > HEIGHT / 4
     env.close()
 
 
