@@ -161,9 +161,14 @@ class _Pages:
         return self._html("instructions.html", **values)
 
     async def page(self, request: Request, session: Session) -> Response:
-        values = {"session": session, "description": describe(session.env_id)}
-        values |= {"instructions": self.instructions, "token": request.path_params["token"]}
-        return self._html("session.html", **values, max_wish=MAX_WISH)
+        return self._html(
+            "session.html",
+            session=session,
+            description=describe(session.env_id),
+            instructions=self.instructions,
+            token=request.path_params["token"],
+            max_wish=MAX_WISH,
+        )
 
     async def state(self, _: Request, session: Session) -> Response:
         return JSONResponse(await self.sessions.view(session))
