@@ -5,6 +5,7 @@ MuJoCo, Meta-World and gymnasium-robotics are loaded by the first ``gymnasium.ma
 import is quick.
 """
 
+import functools
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -16,27 +17,26 @@ from poem_envs.vector import BatchFamily, TaskFamilyVector, set_task
 if TYPE_CHECKING:
     from poem_envs.goal_family import GoalFamily
 
-__all__ = [
-    "BatchFamily",
-    "GoalFamily",
-    "TaskFamily",
-    "TaskFamilyVector",
-    "set_task",
-]
+__all__ = ["BatchFamily", "GoalFamily", "TaskFamily", "TaskFamilyVector", "set_task"]
+#: Where what is loaded on first use is
+_MODULES = {"GoalFamily": "goal_family"}
 
 
 def __getattr__(name: str) -> Any:
-    if name != "GoalFamily":
+    single = name.replace("VectorEnv", "Env")
+    if single not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return import_module("poem_envs.goal_family").GoalFamily
+    family = getattr(import_module(f"poem_envs.{_MODULES[single]}"), single)
+    return family if single == name else functools.partial(TaskFamilyVector, family)
 
 
 def _register(module: str, max_episode_steps: int, *names: str) -> None:
     for name in names:
+        _MODULES[f"{name}Env"] = module
         register(
             id=f"poem/{name}-v0",
             entry_point=f"poem_envs.{module}:{name}Env",
-            vector_entry_point=f"poem_envs.{module}:{name}VectorEnv",
+            vector_entry_point=f"poem_envs:{name}VectorEnv",
             max_episode_steps=max_episode_steps,
         )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import functools
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,34 +11,24 @@ from gymnasium import spaces
 from poem_envs.films import Look
 from poem_envs.legged import DirectionFamily, LeggedFamily
 from poem_envs.mujoco_rendering import arrow, pole
-from poem_envs.vector import TaskFamilyVector
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class _Ant(LeggedFamily):
     marker_height = 1.3
     camera_config = {"distance": 5.0, "elevation": -30.0, "lookat": np.array([0.0, 0.0, 0.5])}  # noqa: RUF012
     look = Look(elevation=-25.0, distance=4.0, lookat=(0.0, 0.0, 0.4), marks="metres")
 
-    def __init__(
-        self,
-        *,
-        xml_file: str = "ant.xml",
-        ctrl_cost_weight: float = 0.5,
-        healthy_z_range: tuple[float, float] = (0.2, 1.0),
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(
-            xml_file=xml_file,
-            ctrl_cost_weight=ctrl_cost_weight,
-            healthy_z_range=healthy_z_range,
-            **kwargs,
-        )
+    xml_file: str = "ant.xml"
+    ctrl_cost_weight: float = 0.5
+    healthy_z_range: tuple[float, float] = (0.2, 1.0)
 
     def _reward_features(self, qpos_before: np.ndarray, actions: np.ndarray) -> np.ndarray:
         velocity = (self._qpos[:, :2] - qpos_before[:, :2]) / self.dt
         return np.column_stack([velocity, np.square(actions).sum(axis=1)])
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class AntVelEnv(_Ant):
     r"""
     ## Description
@@ -117,19 +107,10 @@ class AntVelEnv(_Ant):
 
     task_space = spaces.Box(0.0, 3.0, (1,), np.float64)
 
-    def __init__(
-        self,
-        *,
-        forward_reward_weight: float = 1.0,
-        forward_reward_offset: float = 1.0,
-        healthy_reward: float = 0.05,
-        ctrl_cost_weight: float = 0.005,
-        **kwargs: Any,
-    ) -> None:
-        self.forward_reward_weight = forward_reward_weight
-        self.forward_reward_offset = forward_reward_offset
-        self.healthy_reward = healthy_reward
-        super().__init__(ctrl_cost_weight=ctrl_cost_weight, **kwargs)
+    forward_reward_weight: float = 1.0
+    forward_reward_offset: float = 1.0
+    healthy_reward: float = 0.05
+    ctrl_cost_weight: float = 0.005
 
     def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
         error = np.abs(features[..., 0] - tasks[..., 0])
@@ -140,6 +121,7 @@ class AntVelEnv(_Ant):
         return [arrow(self._marker_place(position), (1.0, 0.0), length=float(task[0]) / 2)]
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class AntFwdBackEnv(_Ant, DirectionFamily):
     r"""
     ## Description
@@ -178,6 +160,7 @@ class AntFwdBackEnv(_Ant, DirectionFamily):
     all_tasks = np.array([[0.0], [np.pi]])
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class AntDir2DEnv(_Ant, DirectionFamily):
     r"""
     ## Description
@@ -198,6 +181,7 @@ class AntDir2DEnv(_Ant, DirectionFamily):
     task_space = spaces.Box(-np.pi / 2, np.pi / 2, (1,), np.float64)
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class AntGoalEnv(_Ant):
     r"""
     ## Description
@@ -246,20 +230,9 @@ class AntGoalEnv(_Ant):
     look = Look(0.0, -90.0, 8.5, (0.0, 0.0, 0.0), "circles", follows=False)
     task_space = spaces.Box(-goal_radius, goal_radius, (2,), np.float64)
 
-    def __init__(
-        self,
-        *,
-        distance_reward_weight: float = 1.0,
-        ctrl_cost_weight: float = 0.1,
-        terminate_when_unhealthy: bool = False,
-        **kwargs: Any,
-    ) -> None:
-        self.distance_reward_weight = distance_reward_weight
-        super().__init__(
-            ctrl_cost_weight=ctrl_cost_weight,
-            terminate_when_unhealthy=terminate_when_unhealthy,
-            **kwargs,
-        )
+    distance_reward_weight: float = 1.0
+    ctrl_cost_weight: float = 0.1
+    terminate_when_unhealthy: bool = False
 
     def _draw_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
         # the root makes the density even over the disc
@@ -280,9 +253,3 @@ class AntGoalEnv(_Ant):
 
     def _task_markers(self, task: np.ndarray, position: np.ndarray) -> list[dict[str, Any]]:
         return [pole(float(task[0]), float(task[1]), height=1.0)]
-
-
-AntVelVectorEnv = functools.partial(TaskFamilyVector, AntVelEnv)
-AntFwdBackVectorEnv = functools.partial(TaskFamilyVector, AntFwdBackEnv)
-AntDir2DVectorEnv = functools.partial(TaskFamilyVector, AntDir2DEnv)
-AntGoalVectorEnv = functools.partial(TaskFamilyVector, AntGoalEnv)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import functools
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,26 +11,18 @@ from gymnasium import spaces
 from poem_envs.films import Look
 from poem_envs.mujoco_family import MujocoFamily
 from poem_envs.mujoco_rendering import arrow
-from poem_envs.vector import TaskFamilyVector
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class _HalfCheetah(MujocoFamily):
     hidden_qpos = 1
     reward_feature_dim = 2
     camera_config = {"distance": 4.0, "elevation": -20.0, "lookat": np.array([0.0, 0.0, 0.6])}  # noqa: RUF012
     look = Look(distance=3.8, lookat=(0.0, 0.0, 0.4), marks="metres")
 
-    def __init__(
-        self,
-        *,
-        xml_file: str = "half_cheetah.xml",
-        forward_reward_weight: float = 1.0,
-        ctrl_cost_weight: float = 0.05,
-        **kwargs: Any,
-    ) -> None:
-        self.forward_reward_weight = forward_reward_weight
-        self.ctrl_cost_weight = ctrl_cost_weight
-        super().__init__(xml_file=xml_file, **kwargs)
+    xml_file: str = "half_cheetah.xml"
+    forward_reward_weight: float = 1.0
+    ctrl_cost_weight: float = 0.05
 
     def _reward_features(self, qpos_before: np.ndarray, actions: np.ndarray) -> np.ndarray:
         velocity = (self._qpos[:, 0] - qpos_before[:, 0]) / self.dt
@@ -139,7 +131,3 @@ class HalfCheetahFwdBackEnv(_HalfCheetah):
 
     def _task_markers(self, task: np.ndarray, position: np.ndarray) -> list[dict[str, Any]]:
         return [arrow(np.array([position[0], 0.0, 1.3]), (float(task[0]), 0.0), length=1.0)]
-
-
-HalfCheetahVelVectorEnv = functools.partial(TaskFamilyVector, HalfCheetahVelEnv)
-HalfCheetahFwdBackVectorEnv = functools.partial(TaskFamilyVector, HalfCheetahFwdBackEnv)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -12,11 +11,11 @@ from gymnasium import spaces
 
 from poem_envs.films import Look
 from poem_envs.legged import DirectionFamily
-from poem_envs.vector import TaskFamilyVector
 
 TORSO = 1  # its subtree is the whole robot
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class HumanoidDir2DEnv(DirectionFamily):
     r"""
     ## Description
@@ -98,28 +97,13 @@ class HumanoidDir2DEnv(DirectionFamily):
     camera_config = {"distance": 5.0, "elevation": -20.0, "lookat": np.array([0.0, 0.0, 1.2])}  # noqa: RUF012
     look = Look(0.0, -25.0, 3.4, (0.0, 0.0, 0.8), "compass")
     task_space = spaces.Box(-np.pi / 2, np.pi / 2, (1,), np.float64)
-    _forward_data: mujoco.MjData | None = None
 
-    def __init__(
-        self,
-        *,
-        xml_file: str = "humanoid.xml",
-        forward_reward_weight: float = 1.25,
-        ctrl_cost_weight: float = 0.1,
-        healthy_reward: float = 5.0,
-        healthy_z_range: tuple[float, float] = (1.0, 2.0),
-        reset_noise_scale: float = 1e-2,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(
-            xml_file=xml_file,
-            forward_reward_weight=forward_reward_weight,
-            ctrl_cost_weight=ctrl_cost_weight,
-            healthy_reward=healthy_reward,
-            healthy_z_range=healthy_z_range,
-            reset_noise_scale=reset_noise_scale,
-            **kwargs,
-        )
+    xml_file: str = "humanoid.xml"
+    forward_reward_weight: float = 1.25
+    ctrl_cost_weight: float = 0.1
+    healthy_reward: float = 5.0
+    healthy_z_range: tuple[float, float] = (1.0, 2.0)
+    reset_noise_scale: float = 1e-2
 
     def _derived_dim(self) -> int:
         return (10 + 6 + 6) * self.model.nbody + self.model.nv
@@ -131,6 +115,7 @@ class HumanoidDir2DEnv(DirectionFamily):
         super()._allocate(n)
         self._derived = np.zeros((n, self._derived_dim()))  # cinert, cvel, qfrc_actuator, cfrc_ext
         self._centre_of_mass = np.zeros((n, 2))
+        self._forward_data = mujoco.MjData(self.model)
 
     def _draw_start(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         scale = self.reset_noise_scale
@@ -153,10 +138,7 @@ class HumanoidDir2DEnv(DirectionFamily):
 
     def _derive(self, copies: np.ndarray, controls: np.ndarray) -> None:
         """Compute what observation and reward take from the simulator, for some copies."""
-        model = self.model
-        if self._forward_data is None:
-            self._forward_data = mujoco.MjData(model)
-        data = self._forward_data
+        model, data = self.model, self._forward_data
         cinert, cvel, cfrc_ext = (
             field.reshape(-1) for field in (data.cinert, data.cvel, data.cfrc_ext)
         )
@@ -171,6 +153,3 @@ class HumanoidDir2DEnv(DirectionFamily):
             mujoco.mj_rnePostConstraint(model, data)
             np.concatenate(derived, out=self._derived[copy])
             self._centre_of_mass[copy] = centre_of_mass
-
-
-HumanoidDir2DVectorEnv = functools.partial(TaskFamilyVector, HumanoidDir2DEnv)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -10,28 +11,20 @@ from poem_envs.mujoco_family import MujocoFamily
 from poem_envs.mujoco_rendering import arrow
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class LeggedFamily(MujocoFamily):
     """A robot that ends its episode outside a range of heights; the last feature is the cost."""
 
     hidden_qpos = 2
     reward_feature_dim = 3
     #: Height at which the task is shown, m.
-    marker_height: float
+    marker_height: ClassVar[float]
     #: How a healthy height compares to the ends of the range.
-    within: np.ufunc = np.less_equal
+    within: ClassVar[np.ufunc] = np.less_equal
 
-    def __init__(
-        self,
-        *,
-        ctrl_cost_weight: float,
-        healthy_z_range: tuple[float, float],
-        terminate_when_unhealthy: bool = True,
-        **kwargs: Any,
-    ) -> None:
-        self.ctrl_cost_weight = ctrl_cost_weight
-        self.terminate_when_unhealthy = terminate_when_unhealthy
-        self.healthy_z_range = healthy_z_range
-        super().__init__(**kwargs)
+    ctrl_cost_weight: float
+    healthy_z_range: tuple[float, float]
+    terminate_when_unhealthy: bool = True
 
     def _unhealthy(self) -> np.ndarray:
         if not self.terminate_when_unhealthy:
@@ -44,15 +37,12 @@ class LeggedFamily(MujocoFamily):
         return np.array([position[0], position[1], self.marker_height])
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class DirectionFamily(LeggedFamily):
     """A robot that is to run in a direction; features are v_x, v_y and the action's square."""
 
-    def __init__(
-        self, *, forward_reward_weight: float = 1.0, healthy_reward: float = 1.0, **kwargs: Any
-    ) -> None:
-        self.forward_reward_weight = forward_reward_weight
-        self.healthy_reward = healthy_reward
-        super().__init__(**kwargs)
+    forward_reward_weight: float = 1.0
+    healthy_reward: float = 1.0
 
     def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
         angle = np.array(tasks[..., 0])  # contiguous: strided input may be rounded differently

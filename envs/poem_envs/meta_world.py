@@ -4,7 +4,6 @@ of ten (ML10).
 
 from __future__ import annotations
 
-import functools
 from dataclasses import replace
 from typing import Any
 
@@ -25,7 +24,6 @@ from poem_envs.sawyer import (
     placements_of,
     take_sawyer,
 )
-from poem_envs.vector import TaskFamilyVector
 
 OBSERVATION_DIM = 39
 #: Manipulations whose goal is nothing but a place that the hand is to reach.
@@ -345,12 +343,6 @@ class MetaWorldML10Env(MetaWorldEnv):
     def _place(self, task: np.ndarray, rng: np.random.Generator) -> tuple[str, np.ndarray]:
         number = round(task[0])
         return self.manipulations[number], task[1 : 1 + self._placement_dims[number]].copy()
-
-
-#: The vectorised :class:`MetaWorldML1Env`: same arguments, and those of ``TaskFamilyVector``.
-MetaWorldML1VectorEnv = functools.partial(TaskFamilyVector, MetaWorldML1Env)
-#: The vectorised :class:`MetaWorldML10Env`.
-MetaWorldML10VectorEnv = functools.partial(TaskFamilyVector, MetaWorldML10Env)
 
 
 def split_stream(rng: np.random.Generator, split: int) -> np.random.Generator:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import gymnasium
 import mujoco
@@ -19,6 +20,7 @@ from poem_envs.vector import BatchFamily, DivergenceError
 RENDER_MODES = ["human", "rgb_array", "depth_array", "rgbd_tuple"]
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class MujocoFamily(MujocoFilms, BatchFamily):
     """Base class of the families of MuJoCo robots.
 
@@ -55,56 +57,42 @@ class MujocoFamily(MujocoFilms, BatchFamily):
     """
 
     #: Number of positions at the head of ``qpos`` that the observation leaves out.
-    hidden_qpos: int
+    hidden_qpos: ClassVar[int]
     #: The following camera: attributes of ``mujoco.MjvCamera``.
-    camera_config: dict[str, Any] = {"distance": 4.0}  # noqa: RUF012 (never changed)
+    camera_config: ClassVar[dict[str, Any]] = {"distance": 4.0}
 
-    metadata: dict[str, Any] = {"render_modes": RENDER_MODES}  # noqa: RUF012 (Gymnasium's way)
-    _rollout: Rollout | None = None
-    _renderer: StateRenderer | FastRenderer | None = None
+    metadata = {"render_modes": RENDER_MODES}  # noqa: RUF012 (Gymnasium's way)
 
-    def __init__(
-        self,
-        *,
-        xml_file: str,
-        frame_skip: int = 5,
-        reset_noise_scale: float = 0.1,
-        width: int = 480,
-        height: int = 480,
-        camera_id: int | None = None,
-        camera_name: str | None = None,
-        default_camera_config: dict[str, Any] | None = None,
-        max_geom: int = 1000,
-        visual_options: dict[int, bool] | None = None,
-        render_quality: str = "full",
-        **kwargs: Any,
-    ) -> None:
-        self.model = mujoco.MjModel.from_xml_path(_model_path(xml_file))
+    xml_file: str
+    frame_skip: int = 5
+    reset_noise_scale: float = 0.1
+    width: int = 480
+    height: int = 480
+    camera_id: int | None = None
+    camera_name: str | None = None
+    default_camera_config: dict[str, Any] | None = None
+    max_geom: int = 1000
+    visual_options: dict[int, bool] | None = None
+    render_quality: str = "full"
+
+    def __post_init__(self) -> None:
+        self.model = mujoco.MjModel.from_xml_path(_model_path(self.xml_file))
         if self.model.na:
             raise ValueError(
-                f"xml_file={xml_file!r} has actuators with activations, which these environments "
-                "do not handle"
+                f"xml_file={self.xml_file!r} has actuators with activations, which these "
+                "environments do not handle"
             )
-        self.frame_skip = frame_skip
-        self.reset_noise_scale = reset_noise_scale
+        self._rollout: Rollout | None = None
+        self._renderer: StateRenderer | FastRenderer | None = None
         initial = mujoco.MjData(self.model)
         self.init_qpos, self.init_qvel = initial.qpos.copy(), initial.qvel.copy()
-        self._renders_fast = renders_fast(render_quality, kwargs.get("render_mode"))
-        self._render_arguments: dict[str, Any] = {
-            "width": width,
-            "height": height,
-            "camera_id": camera_id,
-            "camera_name": camera_name,
-            "default_cam_config": {**self.camera_config, **(default_camera_config or {})},
-            "max_geom": max_geom,
-            "visual_options": visual_options,
-        }
+        self._renders_fast = renders_fast(self.render_quality, self.render_mode)
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.dt)}
         low, high = self.model.actuator_ctrlrange.astype(np.float32).T
         shape = (self._observation_dim(),)
         self.observation_space = spaces.Box(-np.inf, np.inf, shape, np.float64)
         self.action_space = spaces.Box(low, high, dtype=np.float32)
-        super().__init__(**kwargs)
+        super().__post_init__()
 
     @property
     def dt(self) -> float:
@@ -205,7 +193,10 @@ class MujocoFamily(MujocoFilms, BatchFamily):
         markers = [] if task is None else self._task_markers(task, self._qpos[copy, :3])
         if self._renderer is None:
             renderer = FastRenderer if self._renders_fast else StateRenderer
-            self._renderer = renderer(self.model, **self._render_arguments)
+            camera = {**self.camera_config, **(self.default_camera_config or {})}
+            names = ("width", "height", "camera_id", "camera_name", "max_geom", "visual_options")
+            arguments: dict[str, Any] = {name: getattr(self, name) for name in names}
+            self._renderer = renderer(self.model, default_cam_config=camera, **arguments)
         return self._renderer.render(self.states[copy], render_mode, markers)
 
     def film_state(self) -> np.ndarray:

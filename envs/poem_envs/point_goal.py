@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,9 +12,10 @@ from gymnasium import spaces
 
 from poem_envs.drawing import Canvas, Colour, ImageWindow
 from poem_envs.films import PATH_COLOURS, moments_of
-from poem_envs.vector import BatchFamily, TaskFamilyVector
+from poem_envs.vector import BatchFamily
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class PointGoalEnv(BatchFamily):
     r"""
     ## Description
@@ -63,25 +64,16 @@ class PointGoalEnv(BatchFamily):
     action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
     task_space = spaces.Box(0.0, np.pi, (1,), np.float64)
     reward_feature_dim = 2
-    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 10}  # noqa: RUF012
-    _window: ImageWindow | None = None
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 10}  # noqa: RUF012
 
-    def __init__(
-        self,
-        *,
-        step_length: float = 0.05,
-        reset_noise_scale: float = 0.02,
-        width: int = 480,
-        height: int = 480,
-        **kwargs: Any,
-    ) -> None:
-        self.step_length = step_length
-        self.reset_noise_scale = reset_noise_scale
-        self.width, self.height = width, height
-        super().__init__(**kwargs)
+    step_length: float = 0.05
+    reset_noise_scale: float = 0.02
+    width: int = 480
+    height: int = 480
 
     def _allocate(self, n: int) -> None:
         self._positions = np.zeros((n, 2))
+        self._window: ImageWindow | None = None
 
     def _begin_episodes(self, copies: np.ndarray, rngs: Sequence[np.random.Generator]) -> None:
         for copy, rng in zip(copies, rngs, strict=True):
@@ -153,6 +145,3 @@ def _background(width: int, height: int) -> Canvas:
     canvas.upper_half_circle(1.0, 0.015, (190, 190, 190))
     canvas.disc(0.0, 0.0, 0.02, (190, 190, 190))
     return canvas
-
-
-PointGoalVectorEnv = functools.partial(TaskFamilyVector, PointGoalEnv)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 import mujoco
 
 from poem_envs.films import Look, MujocoFilms
 from poem_envs.goal_family import GoalFamily
-from poem_envs.vector import TaskFamilyVector
 
 
 class _RoboticsFamily(MujocoFilms, GoalFamily):
@@ -152,10 +150,3 @@ class AntMazeEnv(_RoboticsFamily):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("AntMaze_UMaze-v5", goal_low=-6.0, goal_high=6.0, **kwargs)
-
-
-#: The vectorised families: same arguments, and those of
-#: :class:`~poem_envs.TaskFamilyVector`.
-FetchReachVectorEnv = functools.partial(TaskFamilyVector, FetchReachEnv)
-FetchPushVectorEnv = functools.partial(TaskFamilyVector, FetchPushEnv)
-AntMazeVectorEnv = functools.partial(TaskFamilyVector, AntMazeEnv)

@@ -8,6 +8,7 @@ import functools
 import os
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -35,19 +36,27 @@ class DivergenceError(Exception):
         self.copy = copy
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class BatchFamily(TaskFamily):
     """A family whose simulator steps any number of copies at once. By itself it is an environment
     of one copy; :class:`TaskFamilyVector` makes room for more.
 
-    A subclass defines the methods below, and ``_reward``. Its constructor sets what
-    :class:`TaskFamily` asks for, and hands all that it does not know to ``super().__init__``.
+    A subclass defines the methods below, and ``_reward``. It sets what :class:`TaskFamily` asks for
+    in its class, in the constructor, which hands all that it does not know to ``super().__init__``,
+    or, as a dataclass whose fields are its arguments, in ``__post_init__``.
     """
 
-    #: How many threads may step the copies.
-    nthread: int = 1
+    render_mode: str | None = None
+    render_task: bool = False
+    split: str = "train"
 
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
+    #: How many threads may step the copies.
+    nthread = 1
+
+    def __post_init__(self) -> None:
+        super().__init__(
+            render_mode=self.render_mode, render_task=self.render_task, split=self.split
+        )
         self._allocate(1)
 
     @abstractmethod
