@@ -6,7 +6,7 @@ from typing import Any
 import torch as th
 
 from sb3_poem.pearl_sac import PEARLSAC
-from sb3_poem.pearl_sac.saving import algorithm_of, is_checkpoint, read_checkpoint, read_config
+from sb3_poem.pearl_sac.saving import algorithm_of, is_checkpoint, read_config
 from sb3_poem.poem_sac import POEMSAC
 from sb3_poem.resources import find_folder, pretrained_names
 
@@ -53,17 +53,13 @@ def load_model(name: str | Path, device: th.device | str = "auto") -> PEARLSAC:
             f"{name} holds no whole model: AdaptedPolicy.load reads a policy, and of a model name "
             "the folder"
         )
-    if archive.is_file() and is_checkpoint(archive):
-        algorithm = _class_named(read_checkpoint(archive)["algorithm"], archive)
-        return algorithm.load_checkpoint(archive, device=device)
     if archive.is_file():
         # where that cannot be told, POEMSAC.load says what is wrong with the file
-        return BY_CLASS_NAME.get(algorithm_of(archive), POEMSAC).load(archive, device=device)
+        kind = BY_CLASS_NAME.get(algorithm_of(archive), POEMSAC)
+        read = kind.load_checkpoint if is_checkpoint(archive) else kind.load
+        return read(archive, device=device)
     path = find_folder(name)
-    return _class_named(read_config(path)["algorithm"], path).from_pretrained(path, device=device)
-
-
-def _class_named(name: str, path: Path) -> type[PEARLSAC]:
-    if name not in BY_CLASS_NAME:
-        raise ValueError(f"{path} holds a {name}, known are {', '.join(BY_CLASS_NAME)}")
-    return BY_CLASS_NAME[name]
+    found = read_config(path)["algorithm"]
+    if found not in BY_CLASS_NAME:
+        raise ValueError(f"{path} holds a {found}, known are {', '.join(BY_CLASS_NAME)}")
+    return BY_CLASS_NAME[found].from_pretrained(path, device=device)

@@ -1,7 +1,7 @@
 """Stores of experience: a replay buffer per task, and the context of the current epoch."""
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch as th
@@ -135,7 +135,7 @@ class TaskReplayBuffer(ReplayBuffer):
         slots = th.arange(int(self.counts[task]), device=self.device)[None]
         return self._gather(task * self.rows.shape[1] + slots)
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> dict[str, th.Tensor]:
         """Everything needed to continue, without unused room."""
         used = int(self.counts.max()) if self.n_tasks else 0
         rows = self.rows[:, :used].clone()
@@ -143,13 +143,13 @@ class TaskReplayBuffer(ReplayBuffer):
             task_rows[count:] = 0  # instead of whatever stood in this memory
         return {
             "rows": rows,
-            "counts": self.counts.copy(),
-            "positions": self.positions.copy(),
+            "counts": th.from_numpy(self.counts.copy()),
+            "positions": th.from_numpy(self.positions.copy()),
             "ends": self.ends.clone(),
-            "free_ends": self._free_ends.copy(),
+            "free_ends": th.from_numpy(self._free_ends.copy()),
         }
 
-    def load_state(self, state: dict[str, Any]) -> None:
+    def load_state(self, state: dict[str, th.Tensor]) -> None:
         """Continue from what :meth:`state` returned."""
         self.reset()
         used = state["rows"].shape[1]
@@ -157,9 +157,8 @@ class TaskReplayBuffer(ReplayBuffer):
             self._reserve(used)
             self.rows[:, :used] = state["rows"].to(self.device)
             self.rows[:, -1] = self.rows[:, 0]
-        # a file gives tensors back where there were arrays
-        arrays = (th.as_tensor(state[name]) for name in ("counts", "positions", "free_ends"))
-        self.counts, self.positions, self._free_ends = (each.numpy().copy() for each in arrays)
+        kept = (state[name].cpu() for name in ("counts", "positions", "free_ends"))
+        self.counts, self.positions, self._free_ends = (each.numpy().copy() for each in kept)
         self.ends = state["ends"].to(self.device, copy=True)
         self._note_counts()
 

@@ -212,6 +212,7 @@ class PEARLSAC(SAC):
         self.n_timesteps: int | None = None  # what learn takes unless told, see from_zoo
         self._family: FamilyView | None = None
         self._logs_pending = False
+        self.keeps_experience = False  # in files, of which only checkpoints do
         self.policy_class = self._get_policy_from_name(policy)
         given = vectorise(env, None, n_train_tasks, trajectories_per_task)
         if _init_setup_model:
@@ -679,13 +680,21 @@ class PEARLSAC(SAC):
         include: Iterable[str] | None = None,
     ) -> None:
         """As SB3's, but a file is written completely or not at all."""
+
+        def write(file: Any) -> None:
+            try:
+                super(PEARLSAC, self).save(file, exclude, include)
+            except RuntimeError as error:
+                # torch raises its own over what stopped its writing
+                if isinstance(error.__context__, (OSError, KeyboardInterrupt)):
+                    raise error.__context__ from None
+                raise
+
         if isinstance(path, io.BufferedIOBase):
-            super().save(path, exclude, include)
+            write(path)
             return
-        archive = io.BytesIO()
-        super().save(archive, exclude, include)
         path = pathlib.Path(path)
-        write_atomically(path if path.suffix else path.with_suffix(".zip"), archive.getbuffer())
+        write_atomically(path if path.suffix else path.with_suffix(".zip"), write)
 
     @classmethod
     def load(
@@ -718,10 +727,11 @@ class PEARLSAC(SAC):
         """Write everything to one file, between two epochs only, from which :meth:`load_checkpoint`
         continues bit for bit. Where it fails, a previous checkpoint stays whole.
         """
-        archive = io.BytesIO()
-        self.save(archive)
-        content, context = archive.getvalue(), self.epoch_context
-        saving.write_checkpoint(path, self.algorithm, content, self.replay_buffer, context)
+        self.keeps_experience = True
+        try:
+            self.save(path)
+        finally:
+            self.keeps_experience = False
 
     @classmethod
     def load_checkpoint(
@@ -736,12 +746,10 @@ class PEARLSAC(SAC):
         :raises ValueError: if the file is truncated or of another algorithm, or env of another
             family
         """
-        state = saving.read_checkpoint(path, cls.__name__)
-        model = cls.load(io.BytesIO(state["model"].numpy().tobytes()), env, device)
-        model.replay_buffer.load_state(state["replay_buffer"])
-        if state["context"]:
-            stored = {name: value.to(model.device) for name, value in state["context"].items()}
-            model.epoch_context = ContextStore(**stored)
+        saving.check_checkpoint(path, cls.__name__)
+        with open(path, "rb") as file:
+            model = cls.load(file, env, device)
+        model.keeps_experience = False
         return model
 
     def save_pretrained(
@@ -791,7 +799,13 @@ class PEARLSAC(SAC):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()
         kept = [name for name in state_dicts if name not in ("actor.optimizer", "critic.optimizer")]
-        return [*kept, "policy.optimizer"], variables
+        kept += ["policy.optimizer"] + ["experience"] * self.keeps_experience
+        return kept, variables
+
+    @property
+    def experience(self) -> saving.Experience:
+        """What a checkpoint holds beside the model."""
+        return saving.Experience(self)
 
 
 def _standardised(values: th.Tensor) -> th.Tensor:

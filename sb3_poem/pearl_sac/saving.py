@@ -1,9 +1,9 @@
 """How models and training runs are written and read: SB3's zip, checkpoints, and pretrained
 folders.
 
-A checkpoint holds all of a training run, so that it continues bit for bit. A pretrained folder
-holds safetensors, JSON and a model card: nothing in it can run code. A model is a PEARLSAC here, or
-of a subclass.
+A checkpoint is such a zip that holds the experience too, so that training continues bit for bit. A
+pretrained folder holds safetensors, JSON and a model card: nothing in it can run code. A model is a
+PEARLSAC here, or of a subclass.
 """
 
 import inspect
@@ -14,7 +14,7 @@ import math
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
@@ -26,7 +26,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.save_util import load_from_zip_file
 from torch import nn
 
-from sb3_poem.common.buffers import ContextStore, TaskReplayBuffer
+from sb3_poem.common.buffers import ContextStore
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.files import write_atomically
 from sb3_poem.common.foreign import check_env_id
@@ -36,7 +36,6 @@ from sb3_poem.pearl_sac.policies import DEFAULT_NET_ARCH
 from sb3_poem.pearl_sac.train_tasks import TrainTasks
 from sb3_poem.resources import find_folder, pretrained_names
 
-CHECKPOINT_FORMAT = "sb3_poem checkpoint 2"
 FORMAT = "sb3_poem pretrained 2"
 WEIGHTS, CONFIG, CARD = FILES
 #: What a configuration holds of a model, as it is, and of its policy
@@ -116,13 +115,18 @@ def read_archive(
     return data
 
 
-def algorithm_of(archive: Path) -> str:
+def algorithm_of(path: str | Path) -> str:
     """Name of the class whose model a zip holds; empty where that cannot be told."""
+    return str(_facts(path).get("algorithm", ""))
+
+
+def _facts(path: str | Path) -> dict[str, Any]:
+    """What a zip says of its model in plain JSON; nothing where it is none of ours."""
     try:
-        with zipfile.ZipFile(archive) as file:
-            return str(json.loads(file.read("data")).get("algorithm"))
-    except (zipfile.BadZipFile, KeyError, ValueError, AttributeError):
-        return ""
+        with zipfile.ZipFile(path) as archive:
+            return dict(json.loads(archive.read("data")))
+    except (zipfile.BadZipFile, KeyError, ValueError, TypeError):
+        return {}
 
 
 def _check_is_file(path: Path, algorithm: str) -> None:
@@ -144,72 +148,37 @@ def _check_is_file(path: Path, algorithm: str) -> None:
 # ---------------------------------------------------------------------- checkpoints
 
 
-def write_checkpoint(
-    path: str | Path,
-    algorithm: str,
-    archive: bytes,
-    replay_buffer: TaskReplayBuffer,
-    context: ContextStore | None,
-) -> None:
-    """Write a training run to one file, atomically.
+class Experience:
+    """A model's replay buffer and contexts, as SB3 writes and reads what has a ``state_dict``."""
 
-    :param algorithm: Name of the model's class
-    :param archive: What the model's ``save`` writes
-    :raises OSError: if it cannot be written; a previous checkpoint stays whole
-    """
-    stored, kept = replay_buffer.state(), {} if context is None else vars(context)
-    state: dict[str, Any] = {
-        "format": CHECKPOINT_FORMAT,
-        "algorithm": algorithm,
-        "model": th.frombuffer(bytearray(archive), dtype=th.uint8),
-        "replay_buffer": {name: th.as_tensor(value).cpu() for name, value in stored.items()},
-        "context": {name: value.cpu() for name, value in kept.items() if value is not None},
-    }
+    def __init__(self, model: Any) -> None:
+        self.model = model
 
-    def write(file: BinaryIO) -> None:
-        try:
-            th.save(state, file)
-        except RuntimeError as error:
-            # torch raises its own over what stopped its writing
-            if isinstance(error.__context__, (OSError, KeyboardInterrupt)):
-                raise error.__context__ from None
-            raise
+    def state_dict(self) -> dict[str, dict[str, th.Tensor]]:
+        """Tensors by name."""
+        context = self.model.epoch_context
+        kept = {} if context is None else vars(context)
+        tensors = {name: value for name, value in kept.items() if value is not None}
+        return {"replay_buffer": self.model.replay_buffer.state(), "context": tensors}
 
-    write_atomically(path, write)
-
-
-def read_checkpoint(path: str | Path, algorithm: str | None = None) -> dict[str, Any]:
-    """Read what :func:`write_checkpoint` wrote.
-
-    :param algorithm: Name of the class whose run it must hold; None takes any
-    :raises FileNotFoundError: if there is no such file
-    :raises ValueError: if it is truncated, of another program, or of another algorithm
-    """
-    try:
-        state = th.load(path, map_location="cpu", weights_only=True)
-    except OSError:
-        raise
-    except Exception as error:  # what unpickling foreign bytes may raise is no closed list
-        raise ValueError(f"{path} is truncated, or no checkpoint of sb3_poem: {error}") from error
-    if not isinstance(state, dict) or state.get("format") != CHECKPOINT_FORMAT:
-        raise ValueError(
-            f"{path} is no checkpoint of this version of sb3_poem (expected {CHECKPOINT_FORMAT!r})"
-        )
-    found = state["algorithm"]
-    if algorithm not in (None, found):
-        raise ValueError(f"{path} holds a {found}; load it with {found}.load_checkpoint")
-    return state
+    def load_state_dict(self, state: dict[str, dict[str, th.Tensor]], strict: bool = True) -> None:
+        """Continue from what :meth:`state_dict` returned."""
+        self.model.replay_buffer.load_state(state["replay_buffer"])
+        if state["context"]:
+            self.model.epoch_context = ContextStore(**state["context"])
 
 
 def is_checkpoint(path: str | Path) -> bool:
     """Whether a file is a checkpoint of a training run, rather than a model that ``save`` wrote."""
-    if not zipfile.is_zipfile(path):
-        return False
-    with zipfile.ZipFile(path) as archive:
-        entries = archive.infolist()
-    # a model's file that is cut short may end with one of its parts, which looks the same
-    pickled = any(Path(entry.filename).name == "data.pkl" for entry in entries)
-    return pickled and entries[0].header_offset == 0
+    return bool(_facts(path).get("keeps_experience"))
+
+
+def check_checkpoint(path: str | Path, algorithm: str) -> None:
+    """:raises ValueError: if a file is no checkpoint, or of another algorithm than the one named"""
+    if not is_checkpoint(path):
+        raise ValueError(f"{path} is truncated, or no checkpoint of sb3_poem")
+    if (found := algorithm_of(path)) != algorithm:
+        raise ValueError(f"{path} holds a {found}; load it with {found}.load_checkpoint")
 
 
 # ---------------------------------------------------------------------- pretrained folders
