@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 from poem_envs.headless import can_draw
-from sb3_poem.cli.outputs import check_writable
+from sb3_poem.cli.needs import check_writable
 
 ADAPTATION = "--oracle return --queries 10 --tasks 30 --record 0 1 2 5 10"
 # one thread, as the time in the README was measured

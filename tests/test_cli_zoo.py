@@ -27,8 +27,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem import PEARLSAC, POEMSAC, cli, resources
 from sb3_poem.cli import experiment
-from sb3_poem.cli.hyperparams import check_entry
-from sb3_poem.cli.hyperparams_opt import SAMPLERS
+from sb3_poem.cli.hyperparams import SAMPLERS, check_entry
 from sb3_poem.cli.zoo import register_algorithms
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.pearl_sac.arguments import UNSUPPORTED

@@ -29,7 +29,7 @@ from sb3_poem.adaptation import (
 )
 from sb3_poem.adaptation.evaluation import evaluation_seed
 from sb3_poem.cli.arguments import DEFAULT_STORE
-from sb3_poem.cli.outputs import check_output
+from sb3_poem.cli.needs import check_output
 from sb3_poem.cli.report import Report, row_text
 from sb3_poem.cli.subject import (
     COPIES,

@@ -14,8 +14,7 @@ from sb3_poem.benchmark.suites import (
     family_name,
     hashable,
 )
-from sb3_poem.cli.outputs import check_writable
-from sb3_poem.cli.packages import import_packages
+from sb3_poem.cli.needs import check_writable, import_packages
 
 
 def run_benchmark(arguments: argparse.Namespace) -> int:

@@ -21,9 +21,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from poem_envs import TaskFamily
 from sb3_poem.adaptation.callback import AdaptationEvalCallback
-from sb3_poem.cli.hyperparams import check_config, check_entry
-from sb3_poem.cli.hyperparams_opt import entry_params
-from sb3_poem.cli.outputs import check_writable
+from sb3_poem.cli.hyperparams import check_config, check_entry, entry_params
+from sb3_poem.cli.needs import check_writable
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.vec_env import TaskVecEnv
 from sb3_poem.loading import ALGORITHMS

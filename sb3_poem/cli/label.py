@@ -9,8 +9,7 @@ from typing import Any
 
 from rich.console import Console
 
-from sb3_poem.cli.outputs import check_output
-from sb3_poem.cli.packages import import_packages
+from sb3_poem.cli.needs import check_output, import_packages
 from sb3_poem.cli.subject import parse_env_kwargs, say
 
 SHORTEST_PASSWORD = 12

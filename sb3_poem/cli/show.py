@@ -11,7 +11,7 @@ from rich.console import Console
 from poem_envs.headless import has_display
 from sb3_poem.adaptation import evaluate_adaptation
 from sb3_poem.cli.experiment import CHECKPOINT
-from sb3_poem.cli.outputs import check_output
+from sb3_poem.cli.needs import check_output
 from sb3_poem.cli.resume import last_run
 from sb3_poem.cli.subject import COPIES_FOR_ONE_TASK, Subject, describe_task, say
 

@@ -18,8 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_poem.adaptation import AdaptedPolicy, KnownTaskReturn, Trajectory, known_task_return
 from sb3_poem.adaptation.evaluation import evaluation_seed
-from sb3_poem.cli.outputs import check_device
-from sb3_poem.cli.packages import import_packages
+from sb3_poem.cli.needs import check_device, import_packages
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.foreign import environment_of
 from sb3_poem.common.rollouts import rollout_latents

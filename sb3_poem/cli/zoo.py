@@ -18,9 +18,8 @@ from rl_zoo3.utils import StoreDict
 from poem_envs.headless import has_display
 from sb3_poem.benchmark.suites import family_label
 from sb3_poem.cli.experiment import TrainingInterrupted, make_experiment
-from sb3_poem.cli.hyperparams_opt import SAMPLERS, convert_params
-from sb3_poem.cli.outputs import check_device
-from sb3_poem.cli.packages import import_packages
+from sb3_poem.cli.hyperparams import SAMPLERS, convert_params
+from sb3_poem.cli.needs import check_device, import_packages
 from sb3_poem.cli.resume import resume_command, resumed
 from sb3_poem.loading import ALGORITHMS
 from sb3_poem.pearl_sac.saving import is_checkpoint

@@ -19,6 +19,7 @@ class Segment:
     """Experience of several environment copies over the same number of steps."""
 
     task_ids: np.ndarray  # (copies,) index of each copy's training task
+    latents: np.ndarray  # (copies, latent_dim), which policy acted
     observations: np.ndarray  # (copies, steps, obs_dim)
     actions: np.ndarray  # (copies, steps, action_dim), scaled to [-1, 1]
     next_observations: np.ndarray  # (copies, steps, obs_dim), the last of an episode included
@@ -26,7 +27,6 @@ class Segment:
     terminated: np.ndarray  # (copies, steps), 1 where an episode ended other than by the time limit
     features: np.ndarray  # (copies, steps, feat_dim), reward features
     first_episode: np.ndarray  # (copies, steps), True up to the end of each copy's first episode
-    latents: np.ndarray  # (copies, latent_dim), which policy acted
 
 
 class TaskBatch(NamedTuple):

@@ -50,47 +50,34 @@ def collect_segment(
     """
     obs = family.reset(tasks, seed)
     check_finite("observations", obs, task_ids, episode_counts, 0)
-    n, horizon = family.num_envs, family.horizon
-    action_dim, obs_dim = family.action_dim, obs.shape[1]
-    segment = Segment(
-        task_ids=task_ids,
-        observations=np.empty((n, horizon, obs_dim), dtype=np.float32),
-        actions=np.empty((n, horizon, action_dim), dtype=np.float32),
-        next_observations=np.empty((n, horizon, obs_dim), dtype=np.float32),
-        rewards=np.empty((n, horizon)),
-        terminated=np.zeros((n, horizon), dtype=np.float32),
-        features=np.empty((n, horizon, family.reward_feature_dim)),
-        first_episode=np.zeros((n, horizon), dtype=bool),
-        latents=latents,
-    )
+    n, steps = family.num_envs, []
     in_first_episode = np.ones(n, dtype=bool)
-    for step in range(horizon):
+    for step in range(family.horizon):
         actions, scaled_actions = act(obs)
         check_finite("actions (of the policy)", actions, task_ids, episode_counts, step)
         new_obs, rewards, dones, infos = family.env.step(actions)
         assert isinstance(new_obs, np.ndarray)
         if not on_step(locals()):
             return None
-        next_obs = new_obs
+        next_obs, terminated = new_obs, np.zeros(n, dtype=np.float32)
         if dones.any():
             next_obs = new_obs.copy()
             for copy in np.flatnonzero(dones):
                 next_obs[copy] = infos[copy]["terminal_observation"]
-                segment.terminated[copy, step] = not infos[copy].get("TimeLimit.truncated", False)
+                terminated[copy] = not infos[copy].get("TimeLimit.truncated", False)
         features = family.features_of(infos)
         returned = {"observations": next_obs, "rewards": rewards, "reward features": features}
         for name, values in returned.items():
             check_finite(name, values, task_ids, episode_counts, step)
-        segment.observations[:, step] = obs
-        segment.actions[:, step] = scaled_actions
-        segment.next_observations[:, step] = next_obs
-        # as most VecEnvs give them; SubprocVecEnv does not round
-        segment.rewards[:, step] = rewards.astype(np.float32)
-        segment.features[:, step] = features
-        segment.first_episode[:, step] = in_first_episode
-        in_first_episode &= ~dones
+        seen, then = obs.astype(np.float32), next_obs.astype(np.float32)
+        # rewards as most VecEnvs give them; SubprocVecEnv does not round
+        paid = rewards.astype(np.float32).astype(np.float64)
+        steps.append((seen, scaled_actions, then, paid, terminated, features, in_first_episode))
+        in_first_episode = in_first_episode & ~dones
         episode_counts += dones
         obs = new_obs
+    stacked = (np.stack(rows, axis=1) for rows in zip(*steps, strict=True))
+    segment = Segment(task_ids, latents, *stacked)
     family.check_experience(tasks, seed, segment)
     return segment
 

@@ -29,6 +29,7 @@ from sb3_poem.common.networks import RunningNorm
 from sb3_poem.common.precision import hidden_dtype
 from sb3_poem.common.random import Generators
 from sb3_poem.common.trajectory import Trajectory
+from sb3_poem.hub import upload
 from sb3_poem.pearl_sac import saving
 from sb3_poem.pearl_sac.arguments import check_arguments, refuse_unknown
 from sb3_poem.pearl_sac.collector import EpochCollector, concatenate
@@ -755,8 +756,17 @@ class PEARLSAC(SAC):
     def save_pretrained(
         self, folder: str | pathlib.Path, card: dict[str, Any] | None = None
     ) -> None:
-        """Write safetensors, JSON and a model card; see :func:`.saving.save_pretrained`."""
-        saving.save_pretrained(self, folder, card)
+        """Write safetensors, JSON and a model card, which :meth:`from_pretrained` reads.
+
+        :param folder: Where; made if missing
+        :param card: What the card should say: ``command``, ``seed``, ``commit``, ``machine``,
+            ``note``, ``license`` (default: MIT), ``results``: any JSON
+        :raises OSError: if the folder cannot be written
+        :raises ValueError: if the policy's activation is none of torch.nn's or its optimiser none
+            of torch.optim's, which JSON could not name
+        """
+        for name, content in saving.pretrained_files(self, card).items():
+            write_atomically(pathlib.Path(folder) / name, content)
 
     def push_to_hub(
         self, repo_id: str, card: dict[str, Any] | None = None, private: bool | None = None
@@ -770,7 +780,7 @@ class PEARLSAC(SAC):
         :return: Its address
         :raises OSError: if the Hub refuses it or cannot be reached
         """
-        return saving.push_to_hub(self, repo_id, card, private)
+        return upload(repo_id, saving.pretrained_files(self, card, repo_id), private)
 
     @classmethod
     def from_pretrained(

@@ -28,9 +28,8 @@ from torch import nn
 
 from sb3_poem.common.buffers import ContextStore
 from sb3_poem.common.checks import check_whole
-from sb3_poem.common.files import write_atomically
 from sb3_poem.common.foreign import check_env_id
-from sb3_poem.hub import FILES, upload
+from sb3_poem.hub import FILES
 from sb3_poem.pearl_sac.model_card import model_card
 from sb3_poem.pearl_sac.policies import DEFAULT_NET_ARCH
 from sb3_poem.pearl_sac.train_tasks import TrainTasks
@@ -184,31 +183,11 @@ def check_checkpoint(path: str | Path, algorithm: str) -> None:
 # ---------------------------------------------------------------------- pretrained folders
 
 
-def save_pretrained(model: Any, folder: str | Path, card: dict[str, Any] | None = None) -> None:
-    """Write a model so that :func:`from_pretrained` can read it.
-
-    :param folder: Where; made if missing
-    :param card: What the card should say: ``command``, ``seed``, ``commit``, ``machine``, ``note``,
-        ``license`` (default: MIT), ``results``: any JSON
-    :raises OSError: if the folder cannot be written
-    :raises ValueError: if the policy's activation is none of torch.nn's or its optimiser none of
-        torch.optim's, which JSON could not name
-    """
-    for name, content in _files(model, card).items():
-        write_atomically(Path(folder) / name, content)
-
-
-def push_to_hub(
-    model: Any, repo_id: str, card: dict[str, Any] | None = None, private: bool | None = None
-) -> str:
-    """Write the files of :func:`save_pretrained` to the Hugging Face Hub; its errors and those of
-    :func:`sb3_poem.hub.upload`.
-    """
-    return upload(repo_id, _files(model, card, repo_id), private)
-
-
-def _files(model: Any, card: dict[str, Any] | None, name: str | None = None) -> dict[str, bytes]:
-    """All three, so that nothing is written if one cannot be made.
+def pretrained_files(
+    model: Any, card: dict[str, Any] | None, name: str | None = None
+) -> dict[str, bytes]:
+    """What :func:`from_pretrained` reads, by the names of its files; see
+    :meth:`PEARLSAC.save_pretrained`.
 
     :param name: By which the card says to load the model; None is its family's
     """
@@ -227,7 +206,7 @@ def model_contents(
     """What a model is made of, from which :func:`build_model` makes it again: its configuration,
     which :func:`config_text` writes, and its tensors by name.
 
-    :raises ValueError: see :func:`save_pretrained`
+    :raises ValueError: see :meth:`PEARLSAC.save_pretrained`
     """
     policy, error = model.policy, model.predicted_rewards_error
     classes = {"activation_fn": nn, "optimizer_class": th.optim}
@@ -324,7 +303,7 @@ def parse_config(text: str | bytes, source: str) -> dict[str, Any]:
 
 
 def from_pretrained(algorithm: type[Model], folder: str | Path, device: th.device | str) -> Model:
-    """Read a model that :func:`save_pretrained` wrote.
+    """Read a model of :func:`pretrained_files`.
 
     :param folder: What :func:`sb3_poem.resources.find_folder` takes
     :raises FileNotFoundError: if the folder does not hold a model

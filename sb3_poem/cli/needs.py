@@ -1,6 +1,10 @@
-"""What a command will need later, checked before it spends its time: files to write, a device."""
+"""What a command will need, checked before it spends its time: files to write, a device, modules
+that register environments.
+"""
 
+import importlib
 import os
+import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -35,3 +39,21 @@ def check_device(name: str) -> None:
     except RuntimeError as error:
         known = "there are auto, cpu and cuda"
         raise ValueError(f"--device {name}: there is no such device; {known}") from error
+
+
+def import_packages(names: Sequence[str]) -> None:
+    """Import the modules of ``--gym-packages``, which may lie in the working folder."""
+    folder = os.getcwd()
+    if names and folder not in sys.path:
+        # last, so that no file there takes the place of an installed package
+        sys.path.append(folder)
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except ModuleNotFoundError as error:
+            if not f"{name}.".startswith(f"{error.name}."):
+                raise  # the module is there, and imports what is not
+            raise ValueError(
+                f"--gym-packages {name}: there is no such module, neither installed nor in "
+                f"{folder}; name a module as in Python's import, without .py"
+            ) from error
