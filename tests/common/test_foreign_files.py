@@ -4,6 +4,7 @@ theirs is run.
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import shutil
