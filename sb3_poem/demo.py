@@ -29,18 +29,18 @@ Next:
 """
 
 
-def run(*arguments: str) -> None:
+def run(words: str, *arguments: object) -> None:
     """Show a command of ``sb3-poem``, and run it; stops the demonstration if it fails."""
-    print(f"\n$ sb3-poem {shlex.join(arguments)}", flush=True)
-    command = [sys.executable, "-m", "sb3_poem.cli", *arguments]
-    if status := subprocess.run(command, check=False).returncode:
+    command = [*shlex.split(words), *map(str, arguments)]
+    print(f"\n$ sb3-poem {shlex.join(command)}", flush=True)
+    if status := subprocess.run([sys.executable, "-m", "sb3_poem.cli", *command]).returncode:
         sys.exit(status)
 
 
-def adapt(model: str, name: str, out: Path, *arguments: str) -> None:
+def adapt(model: str | Path, name: str, out: Path, *arguments: object) -> None:
     """Adapt a model, and write the table and the plot of what that earned."""
-    files = ["--json", str(out / f"{name}.json"), "--plot", str(out / f"{name}.png")]
-    run("adapt", "--model", model, *shlex.split(ADAPTATION), *files, *arguments)
+    files = ["--json", out / f"{name}.json", "--plot", out / f"{name}.png"]
+    run(f"adapt {ADAPTATION}", "--model", model, *files, *arguments)
 
 
 def main() -> None:
@@ -54,13 +54,13 @@ def main() -> None:
 
     print("1. Meta-train a point that walks to goals on a half-circle. It sees some goals and")
     print("   their rewards.")
-    run("train", "-f", str(out / "logs"), *shlex.split(TRAINING))
+    run(f"train {TRAINING}", "-f", out / "logs")
     models = (out / "logs").rglob("poem-PointGoal-v0.zip")
     model = max(models, key=lambda path: path.stat().st_mtime)
 
     print("\n2. Thirty new goals, hidden: each is found by ten answers to `which of these is")
     print("   better?`, without reward.")
-    adapt(str(model), "PointGoal", out)
+    adapt(model, "PointGoal", out)
 
     print("\n3. The same with a model that ships with the package: a robot that runs at a speed")
     print("   nobody tells it.")
@@ -68,7 +68,7 @@ def main() -> None:
     if not draws:
         print("(No video: there is neither a display nor off-screen OpenGL here;")
         print("apt-get install libegl1 libgl1.)")
-    adapt("HalfCheetahVel", "HalfCheetahVel", out, *(["--video", str(video)] if draws else []))
+    adapt("HalfCheetahVel", "HalfCheetahVel", out, *(["--video", video] if draws else []))
 
     print(f"\nDone in {time.perf_counter() - started:.0f} s. The model is {model}; tables and")
     print(f"plots are in {out}/.\n")

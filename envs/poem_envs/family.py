@@ -47,9 +47,9 @@ def definition_problem(family: Any) -> str | None:
     given: list[Any] = [getattr(family, name, None) for name in REQUIRED_ATTRIBUTES]
     observations, actions, tasks, features = given
     fits = (
-        _is_flat(observations),
-        _is_flat(actions) and actions.is_bounded(),
-        _is_flat(tasks) and tasks.dtype == np.float64,
+        is_flat(observations),
+        is_flat(actions) and actions.is_bounded(),
+        is_flat(tasks) and tasks.dtype == np.float64,
         isinstance(features, (int, np.integer)) and features >= 1,
     )
     for (name, what), value, right in zip(REQUIRED_ATTRIBUTES.items(), given, fits, strict=True):
@@ -68,7 +68,8 @@ def definition_problem(family: Any) -> str | None:
     return None
 
 
-def _is_flat(space: Any) -> bool:
+def is_flat(space: Any) -> bool:
+    """Whether a space is a box of vectors."""
     return isinstance(space, spaces.Box) and len(space.shape) == 1
 
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
-from poem_envs.family import BOUNDS_TOLERANCE, TaskFamily
+from poem_envs.family import BOUNDS_TOLERANCE, TaskFamily, is_flat
 from poem_envs.mujoco_rendering import prepare_to_render
 
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
@@ -335,7 +335,7 @@ def check_goal_env(env: gym.Env) -> None:
             f"{', '.join(map(repr, GOAL_KEYS))}, but is {found}"
         )
     for key in GOAL_KEYS:
-        if not isinstance(parts[key], spaces.Box) or len(parts[key].shape or ()) != 1:
+        if not is_flat(parts[key]):
             raise ValueError(
                 f"{bare}: the space of {key!r} must be a flat Box, but is {parts[key]}"
             )

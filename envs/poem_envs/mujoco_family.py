@@ -40,14 +40,12 @@ class MujocoFamily(MujocoFilms, BatchFamily):
     before) / dt``, both taken from the integrated state. Gymnasium's Ant and Humanoid read body
     positions, which MuJoCo updates one physics step late.
 
-    Images have ``width`` and ``height`` in pixels; ``max_geom`` and ``visual_options`` are
-    Gymnasium's.
+    Images have ``width`` and ``height`` in pixels, and hold at most ``max_geom`` shapes.
 
     :param xml_file: model file; a bare name is one of Gymnasium's
     :param frame_skip: physics steps in a control step
     :param reset_noise_scale: scale of the random start around the model's initial pose
-    :param camera_id: camera of the model to render from; None for one that follows the robot
-    :param camera_name: the same by name
+    :param camera_name: camera of the model to render from; None for one that follows the robot
     :param default_camera_config: attributes of the following camera, such as ``{"distance": 4.0}``,
         over the robot's own
     :param render_quality: "full", or "fast": without shadows, reflections and antialiasing, for RGB
@@ -68,11 +66,9 @@ class MujocoFamily(MujocoFilms, BatchFamily):
     reset_noise_scale: float = 0.1
     width: int = 480
     height: int = 480
-    camera_id: int | None = None
     camera_name: str | None = None
     default_camera_config: dict[str, Any] | None = None
     max_geom: int = 1000
-    visual_options: dict[int, bool] | None = None
     render_quality: str = "full"
 
     def __post_init__(self) -> None:
@@ -194,7 +190,7 @@ class MujocoFamily(MujocoFilms, BatchFamily):
         if self._renderer is None:
             renderer = FastRenderer if self._renders_fast else StateRenderer
             camera = {**self.camera_config, **(self.default_camera_config or {})}
-            names = ("width", "height", "camera_id", "camera_name", "max_geom", "visual_options")
+            names = ("width", "height", "camera_name", "max_geom")
             arguments: dict[str, Any] = {name: getattr(self, name) for name in names}
             self._renderer = renderer(self.model, default_cam_config=camera, **arguments)
         return self._renderer.render(self.states[copy], render_mode, markers)

@@ -39,10 +39,6 @@ class _Renderer:
             atexit.register(_close_open_renderers)
         _open_renderers.add(self)
 
-    def render(self, state: np.ndarray, render_mode: str, markers: list[dict[str, Any]]) -> Any:
-        """Render a state ``(1 + nq + nv,)`` with markers as ``add_marker`` takes them."""
-        raise NotImplementedError
-
     def close(self) -> None:
         """Close windows and graphics contexts."""
         _open_renderers.discard(self)
@@ -57,10 +53,11 @@ class StateRenderer(_Renderer):
         from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer  # loads the window system
 
         super().__init__(model, width, height)
-        self._follows = view.get("camera_id") is None and view.get("camera_name") is None
+        self._follows = view.get("camera_name") is None
         self._renderer = MujocoRenderer(model, self._data, width=width, height=height, **view)
 
     def render(self, state: np.ndarray, render_mode: str, markers: list[dict[str, Any]]) -> Any:
+        """Render a state ``(1 + nq + nv,)`` with markers as ``add_marker`` takes them."""
         self._show(state)
         if render_mode != "human":
             choose_headless_backend()
@@ -90,11 +87,9 @@ class FastRenderer(_Renderer):
         *,
         width: int,
         height: int,
-        camera_id: int | None = None,
         camera_name: str | None = None,
         default_cam_config: dict[str, Any] | None = None,
         max_geom: int = 1000,
-        visual_options: dict[int, bool] | None = None,
         slices: int = SLICES,
     ) -> None:
         super().__init__(model, width, height)
@@ -109,14 +104,13 @@ class FastRenderer(_Renderer):
             self._scene.flags[flag] = 0
         self._resources = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         self._options = mujoco.MjvOption()
-        for option, shown in (visual_options or {}).items():
-            self._options.flags[option] = shown
         self._viewport = mujoco.MjrRect(0, 0, width, height)
         self._pixels = np.empty((height, width, 3), dtype=np.uint8)
-        self._camera = self._make_camera(camera_id, camera_name, default_cam_config or {})
+        self._camera = self._make_camera(camera_name, default_cam_config or {})
         self._close_at_exit()
 
     def render(self, state: np.ndarray, render_mode: str, markers: list[dict[str, Any]]) -> Any:
+        """Render a state ``(1 + nq + nv,)`` with markers as ``add_marker`` takes them."""
         self._show(state)
         return self.render_data(self._data, markers)
 
@@ -142,25 +136,17 @@ class FastRenderer(_Renderer):
         self._context.free()
         super().close()
 
-    def _make_camera(
-        self, camera_id: int | None, camera_name: str | None, config: dict[str, Any]
-    ) -> mujoco.MjvCamera:
+    def _make_camera(self, name: str | None, config: dict[str, Any]) -> mujoco.MjvCamera:
         camera = mujoco.MjvCamera()
-        if camera_name is not None:
-            camera_id = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_CAMERA, camera_name)
-            if camera_id < 0:
-                raise ValueError(
-                    f"camera_name={camera_name!r}: the model has no camera of this name"
-                )
-        if camera_id is not None and camera_id >= 0:
-            camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera_id
+        if name is not None:
+            number = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_CAMERA, name)
+            if number < 0:
+                raise ValueError(f"camera_name={name!r}: the model has no camera of this name")
+            camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, number
             return camera
         camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-        for name, value in {"azimuth": 90.0, **config}.items():  # 90 degrees: Gymnasium's viewer
-            if isinstance(value, np.ndarray):
-                getattr(camera, name)[:] = value
-            else:
-                setattr(camera, name, value)
+        for key, value in {"azimuth": 90.0, **config}.items():  # 90 degrees: Gymnasium's viewer
+            setattr(camera, key, value)
         return camera
 
     def _add(self, marker: dict[str, Any]) -> None:

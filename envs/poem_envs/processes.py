@@ -1,17 +1,19 @@
 """Copies of a task family in processes: for simulators whose steps spend their time in Python,
 where threads would wait.
 
-A worker process starts with :mod:`poem_envs.worker` alone, so that user scripts need no ``if
-__name__ == "__main__"`` and no worker loads torch. What a worker does is in :class:`CopyGroup`;
-this process steps a group of its own meanwhile.
+A worker process starts with this module alone, so that user scripts need no ``if __name__ ==
+"__main__"`` and no worker loads torch. What a worker does is in :class:`CopyGroup`; this process
+steps a group of its own meanwhile.
 """
 
 from __future__ import annotations
 
 import os
 import pickle
+import signal
 import subprocess
 import sys
+import traceback
 import weakref
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection, Pipe
@@ -23,6 +25,8 @@ from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 
 from poem_envs.family import TaskFamily
+
+SERVE = "from poem_envs.processes import serve; serve"
 
 
 class EpisodeStart(NamedTuple):
@@ -105,6 +109,30 @@ class CopyGroup:
             env.close()
 
 
+def serve(file_descriptor: int) -> None:
+    """Answer a :class:`RemoteGroup`'s calls of a group's methods, the first of which makes it."""
+    # Ctrl-C reaches all processes; the parent's end ends this one.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    connection, group = Connection(file_descriptor), None
+    while True:
+        try:
+            call = connection.recv_bytes()
+            answer: tuple[bool, Any]
+            try:
+                method, arguments = pickle.loads(call)
+                if method == "__init__":
+                    group, answer = CopyGroup(*arguments), (True, None)
+                else:
+                    answer = True, getattr(group, method)(*arguments)
+            except Exception as error:
+                answer = False, (str(error), traceback.format_exc())
+            connection.send_bytes(cloudpickle.dumps(answer))
+        except (EOFError, BrokenPipeError, ConnectionResetError):
+            break
+    if group is not None:
+        group.close()
+
+
 class WorkerError(Exception):
     """An error's traceback in a worker process, as text; the cause of the error raised for it."""
 
@@ -120,7 +148,7 @@ class RemoteGroup:
         # The worker imports what the parent can import, and "" is the parent's working directory.
         paths = os.pathsep.join(path or os.getcwd() for path in sys.path)
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "poem_envs.worker", str(theirs.fileno())],
+            [sys.executable, "-c", f"{SERVE}({theirs.fileno()})"],
             pass_fds=[theirs.fileno()],
             env={**os.environ, "PYTHONPATH": paths},
             stdin=subprocess.DEVNULL,

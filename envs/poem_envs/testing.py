@@ -263,8 +263,8 @@ def check_relabelling(case: Case) -> None:
                 "features"
             )
     features = case.episodes[0].features
-    together = _together(case.player, "compute_rewards", case.tasks, features)
-    assert np.array_equal(together, _one_by_one(other.compute_rewards, case.tasks, features)), (
+    together, one_by_one = _both_ways(case.player, other, "compute_rewards", case.tasks, features)
+    assert np.array_equal(together, one_by_one), (
         "compute_rewards must give many rewards at once exactly as one after another, but does "
         "not: use elementwise operations in _reward, on the last dimension by tasks[..., i] and "
         "features[..., i]"
@@ -276,10 +276,10 @@ def check_potential(case: Case) -> None:
     env = case.player
     if not env.has_potential:
         return
-    observations = case.episodes[0].observations
-    together = _together(env, "compute_potential", case.tasks, observations)
-    env.reset(seed=case.seed + 1)
-    one_by_one = _one_by_one(env.compute_potential, case.tasks, observations)
+    other, observations = case.make(), case.episodes[0].observations
+    other.reset(seed=case.seed + 1)
+    about = (env, other, "compute_potential", case.tasks, observations)
+    together, one_by_one = _both_ways(*about)
     ok = together.shape == one_by_one.shape and np.allclose(together, one_by_one, rtol=1e-6)
     assert ok, (
         "compute_potential must give many potentials at once as one after another, but does not: "
@@ -412,17 +412,19 @@ def _check_observation(observation: Any, env: TaskFamily, origin: str) -> None:
     )
 
 
-def _together(family: Any, method: str, tasks: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """What a method gives for all tasks and all rows, ``(tasks, rows)``."""
+def _both_ways(
+    family: Any, other: Any, method: str, tasks: np.ndarray, rows: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """What a method gives for all tasks and rows at once, and another's one by one, ``(tasks,
+    rows)`` each.
+    """
+    single = getattr(other, method)
+    one_by_one = np.array([[float(single(task, row)) for row in rows] for task in tasks])
     try:
-        return np.asarray(getattr(family, method)(tasks[:, None, :], rows[None, :, :]))
+        return np.asarray(getattr(family, method)(tasks[:, None, :], rows[None, :, :])), one_by_one
     except Exception as error:
         raise AssertionError(
             f"{method} must broadcast tasks {tasks[:, None, :].shape} against "
             f"{rows[None, :, :].shape}, but raised {type(error).__name__}: {error}; index the last "
             "dimension, as in tasks[..., i]"
         ) from error
-
-
-def _one_by_one(function: Callable[..., Any], tasks: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    return np.array([[float(function(task, row)) for row in rows] for task in tasks])

@@ -20,8 +20,7 @@ WORD = re.compile(r"[\w-]{0,100}", re.ASCII)
 #: Which an image depends on; of a family of one's own they may mean something else, which only its
 #: user knows
 IMAGE_ARGUMENTS = DRAWING_ARGUMENTS | {
-    *("width", "height", "render_quality", "max_geom", "visual_options"),
-    *("camera_id", "camera_name", "default_camera_config"),
+    *("width", "height", "render_quality", "max_geom", "camera_name", "default_camera_config"),
 }
 # How far an argument may be from its default, and how many numbers it may hold.
 TIMES_DEFAULT, LONGEST = 100, 64

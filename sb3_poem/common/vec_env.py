@@ -51,7 +51,7 @@ class TaskVecEnv(VecEnv):
 
     :param env_fns: One function a copy that returns an environment. Only the first is called: all
         copies are made alike, from its registration and arguments. If its ``Monitor`` has a file,
-        the episodes of all copies are written to that file.
+        the episodes of all copies are written to that file. Or a vectorised family.
     :param nthread: Threads (or processes, as the family has it) to step with; None for all cores
     :raises ValueError: If the environment is no task family, has no vectorised version, was not
         made by ``gym.make``, was given a task already, or is inside a wrapper other than
@@ -59,20 +59,22 @@ class TaskVecEnv(VecEnv):
     """
 
     def __init__(
-        self, env_fns: Sequence[Callable[[], gym.Env]], nthread: int | None = None
+        self,
+        env_fns: Sequence[Callable[[], gym.Env]] | TaskFamilyVector,
+        nthread: int | None = None,
     ) -> None:
-        if len(env_fns) < 1:
+        wrappers: list[gym.Wrapper] = []
+        if isinstance(env_fns, TaskFamilyVector):
+            vector_env = env_fns
+        elif len(env_fns) < 1:
             raise ValueError("env_fns is empty; pass one function for each copy")
-        if not callable(env_fns[0]):
+        elif not callable(env_fns[0]):
             raise TypeError(f"env_fns must hold functions that make one, but holds {env_fns[0]!r}")
-        env = env_fns[0]()
-        wrappers = _wrappers(env)
-        vector_env = _vectorised(env, wrappers, len(env_fns), nthread)
-        env.unwrapped.close()  # not env.close(): the monitor's file stays in use
-        self._wrap(vector_env, wrappers)
-
-    def _wrap(self, vector_env: TaskFamilyVector, wrappers: Sequence[gym.Wrapper]) -> None:
-        """Be the face of a vectorised family, which does what the wrappers do."""
+        else:
+            env = env_fns[0]()
+            wrappers = _wrappers(env)
+            vector_env = _vectorised(env, wrappers, len(env_fns), nthread)
+            env.unwrapped.close()  # not env.close(): the monitor's file stays in use
         self.vector_env = vector_env
         self._wrapper_types = tuple(type(wrapper) for wrapper in wrappers)
         self._monitor = next((each for each in wrappers if isinstance(each, Monitor)), None)
@@ -86,18 +88,6 @@ class TaskVecEnv(VecEnv):
         self._returns = np.zeros(self.num_envs)
         self._lengths = np.zeros(self.num_envs, dtype=np.int64)
         self._start_time = time.time() if self._monitor is None else self._monitor.t_start
-
-    @classmethod
-    def from_vector_env(cls, vector_env: TaskFamilyVector) -> TaskVecEnv:
-        """The face of a vectorised family that there is, as ``gym.make_vec`` makes it."""
-        env, spec = cls.__new__(cls), vector_env.spec
-        if spec is not None:
-            # a single environment's: make_vec's own adds what gym.make does not take
-            kwargs = {key: spec.kwargs[key] for key in spec.kwargs.keys() - MAKE_VEC_ARGUMENTS}
-            limit = vector_env.max_episode_steps
-            vector_env.spec = dataclasses.replace(spec, kwargs=kwargs, max_episode_steps=limit)
-        env._wrap(vector_env, ())
-        return env
 
     @property
     def tasks(self) -> np.ndarray | None:
@@ -220,7 +210,12 @@ class TaskVecEnv(VecEnv):
 def as_task_vec_env(vector_env: gym.vector.VectorEnv) -> VecEnv:
     """Gymnasium's vectorised environment of a task family, from ``gym.make_vec``, as one of SB3."""
     if isinstance(vector_env, TaskFamilyVector):
-        return TaskVecEnv.from_vector_env(vector_env)
+        if (spec := vector_env.spec) is not None:
+            # a single environment's: make_vec's own adds what gym.make does not take
+            kwargs = {key: spec.kwargs[key] for key in spec.kwargs.keys() - MAKE_VEC_ARGUMENTS}
+            limit = vector_env.max_episode_steps
+            vector_env.spec = dataclasses.replace(spec, kwargs=kwargs, max_episode_steps=limit)
+        return TaskVecEnv(vector_env)
     if isinstance(vector_env, gym.vector.SyncVectorEnv):
         return DummyVecEnv([functools.partial(Monitor, env) for env in vector_env.envs])
     raise ValueError(
