@@ -12,9 +12,7 @@ REPOSITORY = re.compile(r"[\w-][\w.-]*/[\w-][\w.-]*", re.ASCII)
 
 
 def is_repository(name: str | Path) -> bool:
-    """Whether a name may be a model's on the Hub, ``"user/name"``; a ``Path`` is always a local
-    one.
-    """
+    """Whether a name may be a model's on the Hub, ``"user/name"``; a ``Path`` never is."""
     is_file = Path(name).suffix in (".zip", ".safetensors")
     return isinstance(name, str) and REPOSITORY.fullmatch(name) is not None and not is_file
 

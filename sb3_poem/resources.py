@@ -18,9 +18,7 @@ def shipped_folder(name: str) -> Path:
     for root in (_PACKAGE, _PACKAGE.parent):
         if (root / name).is_dir():
             return root / name
-    raise FileNotFoundError(
-        f"sb3_poem was installed without its folder {name!r}; please install it again"
-    )
+    raise FileNotFoundError(f"sb3_poem was installed without its folder {name!r}: install it anew")
 
 
 def config_file(algorithm: str) -> Path:
@@ -32,9 +30,7 @@ def config_file(algorithm: str) -> Path:
     files = {file.stem: file for file in sorted(shipped_folder("zoo_configs").glob("*.yml"))}
     if algorithm not in files:
         names = ", ".join(files) or "none"
-        raise FileNotFoundError(
-            f"No hyperparameters are shipped for {algorithm!r}; there are: {names}"
-        )
+        raise FileNotFoundError(f"No hyperparameters ship for {algorithm!r}; there are: {names}")
     return files[algorithm]
 
 

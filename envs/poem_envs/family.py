@@ -277,9 +277,7 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
         features = np.asarray(features, dtype=np.float64)
         task_dim, feature_dim = self.task_space.shape[0], self.reward_feature_dim
         if tasks.shape[-1:] != (task_dim,):
-            raise ValueError(
-                f"tasks has shape {tasks.shape}, but its last dimension must be task_dim={task_dim}"
-            )
+            raise ValueError(f"tasks has shape {tasks.shape}, but must end in task_dim={task_dim}")
         if features.shape[-1:] != (feature_dim,):
             raise ValueError(
                 f"features has shape {features.shape}, but its last dimension must be "
@@ -303,9 +301,7 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
 
     def _potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
         """Optional, for families whose rewards say where to be rather than how to move."""
-        raise NotImplementedError(
-            f"{type(self).__name__} defines no _potential(tasks, observations)"
-        )
+        raise NotImplementedError(f"{type(self).__name__} has no _potential(tasks, observations)")
 
     @abstractmethod
     def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
@@ -356,13 +352,9 @@ def check_render_mode(render_mode: str | None, metadata: dict[str, Any]) -> None
     if not modes:
         raise TypeError(f"render_mode={render_mode!r}: this environment cannot be rendered")
     if render_mode not in modes:
-        raise ValueError(
-            f"render_mode={render_mode!r} is not supported, choose None or one of {modes}"
-        )
+        raise ValueError(f"render_mode={render_mode!r} is not supported, choose one of {modes}")
     if render_mode == "human" and not has_display():
-        raise ValueError(
-            "render_mode='human' needs a display; use 'rgb_array' on a machine without one"
-        )
+        raise ValueError("render_mode='human' needs a display; use 'rgb_array' without one")
 
 
 def check_options(options: dict[str, Any] | None, known: frozenset[str]) -> dict[str, Any]:
@@ -380,9 +372,7 @@ def checked_actions(
     actions: npt.ArrayLike, space: spaces.Box, num_envs: int | None = None
 ) -> np.ndarray:
     """Actions as a new float64 array inside the bounds; a ValueError says which are wrong."""
-    array = _numbers(
-        actions, space.shape if num_envs is None else (num_envs, *space.shape), "action"
-    )
+    array = _numbers(actions, (() if num_envs is None else (num_envs,)) + space.shape, "action")
     low, high = space.low.astype(np.float64), space.high.astype(np.float64)
     clipped = np.clip(array, low, high)
     acceptable = np.abs(array - clipped) <= BOUNDS_TOLERANCE  # false for NaN
@@ -401,9 +391,7 @@ def _numbers(values: npt.ArrayLike, shape: tuple[int, ...], name: str) -> np.nda
     try:
         array = np.array(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(
-            f"{name}={values!r} is not an array of numbers of shape {shape}"
-        ) from error
+        raise ValueError(f"{name}={values!r} is no array of numbers of shape {shape}") from error
     if array.shape != shape:
         raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
     return array

@@ -336,9 +336,7 @@ def check_goal_env(env: gym.Env) -> None:
         )
     for key in GOAL_KEYS:
         if not is_flat(parts[key]):
-            raise ValueError(
-                f"{bare}: the space of {key!r} must be a flat Box, but is {parts[key]}"
-            )
+            raise ValueError(f"{bare}: the space of {key!r} must be a flat Box, not {parts[key]}")
     achieved, desired = parts["achieved_goal"].shape, parts["desired_goal"].shape
     if achieved != desired:
         raise ValueError(

@@ -10,9 +10,8 @@ _logger = logging.getLogger(__name__)
 
 def has_display() -> bool:
     """Whether windows can open; on systems other than Linux it is taken for granted."""
-    return sys.platform != "linux" or any(
-        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
-    )
+    names = ("DISPLAY", "WAYLAND_DISPLAY")
+    return sys.platform != "linux" or any(os.environ.get(name) for name in names)
 
 
 def can_draw() -> bool:

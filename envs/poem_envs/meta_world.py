@@ -1,6 +1,4 @@
-"""Meta-World's meta-learning benchmarks as task families: placements of one manipulation (ML1), or
-of ten (ML10).
-"""
+"""Meta-World's benchmarks: placements of one manipulation (ML1), or of ten (ML10)."""
 
 from __future__ import annotations
 
@@ -110,9 +108,7 @@ class MetaWorldEnv(MujocoFilms, TaskFamily):
         return self._sawyer
 
     def render(self) -> Any:
-        """Render the current state as ``render_mode`` says: an image ``(height, width, 3)`` for
-        ``"rgb_array"``.
-        """
+        """An image ``(height, width, 3)``, or what else ``render_mode`` says."""
         image = self._begun("render").render()
         turn = self._upside_down and isinstance(image, np.ndarray)
         return image[::-1, ::-1].copy() if turn else image
@@ -328,9 +324,7 @@ class MetaWorldML10Env(MetaWorldEnv):
         checked = super()._checked_tasks(tasks, shape, name)
         for task in checked.reshape(-1, checked.shape[-1]):
             if abs(task[0] - round(task[0])) > 1e-6:
-                raise ValueError(
-                    f"{name}={task.tolist()} must begin with a manipulation's number, a whole one"
-                )
+                raise ValueError(f"{name}={task.tolist()} must begin with a whole number")
             manipulation, placement = self._place(task, np.random.default_rng(0))
             if np.any(task[1 + len(placement) :] != 0.0):
                 raise ValueError(
@@ -346,9 +340,7 @@ class MetaWorldML10Env(MetaWorldEnv):
 
 
 def split_stream(rng: np.random.Generator, split: int) -> np.random.Generator:
-    """A generator that another determines, and that differs from split to split; the first split
-    draws from the given one directly.
-    """
+    """A generator that another determines, another for each split but the first."""
     return rng if split == 0 else np.random.default_rng([split, *rng.integers(2**32, size=4)])
 
 

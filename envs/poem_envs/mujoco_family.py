@@ -101,9 +101,7 @@ class MujocoFamily(MujocoFilms, BatchFamily):
         return self.states[:, 1 : 1 + self.model.nq]
 
     def _draw_start(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """An episode's first ``qpos`` and ``qvel``; unless overridden, as Gymnasium's HalfCheetah
-        and Ant draw them.
-        """
+        """An episode's first ``qpos`` and ``qvel``; as Gymnasium's Ant unless overridden."""
         scale = self.reset_noise_scale
         qpos = self.init_qpos + rng.uniform(low=-scale, high=scale, size=self.model.nq)
         qvel = self.init_qvel + scale * rng.standard_normal(self.model.nv)
@@ -123,9 +121,7 @@ class MujocoFamily(MujocoFilms, BatchFamily):
         return np.zeros(len(self.states), dtype=bool)
 
     def _task_markers(self, task: np.ndarray, position: np.ndarray) -> list[dict[str, Any]]:
-        """Shapes that show a task, as ``MujocoRenderer``'s ``add_marker`` takes them, where the
-        robot's root has a position, ``(3,)``.
-        """
+        """Shapes that show a task, as ``add_marker`` takes them; ``(3,)``, the robot's root."""
         raise NotImplementedError
 
     def _observation_dim(self) -> int:
@@ -147,9 +143,7 @@ class MujocoFamily(MujocoFilms, BatchFamily):
         return self._reward_features(qpos_before, actions), self._unhealthy()
 
     def _integrate(self, actions: np.ndarray) -> np.ndarray:
-        """The states after a control step, with a cold solver start: a view that the next call
-        overwrites.
-        """
+        """The states after a control step: a view that the next call overwrites."""
         n, steps = len(self.states), self.frame_skip
         if self._rollout is None:
             nthread = min(self.nthread, n)

@@ -204,9 +204,7 @@ class ProcessCopies:
         groups = np.array_split(np.arange(n), min(nthread, n))
         self._firsts = [int(copies[0]) for copies in groups]
         # Where each copy is: its group, and its number there.
-        self._places = [
-            (group, k) for group, copies in enumerate(groups) for k in range(len(copies))
-        ]
+        self._places = [(group, k) for group, own in enumerate(groups) for k in range(len(own))]
         self._groups: list[CopyGroup | RemoteGroup] = []
         self._interrupted = False
         self._attributes: dict[str, Any] = {}

@@ -57,15 +57,11 @@ def checked_manipulation(env_name: str) -> str:
         if near
         else f"choose one of {', '.join(known)}"
     )
-    raise ValueError(
-        f"env_name={env_name!r} is none of Meta-World's {len(known)} manipulations; {hint}"
-    )
+    raise ValueError(f"{env_name=} is none of Meta-World's {len(known)} manipulations; {hint}")
 
 
 class PlacementRefusedError(ValueError):
-    """Meta-World would redraw the placement, for example because object and goal are too near to
-    each other.
-    """
+    """Meta-World would redraw the placement, as where object and goal are too near."""
 
 
 class Sawyer:
@@ -132,9 +128,7 @@ class Sawyer:
         return observation, float(reward), bool(info["success"])
 
     def render(self) -> Any:
-        """What Meta-World returns in its ``render_mode``; an image ``(height, width, 3)``, uint8,
-        where it renders fast.
-        """
+        """An image ``(height, width, 3)`` uint8, or what else ``render_mode`` says."""
         env = self.env
         if not self.arguments["renders_fast"]:
             prepare_to_render(env, env.render_mode)
@@ -167,9 +161,7 @@ _at_rest: dict[tuple[Any, ...], list[Sawyer]] = {}
 
 
 def take_sawyer(manipulation: str, **arguments: Any) -> Sawyer:
-    """A simulator of a manipulation, made anew if none is at rest; arguments as :class:`Sawyer` has
-    them.
-    """
+    """A simulator made with :class:`Sawyer`'s arguments, anew if none is at rest."""
     at_rest = _at_rest.get(_key(manipulation, arguments))
     return at_rest.pop() if at_rest else Sawyer(manipulation, **arguments)
 
@@ -184,9 +176,7 @@ def _key(manipulation: str, arguments: dict[str, Any]) -> tuple[Any, ...]:
 
 
 class Placements:
-    """Which placements a manipulation has, as Meta-World draws them. It needs an environment for
-    that, whose arm stays still.
-    """
+    """A manipulation's placements, as Meta-World draws them, in an arm that stays still."""
 
     def __init__(self, manipulation: str) -> None:
         self._sawyer = Sawyer(manipulation)

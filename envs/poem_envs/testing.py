@@ -41,9 +41,7 @@ def check_task_family(
     if isinstance(env, str):
         env = plain_id(env)
     elif not callable(env):
-        raise TypeError(
-            f"env is {env!r}, but must be a class or a function that makes it, or a registered id"
-        )
+        raise TypeError(f"env is {env!r}, but must be a class, a function, or a registered id")
     case = Case(partial(_make, env, **env_kwargs), n_steps, seed)
     check_spaces(case)
     check_sampling(case)
@@ -190,9 +188,7 @@ def check_seeds(case: Case) -> None:
             "did not: draw all randomness from the rng that _begin_episode is given, and reset the "
             "whole state of the simulator there"
         )
-        assert np.array_equal(family.task, task), (
-            f"reset(seed={case.seed}) must draw the same task every time"
-        )
+        assert np.array_equal(family.task, task), f"reset(seed={case.seed}) must draw one task"
 
 
 def check_set_task(case: Case) -> None:
@@ -200,9 +196,7 @@ def check_set_task(case: Case) -> None:
     env = case.make()
 
     def in_effect(task: np.ndarray, after: str) -> None:
-        assert np.array_equal(env.task, task), (
-            f"after {after}, task must be {task}, but is {env.task}"
-        )
+        assert np.array_equal(env.task, task), f"after {after}, task must be {task}, not {env.task}"
 
     first, second = case.tasks
     env.set_task(first)
@@ -215,9 +209,7 @@ def check_set_task(case: Case) -> None:
     features = info["reward_features"]
     kept, changed = (float(env.compute_rewards(task, features)) for task in (first, second))
     ok = np.array_equal(env.task, first) and not (reward == changed != kept)
-    assert ok, (
-        "set_task must take effect at the next reset only, but it changed the episode under way"
-    )
+    assert ok, "set_task must take effect at the next reset only, but changed the episode under way"
     env.reset()
     in_effect(second, "set_task in an episode and reset")
     env.reset(seed=case.seed)
@@ -415,9 +407,7 @@ def _check_observation(observation: Any, env: TaskFamily, origin: str) -> None:
 def _both_ways(
     family: Any, other: Any, method: str, tasks: np.ndarray, rows: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What a method gives for all tasks and rows at once, and another's one by one, ``(tasks,
-    rows)`` each.
-    """
+    """What a method gives for all tasks and rows at once, and another's one by one."""
     single = getattr(other, method)
     one_by_one = np.array([[float(single(task, row)) for row in rows] for task in tasks])
     try:

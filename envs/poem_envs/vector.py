@@ -1,6 +1,4 @@
-"""Many copies of a task family at once, whose results are those of single environments bit for
-bit.
-"""
+"""Many copies of a task family at once, the same as single ones bit for bit."""
 
 from __future__ import annotations
 
@@ -181,9 +179,7 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         if num_envs < 1:
             raise ValueError(f"num_envs={num_envs!r} must be at least 1")
         if max_episode_steps is not None and max_episode_steps < 1:
-            raise ValueError(
-                f"max_episode_steps={max_episode_steps!r} must be at least 1, or None for no limit"
-            )
+            raise ValueError(f"{max_episode_steps=} must be at least 1, or None for no limit")
         nthread = checked_nthread(nthread)
         if render_mode is not None:
             family_kwargs["render_mode"] = render_mode

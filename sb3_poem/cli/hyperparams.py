@@ -6,7 +6,7 @@ import importlib.util
 import inspect
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -88,9 +88,7 @@ def check_config(config: str) -> None:
     with contextlib.suppress(ImportError, ValueError):
         found = importlib.util.find_spec(config)
     if found is None:
-        raise ValueError(
-            f"-c {config}: there is no such module; the name of a file ends in .yml, .yaml or .py"
-        )
+        raise ValueError(f"-c {config}: there is no such module; a file ends in .yml, .yaml or .py")
 
 
 def entry_params(algorithm: str, entry: dict[str, Any]) -> dict[str, Any]:
@@ -138,6 +136,4 @@ def _sample(
 
 
 #: By the algorithm's name, called with (trial, n_actions, n_envs, additional arguments)
-SAMPLERS: dict[str, Callable[..., dict[str, Any]]] = {
-    name: partial(_sample, name) for name in ALGORITHMS
-}
+SAMPLERS: dict[str, Any] = {name: partial(_sample, name) for name in ALGORITHMS}

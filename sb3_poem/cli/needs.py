@@ -1,6 +1,4 @@
-"""What a command will need, checked before it spends its time: files to write, a device, modules
-that register environments.
-"""
+"""What a command will need, checked before it spends its time."""
 
 import importlib
 import os

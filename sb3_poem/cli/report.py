@@ -21,9 +21,7 @@ TABLE_WIDTH = 76
 
 @dataclass(frozen=True)
 class Report:
-    """The outcome of adapting a model; ``settings`` are JSON-ready, without ``known`` it was left
-    unfinished.
-    """
+    """The outcome of adapting a model, JSON-ready ``settings``; incomplete without ``known``."""
 
     title: str
     settings: dict[str, Any]

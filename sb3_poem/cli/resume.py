@@ -54,9 +54,7 @@ def resume_command(arguments: Sequence[str]) -> str:
 
 
 def is_complete(model: Path) -> bool:
-    """Whether a training made all its steps, by the file of its model, which rl_zoo3 writes when an
-    interrupt stops it, too.
-    """
+    """Whether a training made all its steps; an interrupted one has a model's file, too."""
     if not model.exists():
         return False
     try:
@@ -64,9 +62,7 @@ def is_complete(model: Path) -> bool:
             data = json.loads(archive.read("data"))
         return int(data["num_timesteps"]) >= int(data["_total_timesteps"])
     except (zipfile.BadZipFile, KeyError, ValueError) as error:
-        raise ValueError(
-            f"{model} is truncated, or no model: {error}; remove it to train anew"
-        ) from error
+        raise ValueError(f"{model} is truncated, or no model: {error}; remove it") from error
 
 
 def last_run(folder: Path, env_name: str, seed: int) -> Path | None:

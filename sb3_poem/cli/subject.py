@@ -58,9 +58,7 @@ def say(text: str) -> None:
 
 
 class Subject:
-    """A model, an environment with many copies (``env``), and test tasks: ``n_tasks``, unless
-    ``--task`` names the only one.
-    """
+    """A model, an environment with many copies, and test tasks or the one of ``--task``."""
 
     def __init__(
         self, arguments: argparse.Namespace, console: Console, n_tasks: int, copies: int

@@ -149,9 +149,7 @@ class FamilyView:
         changing += [kind.__name__ for kind in CHANGING_KINDS if any(env.env_is_wrapped(kind))]
         if changing:
             wrappers = ", ".join(names)
-            raise WrapperError(
-                f"env must not be wrapped in {changing[0]} (its wrappers: {wrappers})"
-            )
+            raise WrapperError(f"env must not be wrapped in {changing[0]} (it is in: {wrappers})")
         unknown = [name for name in names if name not in HARMLESS]
         for space in ("observation_space", "action_space") if unknown else ():
             own, given = getattr(self._get("unwrapped"), space), getattr(env, space)

@@ -18,9 +18,7 @@ ALIGNMENT = 16
 
 
 class LowPrecisionMLP:
-    """Copies of a perceptron's hidden layers in another arithmetic, each followed by a ReLU; the
-    output layer stays the perceptron's own, in float32.
-    """
+    """Copies of a perceptron's hidden layers, each with a ReLU; its output is float32's own."""
 
     def __init__(
         self, hidden: Sequence[nn.Linear], output: nn.Linear, dtype: th.dtype, layer_norm: bool

@@ -107,9 +107,7 @@ def check_arguments(given: Mapping[str, Any], algorithm: type) -> None:
     if scale != "auto" and not (isinstance(scale, int | float) and scale > 0):
         raise ValueError(f'reward_scale must be a positive number or "auto", got {scale!r}')
     if given["shaping_coef"] > 0 and given["gamma"] == 1:
-        raise ValueError(
-            "shaping_coef must be 0 with gamma=1: staying somewhere has no finite value then"
-        )
+        raise ValueError("shaping_coef must be 0 with gamma=1: staying has no finite value then")
     hidden_dtype(given["precision"], "cpu")  # refuses an unknown name
     if str(device).startswith("cuda") and not th.cuda.is_available():  # which SB3 says nothing of
         what = f"device is {device!r}, but torch sees no CUDA device: the CPU is used"

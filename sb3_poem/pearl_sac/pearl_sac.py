@@ -569,9 +569,7 @@ class PEARLSAC(SAC):
     @property
     def _known_context(self) -> ContextStore:
         if self.epoch_context is None:
-            raise ValueError(
-                "the model has no contexts before it has collected an epoch: call learn"
-            )
+            raise ValueError("the model has no contexts before its first epoch: call learn")
         return self.epoch_context
 
     # ------------------------------------------------------------------ the task family
@@ -613,9 +611,7 @@ class PEARLSAC(SAC):
             )
 
     def set_env(self, env: GivenEnv, force_reset: bool = True) -> None:
-        """Change the environment, to one of the same family with any number of copies; a registered
-        id gets as many as the model has.
-        """
+        """Train on another environment of the family; an id gets as many copies as before."""
         given = vectorise(env, self.n_envs)
         if given is None:
             raise TypeError("env is None, but set_env needs an environment")

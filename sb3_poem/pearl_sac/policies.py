@@ -75,9 +75,7 @@ class LatentPolicy(SACPolicy):
         optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
         if not (isinstance(activation_fn, type) and issubclass(activation_fn, nn.Module)):
-            raise TypeError(
-                f"activation_fn must be a class of torch.nn, as nn.ReLU, but is {activation_fn!r}"
-            )
+            raise TypeError(f"activation_fn must be a class, as nn.ReLU, but is {activation_fn!r}")
         if optimizer_kwargs is None and optimizer_class is th.optim.Adam:
             optimizer_kwargs = {"fused": True}
         BasePolicy.__init__(
@@ -175,9 +173,8 @@ class LatentPolicy(SACPolicy):
         for trajectory in trajectories:
             total = len(trajectory.actions)
             steps = _evenly_spaced(total, max_steps)
-            obs, next_obs = (
-                self.standardise(tensor(trajectory.observations[at])) for at in (steps, steps + 1)
-            )
+            seen = (trajectory.observations[at] for at in (steps, steps + 1))
+            obs, next_obs = (self.standardise(tensor(values)) for values in seen)
             actions = self.scale_action_batch(tensor(trajectory.actions[steps]))
             rows.append(th.cat([obs, actions, next_obs], dim=1))
             lengths.append(len(steps))
@@ -243,10 +240,8 @@ class LatentPolicy(SACPolicy):
         single = obs.ndim == 1
         obs = np.atleast_2d(obs)
         n, d, expected = len(obs), self.latent_dim, self.observation_space.shape
-        if obs.shape[1:] != expected:
-            raise ValueError(
-                f"observation has shape {obs.shape[1:]}, but the policy takes {expected}"
-            )
+        if (shape := obs.shape[1:]) != expected:
+            raise ValueError(f"observation has shape {shape}, but the policy takes {expected}")
         if not np.all(np.isfinite(obs)):
             where = int(np.argwhere(~np.isfinite(obs))[0, 0])
             raise ValueError(f"observation {where} holds NaN or infinity")

@@ -109,9 +109,7 @@ class MetaBatchSampler:
     def _transitions(
         self, task_ids: th.Tensor, chosen: np.ndarray, batch_size: int
     ) -> tuple[TaskBatch, Bootstraps | None]:
-        """``batch_size`` transitions a task, ``relabel_fraction`` of them relabelled; and what
-        targets need beyond these.
-        """
+        """Transitions, ``relabel_fraction`` of them relabelled; what targets need beyond."""
         generator, buffer = self.generators.torch, self.replay_buffer
         sources = task_ids[:, None].expand(-1, batch_size)
         n_foreign = round(self.relabel_fraction * batch_size)

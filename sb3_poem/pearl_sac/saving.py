@@ -107,10 +107,8 @@ def read_archive(
             learned = [str(coef).startswith("auto") for coef in (value, found[name])]
             fixed = learned[0] != learned[1]
             why = ": a coefficient that is learned stays one, as does a fixed one"
-        if fixed and value != found.get(name):
-            raise ValueError(
-                f"{name} is {found.get(name)!r} in {path}, and cannot become {value!r}{why}"
-            )
+        if fixed and value != (kept := found.get(name)):
+            raise ValueError(f"{name} is {kept!r} in {path}, and cannot become {value!r}{why}")
     return data
 
 
@@ -129,9 +127,7 @@ def _facts(path: str | Path) -> dict[str, Any]:
 
 
 def _check_is_file(path: Path, algorithm: str) -> None:
-    """:raises ValueError: if it is a checkpoint, a folder or a shipped model's name, which other
-    methods read
-    """
+    """:raises ValueError: if it is what another method reads: a checkpoint, a folder"""
     what, method = "", "from_pretrained"
     if path.is_file():
         if is_checkpoint(path):
@@ -213,9 +209,7 @@ def model_contents(
     for argument, module in classes.items():
         value = getattr(policy, argument)
         if getattr(module, value.__name__, None) is not value:
-            raise ValueError(
-                f"{argument} must be one of {module.__name__} to be saved by its name, got {value}"
-            )
+            raise ValueError(f"{argument} must be in {module.__name__} to be saved, but is {value}")
     state, found = policy.state_dict(), [(name, getattr(model, name)) for name in SPACES]
     tensors = {f"policy.{name}": state[name] for name in state if not name.startswith(DERIVED)}
     arrays = {name: getattr(model.train_tasks, field) for name, field in ARRAYS.items()}
@@ -244,9 +238,7 @@ def config_text(config: dict[str, Any]) -> str:
 
 
 def _arguments(model: Any) -> dict[str, Any]:
-    """Arguments of the constructor with which training goes on as it stopped; a schedule's place
-    takes its default.
-    """
+    """Arguments with which training goes on; a schedule's place takes its default."""
     names = [*kept_arguments(type(model)), "target_entropy", "ent_coef"]
     arguments = {name: getattr(model, name) for name in names}
     coefficient = model.entropy_coefficient

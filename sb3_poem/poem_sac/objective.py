@@ -15,9 +15,7 @@ from sb3_poem.pearl_sac.sampler import MetaBatch
 class POEMObjective(Objective):
     """PEARL's losses and, weighted with ``preference_coef``, the preference loss."""
 
-    actor_trains_encoder: ClassVar[bool] = (
-        True  # L_policy trains f_pi and the encoder (section 5.3)
-    )
+    actor_trains_encoder: ClassVar[bool] = True  # L_policy trains both (section 5.3)
 
     preference_coef: float
 

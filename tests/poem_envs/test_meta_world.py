@@ -215,7 +215,7 @@ def test_wrong_tasks_of_ml10(rng):
         task for task in env.sample_tasks(10, rng) if env.manipulations[int(task[0])] == "door-open"
     )
     for index, value, message in (
-        (0, 3.5, "a whole one"),
+        (0, 3.5, "a whole number"),
         (6, 0.1, "is 3 numbers, then zeros"),
         (1, 0.15, "must be inside"),
     ):
