@@ -4,12 +4,12 @@ import contextlib
 import os
 import uuid
 from collections.abc import Callable
+from io import BufferedWriter
 from pathlib import Path
-from typing import BinaryIO
 
 
 def write_atomically(
-    path: str | Path, content: bytes | memoryview | Callable[[BinaryIO], object]
+    path: str | Path, content: bytes | memoryview | Callable[[BufferedWriter], object]
 ) -> None:
     """Write a file, and missing folders, completely or not at all: a crash, a kill or a full disk
     leaves the previous file whole. ``content`` may be a function that writes to an open file.

@@ -677,21 +677,18 @@ class PEARLSAC(SAC):
         include: Iterable[str] | None = None,
     ) -> None:
         """As SB3's, but a file is written completely or not at all."""
-
-        def write(file: Any) -> None:
-            try:
-                super(PEARLSAC, self).save(file, exclude, include)
-            except RuntimeError as error:
-                # torch raises its own over what stopped its writing
-                if isinstance(error.__context__, (OSError, KeyboardInterrupt)):
-                    raise error.__context__ from None
-                raise
-
-        if isinstance(path, io.BufferedIOBase):
-            write(path)
+        if not isinstance(path, io.BufferedIOBase):
+            path = pathlib.Path(path)
+            path = path if path.suffix else path.with_suffix(".zip")
+            write_atomically(path, lambda file: self.save(file, exclude, include))
             return
-        path = pathlib.Path(path)
-        write_atomically(path if path.suffix else path.with_suffix(".zip"), write)
+        try:
+            super().save(path, exclude, include)
+        except RuntimeError as error:
+            # torch raises its own over what stopped its writing
+            if isinstance(error.__context__, (OSError, KeyboardInterrupt)):
+                raise error.__context__ from None
+            raise
 
     @classmethod
     def load(
@@ -726,7 +723,7 @@ class PEARLSAC(SAC):
         """
         self.keeps_experience = True
         try:
-            self.save(path)
+            write_atomically(path, self.save)
         finally:
             self.keeps_experience = False
 
