@@ -10,18 +10,10 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+from poem_envs import sawyer
 from poem_envs.family import TaskFamily
 from poem_envs.films import Look, MujocoFilms
 from poem_envs.mujoco_rendering import renders_fast
-from poem_envs.sawyer import (
-    PlacementRefusedError,
-    Sawyer,
-    checked_manipulation,
-    give_back_sawyer,
-    load_metaworld,
-    placements_of,
-    take_sawyer,
-)
 
 OBSERVATION_DIM = 39
 #: Manipulations whose goal is nothing but a place that the hand is to reach.
@@ -65,7 +57,7 @@ class MetaWorldEnv(MujocoFilms, TaskFamily):
         # Meta-World's models have these cameras upside down.
         self._upside_down = (camera_name or "").startswith("corner")
         self._success = False
-        self._sawyer: Sawyer | None = None
+        self._sawyer: sawyer.Sawyer | None = None
 
     def _place(self, task: np.ndarray, rng: np.random.Generator) -> tuple[str, np.ndarray]:
         """The manipulation and the placement, ``(placement_dim,)``, of an episode."""
@@ -84,7 +76,7 @@ class MetaWorldEnv(MujocoFilms, TaskFamily):
         manipulation, placement = self._place(self._task, rng)
         if self._sawyer is None or self._sawyer.manipulation != manipulation:
             self._release_sawyer()
-            self._sawyer = take_sawyer(manipulation, **self._sawyer_arguments)
+            self._sawyer = sawyer.take_sawyer(manipulation, **self._sawyer_arguments)
         self._success = False
         return self._sawyer.reset(placement, self.render_task)
 
@@ -102,7 +94,7 @@ class MetaWorldEnv(MujocoFilms, TaskFamily):
     def _step_info(self) -> dict[str, Any]:
         return {"success": self._success}
 
-    def _begun(self, method: str) -> Sawyer:
+    def _begun(self, method: str) -> sawyer.Sawyer:
         if self._sawyer is None:
             raise RuntimeError(f"{method}() was called before the first reset()")
         return self._sawyer
@@ -126,7 +118,7 @@ class MetaWorldEnv(MujocoFilms, TaskFamily):
 
     def _release_sawyer(self) -> None:
         if self._sawyer is not None:
-            give_back_sawyer(self._sawyer)
+            sawyer.give_back_sawyer(self._sawyer)
             self._sawyer = None
 
 
@@ -207,7 +199,7 @@ class MetaWorldML1Env(MetaWorldEnv):
     splits = ("train", "test")
 
     def __init__(self, *, env_name: str = "reach", split: str = "train", **kwargs: Any) -> None:
-        self.env_name = checked_manipulation(env_name)
+        self.env_name = sawyer.checked_manipulation(env_name)
         if split == "held-out":
             raise ValueError(
                 "split='held-out': poem/MetaWorldML1-v0 has one manipulation and holds none back; "
@@ -215,7 +207,7 @@ class MetaWorldML1Env(MetaWorldEnv):
                 "manipulations"
             )
         super().__init__(split=split, **kwargs)
-        placements = placements_of(self.env_name)
+        placements = sawyer.placements_of(self.env_name)
         low, high = placements.low, placements.high
         self._reaching = self.shared_dynamics = self.env_name in REACHING
         if self._reaching:
@@ -230,7 +222,7 @@ class MetaWorldML1Env(MetaWorldEnv):
 
     def _draw_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
         rng = split_stream(rng, self.splits.index(self.split))
-        draws = np.stack([placements_of(self.env_name).draw(rng) for _ in range(n)])
+        draws = np.stack([sawyer.placements_of(self.env_name).draw(rng) for _ in range(n)])
         return draws[:, 3:] if self._reaching else draws
 
     def _checked_tasks(self, tasks: npt.ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:
@@ -297,14 +289,14 @@ class MetaWorldML10Env(MetaWorldEnv):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        table = load_metaworld().ML10_V3
+        table = sawyer.load_metaworld().ML10_V3
         names = [*table["train"], *table["test"]]
         #: The names of the manipulations, by number.
         self.manipulations = [name.removesuffix("-v3") for name in names]
         numbers = np.arange(len(names))
         trained, held_out = np.split(numbers, [len(table["train"])])
         self._numbers = held_out if self.split == "held-out" else trained
-        bounds = [placements_of(name) for name in self.manipulations]
+        bounds = [sawyer.placements_of(name) for name in self.manipulations]
         self._placement_dims = [len(placements.low) for placements in bounds]
         width = max(self._placement_dims)
         low = np.min([_padded(placements.low, width) for placements in bounds], axis=0)
@@ -317,7 +309,7 @@ class MetaWorldML10Env(MetaWorldEnv):
         rounds = -(-n // len(self._numbers))
         numbers = np.concatenate([rng.permutation(self._numbers) for _ in range(rounds)])[:n]
         width = self.task_space.shape[0] - 1
-        places = [placements_of(self.manipulations[number]) for number in numbers]
+        places = [sawyer.placements_of(self.manipulations[number]) for number in numbers]
         return np.column_stack([numbers, [_padded(place.draw(rng), width) for place in places]])
 
     def _checked_tasks(self, tasks: npt.ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:
@@ -346,13 +338,13 @@ def split_stream(rng: np.random.Generator, split: int) -> np.random.Generator:
 
 def check_placement(manipulation: str, placement: np.ndarray, name: str) -> None:
     """:raises ValueError: if Meta-World has no such placement of the manipulation"""
-    places = placements_of(manipulation)
+    places = sawyer.placements_of(manipulation)
     what = f"{name}: placement {placement.tolist()} of {manipulation!r}"
     if np.any(placement < places.low - 1e-6) or np.any(placement > places.high + 1e-6):
         raise ValueError(f"{what} must be inside {places.low} to {places.high}")
     try:
         places.check(placement)
-    except PlacementRefusedError as error:
+    except sawyer.PlacementRefusedError as error:
         raise ValueError(f"{what}: {error}; draw one by sample_tasks") from error
 
 

@@ -74,10 +74,7 @@ class MujocoFamily(MujocoFilms, BatchFamily):
     def __post_init__(self) -> None:
         self.model = mujoco.MjModel.from_xml_path(_model_path(self.xml_file))
         if self.model.na:
-            raise ValueError(
-                f"xml_file={self.xml_file!r} has actuators with activations, which these "
-                "environments do not handle"
-            )
+            raise ValueError(f"xml_file={self.xml_file!r} must not have actuators with activations")
         self._rollout: Rollout | None = None
         self._renderer: StateRenderer | FastRenderer | None = None
         initial = mujoco.MjData(self.model)
@@ -209,8 +206,5 @@ def _model_path(xml_file: str) -> str:
     if not path.startswith((".", os.sep)):
         path = os.path.join(os.path.dirname(gymnasium.__file__), "envs", "mujoco", "assets", path)
     if not os.path.exists(path):
-        raise OSError(
-            f"xml_file={xml_file!r} does not exist; give a path, or the bare name of one of "
-            "Gymnasium's models"
-        )
+        raise OSError(f"{xml_file=} does not exist; give a path, or the name of a Gymnasium model")
     return path

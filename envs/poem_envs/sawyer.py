@@ -28,10 +28,7 @@ def load_metaworld() -> Any:
         raise ImportError(f"{needed}: {INSTALL}") from None
     major, minor = (int(part) for part in found.split(".")[:2])
     if major != 3 or minor < 1:
-        raise ImportError(
-            f"{needed}, but metaworld {found} is installed, whose rewards and placements are "
-            f"others: {INSTALL}"
-        )
+        raise ImportError(f"{needed}, but metaworld {found} is installed: {INSTALL}")
     import metaworld.env_dict
 
     return metaworld.env_dict

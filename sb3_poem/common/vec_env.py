@@ -15,15 +15,10 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv
-from stable_baselines3.common.vec_env.base_vec_env import (
-    VecEnv,
-    VecEnvIndices,
-    VecEnvObs,
-    VecEnvStepReturn,
-)
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from poem_envs.family import TaskFamily
+from poem_envs.family import TaskFamily, check_options
 from poem_envs.registration import plain_id
 from poem_envs.vector import TaskFamilyVector
 from sb3_poem.common.family_view import no_family
@@ -102,14 +97,9 @@ class TaskVecEnv(VecEnv):
         """See :meth:`poem_envs.TaskFamilyVector.keep_tasks`."""
         self.vector_env.keep_tasks()
 
-    def reset(self) -> VecEnvObs:
+    def reset(self) -> np.ndarray:
         for index, options in enumerate(self._options):
-            if options:
-                if unknown := set(options) - {"task"}:
-                    raise ValueError(
-                        f"options={options!r} of reset holds unknown keys {sorted(unknown)}, known "
-                        "is 'task'"
-                    )
+            if check_options(options, frozenset({"task"})):
                 self.vector_env.set_tasks([options["task"]], copies=[index])
         observations, _ = self.vector_env.reset(seed=self._seeds)
         self._reset_seeds()
@@ -121,7 +111,7 @@ class TaskVecEnv(VecEnv):
     def step_async(self, actions: np.ndarray) -> None:
         self._actions = actions
 
-    def step_wait(self) -> VecEnvStepReturn:
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         if self._actions is None:
             raise RuntimeError("step_wait() was called without step_async(actions)")
         actions, self._actions = self._actions, None
@@ -326,10 +316,7 @@ def _vectorised(
         what = "Monitor's reset_keywords and allow_early_resets=False are not supported"
         raise ValueError(f"{what}; {instead}")
     if bare.spec is None:
-        raise ValueError(
-            f"{bare} was not made by gym.make, so that its arguments are unknown; register it, or "
-            f"{instead}"
-        )
+        raise ValueError(f"{bare} was not made by gym.make; register it, or {instead}")
     if bare.spec.vector_entry_point is None:
         raise ValueError(f"{bare.spec.id} is registered without a vector_entry_point; {instead}")
     if bare._next_task is not None:
