@@ -124,7 +124,10 @@ class FamilyView:
                 "horizon=<steps>"
             )
         if horizon is not None and horizon != steps:
-            raise ValueError(f"horizon is {horizon}, but the environment's limit is {limit} steps")
+            raise ValueError(
+                f"horizon is {horizon}, but the environment ends episodes after {limit} steps; "
+                "they must agree"
+            )
         if steps < 1:
             raise ValueError(f"horizon must be at least 1 step, got {steps}")
         return int(steps)
