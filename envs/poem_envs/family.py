@@ -17,8 +17,7 @@ from gymnasium.error import ResetNeeded
 
 from poem_envs.headless import has_display
 
-# Rounding in float32 policies and files may leave a value just outside its bounds: up to this it is
-# clipped, not refused.
+# Float32 policies and files round: a value so far outside its bounds is clipped, not refused.
 BOUNDS_TOLERANCE = 1e-6
 
 
@@ -142,8 +141,7 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
     all_tasks: np.ndarray | None = None
     #: Number of reward features, the last dimension of ``info["reward_features"]``.
     reward_feature_dim: int
-    #: Whether tasks differ in the reward alone, so that one task's trajectories can be relabelled
-    #: with another's rewards.
+    #: Whether tasks differ in the reward alone, so that trajectories can be relabelled.
     shared_dynamics: bool = True
     #: The names of the sets that tasks can be drawn from, of which the first is for training.
     splits: tuple[str, ...] = ("train",)

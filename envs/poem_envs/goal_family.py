@@ -19,8 +19,7 @@ from poem_envs.mujoco_rendering import prepare_to_render
 
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 GOAL_SITE = "target"
-#: Wrappers whose work the family, or what is around it, does itself; by name, since rl_zoo3
-#: replaces Gymnasium's TimeLimit
+#: Wrappers whose work is done anyway; by name, since rl_zoo3 replaces Gymnasium's TimeLimit
 TAKEN_OFF = frozenset({"TimeLimit", "OrderEnforcing", "PassiveEnvChecker"})
 REWARD = "compute_reward(achieved_goal, desired_goal, info)"
 SetGoal = Callable[[gym.Env, np.ndarray], None]

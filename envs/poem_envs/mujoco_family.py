@@ -160,8 +160,7 @@ class MujocoFamily(MujocoFilms, BatchFamily):
         return self._after[:, -1]
 
     def _check_divergence(self, after: np.ndarray) -> None:
-        # A simulation that blows up is reset by MuJoCo within the step, with no more than a
-        # warning; its clock tells.
+        # MuJoCo resets a simulation that blows up, with a mere warning; its clock tells.
         late = np.abs(after[:, 0] - self.states[:, 0] - self.dt) > 0.5 * self.model.opt.timestep
         diverged = late | ~np.isfinite(after).all(axis=1)
         if diverged.any():

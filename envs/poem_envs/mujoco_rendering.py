@@ -15,8 +15,7 @@ from poem_envs.headless import choose_headless_backend
 
 RENDER_QUALITIES = ("full", "fast")
 TASK_COLOUR = (0.16, 0.65, 0.27, 1.0)
-# Slices and stacks of a sphere, and quads of a plane: at the size of a web page nobody sees the
-# difference.
+# Slices and stacks of a sphere, quads of a plane: at a web page's size nobody sees it.
 SLICES, COARSE = 12, (6, 1)
 
 
@@ -33,8 +32,7 @@ class _Renderer:
         mujoco.mj_forward(self._model, self._data)
 
     def _close_at_exit(self) -> None:
-        # A graphics context must go before the library that made it, which ends itself at exit: so
-        # register after its import.
+        # A context must go before the library that made it: so register after its import.
         if not _open_renderers:
             atexit.register(_close_open_renderers)
         _open_renderers.add(self)
@@ -45,9 +43,7 @@ class _Renderer:
 
 
 class StateRenderer(_Renderer):
-    """Renders states as Gymnasium's ``MujocoRenderer`` does, whoever simulated them; without a
-    camera, one follows the robot's root.
-    """
+    """Renders states as Gymnasium's ``MujocoRenderer`` does; its own camera follows the root."""
 
     def __init__(self, model: mujoco.MjModel, *, width: int, height: int, **view: Any) -> None:
         from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer  # loads the window system

@@ -96,8 +96,7 @@ class Sawyer:
         :raises PlacementRefusedError: if Meta-World would not have it
         """
         env = self.env
-        # The first pass moves bodies in the model, which the second one's quantities then follow
-        # from.
+        # The first pass moves bodies in the model, from which the second one computes.
         for _ in range(2):
             mujoco.mj_resetData(env.model, env.data)
             self._placement = placement.copy()

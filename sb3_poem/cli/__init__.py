@@ -39,8 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(str(stop) or "Interrupted.", file=sys.stderr)
         return 130
     except (ValueError, TypeError, OSError, EOFError, ImportError, gymnasium.error.Error) as error:
-        # The library says in these what the user gave and what would be right; a developer wants
-        # the place as well.
+        # These say what the user gave and what would be right; a developer wants the place, too.
         if os.environ.get("SB3_POEM_TRACEBACK"):
             raise
         print(f"sb3-poem {arguments.command}: error: {error}", file=sys.stderr)

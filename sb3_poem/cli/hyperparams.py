@@ -30,8 +30,7 @@ SCALES = ("one_minus_gamma", "learning_rate", "tau", *COEFFICIENTS)
 COUNTS = ("gradient_steps", "batch_size", "context_size", "meta_batch_size", "latent_dim")
 #: Searched up to so far from the entry's value
 FRACTIONS = {"relabel_fraction": 0.3}
-#: A learning rate that falls to zero, which rl_zoo3 writes ``lin_1e-3``, is searched under this
-#: name, and stays one
+#: The name of a learning rate that falls to zero (rl_zoo3's ``lin_1e-3``), and stays one
 LINEAR = "lin_learning_rate"
 
 

@@ -82,8 +82,7 @@ class TaskReplayBuffer(ReplayBuffer):
         self.counts = np.zeros(self.n_tasks, dtype=np.int64)
         self.positions = np.zeros(self.n_tasks, dtype=np.int64)
         self._counts_on_device = th.zeros(self.n_tasks, device=self.device)
-        # Observations after an end. A row's mark is the number of its own, negative if the episode
-        # terminated; 0 is no end.
+        # Observations after an end; a row's mark is its number here, negative if it terminated.
         self.ends = th.zeros(1, self.obs_dim, device=self.device)
         self._free_ends = np.zeros(0, dtype=np.int32)
 

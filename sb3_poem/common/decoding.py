@@ -6,8 +6,7 @@ import torch as th
 
 from sb3_poem.common.networks import MLP
 
-# Rows of hidden values that are computed together: enough to pay for a call, few enough to stay in
-# a core's cache.
+# Rows of hidden values at once: enough to pay for a call, few enough for a core's cache.
 BLOCK_ROWS = 2000
 
 

@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 
 # Arguments that change how an environment is drawn, not what it is.
 DRAWING_ARGUMENTS = {"render_mode", "render_task"}
-#: Test tasks come from a stream of their own, so that no seed gives the tasks that a model was
-#: trained on
+#: Test tasks have a stream of their own: no seed gives the tasks of a training
 TEST_TASK_STREAM = 0x7E57
 #: Steps by which it is seen whether a wrapper changes a family
 COMPARED_STEPS = 10

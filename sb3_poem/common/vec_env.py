@@ -291,8 +291,7 @@ def _wrappers(env: gym.Env) -> list[gym.Wrapper]:
 
 
 def _is_absorbed(wrapper: gym.Wrapper) -> bool:
-    # An import of rl_zoo3 replaces Gymnasium's TimeLimit, for environments that are made later, by
-    # a subclass of its own.
+    # An import of rl_zoo3 replaces Gymnasium's TimeLimit by a subclass.
     patched = isinstance(wrapper, TimeLimit) and type(wrapper).__module__ == "rl_zoo3.gym_patches"
     return patched or type(wrapper) in ABSORBED_WRAPPERS
 

@@ -32,8 +32,7 @@ def write_video(frames: Sequence[Frame], path: str | Path, fps: float = 20.0) ->
 
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".gif":
-        # Delays are whole hundredths of a second, and browsers slow those below two down: leave
-        # frames out, and spread the rounding.
+        # Delays are whole hundredths of a second, two at least in browsers: leave frames out.
         step = int(np.ceil(fps / 50))
         kept: list[Any] = [np.asarray(frame) for frame in frames[::step]]
         ends = np.round(100.0 * step * np.arange(len(kept) + 1) / fps)

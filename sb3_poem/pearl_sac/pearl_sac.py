@@ -265,8 +265,7 @@ class PEARLSAC(SAC):
         n_tasks, feature_dim = len(self.train_tasks), self.reward_feature_dim
         self.replay_buffer_kwargs = {"n_tasks": n_tasks, "feature_dim": feature_dim}
         with warnings.catch_warnings():
-            # SB3 says that it ignores n_steps with another replay buffer than its own; our sampler
-            # does not
+            # SB3 says that another replay buffer ignores n_steps; our sampler does not
             warnings.filterwarnings("ignore", "`n_steps=")
             super()._setup_model()
         self.generators = generators  # a model that is loaded goes on with its own

@@ -15,8 +15,7 @@ from sb3_poem.pearl_sac.train_tasks import TrainTasks
 
 #: Bytes of transitions drawn at once: few enough for the cache; on a GPU the number of draws costs
 BYTES_AT_ONCE = {"cpu": 2**20, "cuda": 2**28}
-#: Tasks whose policies a relabelled context comes from, as many as there are trajectories before
-#: adaptation's first estimate
+#: Tasks whose policies a relabelled context comes from, as in a first estimate
 FOREIGN_SOURCES = 2
 
 
