@@ -235,9 +235,7 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         """The tasks in effect, ``(num_envs, task_dim)``; None before the first reset."""
         return None if self._tasks is None else self._tasks.copy()
 
-    def set_tasks(
-        self, tasks: npt.ArrayLike, copies: Sequence[int] | np.ndarray | None = None
-    ) -> None:
+    def set_tasks(self, tasks: npt.ArrayLike, copies: npt.ArrayLike | None = None) -> None:
         """Choose the tasks of the episodes that begin from each copy's next reset on; errors as of
         :meth:`TaskFamily.set_task`.
 

@@ -236,9 +236,7 @@ def _add_adapt_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
     model = parser.add_argument_group("what is taught")
-    told = (
-        "a pretrained folder, a folder of such, a shipped model's name, or user/name on the Hugging"
-    )
+    told = "a pretrained folder or one of such, a shipped model's name, or user/name on the Hugging"
     _option(model, "--model", f"{told} Face Hub (default: all that are shipped)")
     _add_environment(model, "the one that the model was trained on)")
     _option(model, "--queries", "questions before the result", _count(1), 10)

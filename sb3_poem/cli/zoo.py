@@ -45,9 +45,7 @@ def register_algorithms() -> None:
 class CheckedPairs(StoreDict):
     """rl_zoo3's ``KEY:VALUE`` arguments, with an error that names what is no Python."""
 
-    def __call__(
-        self, parser: Any, namespace: Any, values: Any, option_string: str | None = None
-    ) -> None:
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: Any = None) -> None:
         for pair in values:
             key, _, text = pair.partition(":")
             try:

@@ -8,9 +8,7 @@ from io import BufferedWriter
 from pathlib import Path
 
 
-def write_atomically(
-    path: str | Path, content: bytes | memoryview | Callable[[BufferedWriter], object]
-) -> None:
+def write_atomically(path: str | Path, content: bytes | Callable[[BufferedWriter], object]) -> None:
     """Write a file, and missing folders, completely or not at all: a crash, a kill or a full disk
     leaves the previous file whole. ``content`` may be a function that writes to an open file.
     """

@@ -26,10 +26,8 @@ def assert_untouched(path: Path) -> None:
     assert os.listdir(path.parent) == [path.name]
 
 
-@pytest.mark.parametrize(
-    "content", [b"after", memoryview(b"after"), b"", bytes(range(256)) * 10_000]
-)
-def test_replaces_the_file(path: Path, content: bytes | memoryview) -> None:
+@pytest.mark.parametrize("content", [b"after", b"", bytes(range(256)) * 10_000])
+def test_replaces_the_file(path: Path, content: bytes) -> None:
     write_atomically(path, content)
     assert path.read_bytes() == bytes(content)
     assert os.listdir(path.parent) == [path.name]
