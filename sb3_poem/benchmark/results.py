@@ -27,7 +27,6 @@ from sb3_poem.benchmark.suites import (
     digest,
     family_label,
     family_name,
-    hashable,
 )
 
 BOOTSTRAP_SAMPLES = 2000
@@ -46,10 +45,8 @@ class Condition:
 
     @classmethod
     def of(cls, record: Record) -> Condition:
-        identity, training = record.identity, record.identity["training"]
-        given = sorted((k, hashable(v)) for k, v in training["hyperparameters"].items())
+        identity, trained = record.identity, Training.from_dict(record.identity["training"])
         sizes = {name: identity[name] for name in ("tasks", "episodes", "task_seed")}
-        trained = Training(training["timesteps"], tuple(given))
         return cls(identity["env_id"], Budget(**sizes), trained, identity["revision"])
 
     @property

@@ -97,6 +97,11 @@ class Training:
     def to_dict(self) -> dict[str, Any]:
         return {"timesteps": self.timesteps, "hyperparameters": dict(self.hyperparameters)}
 
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Training:
+        given = {name: hashable(value) for name, value in data["hyperparameters"].items()}
+        return cls(data["timesteps"], tuple(sorted(given.items())))
+
 
 @dataclass(frozen=True)
 class ModelKey:
@@ -169,6 +174,27 @@ class Cell:
             "model": self.model,
             "revision": self.revision,
         }
+
+    @classmethod
+    def of_identity(cls, method: str, identity: dict[str, Any]) -> Cell:
+        """The cell of a record, from its method's name and what :meth:`identity` gave."""
+        usual = METHODS[method].recorded({})["options"]
+        options = ((name, hashable(value)) for name, value in identity["options"].items())
+        sizes = {name: identity[name] for name in ("tasks", "episodes", "task_seed")}
+        if identity["record_at"] is not None:
+            sizes["record_at"] = tuple(identity["record_at"])
+        return cls(
+            identity["env_id"],
+            method,
+            identity["seed"],
+            OracleSpec(**identity["oracle"]) if identity["oracle"] else EXACT,
+            Budget(**sizes),
+            Training.from_dict(identity["training"]),
+            identity["snapshot"],
+            tuple(sorted(one for one in options if one not in usual.items())),
+            identity["model"],
+            identity["revision"],
+        )
 
     @property
     def key(self) -> str:

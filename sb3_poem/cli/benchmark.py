@@ -1,8 +1,8 @@
-"""``sb3-poem benchmark``: run suites into a store, and report what it holds."""
+"""``sb3-poem benchmark``: run suites into a store, report what it holds, and verify it."""
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sb3_poem.benchmark.methods import VARIANTS
 from sb3_poem.benchmark.suites import (
@@ -16,11 +16,14 @@ from sb3_poem.benchmark.suites import (
 )
 from sb3_poem.cli.needs import check_writable, import_packages
 
+if TYPE_CHECKING:
+    from sb3_poem.benchmark.models import ModelLibrary
+
 
 def run_benchmark(arguments: argparse.Namespace) -> int:
-    """Run the command, and return the exit status: 1 if a cell failed."""
+    """Run the command, and return the exit status: 1 if a cell failed or differs."""
     try:
-        return _run(arguments) if arguments.part == "run" else _report(arguments)
+        return {"run": _run, "report": _report, "verify": _verify}[arguments.part](arguments)
     except ModuleNotFoundError as error:
         if error.name not in ("rliable", "sqlalchemy"):
             raise
@@ -30,7 +33,7 @@ def run_benchmark(arguments: argparse.Namespace) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from sb3_poem.benchmark.models import ModelLibrary, Workplace, model_folder
+    from sb3_poem.benchmark.models import model_folder
     from sb3_poem.benchmark.running import describe, export_model, make_plan, run_cells
     from sb3_poem.benchmark.store import Store
 
@@ -45,9 +48,7 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.export is not None and (suite.name != "shipped" or arguments.methods):
         raise ValueError("--export is for --suite shipped with all of its methods")
     _check_models(arguments)
-    named = tuple(_parse_named(text) for text in arguments.model)
-    place = (arguments.runs, tuple(arguments.models), named)
-    library = ModelLibrary(Workplace(*place, arguments.device, arguments.num_threads))
+    library = _library(arguments, arguments.device, arguments.num_threads)
     store = Store(arguments.store) if not arguments.list or arguments.store.exists() else None
     plan = make_plan(
         suite,
@@ -94,9 +95,6 @@ def _seeds(arguments: argparse.Namespace) -> range:
 
 def _check_models(arguments: argparse.Namespace) -> None:
     """Refuse what would quietly be trained instead of being taken."""
-    for folder in arguments.models:
-        if not Path(folder).is_dir():
-            raise ValueError(f"--models {folder}: there is no such folder")
     names = arguments.families or SUITES[arguments.suite].families
     families = {family_id(name) for name in names}
     seeds = _seeds(arguments)
@@ -131,6 +129,37 @@ def _report(arguments: argparse.Namespace) -> int:
     for file in files:
         print(f"Wrote {file}")
     return 0
+
+
+def _verify(arguments: argparse.Namespace) -> int:
+    from sb3_poem.benchmark.store import Store
+    from sb3_poem.benchmark.verification import find_record, verify_cell
+
+    import_packages(arguments.gym_packages)
+    store = Store(arguments.store, create=False)
+    if arguments.cell is None:
+        for one in store.records():
+            oracle = (one.identity["oracle"] or {}).get("kind", "")
+            print(f"{one.key}  {one.family}, {one.method}, seed {one.seed} {oracle}".rstrip())
+        return 0
+    record = find_record(store, arguments.cell)
+    where = record.provenance.get("device", "cpu"), record.provenance.get("num_threads", 1)
+    print(f"running {record.key} again: {record.family}, {record.method}, seed {record.seed}")
+    differences = verify_cell(record, _library(arguments, *where), _say)
+    for line in differences or ["the same, bit for bit"]:
+        print(line)
+    return 1 if differences else 0
+
+
+def _library(arguments: argparse.Namespace, device: str, num_threads: int) -> "ModelLibrary":
+    from sb3_poem.benchmark.models import ModelLibrary, Workplace
+
+    for folder in arguments.models:
+        if not Path(folder).is_dir():
+            raise ValueError(f"--models {folder}: there is no such folder")
+    named = tuple(_parse_named(text) for text in arguments.model)
+    place = (arguments.runs, tuple(arguments.models), named)
+    return ModelLibrary(Workplace(*place, device, num_threads))
 
 
 def _say(line: str) -> None:

@@ -16,6 +16,7 @@ examples:
   sb3-poem benchmark run --suite table3 --families HalfCheetahVel --models pretrained --list
   sb3-poem benchmark run --suite shipped --families HalfCheetahVel --export pretrained
   sb3-poem benchmark report --suite smoke --out results
+  sb3-poem benchmark verify --cell 1f0c9a
 """
 
 
@@ -24,12 +25,12 @@ def add_benchmark(commands: Any, count: Count) -> None:
     parser = commands.add_parser(
         "benchmark",
         help="run the paper's comparisons and ablations, and report them",
-        description="Run suites of comparisons into a store of results, and make tables and "
-        "figures of it.",
+        description="Run suites of comparisons into a store of results, make tables and figures of "
+        "it, and run what it holds again.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parts = parser.add_subparsers(dest="part", required=True, metavar="{run,report}")
+    parts = parser.add_subparsers(dest="part", required=True, metavar="{run,report,verify}")
     run = parts.add_parser(
         "run",
         help="train what is missing, adapt, evaluate; goes on where it was interrupted",
@@ -40,8 +41,20 @@ def add_benchmark(commands: Any, count: Count) -> None:
         help="write the tables and figures of what the store holds",
         epilog="example: sb3-poem benchmark report --suite smoke --out results",
     )
+    verify = parts.add_parser(
+        "verify",
+        help="run a finished cell again, and say what differs",
+        description="Run a finished cell again, and compare every number that the store holds of "
+        "it, but for times: on the same kind of machine they are the same bit for bit. The exit "
+        "status is 1 if anything differs.",
+        epilog="example: sb3-poem benchmark verify --cell 1f0c9a --models pretrained",
+    )
     _add_run_arguments(run, count)
     _add_report_arguments(report, count)
+    told = "its key, or the beginning of it (default: only list the store's cells)"
+    verify.add_argument("--cell", metavar="ID", help=told)
+    _add_models(verify.add_argument)
+    _add_store(verify.add_argument)
 
 
 def _add_store(add: Any) -> None:
@@ -49,20 +62,10 @@ def _add_store(add: Any) -> None:
     add("--store", type=Path, default=default, metavar="FILE", help=f"results ({DEFAULT})")
 
 
-def _add_run_arguments(parser: argparse.ArgumentParser, count: Count) -> None:
+def _add_models(add: Any) -> None:
     several: dict[str, Any] = {"nargs": "+", "default": []}
-    add = parser.add_argument_group("what to run").add_argument
-    add("--suite", choices=SUITES, required=True)
-    families = "such as HalfCheetahVel, or ids (default: the suite's)"
-    add("--families", nargs="+", metavar="FAMILY", help=families)
-    add("--methods", nargs="+", metavar="METHOD", help="only these (default: all of the suite)")
-    add("--seeds", type=count(1), default=3, help=f"how many ({DEFAULT})")
-    add("--first-seed", type=count(0), default=0, help=DEFAULT)
     modules = "modules that register environments"
     add("--gym-packages", metavar="MODULE", help=modules, **several)
-    add("--list", action="store_true", help="only show the plan, and what must be trained for it")
-
-    add = parser.add_argument_group("models").add_argument
     runs = f"trainings and checkpoints ({DEFAULT})"
     add("--runs", default="logs/benchmark", metavar="FOLDER", help=runs)
     add(
@@ -79,6 +82,21 @@ def _add_run_arguments(parser: argparse.ArgumentParser, count: Count) -> None:
         "pretrained model",
         **several,
     )
+
+
+def _add_run_arguments(parser: argparse.ArgumentParser, count: Count) -> None:
+    several: dict[str, Any] = {"nargs": "+", "default": []}
+    add = parser.add_argument_group("what to run").add_argument
+    add("--suite", choices=SUITES, required=True)
+    families = "such as HalfCheetahVel, or ids (default: the suite's)"
+    add("--families", nargs="+", metavar="FAMILY", help=families)
+    add("--methods", nargs="+", metavar="METHOD", help="only these (default: all of the suite)")
+    add("--seeds", type=count(1), default=3, help=f"how many ({DEFAULT})")
+    add("--first-seed", type=count(0), default=0, help=DEFAULT)
+    add("--list", action="store_true", help="only show the plan, and what must be trained for it")
+
+    add = parser.add_argument_group("models").add_argument
+    _add_models(add)
     add(
         "--export",
         type=Path,

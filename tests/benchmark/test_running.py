@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -101,6 +102,44 @@ def test_every_method_runs_and_is_recorded(
     assert {row.method for row in rows} == {*TABLE_METHODS, *TABLE_REFERENCES}
     again = make_plan(*arguments)
     assert (len(again.done), again.todo) == (len(plan.todo), [])
+
+
+def test_a_finished_cell_is_verified(
+    tmp_path: Path, handed_over: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Run again it is the same; a record that was changed is found out, figure or identity."""
+    words = ["--models", str(handed_over / "all"), "--runs", str(tmp_path)]
+    words += ["--store", str(tmp_path / "s.sqlite")]
+    run = ["benchmark", "run", "--suite", "smoke", "--seeds", "1", "--tasks", "2"]
+    assert main([*run, "--episodes", "1", "--methods", "poem-paper", "known-task", *words]) == 0
+    verify = ["benchmark", "verify", *words]
+    assert main(verify) == 0
+    listed = capsys.readouterr().out.splitlines()[-3:]
+    assert sum("poem-paper, seed 0" in line for line in listed) == 2
+    for line in listed:
+        assert main([*verify, "--cell", line[:10]]) == 0
+        assert capsys.readouterr().out.endswith("the same, bit for bit\n")
+    key = next(line.split()[0] for line in listed if line.endswith("poem-paper, seed 0 return"))
+    with Store(tmp_path / "s.sqlite") as store:
+        [record] = store.records([key])
+    false = json.loads(json.dumps(record.result))
+    false["task_returns"][1][0] += 0.0001
+    other = {**record.identity, "tasks": 3}
+    for name, change in (("figure", {"result": false}), ("identity", {"identity": other})):
+        words[-1] = str(tmp_path / f"{name}.sqlite")
+        with Store(words[-1]) as store:
+            store.add(replace(record, **change))
+    assert main(["benchmark", "verify", *words, "--cell", key]) != 0
+    assert f"the identity of cell {key} has the key" in capsys.readouterr().err
+    words[-1] = str(tmp_path / "figure.sqlite")
+    assert main(["benchmark", "verify", *words, "--cell", key]) == 1
+    n = len(false["queries"]) * 2
+    assert f"task_returns: 1 of {n} numbers differ, the most at [1, 0]" in capsys.readouterr().out
+    assert main(["benchmark", "verify", *words, "--cell", "x"]) != 0
+    assert "--cell x is no cell's key" in capsys.readouterr().err
+    words[1] = str(handed_over / "without")
+    assert main(["benchmark", "verify", *words, "--cell", key]) != 0
+    assert "say where it is by --runs, --models or --model" in capsys.readouterr().err
 
 
 def test_a_model_without_experience(tmp_path: Path, handed_over: Path) -> None:
