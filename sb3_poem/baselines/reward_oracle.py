@@ -13,7 +13,16 @@ import torch as th
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.oracles import step_rewards
 from sb3_poem.adaptation.preference import Preference
-from sb3_poem.adaptation.rule import Answer, Inference, Rule, Setting, Shown, trajectories_of
+from sb3_poem.adaptation.priors import N_CENTRES, SOURCES
+from sb3_poem.adaptation.rule import (
+    Answer,
+    Inference,
+    Rule,
+    Setting,
+    Shown,
+    check_choice,
+    trajectories_of,
+)
 from sb3_poem.baselines.transitions import transition_rows
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.trajectory import Trajectory
@@ -30,15 +39,24 @@ class RewardOracle(Rule):
 
     Latents are drawn from the posterior, rolled out, and the encoder gives the next posterior from
     what was collected. A context has no more transitions than in training: the posterior is a
-    product over them, and would be too sure of more.
+    product over them, and would be too sure of more. So all that was collected is dealt out, at
+    random, to as many contexts as it fills, and their posteriors' means and variances are averaged.
 
     It is as good as the encoder, whose contexts in training are of the tasks' own policies: where
     it reads the task from what was done rather than from the rewards, contexts of other policies
     mislead it. The model is a ``PEARLSAC`` (not a ``POEMSAC`` whose context holds values), and the
     environment a task family, from which rewards are read.
+
+    :param candidates: Where the first question's latents come from, and what is acted on before it:
+        "prior" (N(0, I)), or "aggregate", the mean and variance of the training tasks' posteriors.
     """
 
+    candidates: str = "prior"
+
     refuses_library = "the reward oracle learns from rollouts on the new task"
+
+    def __post_init__(self) -> None:
+        check_choice("candidates", self.candidates, SOURCES)
 
     def check(self, model: MetaModel, setting: Setting) -> None:
         """See :class:`Rule`: it needs an encoder of rewarded transitions, and rewards to read."""
@@ -59,7 +77,11 @@ class RewardOracle(Rule):
         FamilyView(_env_of(setting))  # which refuses what is no family
 
     def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> RewardInference:
-        return RewardInference(model, rng, _env_of(setting), setting.task)
+        inference = RewardInference(model, rng, _env_of(setting), setting.task)
+        if self.candidates == "aggregate":
+            latents = model.sample_latents(N_CENTRES, rng, source="aggregate")
+            inference.mean, inference.variance = latents.mean(axis=0), latents.var(axis=0)
+        return inference
 
 
 class RewardInference(Inference):
@@ -79,7 +101,7 @@ class RewardInference(Inference):
         self._env, self._task = env, task
 
     def ask(self) -> tuple[Shown, Shown]:
-        """See :class:`Inference`: two draws from the posterior, at first from the prior."""
+        """See :class:`Inference`: two draws from the posterior."""
         noise = self.rng.standard_normal((2, len(self.mean)))
         left, right = self.mean + np.sqrt(self.variance) * noise
         return left, right
@@ -94,12 +116,15 @@ class RewardInference(Inference):
         before = [self.transitions] if len(self.transitions) else []
         self.transitions = np.concatenate([*before, rows])
         n = min(self.model.context_size, len(self.transitions))
-        picks = self.rng.choice(len(self.transitions), size=n, replace=False)
+        dealt = self.rng.permutation(len(self.transitions))[: len(self.transitions) // n * n]
         with th.no_grad():
-            context = th.as_tensor(self.transitions[picks], device=self.model.device)[None]
-            mean, variance = self.model.policy.encoder(context)
-        self.mean = mean[0].double().cpu().numpy()
-        self.variance = variance[0].double().cpu().numpy()
+            # (contexts, n, context_dim)
+            contexts = self.transitions[dealt.reshape(-1, n)]
+            mean, variance = self.model.policy.encoder(
+                th.as_tensor(contexts, device=self.model.device)
+            )
+        self.mean = mean.double().mean(dim=0).cpu().numpy()
+        self.variance = variance.double().mean(dim=0).cpu().numpy()
 
     def estimate(self) -> np.ndarray:
         return self.mean.copy()

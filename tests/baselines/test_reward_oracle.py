@@ -121,13 +121,24 @@ def test_the_posterior_is_that_of_all_rewarded_trajectories(trained, monkeypatch
                 (-np.abs(features[:, 0] + 0.5) - 0.01 * features[:, 1] ** 2 - centre) / deviation
             )
         adapter.tell("equal")
-        # As in training no more than context_size transitions, of all that there are.
+        # A context has no more than context_size transitions, as in training.
         n = min(20 * k, trained.context_size)
         np.testing.assert_allclose(adapter.inference.variance, 1 / n, rtol=1e-5)
         assert len(adapter.inference.transitions) == 20 * k
-        if n == 20 * k:
+        if 20 * k % n == 0:  # all that there are fill contexts, and none is left out
             np.testing.assert_allclose(adapter.policy().latent, np.mean(rewards), rtol=1e-4)
     assert n == trained.context_size == 25
+
+
+def test_it_may_begin_with_the_training_tasks_latents(trained):
+    adapter = PreferenceAdapter(trained, walks(1), rule=RewardOracle(candidates="aggregate"))
+    draws = np.concatenate([adapter.inference.ask() for _ in range(4000)])
+    own = trained.sample_latents(20_000, np.random.default_rng(0), source="aggregate")
+    assert np.abs(own.mean(axis=0)).max() + np.abs(own.std(axis=0) - 1).max() > 0.1  # not N(0, I)
+    np.testing.assert_allclose(draws.mean(axis=0), own.mean(axis=0), atol=0.25)
+    np.testing.assert_allclose(draws.std(axis=0), own.std(axis=0), rtol=0.2)
+    with pytest.raises(ValueError, match="`candidates` must be one of"):
+        RewardOracle(candidates="posterior")
 
 
 def test_what_will_not_do(trained):
