@@ -49,7 +49,7 @@ ARRAYS = {
 # rebuilt from the critics: half of their size for nothing otherwise
 DERIVED = "critic_target."
 #: Arguments that decide what the networks are; a trained model has them for good
-FIXED = ("latent_dim", "similarity", "context")
+FIXED = ("latent_dim", "similarity", "similarity_temperature", "context")
 #: Arguments that are kept as training left them
 LEARNED = ("target_entropy", "ent_coef", "learning_rate")
 #: Arguments that are of one run only, or that the policy tells

@@ -9,6 +9,7 @@ from torch.nn.functional import softplus
 
 from sb3_poem.pearl_sac.objective import Metrics, Objective, TaskEmbeddings
 from sb3_poem.pearl_sac.sampler import MetaBatch
+from sb3_poem.poem_sac.policies import POEMPolicy
 
 
 @dataclass
@@ -17,13 +18,14 @@ class POEMObjective(Objective):
 
     actor_trains_encoder: ClassVar[bool] = True  # L_policy trains both (section 5.3)
 
+    policy: POEMPolicy
     preference_coef: float
 
     def embedding_loss(
         self, batch: MetaBatch, embeddings: TaskEmbeddings
     ) -> tuple[th.Tensor, Metrics]:
         """The preference loss (eqs. 6, 7), weighted."""
-        similarities = embeddings.reward @ embeddings.policy.T  # eq. 3
+        similarities = self.policy.compare(embeddings.reward, embeddings.policy)  # eq. 3
         loss, accuracy = preference_loss(similarities, batch.returns)
         metrics = {"preference_loss": loss, "preference_accuracy": accuracy}
         return self.preference_coef * loss, metrics

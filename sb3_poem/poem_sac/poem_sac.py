@@ -45,8 +45,11 @@ class POEMSAC(PEARLSAC):
     (4, 4)
 
     :param preference_coef: Weight of the preference loss
-    :param similarity: "two-encoder": <f_r(z_i), f_pi(z_j)>; "inner": <z_i, z_j>, the ablation of
-        Proposition 1
+    :param similarity: "two-encoder": <f_r(z_i), f_pi(z_j)>; "cosine": the cosine of the angle
+        between f_r(z_i) and f_pi(z_j), over a temperature, as the text of section 5.1 reads; then S
+        cannot grow without end, and the tolerance of eq. 9 has a scale; "inner": <z_i, z_j>, the
+        ablation of Proposition 1
+    :param similarity_temperature: Of "cosine"
     :param context: "optimal": (s, a, s', r, Q); "pearl": (s, a, s', r), the ablation
     :param preference_source: Where J[i, j] comes from. "relabel": task i's reward function on task
         j's trajectories; "rollout": task j's policy is run on task i, within random groups of
@@ -70,6 +73,7 @@ class POEMSAC(PEARLSAC):
         policy_coef: float = 0.5,
         preference_coef: float = 6.0,
         similarity: str = "two-encoder",
+        similarity_temperature: float = 0.1,
         context: str = "optimal",
         preference_source: str = "auto",
         preference_group_size: int = 4,
@@ -79,7 +83,7 @@ class POEMSAC(PEARLSAC):
         check_number("preference_coef", preference_coef, 0.0)
         check_whole("preference_group_size", preference_group_size, 2)
         for name, value, known in (
-            ("similarity", similarity, ("two-encoder", "inner")),
+            ("similarity", similarity, ("two-encoder", "cosine", "inner")),
             ("context", context, ("optimal", "pearl")),
             ("preference_source", preference_source, ("auto", "relabel", "rollout")),
         ):
@@ -87,7 +91,12 @@ class POEMSAC(PEARLSAC):
                 names = ", ".join(map(repr, known))
                 raise ValueError(f"{name} must be one of {names}, got {value!r}")
         self.preference_coef = preference_coef
+        if not 0.0 < similarity_temperature < float("inf"):
+            raise ValueError(
+                f"similarity_temperature must be positive and finite, got {similarity_temperature}"
+            )
         self.similarity = similarity
+        self.similarity_temperature = similarity_temperature
         self.context = context
         self.preference_source = preference_source
         self.preference_group_size = preference_group_size
@@ -99,7 +108,9 @@ class POEMSAC(PEARLSAC):
 
     def _complete_policy_kwargs(self) -> None:
         super()._complete_policy_kwargs()
-        self.policy_kwargs["two_encoder"] = self.similarity == "two-encoder"
+        self.policy_kwargs["two_encoder"] = self.similarity != "inner"
+        cosine = self.similarity == "cosine"
+        self.policy_kwargs["temperature"] = self.similarity_temperature if cosine else None
         self.policy_kwargs["context_has_value"] = self.context == "optimal"
 
     def _check_family(self, family: FamilyView) -> None:
@@ -111,8 +122,8 @@ class POEMSAC(PEARLSAC):
             )
 
     def similarities(self, task_latents: np.ndarray, policy_latents: np.ndarray) -> np.ndarray:
-        """S(z_i, z_j) = <f_r(z_i), f_pi(z_j)> (eq. 3), how well policy j fits task i: (m,
-        latent_dim), (n, latent_dim) -> (m, n).
+        """S(z_i, z_j) (eq. 3), how well policy j fits task i: (m, latent_dim), (n, latent_dim) ->
+        (m, n).
         """
         with th.no_grad():
             tasks, policies = (

@@ -3,16 +3,21 @@
 from typing import Any
 
 import torch as th
+from torch.nn.functional import normalize
 
 from sb3_poem.common.networks import MLP
 from sb3_poem.pearl_sac.policies import LatentPolicy
 
 
 class POEMPolicy(LatentPolicy):
-    """Adds the embeddings f_r and f_pi of section 5.1 (Xu & Zhu 2025), if ``two_encoder``."""
+    """Adds the embeddings f_r and f_pi of section 5.1 (Xu & Zhu 2025), if ``two_encoder``; they are
+    compared by their inner product, or with a ``temperature`` by the cosine of their angle over it.
+    """
 
-    def __init__(self, *args: Any, two_encoder: bool = True, **kwargs: Any) -> None:
-        self.two_encoder = two_encoder
+    def __init__(
+        self, *args: Any, two_encoder: bool = True, temperature: float | None = None, **kwargs: Any
+    ) -> None:
+        self.two_encoder, self.temperature = two_encoder, temperature
         super().__init__(*args, **kwargs)
 
     def _build_embeddings(self, net_arch: list[int]) -> None:
@@ -29,11 +34,23 @@ class POEMPolicy(LatentPolicy):
         return self.reward_mapping(latents) if self.two_encoder else latents
 
     def similarity(self, task_latents: th.Tensor, policy_latents: th.Tensor) -> th.Tensor:
-        """S(z_i, z_j) = <f_r(z_i), f_pi(z_j)> (eq. 3): (m, d), (n, d) -> (m, n)."""
-        return self.reward_embedding(task_latents) @ self.policy_embedding(policy_latents).T
+        """S(z_i, z_j) (eq. 3): (m, d), (n, d) -> (m, n)."""
+        return self.compare(
+            self.reward_embedding(task_latents), self.policy_embedding(policy_latents)
+        )
+
+    def compare(self, rewards: th.Tensor, policies: th.Tensor) -> th.Tensor:
+        """S of embeddings z_r (m, d) and z_pi (n, d): (m, n)."""
+        if self.temperature is None:
+            return rewards @ policies.T
+        return normalize(rewards) @ normalize(policies).T / self.temperature
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "two_encoder": self.two_encoder}
+        return {
+            **super()._get_constructor_parameters(),
+            "two_encoder": self.two_encoder,
+            "temperature": self.temperature,
+        }
 
 
 MlpPolicy = POEMPolicy

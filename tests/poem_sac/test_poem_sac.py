@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -365,6 +366,38 @@ def test_the_inner_product_has_one_embedding() -> None:
     names = model.policy.state_dict().keys()
     assert not any("mapping" in name for name in names)
     assert any("mapping" in name for name in small(POEMSAC).policy.state_dict())
+
+
+def test_the_cosine_has_a_scale_of_its_own(tmp_path: Path) -> None:
+    """S is bounded by 1 / temperature, whatever the embeddings' norm, and a model trains with it,
+    and keeps it.
+    """
+    model = small(POEMSAC, similarity="cosine", similarity_temperature=0.2).learn(3 * EPOCH)
+    latents = np.random.default_rng(0).normal(size=(6, 5))
+    similarities = model.similarities(latents, 100.0 * latents)
+    assert np.abs(similarities).max() <= 5.0 + 1e-5
+    z = th.tensor(latents).float()
+    with th.no_grad():
+        rewards, policies = model.policy.reward_embedding(z), model.policy.policy_embedding(z)
+    cosine = th.nn.functional.cosine_similarity(rewards[:, None], policies[None], dim=2)
+    found = model.similarities(latents, latents)
+    np.testing.assert_allclose(found, cosine.numpy() / 0.2, atol=1e-5)
+    scaled = model.policy.compare(7.0 * rewards, 0.1 * policies)
+    np.testing.assert_allclose(scaled.numpy(), found, atol=1e-5)
+    assert np.isfinite(model.logger.name_to_value["train/preference_loss"])
+    model.save(tmp_path / "model.zip")
+    model.save_pretrained(tmp_path / "folder")
+    for again in (
+        POEMSAC.load(tmp_path / "model.zip", device="cpu"),
+        POEMSAC.from_pretrained(tmp_path / "folder"),
+    ):
+        np.testing.assert_array_equal(again.similarities(latents, latents), found)
+    with pytest.raises(
+        ValueError, match=r"similarity_temperature is 0\.2 in .* cannot become 0\.5"
+    ):
+        POEMSAC.load(tmp_path / "model.zip", device="cpu", similarity_temperature=0.5)
+    with pytest.raises(ValueError, match="similarity_temperature must be positive and finite"):
+        small(POEMSAC, similarity="cosine", similarity_temperature=0.0)
 
 
 def test_contexts_without_values() -> None:
