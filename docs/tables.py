@@ -120,6 +120,8 @@ def family_section(family: str) -> str:
         ("*limit*", "known-task", "limit"),
     ):
         figures = [row(family, method, k, kind) for k in ANSWERS]
+        if not any(figures):
+            continue
         known = row(family, "known-task", kind="known") if kind == "method" else None
         rows.append([name, *(cell(one, error=True) for one in figures), cell(known)])
         rates = [rate(one) for one in (*figures, known)]
@@ -150,7 +152,8 @@ What the models that ship earn, as `sb3-poem benchmark run --suite shipped --mod
 test tasks that no training saw, 10 episodes each, after k exact answers; ± is the standard error
 over tasks; families that know of success have the share of successes below each return. *Task
 known*: the best of the model's policies for each task, found by trying. *Limit*: the best choice of
-2^k of these policies, chosen with the test tasks in sight: an optimistic bound for k exact answers.
+2^k of these policies, chosen on other tasks where dynamics are shared, and measured by other
+episodes.
 † marks a training of other steps than the family's entry in `zoo_configs/` names. Comparisons with
 the baselines, over training seeds, stand below each family, as far as they were run; they are of an
 earlier revision of the code and of models of their own. What is not listed was not measured.

@@ -17,6 +17,7 @@ from sb3_poem.adaptation.known_task import (
     return_spread,
 )
 from sb3_poem.adaptation.limits import (
+    AnswerLimits,
     answer_capacity,
     best_codebook,
     information_limit,

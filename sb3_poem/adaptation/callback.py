@@ -128,7 +128,7 @@ class AdaptationEvalCallback(EpochCallback):
         result = evaluate_adaptation(
             self.model, env, tasks, record_at=self.record_at, **options, **self.adaptation_kwargs
         )
-        known = known_task_return(self.model, env, tasks, **options)
+        known = known_task_return(self.model, env, tasks, limits=False, **options)
         metrics = {f"return_after_{k}_queries": result.after(k) for k in self.record_at}
         metrics["known_task_return"] = known.mean_return
         if result.success_rates is not None and known.success_rate is not None:

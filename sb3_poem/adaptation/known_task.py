@@ -15,7 +15,7 @@ from sb3_poem.adaptation.evaluation import (
     evaluate_episodes,
     evaluation_seed,
 )
-from sb3_poem.adaptation.limits import information_limit
+from sb3_poem.adaptation.limits import AnswerLimits
 from sb3_poem.adaptation.meta_model import HasSimilarity, MetaModel
 from sb3_poem.adaptation.noise import NoiseModel
 from sb3_poem.common.checks import check_whole
@@ -29,6 +29,12 @@ if TYPE_CHECKING:
 # rollout serves all of them.
 LATENTS_WITH_OWN_DYNAMICS, LATENTS_WITH_SHARED_DYNAMICS = 30, 300
 SPREAD_TASKS = 40
+#: Draws around the best latent of each task, in each of two rounds, and how far from it they go, as
+#: a share of the first latents' deviation
+REFINING_DRAWS, REFINING_WIDTHS = 5, (0.5, 0.2)
+#: Tasks that a limit's codebooks are chosen on
+OTHER_TASKS = 1000
+OTHER_TASK_STREAM = 7
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,40 +44,27 @@ class KnownTaskReturn(EpisodeOutcomes):
 
     :param tasks: (n_tasks, task_dim).
     :param latents: (n_tasks, latent_dim) the best ones.
-    :param candidate_latents: (n_latents, latent_dim) all that were tried.
+    :param candidate_latents: (n_latents, latent_dim) all that were tried for all tasks alike.
     :param candidate_returns: (n_tasks, n_latents) their returns on every task (J).
+    :param limits: What k answers allow among the candidates; None if that was not asked for.
     """
 
     tasks: np.ndarray
     latents: np.ndarray
     candidate_latents: np.ndarray
     candidate_returns: np.ndarray
+    limits: AnswerLimits | None = None
 
     def __repr__(self) -> str:
-        latents = f"the best of {len(self.candidate_latents)} latents"
+        latents = f"the best of {len(self.candidate_latents)} latents, refined"
         found = f"mean return {self.mean_return:.1f} of {latents}"
         return f"KnownTaskReturn({len(self.tasks)} tasks, {found})"
 
     def limit(self, k: int, noise_model: NoiseModel | None = None, n_answers: int = 2) -> float:
-        return repertoire_limit(self.tasks, self.candidate_returns, k, noise_model, n_answers)
-
-
-def repertoire_limit(
-    tasks: np.ndarray,
-    returns: np.ndarray,
-    k: int,
-    noise_model: NoiseModel | None = None,
-    n_answers: int = 2,
-) -> float:
-    """The :func:`information_limit`, with its arguments, of a matrix (n_tasks, n_latents) of
-    returns on tasks (n_tasks, task_dim), which lie on a line if they are numbers.
-    """
-    ordered = tasks.shape[1] == 1
-    if ordered:
-        returns = returns[np.argsort(tasks[:, 0])]
-    return information_limit(
-        returns, k, noise_model=noise_model, ordered=ordered, n_answers=n_answers
-    )
+        """:meth:`AnswerLimits.after`."""
+        if self.limits is None:
+            raise ValueError("`limits` were not measured: call known_task_return(..., limits=True)")
+        return self.limits.after(k, noise_model, n_answers)
 
 
 def known_task_return(
@@ -85,13 +78,21 @@ def known_task_return(
     source: str = "both",
     selection_episodes: int = 1,
     deterministic: bool = True,
+    limits: bool = True,
 ) -> KnownTaskReturn:
-    """The return if the task were known: for each task the best of many latents.
+    """The return if the task were known: for each task the best of many latents, refined by two
+    rounds of draws around it. Winners are rolled out anew, so that the luck of having been chosen
+    does not count.
 
     Beside the adapted return it tells which to work on: the repertoire of policies, or the
     inference among them. Where tasks share their dynamics every latent is rolled out once, and its
-    trajectory relabelled for every task. The winners are then rolled out anew, so that the luck of
-    having been chosen does not count.
+    trajectory relabelled for every task.
+
+    The *limit* is what the best 2^k of the latents that were tried at first earn on these tasks
+    (:class:`AnswerLimits`). They are chosen on other tasks, for which the same rollouts are
+    relabelled, and scored by fresh episodes: so it does not profit from luck, nor from knowing the
+    test tasks. Where tasks do not share dynamics they are chosen on the test tasks themselves, and
+    only the episodes are others. It is the best codebook of these policies, not of any method.
 
     >>> best = known_task_return("PointGoal", "poem/PointGoal-v0", 5, n_latents=50)
     >>> best.latents.shape  # a policy for each of five tasks
@@ -99,28 +100,62 @@ def known_task_return(
 
     :param model: And ``env``: see :func:`adapt_tasks`.
     :param tasks: See :func:`evaluate_adaptation`.
-    :param n_latents: How many to try; None for 300, or for 30 where every latent must be rolled out
-        in every task.
+    :param n_latents: How many to try at first; None for 300, or for 30 where every latent must be
+        rolled out in every task.
     :param n_episodes: Fresh episodes per winner.
     :param source: Where latents come from: "prior", "aggregate", or "both" in equal parts.
     :param selection_episodes: Episodes per latent (and task, where dynamics differ) for choosing.
     :param deterministic: Whether policies act by their mode.
+    :param limits: Whether to measure limits, which takes the rollouts of all latents once more.
     """
     model, vec_env = model_and_env(model, env)
     tasks = choose_test_tasks(model, vec_env, tasks, seed)
+    family = FamilyView(vec_env)
+    shared = family.shared_dynamics
     if n_latents is None:
-        shared = FamilyView(vec_env).shared_dynamics
         n_latents = LATENTS_WITH_SHARED_DYNAMICS if shared else LATENTS_WITH_OWN_DYNAMICS
     check_whole("n_latents", n_latents, 1)
-    candidates = _draw_latents(model, n_latents, source, np.random.default_rng([seed, 2]))
-    start = evaluation_seed(seed, 1)
-    returns = return_matrix(
-        model, vec_env, tasks, candidates, selection_episodes, start, deterministic
+    rng = np.random.default_rng([seed, 2])
+    candidates = _draw_latents(model, n_latents, source, rng)
+    others = tasks[:0]
+    if limits and shared:
+        drawn = family.sample_tasks(OTHER_TASKS, np.random.default_rng([seed, OTHER_TASK_STREAM]))
+        others = np.unique(drawn, axis=0)
+    every = np.concatenate([tasks, others])
+
+    def returns_of(tasks: np.ndarray, latents: np.ndarray, stream: int) -> np.ndarray:
+        how = selection_episodes, evaluation_seed(seed, stream), deterministic
+        return return_matrix(model, vec_env, tasks, latents, *how)
+
+    returns, on_others = np.split(returns_of(every, candidates, 1), [len(tasks)])
+    best = candidates[np.argmax(returns, axis=1)]
+    for stream, width in enumerate(REFINING_WIDTHS, start=2):
+        # The best so far takes part again: that it was the best by luck must not keep it.
+        steps = rng.standard_normal((len(tasks), 1 + REFINING_DRAWS, candidates.shape[1]))
+        steps[:, 0] = 0.0
+        draws = best[:, None] + width * candidates.std(axis=0) * steps
+        if shared:
+            flat = draws.reshape(-1, draws.shape[2])
+            best = flat[np.argmax(returns_of(tasks, flat, stream), axis=1)]
+            continue
+        rows = np.repeat(tasks, draws.shape[1], axis=0)
+        how = selection_episodes, evaluation_seed(seed, stream), deterministic
+        found = evaluate_episodes(model, vec_env, draws.reshape(len(rows), -1), rows, *how)
+        picks = np.argmax(found.returns.mean(axis=1).reshape(draws.shape[:2]), axis=1)
+        best = draws[np.arange(len(tasks)), picks]
+    measured = None
+    if limits:
+        fresh = returns_of(tasks, candidates, 4)
+        chosen_on, along = (on_others, others) if shared else (returns, tasks)
+        ordered = along.shape[1] == 1
+        if ordered:
+            chosen_on = chosen_on[np.argsort(along[:, 0])]
+        measured = AnswerLimits.measure(chosen_on, returns, fresh, ordered=ordered)
+    outcomes = evaluate_episodes(
+        model, vec_env, best, tasks, n_episodes, evaluation_seed(seed), deterministic
     )
-    best, start = candidates[np.argmax(returns, axis=1)], evaluation_seed(seed)
-    fresh = evaluate_episodes(model, vec_env, best, tasks, n_episodes, start, deterministic)
     own = {"tasks": tasks, "latents": best, "candidate_latents": candidates}
-    return KnownTaskReturn(**vars(fresh), **own, candidate_returns=returns)
+    return KnownTaskReturn(**vars(outcomes), **own, candidate_returns=returns, limits=measured)
 
 
 def return_spread(model: MetaModel | str | Path, env: Env, seed: int = 0) -> float:
@@ -213,7 +248,8 @@ def preference_order(model: HasSimilarity, known: KnownTaskReturn) -> tuple[floa
     """
     best = np.argmax(known.candidate_returns, axis=1)
     policies = np.unique(best)
-    similarities = model.similarities(known.latents, known.candidate_latents[policies])
+    latents = known.candidate_latents
+    similarities = model.similarities(latents[best], latents[policies])
     return property_one(similarities, known.candidate_returns[:, policies])
 
 

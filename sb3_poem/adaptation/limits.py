@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import combinations
 from math import comb
 
@@ -17,6 +18,78 @@ MAX_SWAP_ROUNDS = 50
 MAX_ITERATIONS = 1000
 TOLERANCE = 1e-4  # nats
 CHANNEL_INPUTS, CHANNEL_OUTPUTS = 81, 400
+#: Of the rate-distortion curve: the worth of the whole range of returns, in nats
+SLOPES = np.geomspace(0.1, 1e4, 40)
+
+
+@dataclass(frozen=True)
+class AnswerLimits:
+    """What the best choice of some policies earns after k answers, where the choice is made on
+    other tasks and scored on the test tasks by fresh episodes.
+
+    k exact answers tell 2^k policies apart, so a method ends in one of a *codebook* of 2^k; here
+    it is the codebook that is best for the other tasks, and each test task gets the best of it.
+    Answers with errors tell less than a bit each: then policies are chosen as rate-distortion
+    theory says (Shannon 1959), with the marginal that is best for the other tasks at that many
+    bits. Both are of *these policies*: a method with other ones may earn more.
+
+    :param codebooks: Mean return after 0, 1, 2, ... exact answers, until all policies are in.
+    :param bits: Ascending from 0, and ``returns``, the mean returns when so much is told.
+    :param spread: The largest difference of two policies' returns on a task.
+    """
+
+    codebooks: tuple[float, ...]
+    bits: tuple[float, ...]
+    returns: tuple[float, ...]
+    spread: float
+
+    @classmethod
+    def measure(
+        cls, others: np.ndarray, chosen: np.ndarray, fresh: np.ndarray, *, ordered: bool = False
+    ) -> AnswerLimits:
+        """Take three matrices of returns of the same policies.
+
+        :param others: (n_others, n_policies), on which codebooks are chosen.
+        :param chosen: (n_tasks, n_policies), by which each test task's policy is chosen.
+        :param fresh: (n_tasks, n_policies), of other episodes, which score it.
+        :param ordered: See :func:`best_codebook`.
+        """
+        others, chosen, fresh = (_check_returns(returns) for returns in (others, chosen, fresh))
+        n_policies, every = others.shape[1], np.arange(len(chosen))
+        codebooks = []
+        for k in range((n_policies - 1).bit_length() + 1):
+            book = best_codebook(others, 2**k, ordered=ordered)
+            picks = book[np.argmax(chosen[:, book], axis=1)]
+            codebooks.append(float(fresh[every, picks].mean()))
+        bits, returns = [0.0], [codebooks[0]]
+        marginal = None
+        for slope in SLOPES / max(float(np.ptp(others)), 1e-12):
+            marginal, _ = _best_marginal(others, slope, marginal)
+            told = _channel(others, slope, marginal)
+            logs = np.log(np.maximum(told, 1e-300) / np.maximum(marginal, 1e-300))
+            rate = float((told * logs).sum(axis=1).mean() / np.log(2.0))
+            if rate > bits[-1]:
+                bits.append(rate)
+                scored = _channel(chosen, slope, marginal) * fresh
+                returns.append(float(scored.sum(axis=1).mean()))
+        spread = float(np.ptp(chosen, axis=1).max())
+        return cls(tuple(codebooks), tuple(bits), tuple(returns), spread)
+
+    def after(self, k: int, noise_model: NoiseModel | None = None, n_answers: int = 2) -> float:
+        """Mean return after k answers.
+
+        :param noise_model: How the oracle errs; None is an oracle that does not.
+        :param n_answers: Kinds of answers to a question: m of them name m^k policies. Between two
+            powers of 2 the codebooks' returns are interpolated.
+        """
+        if k < 0:
+            raise ValueError(f"`k` must not be negative, but is {k}")
+        capacity = answer_capacity(noise_model, self.spread, n_answers)
+        most = k * np.log2(n_answers)
+        exact = float(np.interp(most, range(len(self.codebooks)), self.codebooks))
+        if capacity == np.log2(n_answers):
+            return exact
+        return min(exact, float(np.interp(k * capacity, self.bits, self.returns)))
 
 
 def information_limit(
@@ -53,7 +126,7 @@ def information_limit(
     if k < 0:
         raise ValueError(f"`k` must not be negative, but is {k}")
     returns = _check_returns(returns)
-    capacity = answer_capacity(noise_model, returns, n_answers)
+    capacity = answer_capacity(noise_model, float(np.ptp(returns, axis=1).max()), n_answers)
     n_tasks, n_policies = returns.shape
     if k >= 63 or n_answers**k >= min(n_tasks, n_policies):
         limit = float(returns.max(axis=1).mean())
@@ -122,7 +195,7 @@ def best_intervals(returns: np.ndarray, size: int) -> np.ndarray:
     return np.array(sorted(chosen))
 
 
-def answer_capacity(noise: NoiseModel | None, returns: np.ndarray, n_answers: int = 2) -> float:
+def answer_capacity(noise: NoiseModel | None, spread: float, n_answers: int = 2) -> float:
     """The most that one answer can tell, whatever is asked: bits, in [0, log2(n_answers)].
 
     Where an answer is left or right it is the capacity of the binary symmetric channel at the
@@ -134,13 +207,12 @@ def answer_capacity(noise: NoiseModel | None, returns: np.ndarray, n_answers: in
     perceives, whose capacity is found by the algorithm of Blahut and Arimoto.
 
     >>> from sb3_poem.adaptation import MistakeNoise
-    >>> round(answer_capacity(MistakeNoise(0.1), np.zeros((1, 1))), 2)  # a tenth is wrong
+    >>> round(answer_capacity(MistakeNoise(0.1), spread=1.0), 2)  # a tenth is wrong
     0.53
 
     :param noise: How the oracle errs; None is an oracle that does not.
-    :param returns: (n_tasks, n_policies). With a fixed ``beta`` an answer is the surer the larger
-        the difference of returns, and no question is supposed to show a larger one than there is
-        between two policies here.
+    :param spread: The largest difference of returns that a question can show: with a fixed
+        ``beta`` an answer is the surer the larger it is.
     :param n_answers: See :func:`information_limit`.
     """
     if n_answers < 2:
@@ -151,7 +223,7 @@ def answer_capacity(noise: NoiseModel | None, returns: np.ndarray, n_answers: in
         mistake = noise.rate
     elif isinstance(noise, BoltzmannNoise):
         # The paper's exponent, |R_left - R_right| / (|R_left| + |R_right|), is at most 1.
-        exponent = 1.0 if noise.beta is None else noise.beta * float(np.ptp(returns, axis=1).max())
+        exponent = 1.0 if noise.beta is None else noise.beta * spread
         if n_answers > 2:
             return min(float(np.log2(n_answers)), _logistic_capacity(exponent))
         mistake = float(0.5 * (1.0 - np.tanh(0.5 * exponent)))
@@ -215,13 +287,21 @@ def _swap(returns: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     """Replace one policy at a time by the best other one, as long as that helps."""
     chosen = chosen.copy()
     value = _value(returns, chosen)
+    every, replaced = np.arange(len(returns)), True
     for _ in range(MAX_SWAP_ROUNDS):
         improved = False
         for position in range(len(chosen)):
-            rest = returns[:, np.delete(chosen, position)].max(axis=1, initial=-np.inf)
+            if replaced:
+                taken = returns[:, chosen]
+                best = np.argmax(taken, axis=1)
+                first = taken[every, best]
+                taken[every, best] = -np.inf
+                second = taken.max(axis=1)
+            rest = np.where(best == position, second, first)
             values = np.maximum(returns, rest[:, None]).mean(axis=0)
             candidate = int(np.argmax(values))
-            if values[candidate] > value + 1e-12 * max(1.0, abs(value)):
+            replaced = values[candidate] > value + 1e-12 * max(1.0, abs(value))
+            if replaced:
                 chosen[position], value, improved = candidate, values[candidate], True
         if not improved:
             break
@@ -242,9 +322,19 @@ def _log_partition(returns: np.ndarray, slope: float) -> float:
     """An upper bound, tight within ``TOLERANCE``, on the maximum over p(j | i) of slope E[J] - I(i;
     j).
     """
+    return _best_marginal(returns, slope)[1]
+
+
+def _best_marginal(
+    returns: np.ndarray, slope: float, marginal: np.ndarray | None = None
+) -> tuple[np.ndarray, float]:
+    """(n_policies,) how often each policy is taken at the maximum of slope E[J] - I(i; j), and an
+    upper bound on it, by the algorithm of Blahut and Arimoto; it may start at a marginal.
+    """
     best = returns.max(axis=1, keepdims=True)
     kernel = np.exp(slope * (returns - best))
-    marginal = np.full(returns.shape[1], 1.0 / returns.shape[1])
+    if marginal is None:
+        marginal = np.full(returns.shape[1], 1.0 / returns.shape[1])
     smallest = np.inf
     for _ in range(MAX_ITERATIONS):
         z = kernel @ marginal
@@ -255,7 +345,14 @@ def _log_partition(returns: np.ndarray, slope: float) -> float:
             break
         # No policy may vanish for good by rounding: its task would then have none.
         marginal = np.maximum(marginal * growth, 1e-200)
-    return smallest + slope * float(best.mean())
+    return marginal, smallest + slope * float(best.mean())
+
+
+def _channel(returns: np.ndarray, slope: float, marginal: np.ndarray) -> np.ndarray:
+    """(n_tasks, n_policies) p(j | i) for a marginal."""
+    logs = slope * returns + np.log(marginal)
+    weights = np.exp(logs - logs.max(axis=1, keepdims=True))
+    return weights / weights.sum(axis=1, keepdims=True)
 
 
 def _logistic_capacity(amplitude: float) -> float:

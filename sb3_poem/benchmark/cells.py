@@ -117,7 +117,7 @@ def _measure_adaptation(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) 
 
 def _measure_known(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) -> dict[str, Any]:
     """What the model's policies could earn: returns of the best of them for each task, and the
-    matrix J for the limits.
+    limits.
     """
     budget = cell.budget
     episodes = min(budget.episodes, SELECTION_EPISODES)
@@ -132,7 +132,7 @@ def _measure_known(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) -> di
     data: dict[str, Any] = {
         "tasks": _rounded(tasks),
         "task_returns": _rounded(known.returns.mean(axis=1)),
-        "candidate_returns": _rounded(known.candidate_returns, 2),
+        "limits": {name: _rounded(value) for name, value in vars(known.limits).items()},
     }
     if known.successes is not None:
         data["task_success_rates"] = _rounded(known.successes.mean(axis=1))
@@ -142,8 +142,8 @@ def _measure_known(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) -> di
     return data
 
 
-def _rounded(values: np.ndarray, digits: int = DIGITS) -> Any:
-    return np.round(np.asarray(values, dtype=np.float64), digits).tolist()
+def _rounded(values: Any) -> Any:
+    return np.round(np.asarray(values, dtype=np.float64), DIGITS).tolist()
 
 
 def _number(value: float) -> float | None:

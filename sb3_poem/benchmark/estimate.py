@@ -9,7 +9,12 @@ from typing import Any
 
 import torch as th
 
-from sb3_poem.adaptation.known_task import LATENTS_WITH_OWN_DYNAMICS, LATENTS_WITH_SHARED_DYNAMICS
+from sb3_poem.adaptation.known_task import (
+    LATENTS_WITH_OWN_DYNAMICS,
+    LATENTS_WITH_SHARED_DYNAMICS,
+    REFINING_DRAWS,
+    REFINING_WIDTHS,
+)
 from sb3_poem.baselines import ANOLE, MAMLReward
 from sb3_poem.baselines.fragments import default_fragment_length
 from sb3_poem.benchmark.cells import SELECTION_EPISODES
@@ -76,6 +81,7 @@ def cell_seconds(cell: Cell, pace: Pace) -> float:
         latents = LATENTS_WITH_OWN_DYNAMICS * budget.tasks
         if facts.shared_dynamics:
             latents = LATENTS_WITH_SHARED_DYNAMICS
+        latents = 2 * latents + len(REFINING_WIDTHS) * (1 + REFINING_DRAWS) * budget.tasks
         episodes = latents * min(budget.episodes, SELECTION_EPISODES)
         return (episodes + budget.tasks * budget.episodes) * facts.horizon * pace.step
     episodes = budget.tasks * budget.episodes * len(budget.record_at)

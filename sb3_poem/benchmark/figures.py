@@ -86,7 +86,8 @@ def _queries_figure(
 
 
 def _draw_yardsticks(axes: Axes, reference: Reference, entry: Entry, oracle: OracleSpec) -> None:
-    limits = [float(reference.limits(k, oracle).mean()) for k in entry.record_at]
+    measured = [reference.limits(k, oracle) for k in entry.record_at]
+    limits = [np.nan if values is None else float(values.mean()) for values in measured]
     limit = {"color": "0.25", "linestyle": "--", "label": "limit (POEM's policies)"}
     known = {"color": "0.5", "linestyle": ":", "label": "task known (POEM's policies)"}
     axes.plot(entry.record_at, limits, linewidth=1.2, **limit)  # type: ignore[arg-type]

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
-from rliable import library, metrics
 from scipy.stats import sem, trim_mean
 
-from sb3_poem.adaptation.known_task import repertoire_limit
+from sb3_poem.adaptation.limits import AnswerLimits
 from sb3_poem.benchmark.cells import make_oracle_factory
 from sb3_poem.benchmark.methods import METHODS
 from sb3_poem.benchmark.store import Record
@@ -120,6 +118,19 @@ class Series(_Measured):
         """(n_seeds, n_tasks) after so many answers; None if that was not measured."""
         return self.returns[:, :, self.queries.index(queries)] if queries in self.queries else None
 
+    def against(self, other: Series, queries: int) -> Comparison | None:
+        """After so many answers, on the seeds that both have; None if there is nothing of it."""
+        seeds = [[record.seed for record in series.records] for series in (self, other)]
+        common = sorted(set(seeds[0]) & set(seeds[1]))
+        mine, theirs = self.at(queries), other.at(queries)
+        if mine is None or theirs is None or not common:
+            return None
+        one, two = (
+            returns[[own.index(seed) for seed in common]]
+            for returns, own in ((mine, seeds[0]), (theirs, seeds[1]))
+        )
+        return compare(one, two)
+
 
 @dataclass(frozen=True, eq=False)
 class Reference(_Measured):
@@ -136,19 +147,16 @@ class Reference(_Measured):
         rates = _success_rates(self.records)
         return None if rates is None else float(rates.mean())
 
-    def limits(self, queries: int, oracle: OracleSpec) -> np.ndarray:
-        """(n_seeds,): the most that so many answers of this oracle allow with these policies."""
-        return np.array(_limits(self, queries, oracle))
-
-
-@cache
-def _limits(reference: Reference, queries: int, oracle: OracleSpec) -> tuple[float, ...]:
-    """Tables and figures ask for the same ones."""
-    noise, limits = make_oracle_factory(oracle)().noise_model, []
-    for result in (record.result for record in reference.records):
-        tasks, candidates = np.array(result["tasks"]), np.array(result["candidate_returns"])
-        limits.append(repertoire_limit(tasks, candidates, queries, noise))
-    return tuple(limits)
+    def limits(self, queries: int, oracle: OracleSpec) -> np.ndarray | None:
+        """(n_seeds,): the most that so many answers of this oracle allow with these policies; None
+        where it was not measured.
+        """
+        results = [record.result for record in self.records]
+        if any("limits" not in result for result in results):
+            return None
+        noise = make_oracle_factory(oracle)().noise_model
+        limits = [AnswerLimits(**result["limits"]) for result in results]
+        return np.array([one.after(queries, noise) for one in limits])
 
 
 class Selection:
@@ -234,8 +242,8 @@ def _handed_over(record: Record) -> bool:
 @dataclass(frozen=True)
 class Summary:
     """What several seeds earned: the mean of their mean returns, its deviation (n - 1), and the
-    interquartile mean over seeds and tasks with its 95 % interval (both None for one seed); and the
-    standard error over tasks of their means over seeds (None for one task).
+    interquartile mean over seeds and tasks with its :func:`interval` (both None for one seed); and
+    the standard error over tasks of their means over seeds (None for one task).
     """
 
     n_seeds: int
@@ -247,48 +255,84 @@ class Summary:
     task_error: float | None
 
 
-def summarise(returns: np.ndarray, intervals: bool = True) -> list[Summary]:
-    """Summarise one method on one family after several numbers of answers.
-
-    :param returns: (n_seeds, n_tasks, n_records); column j is the same test task for all seeds.
-    :param intervals: Whether intervals are wanted, which take about a second: rliable's percentiles
-        of stratified bootstrap samples, which draw the seeds anew for every task.
-    """
+def summarise(returns: np.ndarray) -> Summary:
+    """Summarise returns (n_seeds, n_tasks), column j the same test task for all seeds."""
     returns = np.asarray(returns, dtype=np.float64)
-    if returns.ndim != 3 or 0 in returns.shape or not np.isfinite(returns).all():
+    if returns.ndim != 2 or 0 in returns.shape or not np.isfinite(returns).all():
         raise ValueError(
-            "`returns` must be finite, (n_seeds, n_tasks, n_records), none 0, but has shape "
+            "`returns` must be finite, (n_seeds, n_tasks), neither 0, but has shape "
             f"{returns.shape}"
         )
     seeds, tasks = returns.mean(axis=1), returns.mean(axis=0)
-    iqms = [float(metrics.aggregate_iqm(record)) for record in np.moveaxis(returns, 2, 0)]
-    nothing: list[float | None] = [None] * len(iqms)
-    low = high = nothing
-    if intervals and len(seeds) > 1:
-        with _seeded(0):
-            _, bounds = library.get_interval_estimates(
-                {"method": returns}, _iqms, reps=BOOTSTRAP_SAMPLES
-            )
-        low, high = bounds["method"].tolist()
-    deviations = seeds.std(axis=0, ddof=1).tolist() if len(seeds) > 1 else nothing
-    errors = sem(tasks).tolist() if len(tasks) > 1 else nothing
-    figures = zip(seeds.mean(axis=0).tolist(), deviations, iqms, low, high, errors, strict=True)
-    return [Summary(len(returns), *figure) for figure in figures]
+    deviation = float(seeds.std(ddof=1)) if len(seeds) > 1 else None
+    error = float(sem(tasks)) if len(tasks) > 1 else None
+    figures = (float(_iqm(returns)), *interval(_iqm, returns), error)
+    return Summary(len(seeds), float(seeds.mean()), deviation, *figures)
 
 
-def _iqms(scores: np.ndarray) -> np.ndarray:
-    """(n_seeds, n_tasks, n_records) -> (n_records,): each record's interquartile mean."""
-    return trim_mean(scores.reshape(-1, scores.shape[2]), proportiontocut=0.25, axis=0)
-
-
-@contextlib.contextmanager
-def _seeded(seed: int) -> Iterator[None]:
-    """rliable draws from the global generator: seed it, so that a report is the same twice, and
-    hand it back as it was.
+@dataclass(frozen=True)
+class Comparison:
+    """What a method earns more than another on the same seeds and tasks: the mean and the
+    interquartile mean of the paired differences; and the probability of improvement, that it earns
+    more on a task when both take any seed (Mann & Whitney's, averaged over tasks; a tie counts one
+    half). ``low`` and ``high`` are the :func:`interval` of the mean.
     """
-    state = np.random.get_state()  # noqa: NPY002
-    np.random.seed(seed)  # noqa: NPY002
-    try:
-        yield
-    finally:
-        np.random.set_state(state)  # noqa: NPY002
+
+    n_seeds: int
+    mean: float
+    low: float | None
+    high: float | None
+    iqm: float
+    probability: float
+    probability_low: float | None
+    probability_high: float | None
+
+    @property
+    def claim(self) -> str:
+        """ "ahead" or "behind" if the mean, the interquartile mean and the whole interval agree."""
+        for word, sign in (("ahead", 1.0), ("behind", -1.0)):
+            ends = (self.mean, self.iqm, self.low, self.high)
+            if all(end is not None and sign * end > 0 for end in ends):
+                return word
+        return "not distinguishable"
+
+
+def compare(one: np.ndarray, other: np.ndarray) -> Comparison:
+    """Compare returns (n_seeds, n_tasks) of two methods, of the same seeds and tasks."""
+    if one.shape != other.shape:
+        raise ValueError(f"`one` {one.shape} and `other` {other.shape} must have the same shape")
+    gaps = one - other
+    mean, iqm, probability = map(float, (gaps.mean(), _iqm(gaps), _probability(one, other)))
+    low, high = interval(lambda drawn: drawn.mean(axis=(-2, -1)), gaps)
+    ends = interval(_probability, one, other)
+    return Comparison(len(gaps), mean, low, high, iqm, probability, *ends)
+
+
+def interval(
+    statistic: Callable[..., np.ndarray], *samples: np.ndarray
+) -> tuple[float, float] | tuple[None, None]:
+    """The 95 % percentile bootstrap interval of a statistic of samples (n_seeds, n_tasks): seeds
+    and tasks are drawn anew, the same ones for all samples (Owen 2007). None for one seed, which
+    says nothing of another.
+
+    :param statistic: Of arrays (..., n_seeds, n_tasks), giving (...).
+    """
+    n_seeds, n_tasks = samples[0].shape
+    if n_seeds < 2:
+        return None, None
+    rng = np.random.default_rng(0)  # a report is the same twice
+    seeds = rng.integers(n_seeds, size=(BOOTSTRAP_SAMPLES, n_seeds, 1))
+    tasks = rng.integers(n_tasks, size=(BOOTSTRAP_SAMPLES, 1, n_tasks))
+    low, high = np.quantile(statistic(*(each[seeds, tasks] for each in samples)), (0.025, 0.975))
+    return float(low), float(high)
+
+
+def _iqm(scores: np.ndarray) -> np.ndarray:
+    """(..., n_seeds, n_tasks) -> (...)."""
+    return trim_mean(scores.reshape(*scores.shape[:-2], -1), proportiontocut=0.25, axis=-1)
+
+
+def _probability(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """(..., n_seeds, n_tasks), twice -> (...)."""
+    order = np.sign(one[..., :, None, :] - other[..., None, :, :])
+    return 0.5 + 0.5 * order.mean(axis=(-3, -2, -1))

@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from sb3_poem.adaptation.limits import AnswerLimits
 from sb3_poem.benchmark.cells import run_cell
 from sb3_poem.benchmark.estimate import cell_seconds, measure_pace, training_seconds
 from sb3_poem.benchmark.methods import VARIANTS
 from sb3_poem.benchmark.models import ModelLibrary, Say, locked, try_lock
+from sb3_poem.benchmark.results import Reference
 from sb3_poem.benchmark.store import Store
 from sb3_poem.benchmark.suites import (
-    EXACT,
     Budget,
     Cell,
     ModelKey,
@@ -221,14 +222,12 @@ def export_model(cells: Sequence[Cell], library: ModelLibrary, store: Store, fol
     """Write the model of finished cells (of its methods with preferences, and what is known) as a
     pretrained folder, with how it was trained and what it earns on its card.
     """
-    from sb3_poem.benchmark.results import Reference  # rliable is slow to import
-
     records = {record.key: record for record in store.records(cell.key for cell in cells)}
     missing = [str(cell) for cell in cells if cell.key not in records]
     if missing:
         raise ValueError(f"{folder} cannot be written before its cells are finished: {missing}")
     [known] = [records[cell.key] for cell in cells if cell.definition.rule is None]
-    reference = Reference("known-task", (known,))
+    reference, limits = Reference("known-task", (known,)), AnswerLimits(**known.result["limits"])
     adaptations = []
     for cell in cells:
         if cell.definition.rule is None:
@@ -238,7 +237,7 @@ def export_model(cells: Sequence[Cell], library: ModelLibrary, store: Store, fol
             "inference": str(cell.definition.rule).lower(),
             "queries": result["queries"],
             "mean_return": np.mean(result["task_returns"], axis=0).tolist(),
-            "limit": [float(reference.limits(k, EXACT)[0]) for k in result["queries"]],
+            "limit": [limits.after(k) for k in result["queries"]],
             "known_task_return": float(reference.known[0]),
         }
         if reference.success_rate is not None:

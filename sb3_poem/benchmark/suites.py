@@ -39,6 +39,8 @@ TABLE_METHODS = (
     "maml-reward",
     "reward-oracle",
 )
+#: Methods whose differences from all others tables show
+SUBJECTS = ("poem-bayes", "poem-paper")
 TABLE_REFERENCES = ("known-task", "known-task-pearl")
 # MAML-reward trains a reward only, so its return does not depend on how long a policy was trained;
 # greedy search takes as long as all the others together, and lies beside ANOLE.

@@ -14,9 +14,9 @@ import numpy as np
 
 from sb3_poem.benchmark.figures import write_figures
 from sb3_poem.benchmark.methods import METHODS
-from sb3_poem.benchmark.results import Condition, Selection, summarise
+from sb3_poem.benchmark.results import Condition, Selection, Series, summarise
 from sb3_poem.benchmark.store import Store
-from sb3_poem.benchmark.suites import EXACT, SUITES, Entry, OracleSpec
+from sb3_poem.benchmark.suites import EXACT, SUBJECTS, SUITES, Entry, OracleSpec
 
 SUFFIX = {"md": ".md", "latex": ".tex", "csv": ".csv", "json": ".json"}
 #: Table 3 of Xu & Zhu (ICML 2025): family -> row -> [mean, standard deviation] after 1, 5 and 10
@@ -32,7 +32,8 @@ class Row:
     """A method, or a yardstick, after some number of answers; what CSV and JSON hold. For the
     figures see :class:`Summary`.
 
-    :param kind: "method", "limit" or "known".
+    :param kind: "method", "limit", "known", or "difference": what ``method`` earns more than the
+        method ``against``, see :class:`Comparison`.
     :param queries: After how many answers; None for "known".
     :param snapshot: The share of the training after which; None: all.
     :param samples: Environment steps of the training, mean over seeds.
@@ -59,6 +60,13 @@ class Row:
     paper_deviation: float | None = None
     task_error: float | None = None
     success_rate: float | None = None
+    against: str | None = None
+    low: float | None = None
+    high: float | None = None
+    probability: float | None = None
+    probability_low: float | None = None
+    probability_high: float | None = None
+    claim: str | None = None
 
 
 @dataclass(frozen=True)
@@ -135,6 +143,8 @@ def suite_tables(selection: Selection) -> list[Table]:
                 rows = list(_rows(selection, condition, entry, oracle))
                 if rows:
                     tables.append(_comparison(condition, entry, oracle, rows))
+                if any(row.kind == "difference" for row in rows):
+                    tables.append(_differences(condition, entry, oracle, rows))
                 if entry.by_task and any(row.success_rate is not None for row in rows):
                     tables.append(_successes(condition, entry, rows))
         tables += _models(selection, condition)
@@ -184,9 +194,8 @@ def _rows(
         final = one.snapshot is None
         # The paper's figures are of the whole training and of its own answers.
         has_paper = final and oracle == EXACT and entry.name == "methods"
-        summaries = summarise(one.returns, intervals=final and not entry.by_task)
         successes = one.success_rates
-        for i, (queries, summary) in enumerate(zip(one.queries, summaries, strict=True)):
+        for i, queries in enumerate(one.queries):
             row = METHODS[one.method].paper_row if has_paper else None
             paper = paper_figure(condition.family, row, queries) or (None, None)
             yield Row(
@@ -197,11 +206,13 @@ def _rows(
                 queries=queries,
                 snapshot=one.snapshot,
                 samples=one.samples,
-                **vars(summary),
+                **vars(summarise(one.returns[:, :, i])),
                 paper_mean=paper[0],
                 paper_deviation=paper[1],
                 success_rate=None if successes is None else successes[i],
             )
+    ended = {one.method: one for one in some if one.snapshot is None}
+    yield from _paired(place, entry, ended)
     variants = {METHODS[one.method].variant for one in some}
     for reference in selection.references(condition):
         if METHODS[reference.method].variant not in variants:
@@ -209,10 +220,28 @@ def _rows(
         of = {**place, "method": reference.method, "snapshot": None, "samples": None}
         limit = reference.label.replace("task known", "limit")
         for queries in entry.record_at:
-            values = _over_seeds(reference.limits(queries, oracle))
-            yield Row(**of, label=limit, kind="limit", queries=queries, **values)
+            measured = reference.limits(queries, oracle)
+            if measured is not None:
+                values = _over_seeds(measured)
+                yield Row(**of, label=limit, kind="limit", queries=queries, **values)
         values = {**_over_seeds(reference.known), "success_rate": reference.success_rate}
         yield Row(**of, label=reference.label, kind="known", queries=None, **values)
+
+
+def _paired(place: dict[str, Any], entry: Entry, found: dict[str, Series]) -> Iterator[Row]:
+    """Each of :data:`SUBJECTS` against every other method, each pair once."""
+    subjects = [name for name in SUBJECTS if name in found and not entry.by_task]
+    for position, name in enumerate(subjects):
+        for other, theirs in found.items():
+            if other in subjects[: position + 1]:
+                continue
+            mine = found[name]
+            for k in filter(entry.record_at.__contains__, entry.shown):
+                versus = mine.against(theirs, k)
+                if versus is not None:
+                    of = {**place, "method": name, "label": mine.label, "against": other}
+                    of |= {"snapshot": None, "samples": None, "claim": versus.claim}
+                    yield Row(**of, kind="difference", queries=k, **vars(versus))
 
 
 def _over_seeds(values: np.ndarray) -> dict[str, Any]:
@@ -260,12 +289,47 @@ def _comparison(
     ]
     if any(row.kind == "limit" for row in rows):
         notes.append(
-            "A limit is the most that so many of these answers allow with those policies, chosen "
-            "with the test tasks in sight; it does not bind the reward oracle, which sees more "
-            "than answers."
+            "A limit is what the best choice of those policies earns that so many of these "
+            "answers can name: chosen on other tasks of the family, where dynamics are shared, and "
+            "measured by other episodes. It binds no method with other policies, nor the reward "
+            "oracle, which sees more than answers."
         )
     title = f"{condition}; {entry.title.lower()}, {oracle.label}"
     return Table(title, tuple(header), tuple(body), tuple(notes))
+
+
+def _differences(
+    condition: Condition, entry: Entry, oracle: OracleSpec, rows: Sequence[Row]
+) -> Table:
+    """Paired differences, probabilities of improvement, and what may be said."""
+    queries = [k for k in entry.shown if k in entry.record_at]
+    header = ["method", "against", "seeds"]
+    for k in queries:
+        header += [_after(k), "IQM", "P(better)", ""]
+    body = []
+    paired = {(r.label, r.against, r.queries): r for r in rows if r.kind == "difference"}
+    for label, against in dict.fromkeys(key[:2] for key in paired):
+        some = [paired.get((label, against, k)) for k in queries]
+        seeds = max(row.n_seeds for row in some if row is not None)
+        cells = [label, METHODS[against or ""].label, str(seeds)]
+        for row in some:
+            if row is None:
+                cells += [""] * 4
+                continue
+            chance = _shown(row.probability, ".2f")
+            if row.probability_low is not None:
+                chance += f" [{row.probability_low:.2f}, {row.probability_high:.2f}]"
+            mean = _number(row.mean, row.low, row.high)
+            cells += [mean, _number(row.iqm), chance, row.claim or ""]
+        body.append(tuple(cells))
+    notes = (
+        "Differences of returns, paired by seed and test task: mean with its 95 % interval, "
+        "interquartile mean, and the probability of improvement. Bootstrap over seeds and tasks. "
+        "A method is ahead or behind if the mean, the interquartile mean and the whole interval of "
+        "the mean say so.",
+    )
+    title = f"{condition}; differences of {entry.title.lower()}, {oracle.label}"
+    return Table(title, tuple(header), tuple(body), notes)
 
 
 def _successes(condition: Condition, entry: Entry, rows: Sequence[Row]) -> Table:

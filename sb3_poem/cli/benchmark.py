@@ -25,7 +25,7 @@ def run_benchmark(arguments: argparse.Namespace) -> int:
     try:
         return {"run": _run, "report": _report, "verify": _verify}[arguments.part](arguments)
     except ModuleNotFoundError as error:
-        if error.name not in ("rliable", "sqlalchemy"):
+        if error.name != "sqlalchemy":
             raise
         raise ValueError(
             f"the benchmark's packages are missing: pip install 'sb3_poem[benchmark]' ({error})"

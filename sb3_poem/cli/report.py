@@ -30,9 +30,7 @@ class Report:
 
     @property
     def limits(self) -> list[float] | None:
-        """What the best 2^k of the policies that were tried (5^k where answers are graded) earn on
-        these tasks, (n_records,).
-        """
+        """What k exact answers allow among the policies that were tried, (n_records,)."""
         if self.known is None:
             return None
         kinds = self._kinds_of_answers
@@ -67,11 +65,11 @@ class Report:
             return None
         n, episodes = len(self.known.candidate_latents), self.known.returns.shape[1]
         return (
-            f"task known: the best of {n} policies for each task, measured anew on {episodes} "
-            "episodes.\n"
-            f"limit: the best {self._kinds_of_answers}^answers of those {n} for these very tasks, "
-            "chosen with the tasks in sight: an optimistic bound for error-free answers that "
-            "choose among these policies, not for any method."
+            f"task known: the best of {n} policies for each task, refined, and measured anew on "
+            f"{episodes} episodes.\n"
+            f"limit: the best {self._kinds_of_answers}^answers of those {n}, chosen on other tasks "
+            "where dynamics are shared, and measured anew: what error-free answers can name of "
+            "these policies, no bound for methods with others."
         )
 
     def to_dict(self) -> dict[str, Any]:

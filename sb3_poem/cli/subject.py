@@ -97,9 +97,10 @@ class Subject:
             else np.array([task], dtype=np.float64)
         )
 
-    def known_task_return(self, n_episodes: int) -> KnownTaskReturn:
+    def known_task_return(self, n_episodes: int, limits: bool = True) -> KnownTaskReturn:
         """The best of the model's policies for each task, measured on so many episodes."""
         how: dict[str, Any] = {"selection_episodes": min(n_episodes, SELECTION_EPISODES)}
+        how["limits"] = limits
         about = (self.model, self.env, self.tasks)
         return known_task_return(*about, n_episodes=n_episodes, seed=self.seed, **how)
 

@@ -7,6 +7,7 @@ import pytest
 from scipy.optimize import brentq, minimize
 
 from sb3_poem.adaptation import (
+    AnswerLimits,
     BoltzmannNoise,
     ExactNoise,
     MistakeNoise,
@@ -162,12 +163,11 @@ def test_rate_distortion_on_a_line_lies_between_shannon_and_the_codebook(bits):
 
 
 def test_the_information_in_answers():
-    assert answer_capacity(None, SPEEDS) == answer_capacity(ExactNoise(), SPEEDS) == 1.0
-    assert answer_capacity(MistakeNoise(0.2), SPEEDS) == pytest.approx(1 - entropy(0.2))
-    assert answer_capacity(MistakeNoise(0.5), SPEEDS) == 0.0
-    assert answer_capacity(BoltzmannNoise(), SPEEDS) == pytest.approx(1 - entropy(1 / (1 + np.e)))
-    returns = np.array([[0.0, 3.0], [1.0, 0.0]])
-    assert answer_capacity(BoltzmannNoise(0.5), returns) == pytest.approx(
+    assert answer_capacity(None, 1.0) == answer_capacity(ExactNoise(), 1.0) == 1.0
+    assert answer_capacity(MistakeNoise(0.2), 1.0) == pytest.approx(1 - entropy(0.2))
+    assert answer_capacity(MistakeNoise(0.5), 1.0) == 0.0
+    assert answer_capacity(BoltzmannNoise(), 1.0) == pytest.approx(1 - entropy(1 / (1 + np.e)))
+    assert answer_capacity(BoltzmannNoise(0.5), 3.0) == pytest.approx(
         1 - entropy(1 / (1 + np.exp(1.5)))
     )
     # No inputs in between carry more: the capacity of all probabilities in the range, found by
@@ -177,7 +177,7 @@ def test_the_information_in_answers():
         entropy(w * p + (1 - w) * q) - w * entropy(p) - (1 - w) * entropy(q)
         for p, q, w in itertools.product(left, left, np.linspace(0, 1, 21))
     ]
-    assert max(mixed) == pytest.approx(answer_capacity(MistakeNoise(0.2), returns), abs=1e-9)
+    assert max(mixed) == pytest.approx(answer_capacity(MistakeNoise(0.2), 1.0), abs=1e-9)
 
 
 def test_noise_lowers_the_limit():
@@ -201,10 +201,10 @@ def test_majority_votes_stay_below_the_noisy_limit():
 
 def test_more_kinds_of_answers_raise_the_limit():
     returns = SPEEDS[::8, ::8]
-    assert answer_capacity(None, returns, 5) == pytest.approx(np.log2(5))
-    assert answer_capacity(MistakeNoise(0.0), returns, 5) == pytest.approx(np.log2(5))
+    assert answer_capacity(None, 1.0, 5) == pytest.approx(np.log2(5))
+    assert answer_capacity(MistakeNoise(0.0), 1.0, 5) == pytest.approx(np.log2(5))
     # Always random between opposites: the size alone is told, of three.
-    assert answer_capacity(MistakeNoise(0.5), returns, 5) == pytest.approx(np.log2(3))
+    assert answer_capacity(MistakeNoise(0.5), 1.0, 5) == pytest.approx(np.log2(3))
     best = returns[:, best_codebook(returns, 5, ordered=True)].max(axis=1).mean()
     assert information_limit(returns, 1, n_answers=5, ordered=True) == pytest.approx(best)
     for noise in (None, MistakeNoise(0.2), BoltzmannNoise()):
@@ -212,14 +212,13 @@ def test_more_kinds_of_answers_raise_the_limit():
         assert limits == sorted(limits)
         assert limits[0] < limits[2]
     with pytest.raises(ValueError, match="`n_answers` must be at least 2"):
-        answer_capacity(None, SPEEDS, 1)
+        answer_capacity(None, 1.0, 1)
 
 
 @pytest.mark.parametrize("beta", [0.02, 0.2])
 def test_boltzmann_grades_tell_no_more_than_their_bound(beta):
-    returns = np.array([[0.0, 30.0]])
-    bound = answer_capacity(BoltzmannNoise(beta), returns, 5)
-    assert bound >= answer_capacity(BoltzmannNoise(beta), returns)
+    bound = answer_capacity(BoltzmannNoise(beta), 30.0, 5)
+    assert bound >= answer_capacity(BoltzmannNoise(beta), 30.0)
     inputs = np.linspace(-30, 30, 7)
     for equal, much in ((5.0, 15.0), (10.0, 25.0)):
         cuts = np.array([-much, -equal, equal, much])
@@ -230,6 +229,35 @@ def test_boltzmann_grades_tell_no_more_than_their_bound(beta):
             marginal = shares @ channel
             told = shares @ np.sum(channel * np.log2(channel / marginal), axis=1)
             assert told < bound < np.log2(5)
+
+
+def test_fair_limits_do_not_profit_from_luck():
+    """Policies that are all alike: what they earned was luck, and a limit by it would lie above."""
+    rng = np.random.default_rng(0)
+    others, chosen, fresh = (rng.normal(size=(n, 60)) for n in (200, 100, 100))
+    limits = AnswerLimits.measure(others, chosen, fresh)
+    assert information_limit(chosen, 5) > 1.5
+    assert len(limits.codebooks) == 7
+    for k in (0, 1, 5, 10):
+        for noise in (None, MistakeNoise(0.1)):
+            assert abs(limits.after(k, noise)) < 0.35  # 100 tasks: the standard error is 0.1
+
+
+def test_fair_limits_on_a_line():
+    """Without luck, and with other tasks as dense as these, they are the plain ones."""
+    returns, others = SPEEDS[4::8, ::8], SPEEDS[::8, ::8]
+    limits = AnswerLimits.measure(others, returns, returns, ordered=True)
+    for k in range(4):
+        assert limits.after(k) == pytest.approx(-150 / 2**k, rel=0.06)
+    for k in (1, 3):
+        noisy = limits.after(k, MistakeNoise(0.1))
+        bound = rate_distortion_limit(returns, k * answer_capacity(MistakeNoise(0.1), 1.0))
+        assert noisy == pytest.approx(bound, abs=4.0)
+        assert limits.after(0) < noisy < limits.after(k)
+    assert limits.after(1) < limits.after(1, n_answers=3) < limits.after(2)
+    assert limits.after(1, n_answers=4) == limits.after(2)
+    with pytest.raises(ValueError, match="`k` must not be negative"):
+        limits.after(-1)
 
 
 class OtherNoise:

@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from benchmark_records import finished
+from scipy.stats import mannwhitneyu
 
-from sb3_poem.benchmark.results import Selection, summarise
+from sb3_poem.adaptation import AnswerLimits
+from sb3_poem.benchmark.results import Selection, compare, summarise
 from sb3_poem.benchmark.store import Store
 from sb3_poem.benchmark.suites import BOLTZMANN, SUITES, Budget, Cell, OracleSpec, Training
 from sb3_poem.benchmark.tables import make_report, suite_rows, suite_tables
@@ -30,13 +32,13 @@ def ladder(cell: Cell, k: int) -> np.ndarray:
 
 
 def matrix(cell: Cell) -> dict:
-    """Four tasks and four policies, each the best of one: 0 on the diagonal, -1 beside it, and so
-    on.
+    """Limits of four tasks and four policies, each the best of one: 0 on the diagonal, -1 beside
+    it, and so on.
     """
     places = np.arange(4)
-    return {
-        "candidate_returns": (-np.abs(places[:, None] - places[None, :]).astype(float)).tolist()
-    }
+    returns = -np.abs(places[:, None] - places[None, :]).astype(float)
+    limits = AnswerLimits.measure(returns, returns, returns)
+    return {"limits": {name: np.array(value).tolist() for name, value in vars(limits).items()}}
 
 
 def fill(path: Path, suite: str = "table3", seeds: int = 3, **arguments: object) -> Store:
@@ -49,28 +51,86 @@ def fill(path: Path, suite: str = "table3", seeds: int = 3, **arguments: object)
 
 def test_means_deviations_and_interquartile_means() -> None:
     returns = np.array([[0.0, 10.0, 20.0, 30.0], [4.0, 14.0, 24.0, 34.0]])  # two seeds, four tasks
-    one, shifted = summarise(np.stack([returns, returns + 100.0], axis=2))
+    one, shifted = summarise(returns), summarise(returns + 100.0)
     assert (one.n_seeds, one.mean) == (2, 17.0)
     assert one.deviation == pytest.approx(np.sqrt(8.0))  # seeds 15 and 19
     assert one.iqm == 17.0  # of 0 4 10 14 20 24 30 34 the middle four
-    # Of a seed drawn for each task anew the sorted eight values lie between all of seed 0 and all
-    # of seed 1.
-    assert 15.0 <= one.iqm_low < one.iqm < one.iqm_high <= 19.0
+    # Tasks of the lowest draw may all be the first, and of the highest all the last.
+    assert 0.0 <= one.iqm_low < one.iqm < one.iqm_high <= 34.0
     assert shifted.mean == one.mean + 100.0
-    assert summarise(returns[:, :, None]) == summarise(
-        returns[:, :, None]
-    )  # a report is the same twice
-    [single] = summarise(returns[:1, :, None])
+    assert summarise(returns) == summarise(returns)  # a report is the same twice
+    same_tasks = summarise(np.array([[15.0] * 4, [19.0] * 4]))
+    assert (same_tasks.iqm_low, same_tasks.iqm_high) == (15.0, 19.0)
+    single = summarise(returns[:1])
     assert (single.deviation, single.iqm_low, single.iqm_high) == (None, None, None)
-    for bad in (returns, np.full((2, 2, 1), np.nan), np.empty((0, 3, 1))):
+    for bad in (returns[0], np.full((2, 2), np.nan), np.empty((0, 3))):
         with pytest.raises(ValueError, match="`returns` must be finite"):
             summarise(bad)
+
+
+def test_the_probability_of_improvement_is_mann_and_whitneys() -> None:
+    rng = np.random.default_rng(0)
+    one, other = np.round(rng.normal(size=(2, 3, 8)), 1)  # with ties
+    statistics = [
+        mannwhitneyu(one[:, task], other[:, task]).statistic / 9 for task in range(one.shape[1])
+    ]
+    found = compare(one, other)
+    assert found.probability == pytest.approx(np.mean(statistics))
+    assert found.mean == pytest.approx((one - other).mean())
+    assert found.low < found.mean < found.high
+    assert found.probability_low < found.probability < found.probability_high
+
+
+def test_a_claim_needs_mean_interquartile_mean_and_interval() -> None:
+    rng = np.random.default_rng(1)
+    tasks = 100.0 * rng.normal(size=10)  # far apart: only pairing shows a difference of one
+    other = tasks + 0.1 * rng.normal(size=(3, 10))
+    assert compare(other + 1.0, other).claim == "ahead"
+    assert compare(other - 1.0, other).claim == "behind"
+    assert compare(other[:1] + 1.0, other[:1]).claim == "not distinguishable"  # of one seed
+    assert compare(other + rng.normal(size=10), other).claim == "not distinguishable"
+    # One task of ten is much better, and all others a little worse.
+    lucky = other + np.where(np.arange(10) == 0, 1000.0, -0.5)
+    found = compare(lucky, other)
+    assert (found.mean > 0, found.iqm < 0, found.claim) == (True, True, "not distinguishable")
+    assert found.probability == pytest.approx(0.1, abs=0.05)
+
+
+def test_differences_are_paired_by_seed(tmp_path: Path) -> None:
+    def returns(cell: Cell, k: int) -> np.ndarray:
+        return ladder(cell, k) + (1.0 if cell.method == "poem-bayes" else 0.0)
+
+    with Store(tmp_path / "store.sqlite") as store:
+        cells = SUITES["table3"].cells([VEL], range(3), None, FOUR, snapshots=1)
+        for cell in cells:
+            if cell.definition.rule and (cell.method, cell.seed) != ("anole", 0):
+                store.add(finished(cell, returns))
+        text, _ = make_report(store, ["table3"])
+        rows = json.loads(make_report(store, ["table3"], kind="json")[0])
+    paired = [row for row in rows if row["kind"] == "difference"]
+    pairs = {(row["method"], row["against"]) for row in paired}
+    assert len(pairs) == 6 + 5
+    assert ("poem-bayes", "poem-paper") in pairs
+    assert ("poem-paper", "poem-bayes") not in pairs
+    [row] = [
+        row
+        for row in paired
+        if (row["method"], row["against"], row["queries"]) == ("poem-bayes", "anole", 5)
+    ]
+    # Unpaired the means would differ by 1 - 2.5, as ANOLE lacks the worst seed.
+    assert (row["n_seeds"], row["mean"], row["low"], row["high"]) == (2, 1.0, 1.0, 1.0)
+    assert row["claim"] == "ahead"
+    [line] = [line for line in text.splitlines() if line.startswith("| POEM (Bayes) | ANOLE | 2 |")]
+    assert line.split(" | ")[3:5] == ["1.0 [1.0, 1.0]", "1.0"]
+    assert line.count("ahead") == 3
+    assert "| POEM (paper) | ANOLE | 2 | 0.0 [0.0, 0.0] |" in text
 
 
 def test_rows_of_table_3(tmp_path: Path) -> None:
     selection = Selection(SUITES["table3"], fill(tmp_path / "store.sqlite").records())
     rows = suite_rows(selection)
-    [row] = [r for r in rows if (r.method, r.queries, r.snapshot) == ("poem-paper", 5, None)]
+    wanted = ("method", "poem-paper", 5, None)
+    [row] = [r for r in rows if (r.kind, r.method, r.queries, r.snapshot) == wanted]
     # Seeds' means are -20, -15, -10.
     assert (row.n_seeds, row.mean, row.deviation) == (3, -15.0, 5.0)
     # The middle six of twelve values -35 -30 -25 -25 -20 -15 -15 -10 -5 -5 0 5.
@@ -118,6 +178,7 @@ def test_other_budgets_stand_in_other_tables(tmp_path: Path) -> None:
         tables = suite_tables(Selection(SUITES["table3"], store.records()))
     assert [table.title for table in tables] == [
         "HalfCheetahVel: 4 test tasks, 2 episodes each; methods, exact answers",
+        "HalfCheetahVel: 4 test tasks, 2 episodes each; differences of methods, exact answers",
         "HalfCheetahVel: the models",
         "HalfCheetahVel: 4 test tasks, 3 episodes each; methods, exact answers",
     ]
@@ -207,14 +268,14 @@ def test_hyperparameters_that_are_lists(tmp_path: Path) -> None:
 def test_every_format(tmp_path: Path) -> None:
     store = fill(tmp_path / "store.sqlite", snapshots=1)
     markdown, _ = make_report(store, ["table3"])
-    [line] = [line for line in markdown.splitlines() if line.startswith("| POEM (paper) ")]
+    [line] = [line for line in markdown.splitlines() if line.startswith("| POEM (paper) | 3 ")]
     cells = [cell.strip() for cell in line.strip("|").split("|")]
     assert cells[:3] == ["POEM (paper)", "3", "-19.0 ± 5.0"]
     assert cells[3].startswith("-19.0 [-")
     assert cells[4] == "-65.0 ± 10.0"
     latex, _ = make_report(store, ["table3"], kind="latex")
     assert r"POEM (paper) & 3 & -19.0 $\pm$ 5.0 & " in latex
-    assert latex.count(r"\begin{tabular}") == latex.count(r"\end{tabular}") == 2
+    assert latex.count(r"\begin{tabular}") == latex.count(r"\end{tabular}") == 3
     assert "95 %" not in latex.replace(r"95 \%", "")
     table = list(csv.DictReader(io.StringIO(make_report(store, ["table3"], kind="csv")[0])))
     data = json.loads(make_report(store, ["table3"], kind="json")[0])
@@ -269,7 +330,7 @@ def test_a_table_has_the_yardsticks_of_its_own_models_only(tmp_path: Path) -> No
     store = fill(tmp_path / "store.sqlite", "ablation", seeds=1, snapshots=1)
     yardsticks: dict[str, set[str]] = {}
     for row in suite_rows(Selection(SUITES["ablation"], store.records())):
-        if row.kind != "method":
+        if row.kind in ("limit", "known"):
             yardsticks.setdefault(row.entry, set()).add(row.method)
     assert yardsticks["rules"] == yardsticks["queries"] == {"known-task"}
     assert {"known-task", "known-task-poem-inner", "known-task-poem-d2"} <= yardsticks["design"]
