@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sb3_poem.adaptation.environments import Env, model_and_env
-from sb3_poem.adaptation.many_tasks import OracleFactory, TaskAdaptations, adapt_tasks
+from sb3_poem.adaptation.many_tasks import Library, OracleFactory, TaskAdaptations, adapt_tasks
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.oracles import ReturnOracle
 from sb3_poem.adaptation.rule import Rule
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.rollouts import rollout_outcomes
-from sb3_poem.common.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
@@ -159,7 +158,7 @@ def evaluate_adaptation(
     n_episodes: int = 10,
     seed: int = 0,
     deterministic: bool = True,
-    library: Sequence[Trajectory] | None = None,
+    library: Library | None = None,
     progress_bar: bool = False,
     on_record: Callable[[AdaptationEvaluation], None] | None = None,
 ) -> AdaptationEvaluation:

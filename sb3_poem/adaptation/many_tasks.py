@@ -21,6 +21,7 @@ from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
 
 OracleFactory = Callable[..., Callable[[Trajectory, Trajectory], Any]]
+Library = Sequence[Trajectory] | Callable[[np.ndarray], Sequence[Trajectory]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +52,7 @@ def adapt_tasks(
     record_at: Sequence[int] | None = None,
     seed: int = 0,
     deterministic: bool = True,
-    library: Sequence[Trajectory] | None = None,
+    library: Library | None = None,
     progress_bar: bool = False,
     on_record: Callable[[TaskAdaptations], None] | None = None,
 ) -> TaskAdaptations:
@@ -77,6 +78,8 @@ def adapt_tasks(
     :param oracle_factory: Called as ``oracle_factory(env=vec_env, task=task, seed=seed + i)``,
         gives task i's oracle: an oracle's class, say, or ``functools.partial(MistakeOracle, 0.1)``.
         The first task's oracle says how all err.
+    :param library: Trajectories to ask about instead of new rollouts, or a function that gives
+        those of a task (task_dim,).
     :param record_at: Numbers of answers at which to keep the estimate; None keeps 0, 1, ...,
         n_queries.
     :param on_record: Called with all that there is so far, each time that estimates are kept. It
@@ -94,11 +97,12 @@ def adapt_tasks(
     kept, numbered = _check_record_at(record_at, n_queries), list(enumerate(tasks, seed))
     oracles = [oracle_factory(env=vec_env, task=task, seed=number) for number, task in numbered]
     rule = (Bayes() if rule is None else as_rule(rule)).answered_by(oracles[0])
-    rule.check(model, Setting(n_queries, library, vec_env))
+    libraries = [library(task) if callable(library) else library for task in tasks]
+    rule.check(model, Setting(n_queries, libraries[0], vec_env))
     warn_if_untrained(model)
     inferences = [
-        rule.start(model, inference_rng(number), Setting(n_queries, library, vec_env, task))
-        for number, task in numbered
+        rule.start(model, inference_rng(number), Setting(n_queries, own, vec_env, task))
+        for own, (number, task) in zip(libraries, numbered, strict=True)
     ]
 
     preferences: list[list[Preference]] = [[] for _ in tasks]

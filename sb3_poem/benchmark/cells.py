@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_poem.adaptation import BoltzmannOracle, MistakeOracle, ReturnOracle, TaskOracle
 from sb3_poem.adaptation.evaluation import evaluate_adaptation
 from sb3_poem.adaptation.known_task import known_task_return, preference_order
+from sb3_poem.adaptation.many_tasks import Library
 from sb3_poem.adaptation.meta_model import HasSimilarity
 from sb3_poem.baselines import ANOLE, MAMLRewardModel, rollout_fragments
 from sb3_poem.baselines.anole import has_experience
@@ -23,6 +24,8 @@ from sb3_poem.benchmark.provenance import provenance
 from sb3_poem.benchmark.store import Record
 from sb3_poem.benchmark.suites import Cell, OracleSpec
 from sb3_poem.common.family_view import FamilyView
+from sb3_poem.common.rollouts import rollout_latents
+from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.common.vec_env import make_task_vec_env
 
 SELECTION_EPISODES = 3
@@ -80,14 +83,27 @@ def _episode_seed(cell: Cell) -> int:
 
 def _measure_adaptation(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) -> dict[str, Any]:
     rule, budget = cell.definition.make_rule(**dict(cell.overrides)), cell.budget
-    fragments, shown = None, {}
-    if isinstance(rule, ANOLE):
+    fragments: Library | None = None
+    shown: dict[str, Any] = {}
+    if cell.definition.library:
+        n, source = 2 * budget.record_at[-1], rule.to_dict()["options"]["candidates"]
+        rng = np.random.default_rng([_episode_seed(cell), 8])
+
+        def fragments(task: np.ndarray) -> list[Trajectory]:
+            latents = model.sample_latents(n, rng, source=source)
+            seed = int(rng.integers(2**31))
+            return rollout_latents(model, env, latents, np.repeat(task[None], n, axis=0), seed)
+
+        shown = {"fragments": "rollouts of the new task", "fragment_length": model.horizon}
+        rolled_out = n * len(tasks)
+    elif isinstance(rule, ANOLE):
         length = rule.fragment_length or default_fragment_length(model.horizon)
         source = "replay buffer"
         if not has_experience(model):
             source = "rollouts of the training tasks"
             fragments = rollout_fragments(model, env, 2 * rule.n_pairs, length, cell.seed)
         shown = {"fragments": source, "fragment_length": length}
+        rolled_out = 0  # on the new tasks
     evaluation = evaluate_adaptation(
         model,
         env,
@@ -106,8 +122,7 @@ def _measure_adaptation(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) 
         "task_returns": _rounded(evaluation.task_returns),
         "task_deviations": _rounded(evaluation.returns.std(axis=2)),
         "answers": ["".join(answer[0] for answer in row) for row in answers],
-        # ANOLE shows what it has; the others roll two trajectories out for each question.
-        "adaptation_trajectories": 0 if shown else 2 * sum(map(len, answers)),
+        "adaptation_trajectories": rolled_out if shown else 2 * sum(map(len, answers)),
         **shown,
     }
     if evaluation.successes is not None:

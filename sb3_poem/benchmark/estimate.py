@@ -86,7 +86,7 @@ def cell_seconds(cell: Cell, pace: Pace) -> float:
         return (episodes + budget.tasks * budget.episodes) * facts.horizon * pace.step
     episodes = budget.tasks * budget.episodes * len(budget.record_at)
     rule = method.make_rule(**dict(cell.overrides))
-    if method.rule != "ANOLE":  # which asks about what there is
+    if method.rule != "ANOLE" or method.library:  # else it asks about what there is
         episodes += budget.tasks * 2 * queries
     updates = UPDATES_PER_ANSWER.get(method.rule, 0.0)
     if isinstance(rule, ANOLE) and rule.strategy == "greedy":

@@ -50,7 +50,7 @@ def suite_figures(selection: Selection) -> dict[str, Figure]:
     for entry in selection.suite.entries:
         name = f"{selection.suite.name}-{entry.name}"
         found = {one: selection.series(entry, one) for one in selection.conditions}
-        if entry.name == TOLERANCE:
+        if entry.name.startswith(TOLERANCE):
             if any(found.values()):
                 figures[name] = _tolerance_figure(entry, found)
             continue

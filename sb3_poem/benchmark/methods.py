@@ -13,6 +13,8 @@ EPSILONS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4)
 LATENT_DIMS = (2, 10)  # beside the default, 5
 QUERY_RULES = ("worst-case", "information-gain", "random")
 DEFAULT_QUERY_RULE = {"paper": "worst-case", "bayes": "information-gain"}
+ANOLES = {"ANOLE": "berlekamp", "ANOLE-greedy": "greedy", "ANOLE-random": "random"}
+CANDIDATES = {"prior": "prior", "aggregate": "training tasks"}
 INFERENCE_LABELS = {"paper": "POEM (paper)", "bayes": "POEM (Bayes)"}
 
 # Outer steps of MAML-reward's meta-training, with what differs for a family.
@@ -57,6 +59,8 @@ class Method:
     :param variant: The model that it adapts.
     :param rule: The rule's name in :mod:`sb3_poem`; None for what the model's policies could earn.
     :param paper_row: Its row in Table 3 of Xu & Zhu 2025.
+    :param library: Whether it asks about whole rollouts on the new task, two for each question, all
+        made before the first.
     """
 
     name: str
@@ -65,12 +69,18 @@ class Method:
     rule: str | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
     paper_row: str | None = None
+    library: bool = False
 
     def objection(self, shared_dynamics: bool) -> str | None:
         """Why the method cannot run on a family; None if it can."""
-        if shared_dynamics or self.rule not in SHARED_DYNAMICS_REASONS:
+        reason = SHARED_DYNAMICS_REASONS.get(self.rule or "")
+        if self.rule == "ANOLE" and self.library:
+            reason = None
+        elif self.rule == "Bayes" and self.options.get("likelihood") == "decoder":
+            reason = "a decoder's error is known only where they do"
+        if shared_dynamics or reason is None:
             return None
-        return f"its tasks do not share their dynamics, and {SHARED_DYNAMICS_REASONS[self.rule]}"
+        return f"its tasks do not share their dynamics, and {reason}"
 
     def make_rule(self, **changes: Any) -> Rule:
         """The rule, with these changes of its options; a ``ValueError`` if the method has none."""
@@ -84,7 +94,8 @@ class Method:
     def recorded(self, changes: Mapping[str, Any]) -> dict[str, Any]:
         """What a cell's identity says of the rule, with these changes of its options."""
         kind, words = RECORDED[self.rule]
-        return {"kind": kind, "options": {**words, **self.options, **changes}}
+        asked = {"library": "rollouts"} if self.library else {}
+        return {"kind": kind, "options": {**words, **self.options, **changes}, **asked}
 
 
 VARIANTS = {
@@ -92,7 +103,9 @@ VARIANTS = {
     for variant in (
         Variant("poem", "poem_sac"),
         Variant("poem-inner", "poem_sac", {"similarity": "inner"}),
+        Variant("poem-cosine", "poem_sac", {"similarity": "cosine"}),
         Variant("poem-pearl-context", "poem_sac", {"context": "pearl"}),
+        Variant("poem-no-preferences", "poem_sac", {"preference_coef": 0.0}),
         *(Variant(f"poem-d{d}", "poem_sac", {"latent_dim": d}) for d in LATENT_DIMS),
         Variant("pearl", "pearl_sac"),
         Variant("maml-reward", "pearl_sac", base="pearl"),
@@ -103,17 +116,19 @@ VARIANTS = {
 def _methods() -> Iterator[Method]:
     yield Method("poem-bayes", "POEM (Bayes)", "poem", "Bayes", paper_row="POEM")
     yield Method("poem-paper", "POEM (paper)", "poem", "Paper", paper_row="POEM")
-    for name, strategy in (
-        ("ANOLE", "berlekamp"),
-        ("ANOLE-greedy", "greedy"),
-        ("ANOLE-random", "random"),
-    ):
+    for name, strategy in ANOLES.items():
         yield Method(name.lower(), name, "pearl", "ANOLE", {"strategy": strategy}, name)
     yield Method("maml-reward", "MAML-reward", "maml-reward", "MAMLReward", paper_row="MAML-reward")
     yield Method("reward-oracle", "reward oracle", "pearl", "RewardOracle")
     yield Method("known-task", "task known (POEM's policies)", "poem")
     yield Method("known-task-pearl", "task known (PEARL's policies)", "pearl")
-    ablations = {"poem-inner": "inner product", "poem-pearl-context": "PEARL's context"}
+    yield from _informed()
+    ablations = {
+        "poem-inner": "inner product",
+        "poem-cosine": "cosine",
+        "poem-pearl-context": "PEARL's context",
+        "poem-no-preferences": "no preference loss",
+    }
     for variant, label in (ablations | {f"poem-d{d}": f"d = {d}" for d in LATENT_DIMS}).items():
         yield Method(f"known-task-{variant}", f"task known ({label})", variant)
         for rule, poem in INFERENCE_LABELS.items():
@@ -123,11 +138,49 @@ def _methods() -> Iterator[Method]:
             if asked != DEFAULT_QUERY_RULE[rule]:
                 name, label = f"poem-{rule}-{asked}", f"{poem}, {asked} queries"
                 yield Method(name, label, "poem", rule.capitalize(), {"query_rule": asked})
-    for epsilon in EPSILONS:
-        # 0.1 is the default, and so the same cell as poem-paper.
-        tolerant = {} if epsilon == 0.1 else {"epsilon": epsilon}
-        name, label = f"poem-paper-epsilon-{epsilon:g}", f"epsilon = {epsilon:g}"
-        yield Method(name, label, "poem", "Paper", tolerant)
+    for variant, of in (("poem", ""), ("poem-cosine", ", cosine")):
+        for epsilon in EPSILONS:
+            # 0.1 is the default, and so the same cell as poem-paper.
+            tolerant = {} if epsilon == 0.1 else {"epsilon": epsilon}
+            name, label = f"{variant}-paper-epsilon-{epsilon:g}", f"epsilon = {epsilon:g}{of}"
+            yield Method(name, label, variant, "Paper", tolerant)
+
+
+def _informed() -> Iterator[Method]:
+    """Methods that are told more, or less, than their default form is."""
+    own = {"candidates": "aggregate"}
+    for rule, poem in INFERENCE_LABELS.items():
+        name, label = f"poem-{rule}-aggregate", f"{poem}, training tasks"
+        yield Method(name, label, "poem", rule.capitalize(), own)
+    for name, strategy in ANOLES.items():
+        options = {"strategy": strategy, **own}
+        yield Method(
+            f"{name.lower()}-aggregate", f"{name}, training tasks", "pearl", "ANOLE", options
+        )
+    yield Method(
+        "reward-oracle-aggregate", "reward oracle, training tasks", "pearl", "RewardOracle", own
+    )
+    for suffix, options, of in (("", {}, ""), ("-aggregate", own, ", training tasks")):
+        asked = {"strategy": "berlekamp", **options}
+        name, label = f"anole-rollouts{suffix}", f"ANOLE on rollouts{of}"
+        yield Method(name, label, "pearl", "ANOLE", asked, library=True)
+        name, label = f"pearl-bayes{suffix}", f"Bayes, PEARL's model{of}"
+        options = {"candidates": "prior", "likelihood": "decoder", **options}
+        yield Method(name, label, "pearl", "Bayes", options, library=True)
+    for source, of in CANDIDATES.items():
+        for likelihood, by in (("similarity", "S"), ("decoder", "decoder")):
+            options = {"candidates": source, "likelihood": likelihood}
+            name, label = f"poem-bayes-{source}-{likelihood}", f"POEM (Bayes), {of}, {by}"
+            yield Method(name, label, "poem", "Bayes", options)
+    untold = {"noise_model": "infer"}
+    yield Method("poem-bayes-untold", "POEM (Bayes), not told the noise", "poem", "Bayes", untold)
+    yield Method(
+        "poem-bayes-untold-aggregate",
+        "POEM (Bayes), not told the noise, training tasks",
+        "poem",
+        "Bayes",
+        {**untold, **own},
+    )
 
 
 METHODS = {method.name: method for method in _methods()}

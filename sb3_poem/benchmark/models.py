@@ -8,7 +8,7 @@ import json
 import os
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -344,28 +344,30 @@ def _is_variant(config: dict[str, Any], key: ModelKey) -> bool:
     variant, arguments = VARIANTS[key.variant], config["arguments"]
     if variant.base is not None or config["algorithm"] != ALGORITHMS[variant.algorithm].__name__:
         return False
-    facts = (arguments.get("similarity"), arguments.get("context"), arguments["latent_dim"])
-    return (config["env_id"], arguments.get("seed"), facts) == _expected(key)
+    return (config["env_id"], arguments.get("seed"), _facts(arguments)) == _expected(key)
 
 
 def _check_variant(model: Any, key: ModelKey, path: Path) -> None:
-    facts = (getattr(model, "similarity", None), getattr(model, "context", None), model.latent_dim)
-    names = ("env_id", "seed", "(similarity, context, latent_dim)")
-    both = zip(names, (model.env_id, model.seed, facts), _expected(key), strict=True)
+    names = ("env_id", "seed", "(similarity, context, latent_dim, without preferences)")
+    both = zip(names, (model.env_id, model.seed, _facts(vars(model))), _expected(key), strict=True)
     wrong = [f"{name} {one!r} instead of {other!r}" for name, one, other in both if one != other]
     if wrong:
         raise ValueError(f"{path} was handed over as {key}, but has {', '.join(wrong)}")
 
 
-def _expected(key: ModelKey) -> tuple[str, int, tuple[str | None, str | None, int]]:
-    """Environment, seed, and (similarity, context, latent dimension) of a model: as its family's
-    entry makes it.
-    """
+def _facts(values: Mapping[str, Any]) -> tuple[Any, ...]:
+    """What tells variants apart, of arguments or a model's attributes."""
+    kinds = values.get("similarity"), values.get("context"), int(values.get("latent_dim", 5))
+    return (*kinds, values.get("preference_coef") == 0)
+
+
+def _expected(key: ModelKey) -> tuple[str, int, tuple[Any, ...]]:
+    """Environment, seed, and :func:`_facts` of a model: as its family's entry makes it."""
     variant = VARIANTS[key.variant]
     given = zoo_entry(config_file(variant.algorithm), key.env_id, **overrides(key))
-    kinds = given.get("similarity", "two-encoder"), given.get("context", "optimal")
-    similarity, context = (None, None) if variant.algorithm == "pearl_sac" else kinds
-    return key.env_id, key.seed, (similarity, context, int(given.get("latent_dim", 5)))
+    if variant.algorithm == "poem_sac":
+        given = {"similarity": "two-encoder", "context": "optimal", **given}
+    return key.env_id, key.seed, _facts(given)
 
 
 def _describe_given(path: Path) -> dict[str, Any]:

@@ -23,7 +23,7 @@ PAPER_FAMILIES = (
 )
 CHEETAHS = PAPER_FAMILIES[:2]
 RECORD_AT = (0, 1, 2, 3, 5, 7, 10)
-REVISION = 2
+REVISION = 3
 """Of the code that trains, adapts and measures: part of every cell's identity. Raise it with each
 change after which the same cell may come to another figure (a loss, a default of an algorithm or a
 rule, how tasks and seeds are drawn), not for what only takes less time, nor for ``zoo_configs/``,
@@ -39,8 +39,48 @@ TABLE_METHODS = (
     "maml-reward",
     "reward-oracle",
 )
+#: The same with candidates from the training tasks, where a method has candidates, and ANOLE
+#: with questions about rollouts on the new task
+INFORMED_METHODS = (
+    "poem-bayes-aggregate",
+    "poem-paper-aggregate",
+    "anole-aggregate",
+    "anole-greedy-aggregate",
+    "anole-random-aggregate",
+    "anole-rollouts",
+    "anole-rollouts-aggregate",
+    "maml-reward",
+    "reward-oracle-aggregate",
+)
+#: What makes the difference between the paper's row and the other: rule, candidates, likelihood,
+#: model, preference loss
+PARTS = (
+    "poem-bayes",
+    "poem-paper",
+    "poem-paper-aggregate",
+    *(f"poem-bayes-{c}-{s}" for c in ("prior", "aggregate") for s in ("similarity", "decoder")),
+    "pearl-bayes",
+    "pearl-bayes-aggregate",
+    "poem-no-preferences-bayes",
+    "poem-no-preferences-paper",
+)
+#: Methods that are not told how answers err: POEM infers it or does not ask, ANOLE takes a fifth to
+#: be wrong whoever answers
+UNTOLD_METHODS = (
+    "poem-bayes-untold",
+    "poem-bayes-untold-aggregate",
+    "poem-paper",
+    "poem-paper-aggregate",
+    "anole",
+    "anole-aggregate",
+    "anole-rollouts-aggregate",
+    "maml-reward",
+)
 #: Methods whose differences from all others tables show
-SUBJECTS = ("poem-bayes", "poem-paper")
+SUBJECTS = (
+    *("poem-bayes", "poem-bayes-untold", "poem-bayes-aggregate", "poem-bayes-untold-aggregate"),
+    *("poem-paper", "poem-paper-aggregate"),
+)
 TABLE_REFERENCES = ("known-task", "known-task-pearl")
 # MAML-reward trains a reward only, so its return does not depend on how long a policy was trained;
 # greedy search takes as long as all the others together, and lies beside ANOLE.
@@ -356,13 +396,13 @@ def family_id(name: str) -> str:
     return name if "/" in name or "-v" in name else f"poem/{name}-v0"
 
 
-_ABLATED = ("poem-inner", "poem-pearl-context", "poem-d2", "poem-d10")
+_ABLATED = ("poem-inner", "poem-cosine", "poem-pearl-context", "poem-d2", "poem-d10")
 _BOTH = ("poem-bayes", "poem-paper")
 _DESIGNS = (*_BOTH, *(f"{variant}-{rule}" for variant in _ABLATED for rule in ("bayes", "paper")))
 # A rule's own way of asking has no name of its own.
 _ASKING = (*_BOTH, *(name for b in _BOTH for q in QUERY_RULES if (name := f"{b}-{q}") in METHODS))
-_EPSILONS = tuple(f"poem-paper-epsilon-{epsilon:g}" for epsilon in EPSILONS)
 _TABLE = Entry("methods", "Methods", TABLE_METHODS, curves=(EXACT,))
+_INFORMED = Entry("informed", "Methods with candidates from the training tasks", INFORMED_METHODS)
 
 SUITES = {
     suite.name: suite
@@ -371,7 +411,7 @@ SUITES = {
             "table3",
             "Methods under exact answers (Table 3; figures 5, 9, 10)",
             PAPER_FAMILIES,
-            (_TABLE,),
+            (_TABLE, _INFORMED, Entry("parts", "What POEM's rows owe to what", PARTS)),
             TABLE_REFERENCES,
         ),
         Suite(
@@ -386,7 +426,10 @@ SUITES = {
             "noise",
             "Methods under answers with errors (figures 6, 11)",
             CHEETAHS,
-            (replace(_TABLE, oracles=NOISES, curves=(BOLTZMANN,)),),
+            (
+                replace(_TABLE, oracles=NOISES, curves=(BOLTZMANN,)),
+                Entry("untold", "Methods that are not told the noise", UNTOLD_METHODS, NOISES),
+            ),
             TABLE_REFERENCES,
         ),
         Suite(
@@ -410,8 +453,16 @@ SUITES = {
             "epsilon",
             "Tolerance of the paper's rule (figures 14, 15)",
             CHEETAHS,
-            (Entry("tolerance", "Tolerance epsilon", _EPSILONS, (EXACT, BOLTZMANN)),),
-            ("known-task",),
+            tuple(
+                Entry(
+                    f"tolerance{of}",
+                    f"Tolerance epsilon{of.replace('-', ', ')}",
+                    tuple(f"poem{of}-paper-epsilon-{epsilon:g}" for epsilon in EPSILONS),
+                    (EXACT, BOLTZMANN),
+                )
+                for of in ("", "-cosine")
+            ),
+            ("known-task", "known-task-poem-cosine"),
         ),
         Suite(
             "smoke",

@@ -155,6 +155,22 @@ def test_it_finds_the_speed(strategy):
     assert result.after(10) > (-40 if strategy == "random" else -15)
 
 
+def test_every_task_may_have_a_library_of_its_own():
+    shown = {}
+
+    class Seen(ReturnOracle):
+        def __call__(self, left, right):
+            shown.setdefault(float(self.task[0]), []).extend([left, right])
+            return super().__call__(left, right)
+
+    own = {float(goal): library(4) for goal in GOALS[:2, 0]}
+    options = {"rule": ANOLE(), "n_queries": 3, "library": lambda task: own[float(task[0])]}
+    adapt_tasks(MODEL, SpeedVecEnv(4), GOALS[:2], Seen, **options)
+    for goal, trajectories in shown.items():
+        assert len(trajectories) == 6
+        assert all(any(one is other for other in own[goal]) for one in trajectories)
+
+
 def test_two_lies_in_ten_answers_are_borne():
     returns = {
         strategy: evaluate_adaptation(

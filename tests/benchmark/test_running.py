@@ -104,6 +104,26 @@ def test_every_method_runs_and_is_recorded(
     assert (len(again.done), again.todo) == (len(plan.todo), [])
 
 
+def test_methods_that_know_more_run_and_are_recorded(tmp_path: Path, handed_over: Path) -> None:
+    """Candidates from the training tasks, and questions about rollouts on the new task, which are
+    as many as others make.
+    """
+    library, store = library_of(tmp_path, handed_over / "all")
+    methods = ("anole-rollouts-aggregate", "pearl-bayes", "reward-oracle-aggregate")
+    informed = (*methods, "poem-bayes-aggregate-decoder")
+    suite = replace(TINY, entries=(Entry("informed", "", informed, record_at=(0, 2)),))
+    plan = make_plan(suite, library, store, None, informed, range(1), BUDGET, Training(), 1)
+    assert run_cells(plan.todo, library, store) == []
+    records = {record.method: record for record in store.records()}
+    assert records.keys() == set(informed)
+    for method, record in records.items():
+        assert np.isfinite(record.result["task_returns"]).all()
+        assert record.result["adaptation_trajectories"] == 2 * 2 * 2  # tasks, answers, two each
+        asked = "rollouts of the new task" if method in methods[:2] else None
+        assert record.result.get("fragments") == asked
+        assert record.identity.get("library") == (None if asked is None else "rollouts")
+
+
 def test_a_finished_cell_is_verified(
     tmp_path: Path, handed_over: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

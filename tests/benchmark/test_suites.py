@@ -63,6 +63,7 @@ def test_suites_hold_what_the_issue_asks_for() -> None:
         for changes in (
             {},
             {"similarity": "inner"},
+            {"similarity": "cosine"},
             {"context": "pearl"},
             {"latent_dim": 2},
             {"latent_dim": 10},
@@ -86,13 +87,29 @@ def test_suites_hold_what_the_issue_asks_for() -> None:
     assert {(cell.definition.options["epsilon"], cell.oracle) for cell in epsilon} == {
         (value, oracle) for value in (0.0, 0.4) for oracle in (EXACT, BOLTZMANN)
     }
-    assert len([name for name in SUITES["epsilon"].methods if "epsilon" in name]) == 6
+    assert len([name for name in SUITES["epsilon"].methods if "epsilon" in name]) == 2 * 6
     noise = {cell.oracle for cell in cells_of(SUITES["noise"]) if cell.definition.rule is not None}
     assert {(oracle.kind, oracle.value) for oracle in noise} == {
         ("boltzmann", None),
         ("mistake", 0.1),
         ("mistake", 0.2),
     }
+
+
+def test_every_method_has_a_form_with_the_training_tasks_latents() -> None:
+    """But MAML-reward, which has no candidates. No method of the last table is told the noise."""
+    for name in {*SUITES["table3"].entries[0].methods} - {"maml-reward"}:
+        plain, informed = METHODS[name], METHODS[f"{name}-aggregate"]
+        assert informed.name in SUITES["table3"].methods
+        assert dict(informed.options) == {**plain.options, "candidates": "aggregate"}
+        assert (informed.variant, informed.rule) == (plain.variant, plain.rule)
+    parts = [METHODS[name] for name in SUITES["table3"].entries[-1].methods]
+    tried = {(one.options.get("candidates"), one.options.get("likelihood")) for one in parts}
+    assert {(c, s) for c in ("prior", "aggregate") for s in ("similarity", "decoder")} < tried
+    assert {"pearl", "poem", "poem-no-preferences"} == {one.variant for one in parts}
+    for name in SUITES["noise"].entries[-1].methods:
+        method = METHODS[name]
+        assert method.rule != "Bayes" or method.options["noise_model"] == "infer"
 
 
 def test_a_cell_is_the_same_in_every_suite() -> None:
@@ -156,7 +173,8 @@ def test_unknown_methods_are_refused() -> None:
 def test_methods_that_need_shared_dynamics_say_why() -> None:
     assert METHODS["poem-bayes"].objection(shared_dynamics=False) is None
     assert METHODS["anole"].objection(shared_dynamics=True) is None
-    for name in ("anole", "anole-greedy", "anole-random", "maml-reward"):
+    assert METHODS["anole-rollouts"].objection(shared_dynamics=False) is None
+    for name in ("anole", "anole-greedy", "anole-random", "maml-reward", "pearl-bayes"):
         assert "do not share their dynamics" in (
             METHODS[name].objection(shared_dynamics=False) or ""
         )
