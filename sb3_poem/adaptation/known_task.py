@@ -31,9 +31,9 @@ LATENTS_WITH_OWN_DYNAMICS, LATENTS_WITH_SHARED_DYNAMICS = 30, 300
 SPREAD_TASKS = 40
 #: Draws around the best latent of each task, in each of two rounds, and how far from it they go, as
 #: a share of the first latents' deviation
-REFINING_DRAWS, REFINING_WIDTHS = 5, (0.5, 0.2)
+REFINING_DRAWS, REFINING_WIDTHS = 3, (0.5, 0.2)
 #: Tasks that a limit's codebooks are chosen on
-OTHER_TASKS = 1000
+OTHER_TASKS = 500
 OTHER_TASK_STREAM = 7
 
 
@@ -106,7 +106,7 @@ def known_task_return(
     :param source: Where latents come from: "prior", "aggregate", or "both" in equal parts.
     :param selection_episodes: Episodes per latent (and task, where dynamics differ) for choosing.
     :param deterministic: Whether policies act by their mode.
-    :param limits: Whether to measure limits, which takes the rollouts of all latents once more.
+    :param limits: Whether to measure limits, which takes one more rollout of all latents.
     """
     model, vec_env = model_and_env(model, env)
     tasks = choose_test_tasks(model, vec_env, tasks, seed)
@@ -123,8 +123,10 @@ def known_task_return(
         others = np.unique(drawn, axis=0)
     every = np.concatenate([tasks, others])
 
-    def returns_of(tasks: np.ndarray, latents: np.ndarray, stream: int) -> np.ndarray:
-        how = selection_episodes, evaluation_seed(seed, stream), deterministic
+    def returns_of(
+        tasks: np.ndarray, latents: np.ndarray, stream: int, episodes: int = selection_episodes
+    ) -> np.ndarray:
+        how = episodes, evaluation_seed(seed, stream), deterministic
         return return_matrix(model, vec_env, tasks, latents, *how)
 
     returns, on_others = np.split(returns_of(every, candidates, 1), [len(tasks)])
@@ -145,7 +147,7 @@ def known_task_return(
         best = draws[np.arange(len(tasks)), picks]
     measured = None
     if limits:
-        fresh = returns_of(tasks, candidates, 4)
+        fresh = returns_of(tasks, candidates, 4, 1)
         chosen_on, along = (on_others, others) if shared else (returns, tasks)
         ordered = along.shape[1] == 1
         if ordered:

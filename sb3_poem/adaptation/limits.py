@@ -19,7 +19,9 @@ MAX_ITERATIONS = 1000
 TOLERANCE = 1e-4  # nats
 CHANNEL_INPUTS, CHANNEL_OUTPUTS = 81, 400
 #: Of the rate-distortion curve: the worth of the whole range of returns, in nats
-SLOPES = np.geomspace(0.1, 1e4, 40)
+SLOPES = np.geomspace(0.1, 1e4, 25)
+#: Policies of a codebook up to which the order of tasks is made use of
+ORDERED_POLICIES = 32
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ class AnswerLimits:
         n_policies, every = others.shape[1], np.arange(len(chosen))
         codebooks = []
         for k in range((n_policies - 1).bit_length() + 1):
-            book = best_codebook(others, 2**k, ordered=ordered)
+            book = best_codebook(others, 2**k, ordered=ordered and 2**k <= ORDERED_POLICIES)
             picks = book[np.argmax(chosen[:, book], axis=1)]
             codebooks.append(float(fresh[every, picks].mean()))
         bits, returns = [0.0], [codebooks[0]]

@@ -81,8 +81,8 @@ def cell_seconds(cell: Cell, pace: Pace) -> float:
         latents = LATENTS_WITH_OWN_DYNAMICS * budget.tasks
         if facts.shared_dynamics:
             latents = LATENTS_WITH_SHARED_DYNAMICS
-        latents = 2 * latents + len(REFINING_WIDTHS) * (1 + REFINING_DRAWS) * budget.tasks
-        episodes = latents * min(budget.episodes, SELECTION_EPISODES)
+        refining = len(REFINING_WIDTHS) * (1 + REFINING_DRAWS) * budget.tasks
+        episodes = latents + (latents + refining) * min(budget.episodes, SELECTION_EPISODES)
         return (episodes + budget.tasks * budget.episodes) * facts.horizon * pace.step
     episodes = budget.tasks * budget.episodes * len(budget.record_at)
     rule = method.make_rule(**dict(cell.overrides))

@@ -199,11 +199,11 @@ def test_winners_are_measured_on_fresh_episodes():
     )
     assert known.candidate_returns.max() > 1.5 * HORIZON  # the best of a hundred draws
     assert abs(known.mean_return) < 0.5 * HORIZON
-    few = known_task_return(
-        MODEL, DummyVecEnv([Lucky] * 10), GOALS[:3], 50, n_episodes=1, selection_episodes=10
-    )
-    assert few.candidate_returns.max() > 0.6 * HORIZON
-    assert few.limit(10) < 0.5 * few.candidate_returns.max()  # nor does a limit live on luck
+    env = DummyVecEnv([Lucky] * 10)
+    several = [known_task_return(MODEL, env, GOALS[:3], 20, 1, seed) for seed in range(5)]
+    best = np.mean([one.candidate_returns.max() for one in several])
+    assert best > 1.2 * HORIZON
+    assert np.mean([one.limit(10) for one in several]) < 0.6 * best  # nor does a limit live on luck
 
 
 def test_property_one_against_scipy():
