@@ -32,7 +32,7 @@ from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.pearl_sac import PEARLSAC
 from sb3_poem.pearl_sac.policies import LatentPolicy
 
-FORMAT = "sb3_poem meta reward 1"
+FORMAT = "sb3_poem meta reward 2"
 WEIGHTS, CONFIG = "reward.safetensors", "reward.json"
 
 
@@ -41,6 +41,7 @@ class MetaReward:
 
     :param policy: Whose standardisation of observations is used.
     :param inner_learning_rate: Step size of MAML's inner loop, which has ``inner_steps``.
+    :param fragment_length: Steps of the fragments of the meta-training; None: any.
     :param seed: Of the initial parameters.
     """
 
@@ -50,6 +51,7 @@ class MetaReward:
         net_arch: Sequence[int] = (64, 64),
         inner_learning_rate: float = 0.1,
         inner_steps: int = 5,
+        fragment_length: int | None = None,
         seed: int = 0,
     ) -> None:
         if not inner_learning_rate > 0:
@@ -58,6 +60,7 @@ class MetaReward:
         check_whole("inner_steps", inner_steps, 1)
         self.policy = policy
         self.inner_learning_rate, self.inner_steps = inner_learning_rate, inner_steps
+        self.fragment_length = fragment_length
         self.net_arch = tuple(int(width) for width in net_arch)
         in_dim = 2 * spaces.flatdim(policy.observation_space) + spaces.flatdim(policy.action_space)
         with th.random.fork_rng():
@@ -82,6 +85,7 @@ class MetaReward:
             "net_arch": list(self.net_arch),
             "inner_learning_rate": self.inner_learning_rate,
             "inner_steps": self.inner_steps,
+            "fragment_length": self.fragment_length,
         }
         content = {name: value.cpu().contiguous() for name, value in tensors.items()}
         write_atomically(Path(folder) / WEIGHTS, tensors_to_bytes(content))
@@ -108,7 +112,8 @@ class MetaReward:
                     "`policy` is not the one with which the reward in "
                     f"{folder} was meta-trained: its {name} differs; load the same model again"
                 )
-        meta = cls(policy, config["net_arch"], config["inner_learning_rate"], config["inner_steps"])
+        names = ("net_arch", "inner_learning_rate", "inner_steps", "fragment_length")
+        meta = cls(policy, *(config[name] for name in names))
         shapes = {f"network.{name}": value.shape for name, value in meta.parameters.items()}
         if shapes != {name: t.shape for name, t in tensors.items() if name.startswith("network.")}:
             raise ValueError(f"{weights} does not hold the network that {CONFIG} describes")
@@ -121,7 +126,10 @@ class MetaReward:
         return transition_rows(self.policy, trajectory, 1.0)
 
     def adapted(self, answers: Sequence[Answer]) -> Parameters:
-        """The network's parameters after some answers, about trajectories of any length."""
+        """The network's parameters after some answers, about trajectories of any length. The inner
+        loop's steps suit sums over the fragments of the meta-training, so longer trajectories count
+        with their mean over as many steps.
+        """
         parameters = self.parameters
         if not answers:
             return parameters
@@ -131,6 +139,9 @@ class MetaReward:
             th.stack([_filled(self.transitions(trajectory), longest) for trajectory in side])
             for side in zip(*shown, strict=True)
         )
+        share = min(1.0, (self.fragment_length or longest) / longest)
+        left[..., -1] *= share
+        right[..., -1] *= share
         labels = [0.5 + 0.5 * SIGNS[answer.preference] for answer in answers]
         pairs = PreferencePairs(left, right, th.tensor(labels, device=left.device))
         rate, steps = self.inner_learning_rate, self.inner_steps
@@ -183,8 +194,8 @@ def meta_train_reward(
     check_whole("n_support", n_support, 1)
     check_whole("n_query", n_query, 1)
     rng = np.random.default_rng([seed, 5])
-    meta = MetaReward(model.policy, seed=seed, **arguments)
     length = default_fragment_length(model.horizon) if fragment_length is None else fragment_length
+    meta = MetaReward(model.policy, fragment_length=length, seed=seed, **arguments)
     fragments = replay_fragments(model, n_fragments, length, rng)
     inputs = th.stack([meta.transitions(fragment) for fragment in fragments])
     features = np.stack([np.asarray(fragment.reward_features) for fragment in fragments])

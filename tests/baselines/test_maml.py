@@ -18,6 +18,7 @@ from sb3_poem.baselines.maml import (
     preference_loss,
 )
 from sb3_poem.baselines.meta_reward import MetaReward, meta_train_reward
+from sb3_poem.common.trajectory import Trajectory
 
 
 def tiny():
@@ -151,6 +152,23 @@ def test_answers_about_episodes_that_ended_early(trained):
     assert meta.adapted([]) is meta.parameters
 
 
+def test_a_whole_rollout_weighs_as_much_as_a_fragment_of_the_meta_training(trained):
+    """Of three times its length, and alike in every step, it adapts the reward as the fragment."""
+    meta = MetaReward(trained.policy, (8,), fragment_length=5)
+
+    def standing(place, steps):
+        observations = np.full((steps + 1, 2), place, dtype=np.float32)
+        return Trajectory(observations, np.zeros((steps, 1), np.float32), np.zeros(5))
+
+    short, long = (
+        meta.adapted([Answer(Preference.LEFT, standing(0.5, n), standing(-0.2, n))])
+        for n in (5, 15)
+    )
+    assert any(not th.equal(value, meta.parameters[name]) for name, value in short.items())
+    for name, value in short.items():
+        th.testing.assert_close(long[name], value)
+
+
 def test_what_will_not_do(trained):
     windy = small(PEARLSAC, walks(2, WindyWalk), horizon=10, n_train_tasks=2)
     with pytest.raises(ValueError, match="a family whose tasks share their dynamics"):
@@ -193,6 +211,6 @@ def test_a_meta_reward_is_saved_and_read(tmp_path):
     with pytest.raises(ValueError, match="is truncated, or no safetensors file"):
         MetaReward.load(tmp_path / "reward", model.policy)
     config = tmp_path / "reward" / "reward.json"
-    config.write_text(config.read_text().replace("meta reward 1", "meta reward 2"))
+    config.write_text(config.read_text().replace("meta reward 2", "meta reward 1"))
     with pytest.raises(ValueError, match="is not of this version of sb3_poem"):
         MetaReward.load(tmp_path / "reward", model.policy)
