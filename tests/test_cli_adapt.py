@@ -104,7 +104,6 @@ def test_json_holds_what_the_library_measures(
     )
     assert result["known_task_return"] == pytest.approx(known.mean_return, rel=1e-4)
     assert result["limit"] == pytest.approx([known.limit(k) for k in range(4)], rel=1e-4)
-    assert result["limit"] == sorted(result["limit"])
     assert result["seed"] == 5
     assert result["versions"]["mujoco"] == "3.3.0"
     assert {result["oracle"], result["inference"], result["env_id"]} == {
