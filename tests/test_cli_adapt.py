@@ -137,13 +137,8 @@ def test_table_plot_and_video(
     for words in ("answers", "limit", "std. error", "task known", str(plot), str(video)):
         assert words in shown
     prose = " ".join(shown.split())
-    assert (
-        "task known: the best of 300 policies for each task, measured anew on 1 episodes" in prose
-    )
-    assert (
-        "limit: the best 2^answers of those 300 for these very tasks, chosen with the tasks in "
-        "sight" in prose
-    )
+    assert "the best of 300 policies for each task, refined, and measured anew on 1 episo" in prose
+    assert "limit: the best 2^answers of those 300, chosen on other tasks where dynamics" in prose
     assert (
         shown.index("after 0 answers: return")
         < shown.index("after 2 answers: return")
@@ -355,7 +350,7 @@ def test_a_person_who_stops_goes_on_later_as_if_they_had_not(
     assert adapt(model[1], *flags) == 0
     shown = capsys.readouterr().out
     assert "Standard input ended after 1 of 3 answers" in shown
-    assert "It believes that you mean a place near" in shown
+    assert "It believes that you mean a place" in shown
     words = f"--oracle human --queries 3 --seed 2 {shlex.join(TINY)} --resume"
     again = f"sb3-poem adapt --model {model[1]} {words}"
     assert f"answer the rest:  {again}\n" in shown

@@ -185,12 +185,9 @@ def test_a_method_that_cannot_run_on_a_family_says_so_before_training(
     ):
         plan_for(library, "table3", ["MetaWorldML10"], ["anole"])
     plan = plan_for(library, "table3", ["MetaWorldML10"])
-    assert {cell.method for cell, _ in plan.skipped} == {
-        "anole",
-        "anole-greedy",
-        "anole-random",
-        "maml-reward",
-    }
+    skipped = {cell.method for cell, _ in plan.skipped}
+    assert skipped >= {"anole", "anole-greedy-aggregate", "maml-reward"}
+    assert not skipped & {"anole-rollouts", "poem-bayes-prior-similarity", "reward-oracle"}
     assert {cell.method for cell in plan.todo} >= {"poem-bayes", "poem-paper", "reward-oracle"}
     lines = "\n".join(describe(plan, library))
     assert "anole cannot run on MetaWorldML10" in lines
@@ -229,7 +226,9 @@ def test_families_whose_extra_is_missing_are_left_out_unless_named(
 def test_the_plan_names_each_model_once_and_a_base_first(tmp_path: Path) -> None:
     plan = plan_for(ModelLibrary(Workplace(str(tmp_path))), "table3", ["PointGoal"], seeds=2)
     names = [(key.variant, key.seed) for key in plan.models]
-    assert names == [(v, s) for s in range(2) for v in ("poem", "pearl", "maml-reward")]
+    variants = ("poem", "pearl", "maml-reward", "poem-no-preferences")
+    assert sorted(names) == sorted((v, s) for s in range(2) for v in variants)
+    assert all(names.index(("pearl", s)) < names.index(("maml-reward", s)) for s in range(2))
     only = plan_for(
         ModelLibrary(Workplace(str(tmp_path))), "table3", ["PointGoal"], ["maml-reward"]
     )
