@@ -42,7 +42,7 @@ def test_the_training_plan_follows_the_hyperparameter_file(tmp_path: Path) -> No
     assert plan.hyperparameters["latent_dim"] == 2
     assert plan.overrides == {"latent_dim": 2}
     two_tasks = training_plan(ModelKey("poem/HalfCheetahFwdBack-v0", "poem", 0))
-    assert (two_tasks.epoch_steps, two_tasks.updates) == (24_000, 60_000)
+    assert (two_tasks.epoch_steps, two_tasks.updates) == (24_000, 120_000)
     shorter = training_plan(ModelKey(POINT, "pearl", 0, Training(3000, (("gradient_steps", 7),))))
     assert (shorter.timesteps, shorter.updates) == (3000, 7)
     assert shorter.overrides == {"gradient_steps": 7}
