@@ -27,6 +27,7 @@ from sb3_poem.adaptation.rule import (
     inference_rng,
     latent_of,
     rollout_seed,
+    trajectories_of,
 )
 from sb3_poem.adaptation.state import parse_json, read_json, write_json_atomically
 from sb3_poem.common.checks import check_whole
@@ -161,8 +162,35 @@ class PreferenceAdapter:
         ):
             # It comes from a file, which holds no frames; the same seed gives the same rollouts.
             left, right = self._pending.left.latent, self._pending.right.latent
-            self._pending = self._make_query(*self.inference.same_latents(left, right))
+            latents = self.inference.same_latents(left, right)
+            self._pending = self._make_query(*latents, self._number_of(self._pending))
         return self._pending
+
+    @property
+    def contradicted(self) -> int | None:
+        """The number, from 0, of the answer that the others contradict most, see :class:`Bayes`;
+        None if they agree, or the rule does not tell.
+        """
+        return self.inference.contradicted()
+
+    def ask_again(self, number: int) -> Query:
+        """Ask about the same two trajectories as question ``number``, from 0, instead of the one
+        that waits, if any. Its answer is one more, beside the first.
+
+        :raises RuntimeError: If all questions have been answered.
+        :raises ValueError: If question ``number`` has no answer.
+        """
+        if self.done:
+            raise RuntimeError(f"all {self.n_queries} questions have been answered; take policy()")
+        if number not in range(self.n_answers):
+            raise ValueError(
+                f"`number` must be that of an answer, from 0 to {self.n_answers - 1}, but is "
+                f"{number!r}"
+            )
+        answer = self.inference.answers[number]
+        left, right = trajectories_of("ask_again()", answer.left, answer.right)
+        self._pending = Query(left, right, self.rule.question)
+        return self.ask()
 
     def tell(self, preference: Preference | str) -> None:
         """Answer the pending question.
@@ -237,13 +265,23 @@ class PreferenceAdapter:
         if bind is not None and getattr(oracle, "env", None) is None:
             bind(self.env)
 
-    def _make_query(self, left: Shown, right: Shown) -> Query:
+    def _number_of(self, query: Query) -> int:
+        """Of the answer about the very trajectories of a question; else the next one's."""
+        asked = (query.left, query.right)
+        for number, answer in enumerate(self.answers):
+            pairs = zip(trajectories_of("ask()", answer.left, answer.right), asked, strict=True)
+            if all(np.array_equal(old.observations, new.observations) for old, new in pairs):
+                return number
+        return self.n_answers
+
+    def _make_query(self, left: Shown, right: Shown, number: int | None = None) -> Query:
         """Both rollouts start alike, one after the other in the first copy: other copies may hold
         other tasks.
         """
         if isinstance(left, Trajectory) and isinstance(right, Trajectory):
             return Query(left, right, self.rule.question)
-        seed, frames = rollout_seed(self.seed, self.n_answers), self._needs_frames
+        number = self.n_answers if number is None else number
+        seed, frames = rollout_seed(self.seed, number), self._needs_frames
         by_mode = self.deterministic and not self.rule.explores
         # Each fills a wave of its own; copies beyond the first repeat it and are not read.
         first, second = (

@@ -85,6 +85,9 @@ SPREAD_LATENTS = 32
 # Width of the kernel that replaces a copy of a particle by a neighbour, as a share of the
 # particles' own spread.
 KERNEL_WIDTH = 0.3
+# An answer whose side is less probable than this, given all others, contradicts them, unless it is
+# believed all the same.
+CONTRADICTED, BELIEVED = 0.2, 0.5
 
 
 class Thinning(NamedTuple):
@@ -381,6 +384,47 @@ class BayesInference(Inference):
             self.prior.has_holes,
         )
 
+    def agreements(self) -> np.ndarray:
+        """(k, 2) how well each answer agrees with the others: P(better on its side, or EQUAL),
+        given all others and given all; 1 for EQUAL. The posterior without an answer is that of all,
+        each latent and person divided by their probability of it (Gelfand, Dey & Chang 1992).
+        """
+        found = np.ones((len(self.answers), 2))
+        if not self.answers:
+            return found
+        joint = self.weights[:, None]  # (m, 1) or (m, G)
+        if self.people is not None:
+            joint = joint * np.exp(self.people_log_shares.astype(np.float64))
+        difference, error, magnitude, spread = self._differences(self.particles, self.answers)
+        columns = [np.broadcast_to(x, difference.shape).T for x in (difference, error, magnitude)]
+        kinds = ANSWERS[self.rule.question]
+        middle = kinds.index(Preference.EQUAL)
+        for i, (answer, d, e, m) in enumerate(zip(self.answers, *columns, strict=True)):
+            place = kinds.index(answer.preference)
+            if place == middle:
+                continue
+            if self.people is not None:
+                said = self.people.probabilities(d, e, m, spread)  # (answers, m, G)
+            else:
+                assert self.noise_model is not None
+                left = self.noise_model.probability_left(d, e, m)[:, None]
+                said = np.stack([1.0 - left, np.zeros_like(left), left])
+            side = (said[: middle + 1] if place < middle else said[middle:]).sum(axis=0)
+            given = joint / said[place], joint
+            found[i] = [np.sum(weights * side) / weights.sum() for weights in given]
+        return found
+
+    def contradicted(self) -> int | None:
+        """See :class:`Inference`: the answer that agrees least with all others, see
+        :meth:`agreements`, if that is less than 0.2, and less than 0.5 given all. A pair that was
+        asked about twice is left alone.
+        """
+        pairs = [(*latent_of(a.left), *latent_of(a.right)) for a in self.answers]
+        asked_twice = np.array([pairs.count(pair) > 1 for pair in pairs], dtype=bool)
+        others, everything = self.agreements().T
+        found = np.where(asked_twice | (everything >= BELIEVED), 1.0, others)
+        return int(np.argmin(found)) if np.any(found < CONTRADICTED) else None
+
     def _similarity_scale(self) -> np.ndarray:
         """The spread of S's differences, and the unit in which a difference counts as one logistic
         unit of doubt.
@@ -430,15 +474,13 @@ class BayesInference(Inference):
     def _decoder_error(self, steps: Values) -> Any:
         return self.model.predicted_rewards_error * np.sqrt(steps * ERROR_CORRELATION)
 
-    def _log_likelihoods(
+    def _differences(
         self, latents: np.ndarray, answers: Sequence[Answer], new: bool = False
-    ) -> np.ndarray:
-        """(m,) log P(answers | latent) of (m, d), or (m, G) for each of the people; what else a new
-        answer tells is noted.
+    ) -> tuple[np.ndarray, Values, Values, float]:
+        """What each of (m, d) latents predicts of k answers: (m, k) differences, their error and
+        magnitude, as :meth:`NoiseModel.probability_left` takes them, and the family's spread.
         """
         shown = [item for answer in answers for item in (answer.left, answer.right)]
-        error: Values
-        magnitude: Values
         if self.likelihood == "decoder":
             values = self.model.predicted_returns(latents, shown, DECODED_STEPS)  # (m, 2 k)
             left, right = values[:, 0::2], values[:, 1::2]
@@ -448,17 +490,22 @@ class BayesInference(Inference):
                 self.thinning = np.concatenate([self.thinning, [measured]])
             intercepts, slopes, errors = self.thinning[-len(answers) :].T
             error = np.hypot(self._decoder_error(steps[0::2] + steps[1::2]), errors)
-            magnitude = np.abs(left) + np.abs(right)
             difference = left - right
             difference = difference + intercepts + slopes * difference
             if new and self.has_similarity:
                 self._calibrate(latents, shown, values)
-            spread = self._return_spread(shown)
-        else:
-            values = self.model.similarities(latents, np.stack([latent_of(item) for item in shown]))
-            difference = values[:, 0::2] - values[:, 1::2]
-            error, magnitude = float(self.scale[1]) * PROBIT_SLOPE, 2.0 * self._spread
-            spread = self._spread
+            return difference, error, np.abs(left) + np.abs(right), self._return_spread(shown)
+        values = self.model.similarities(latents, np.stack([latent_of(item) for item in shown]))
+        error = float(self.scale[1]) * PROBIT_SLOPE
+        return values[:, 0::2] - values[:, 1::2], error, 2.0 * self._spread, self._spread
+
+    def _log_likelihoods(
+        self, latents: np.ndarray, answers: Sequence[Answer], new: bool = False
+    ) -> np.ndarray:
+        """(m,) log P(answers | latent) of (m, d), or (m, G) for each of the people; what else a new
+        answer tells is noted.
+        """
+        difference, error, magnitude, spread = self._differences(latents, answers, new)
         if self.people is None:
             assert self.noise_model is not None
             probability = self.noise_model.probability_left(difference, error, magnitude)

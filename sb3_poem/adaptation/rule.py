@@ -86,6 +86,12 @@ class Inference(ABC):
     def estimate(self) -> np.ndarray:
         """(d,) the latent to act on, given the answers so far."""
 
+    def contradicted(self) -> int | None:
+        """The place in :attr:`answers` of the one that the others contradict most; None if they
+        agree, or the rule does not tell.
+        """
+        return None
+
     def snapshot(self) -> Snapshot:
         """A copy of the posterior and the random state, as they are now."""
         arrays = {name: np.array(getattr(self, name)) for name in self.state}

@@ -25,9 +25,10 @@ from sb3_poem.adaptation.particles import (
     kernel_neighbours,
     systematic_resample,
 )
+from sb3_poem.adaptation.preference import ANSWERS as ANSWERS_OF
 from sb3_poem.adaptation.preference import Preference, preference_log_likelihood
 from sb3_poem.adaptation.priors import AggregatePrior, GaussianPrior
-from sb3_poem.adaptation.rule import Setting, Snapshot
+from sb3_poem.adaptation.rule import Answer, Setting, Snapshot
 from sb3_poem.common.trajectory import Trajectory
 
 LEFT, RIGHT, EQUAL = Preference.LEFT, Preference.RIGHT, Preference.EQUAL
@@ -94,7 +95,7 @@ def test_the_decoders_likelihood_is_the_direct_formula(noise, probability):
     assert inference.weights.sum() == pytest.approx(1.0)
 
 
-MUCH_LEFT = Preference.MUCH_LEFT
+MUCH_LEFT, MUCH_RIGHT = Preference.MUCH_LEFT, Preference.MUCH_RIGHT
 
 
 @pytest.mark.parametrize(
@@ -175,6 +176,74 @@ def test_who_answers_is_found_out(question):
     exact = mistakes(partial(ReturnOracle, **thresholds))
     often = mistakes(partial(MistakeOracle, 0.25, **thresholds))
     assert exact < 0.02 < 0.05 < often  # 0.05 before the first answer
+
+
+@pytest.mark.parametrize(
+    ("question", "noise"), [("graded", "infer"), ("pair", "infer"), ("pair", MistakeNoise(0.1))]
+)
+def test_the_probability_of_an_answer_given_the_others(question, noise):
+    """Of one that was left out in truth."""
+    answers = [(LEFT, 0.7, -0.4), (RIGHT, 0.2, 0.9), (EQUAL, 0.1, 0.8)]
+    if question == "graded":
+        answers[0] = (MUCH_LEFT, *answers[0][1:])
+
+    def told(answers):
+        options = {"question": question, "noise_model": noise, "likelihood": "similarity"}
+        inference = make(n_particles=40, **options)
+        inference._rejuvenate = lambda: None
+        for preference, *sides in answers:
+            inference.tell(preference, *(np.full(5, side) for side in sides))
+        return inference
+
+    found = told(answers).agreements()
+    for i, (preference, *sides) in enumerate(answers):
+        others = told(answers[:i] + answers[i + 1 :])
+        if preference is EQUAL:
+            assert found[i, 0] == 1.0
+            continue
+        side = (RIGHT, MUCH_RIGHT) if preference is RIGHT else (LEFT, MUCH_LEFT)
+        expected = 0.0
+        for each in side if others.people is None else (*side, EQUAL):
+            if each not in ANSWERS_OF[question]:
+                continue
+            answer = Answer(each, *(np.full(5, side) for side in sides))
+            likelihood = np.exp(others._log_likelihoods(others.particles, [answer]))
+            if others.people is not None:
+                shares = np.exp(others.people_log_shares.astype(np.float64))
+                likelihood = np.sum(shares * likelihood, axis=1)
+            expected += others.weights @ likelihood
+        assert found[i, 0] == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize(("question", "seed", "wrong"), [("graded", 1, 3), ("pair", 2, 4)])
+def test_what_the_other_answers_contradict_is_found_and_asked_again(question, seed, wrong):
+    graded = question == "graded"
+    env = SpeedEnv()
+    oracle = ReturnOracle(env, thresholds=(20.0, 200.0) if graded else None)
+    opposite = {LEFT: RIGHT, MUCH_LEFT: MUCH_RIGHT, RIGHT: LEFT, MUCH_RIGHT: MUCH_LEFT}
+    for turned in (None, wrong):
+        adapter = PreferenceAdapter(
+            SpeedModel(), env, rule=Bayes(question=question, noise_model="infer"), seed=seed
+        )
+        assert adapter.contradicted is None
+        for number in range(9):
+            query = adapter.ask()
+            answer = oracle(query.left, query.right)
+            adapter.tell(opposite[answer] if number == turned else answer)
+        assert adapter.contradicted == turned
+    asked = adapter.answers[wrong]
+    with pytest.raises(ValueError, match="from 0 to 8, but is 9"):
+        adapter.ask_again(9)
+    adapter.ask()
+    again = adapter.ask_again(wrong)
+    assert adapter.ask() is again
+    np.testing.assert_array_equal(again.left.observations, asked.left.observations)
+    adapter.tell(oracle(again.left, again.right))
+    assert adapter.contradicted is None
+    kept = [adapter.answers[number].preference for number in (wrong, -1)]
+    assert kept == [asked.preference, opposite[asked.preference]]  # the first stays
+    with pytest.raises(RuntimeError, match="all 10 questions"):
+        adapter.ask_again(wrong)
 
 
 def test_the_likelihood_from_s_is_the_direct_formula():
