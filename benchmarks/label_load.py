@@ -24,6 +24,7 @@ from typing import Any
 import requests
 from common import arguments, label_server
 
+from sb3_poem.adaptation.preference import Preference
 from sb3_poem.label.store import Store
 
 POLL_SECONDS = 0.15
@@ -58,7 +59,7 @@ class Person(threading.Thread):
         self.first = time.monotonic() - begun
         while time.monotonic() < self.until and view["phase"] == "question":
             time.sleep(self.random.uniform(0.5, 1.5) * self.watch)
-            preference = self.random.choice(("left", "right", "equal"))
+            preference = self.random.choice([each.value for each in Preference])
             asked = time.monotonic()
             answer = {"question": view["turn"]["id"], "preference": preference}
             self._call(f"/s/{self.token}/answer", json=answer)

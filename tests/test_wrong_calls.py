@@ -553,6 +553,7 @@ COMMANDS = [
     command("--host...--token", "label", "--host", "0.0.0.0"),
     command("PointGaol...PointGoal", "label", "--model", "PointGaol"),
     command("rate...2", "label", "--mistake-rate", 2),
+    command("pairs...graded", "label", "--inference", "paper", "--question", "graded"),
     command("--store...no answers", "label", "export", "--out", "a.jsonl"),
     command("--out a.csv....jsonl", "label", "export", "--out", "a.csv"),
     command("--store...no answers", "label", "replay"),

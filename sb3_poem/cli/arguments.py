@@ -241,7 +241,10 @@ def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
     _add_environment(model, "the one that the model was trained on)")
     _option(model, "--queries", "questions before the result", _count(1), 10)
     _option(model, "--inference", "", default="bayes", choices=INFERENCES)
-    _option(model, "--mistake-rate", "how often people are taken to err", float, 0.05)
+    told = "left or right; or graded: how much better, too (default: graded; paper: pair)"
+    _option(model, "--question", told, choices=("pair", "graded"))
+    told = "how often people are taken to err (default: inferred from their answers)"
+    _option(model, "--mistake-rate", told, float)
     _option(model, "--seed", "of every session (default: each has its own)", _count(0))
     told = "text or Markdown that people read before their first question"
     _file(model, "--instructions", told)
@@ -294,6 +297,6 @@ def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
     told = "a model's .zip, a pretrained folder, or a shipped model (default: each session's own)"
     _option(replay, "--model", told, **own)
     _option(replay, "--inference", "default: bayes", choices=INFERENCES, **own)
-    _option(replay, "--mistake-rate", "default: 0.05", float, **own)
+    _option(replay, "--mistake-rate", "default: inferred", float, **own)
     _option(replay, "--seed", "of the inference (default: 0)", _count(0), **own)
     _file(replay, "--json", "write what was foretold, and the latents after each answer")

@@ -46,7 +46,7 @@ def run_page(arguments: argparse.Namespace) -> None:
         )
     workers, packages = arguments.workers, arguments.gym_packages
     import_packages(packages)
-    options = {"inference": arguments.inference, "mistake_rate": arguments.mistake_rate}
+    options = page_options(arguments)
     session_rule(options)  # says now what is out of range
     models = find_models(arguments.model, arguments.env, parse_env_kwargs(arguments.env_kwargs))
     listener = bind(arguments.host, arguments.port)
@@ -74,6 +74,18 @@ def run_page(arguments: argparse.Namespace) -> None:
         make_server(app, arguments.host, port).run(sockets=[listener])
     finally:
         store.close()
+
+
+def page_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """What the sessions of a page are like."""
+    usual = "pair" if arguments.inference == "paper" else "graded"
+    return {**rule_options(arguments), "question": arguments.question or usual}
+
+
+def rule_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """The rule of the arguments, as a session's options name it."""
+    told = {"inference": arguments.inference, "mistake_rate": arguments.mistake_rate}
+    return {name: value for name, value in told.items() if value is not None}
 
 
 def read_password(auth: str | None, file: Path | None) -> tuple[str | None, str | None]:
@@ -139,7 +151,7 @@ def run_replay(arguments: argparse.Namespace) -> None:
 
     check_output("--json", arguments.json, (".json",))
     store, given = _open_store(arguments.store), arguments.model
-    options = {"inference": arguments.inference, "mistake_rate": arguments.mistake_rate}
+    options = rule_options(arguments)
     answered = [session for session in store.sessions() if store.answers(session.id)]
     if not answered:
         raise ValueError(f"--store {arguments.store} holds no answers")

@@ -18,6 +18,7 @@ from sb3_poem.label.store import Session, Store
 FIELDS = {
     **{"session": "int64", "source": "string", "model": "string", "env_id": "string"},
     **{"seed": "int64", "number": "int64", "question": "string", "preference": "string"},
+    "repeats": "int64",
     **{"undone": "bool", "wish": "string", "verdict": "string", "asked": "string"},
     **{"shown": "string", "answered": "string", "seconds": "float64", "video": "string"},
     **{"fps": "float64", "frames": "int64", "left_latent": "list", "right_latent": "list"},

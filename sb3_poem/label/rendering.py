@@ -21,6 +21,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
 from sb3_poem.adaptation.adapter import PreferenceAdapter
 from sb3_poem.adaptation.named_rule import named_rule
+from sb3_poem.adaptation.people import INFER
 from sb3_poem.adaptation.preference import Preference
 from sb3_poem.adaptation.rule import Rule, rollout_seed
 from sb3_poem.common.family_view import FamilyView
@@ -80,6 +81,7 @@ class TurnRequest:
     answers: Sequence[dict[str, Any]] = ()
     pending: dict[str, Any] | None = None
     preference: str | None = None
+    repeats: int | None = None  # number of the question that is asked again instead of a new one
     film_every: int = 1  # steps between two frames of the video, if it is smooth enough then
 
     @property
@@ -97,7 +99,8 @@ class Turn:
     state: dict[str, Any] | None
     left: dict[str, Any] | None  # the question's trajectory, as ``right``; None in a result
     right: dict[str, Any] | None
-    belief: dict[str, Any] | None  # as :func:`sb3_poem.label.beliefs.belief` gives it
+    # As :func:`sb3_poem.label.beliefs.belief` gives it, and the adapter's ``contradicted``
+    belief: dict[str, Any] | None
     latent: list[float] | None  # (d,) of the policy that would be taken now
     fps: float
     frames: int
@@ -175,9 +178,11 @@ class Renderer:
         adapter = self._adapter(request, every)
         if request.preference is not None:
             adapter.tell(request.preference)
-        believed, latent = belief(adapter, self.env_id), adapter.policy().latent
+        believed = {**belief(adapter, self.env_id), "contradicted": adapter.contradicted}
+        latent = adapter.policy().latent
         if request.kind == "question":
-            query = adapter.ask()
+            again = request.repeats
+            query = adapter.ask() if again is None else adapter.ask_again(again)
             clips = [query.left, query.right]
         else:
             seeds = [rollout_seed(adapter.seed, RESULT_ROLLOUT)]
@@ -225,8 +230,11 @@ def film_rate(fps: float, horizon: int, wanted: int) -> tuple[int, float]:
 
 
 def session_rule(options: dict[str, Any]) -> Rule:
-    """The rule that a session's options name; a person errs now and then."""
-    return named_rule(**{"mistake_rate": 0.05, **options})
+    """The rule that a session's options name; who answers is inferred, unless they say how often
+    that person errs.
+    """
+    infers = "mistake_rate" not in options
+    return named_rule(**{**({"noise_model": INFER} if infers else {}), **options})
 
 
 def make_turn(request: TurnRequest) -> Turn:

@@ -94,6 +94,7 @@ class _Pages:
                 self.route("/instructions", self.read),
                 self.route("/state", self.state),
                 post("/answer", store.add_answer, question=int, preference=str),
+                post("/again", store.ask_again, question=int),
                 post("/undo", store.undo, answered=int),
                 post("/stop", store.stop),
                 post("/verdict", store.judge, result=int, verdict=str),

@@ -42,11 +42,14 @@ class FullError(RuntimeError):
 
 
 class _Key(NamedTuple):
-    """What a turn follows from: a question's turn (None at the start) and its answer."""
+    """What a turn follows from: a question's turn (None at the start) and its answer; and the
+    number of a question that it asks again.
+    """
 
     question: int | None
     preference: str | None
     kind: str
+    repeats: int | None = None
 
 
 @dataclass
@@ -141,7 +144,8 @@ class SessionManager:
         if turn["shown"] is None:
             await asyncio.to_thread(self.store.mark_shown, turn["id"])
         view["phase"] = kind
-        view["turn"] = {name: turn[name] for name in ("id", "fps", "frames", "verdict")}
+        about = ("id", "fps", "frames", "verdict", "repeats")
+        view["turn"] = {name: turn[name] for name in about}
         if kind == "question" and self.render_ahead:
             self._render_ahead(session, answered, turn["id"])
         return view
@@ -166,7 +170,13 @@ class SessionManager:
         video = self.store.videos / f"{session.id}-{secrets.token_hex(12)}.mp4"
         about = (info, session.seed, session.options, key.kind, video)
         before = {} if key.question is None else self.store.adapter_data(key.question)
-        return TurnRequest(*about, **before, preference=key.preference, film_every=film_every)
+        return TurnRequest(
+            *about,
+            **before,
+            preference=key.preference,
+            repeats=key.repeats,
+            film_every=film_every,
+        )
 
     def _look(self, number: int) -> tuple[Session, int, str, Any, Any]:
         """The session, its answers, the turn that is due and its kind, else the question before."""
@@ -218,7 +228,9 @@ class SessionManager:
             if len(answers) != answered:
                 return
             last = answers[-1] if answers else dict.fromkeys(("id", "question", "preference"))
-            key = _Key(last["question"], last["preference"], kind)
+            kept = await asyncio.to_thread(self.store.turn, session.id, kind, answered)
+            repeats = None if kept is None else kept["repeats"]
+            key = _Key(last["question"], last["preference"], kind, repeats)
             self._keep_only(active, key.question, key)
             job = active.jobs.get(key)
             if job is None or _has_failed(job):

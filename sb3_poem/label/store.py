@@ -21,7 +21,7 @@ from sb3_poem.label.rendering import StorageError, Turn
 
 VERDICTS = ("yes", "not quite")
 MAX_WISH = 2000  # characters
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 SCHEMA = """
 CREATE TABLE sessions (
     id INTEGER PRIMARY KEY,
@@ -42,6 +42,7 @@ CREATE TABLE turns (
     session INTEGER NOT NULL REFERENCES sessions(id),
     kind TEXT NOT NULL CHECK (kind IN ('question', 'result')),
     number INTEGER NOT NULL,         -- answers before it
+    repeats INTEGER,                 -- number of the question that it asks again
     state TEXT,                      -- JSON, or NULL where nothing continues from it
     left_trajectory TEXT,            -- JSON
     right_trajectory TEXT,           -- JSON
@@ -54,7 +55,7 @@ CREATE TABLE turns (
     shown REAL,
     verdict TEXT CHECK (verdict IN ('yes', 'not quite')),
     verdict_time REAL,
-    dropped REAL                     -- when an undo made it void
+    dropped REAL                     -- when an undo, or one asked again, made it void
 );
 CREATE UNIQUE INDEX one_turn ON turns(session, kind, number) WHERE dropped IS NULL;
 """
@@ -77,6 +78,17 @@ ALTER TABLE answers RENAME TO answers_1;
 {ANSWERS_SCHEMA}
 INSERT INTO answers SELECT * FROM answers_1;
 DROP TABLE answers_1;
+"""
+# Version 2 asks nothing again.
+FROM_VERSION_2 = "ALTER TABLE turns ADD COLUMN repeats INTEGER;"
+# The pair that was asked about, where the waiting question stands.
+ASK_AGAIN = """
+INSERT INTO turns (session, kind, number, state, left_trajectory, right_trajectory, belief, latent,
+    video, fps, frames, created, repeats)
+SELECT waiting.session, waiting.kind, waiting.number, waiting.state, asked.left_trajectory,
+    asked.right_trajectory, waiting.belief, waiting.latent, asked.video, asked.fps, asked.frames,
+    waiting.dropped, asked.number
+FROM turns AS waiting, turns AS asked WHERE waiting.id = :waiting AND asked.id = :asked
 """
 
 
@@ -181,7 +193,8 @@ class Store:
         """The row of a "question" or "result" that counts, if any, without what is large."""
         return self._one(
             "SELECT id, session, kind, number, belief, latent, video, fps, frames, created, shown, "
-            "verdict FROM turns WHERE session = ? AND kind = ? AND number = ? AND dropped IS NULL",
+            "verdict, repeats FROM turns "
+            "WHERE session = ? AND kind = ? AND number = ? AND dropped IS NULL",
             *(session, kind, number),
         )
 
@@ -292,6 +305,23 @@ class Store:
                 "answers", session=session, number=len(answers), created=now, **about_answer
             )
 
+    def ask_again(self, session: int, question: int) -> None:
+        """Ask once more about the pair whose answer the others contradict, as the waiting question
+        has it, instead of that one. The same wish again changes nothing.
+        """
+        with self._transaction() as execute:
+            answers = self.answers(session)
+            waiting = self.turn(session, "question", len(answers))
+            if waiting is not None and waiting["repeats"] is not None:
+                return
+            if waiting is None or waiting["id"] != question:
+                raise RefusedError("the conversation has moved on; look again at the page")
+            number = json.loads(waiting["belief"] or "{}").get("contradicted")
+            if number is None:
+                raise RefusedError("no answer is contradicted by the others")
+            execute("UPDATE turns SET dropped = ? WHERE id = ?", (time.time(), question))
+            execute(ASK_AGAIN, {"waiting": question, "asked": answers[number]["question"]})
+
     def undo(self, session: int, answered: int) -> None:
         """Take the last of ``answered`` answers back, as many as there were where it was asked for;
         or, after an early stop, go back to the question that waited.
@@ -354,6 +384,7 @@ class Store:
         return self._all(
             """SELECT sessions.id AS session, sessions.source, sessions.model, sessions.env_id,
                 sessions.seed, sessions.options, sessions.wish, answers.number, answers.preference,
+                turns.repeats,
                 answers.created AS answered, answers.undone, turns.created AS asked, turns.shown,
                 turns.video, turns.fps, turns.frames, turns.left_trajectory, turns.right_trajectory,
                 (SELECT results.verdict FROM turns AS results
@@ -394,7 +425,8 @@ class Store:
     def _make_tables(self) -> None:
         with self._transaction() as execute:
             version = execute("PRAGMA user_version").fetchone()[0]
-            scripts = {0: SCHEMA + ANSWERS_SCHEMA, 1: FROM_VERSION_1, SCHEMA_VERSION: ""}
+            scripts = {0: SCHEMA + ANSWERS_SCHEMA, 1: FROM_VERSION_1 + FROM_VERSION_2}
+            scripts |= {2: FROM_VERSION_2, SCHEMA_VERSION: ""}
             if version not in scripts:
                 raise ValueError(
                     f"{self.path} is a store of version {version}; "

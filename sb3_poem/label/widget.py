@@ -27,7 +27,8 @@ class LabelWidget:
     .. code-block:: python
 
         env = gym.make("poem/HalfCheetahVel-v0", render_mode="rgb_array")
-        widget = LabelWidget(PreferenceAdapter(model, env))
+        rule = Bayes(question="graded", noise_model="infer")  # five answers, whoever gives them
+        widget = LabelWidget(PreferenceAdapter(model, env, rule=rule))
         widget                      # answer in the page below the cell
         policy = widget.policy()    # in a later cell
 

@@ -21,7 +21,6 @@ from label_world import make_sessions
 
 from sb3_poem import Bayes
 from sb3_poem.adaptation import PreferenceAdapter, ReturnOracle, evaluate_episodes
-from sb3_poem.adaptation.noise import MistakeNoise
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.label.families import ModelInfo, find_models
@@ -40,6 +39,13 @@ pytestmark = [
 SEED = 3
 DESKTOP, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
 LANDSCAPE = {"width": 844, "height": 390}
+# Differences of returns that the scripted person calls better, and much better.
+THRESHOLDS = {"PointGoal": (1.0, 8.0), "HalfCheetahVel": (5.0, 60.0)}
+KEYS = {
+    "pair": {"left": "ArrowLeft", "equal": "2", "right": "ArrowRight"},
+    "graded": {"much left": "1", "left": "2", "equal": "3", "right": "ArrowRight"}
+    | {"much right": "5"},
+}
 SHOWN = "() => typeof view !== 'undefined' && view !== null && view.phase !== 'preparing' && !busy"
 
 
@@ -151,11 +157,13 @@ class Person:
         self.page = page
         self.token = page.url.rpartition("/s/")[2]
         self.task = np.array([task])
-        self.oracle = ReturnOracle(gym.make(info.env_id), self.task)
+        self.question = page.evaluate("() => view.question")
+        graded = {"thresholds": THRESHOLDS[info.name]} if self.question == "graded" else {}
+        self.oracle = ReturnOracle(gym.make(info.env_id), self.task, **graded)
         self.store = server.store
 
     def judge(self) -> str:
-        """The better side of the question that waits."""
+        """The answer to the question that waits."""
         store = Store(self.store)
         session = store.find(self.token)
         assert session is not None
@@ -171,18 +179,19 @@ class Person:
         return self.oracle(*sides).value
 
     def answer(self, times: int = 1, keyboard: bool = False) -> None:
-        keys = {"left": "ArrowLeft", "right": "ArrowRight", "equal": "2"}
         for _ in range(times):
             self.page.wait_for_function(SHOWN)
-            answered = self.answered()
-            preference = self.judge()
-            if keyboard:
-                self.page.keyboard.press(keys[preference])
-            else:
-                self.page.click(f"[data-preference={preference}]")
-            self.page.wait_for_function(
-                f"() => view.answered === {answered + 1} && view.phase !== 'preparing' && !busy"
-            )
+            self.say(self.judge(), keyboard)
+
+    def say(self, preference: str, keyboard: bool = False) -> None:
+        answered = self.answered()
+        if keyboard:
+            self.page.keyboard.press(KEYS[self.question][preference])
+        else:
+            self.page.click(f'[data-preference="{preference}"]')
+        self.page.wait_for_function(
+            f"() => view.answered === {answered + 1} && view.phase !== 'preparing' && !busy"
+        )
 
     def answered(self) -> int:
         return int(self.page.evaluate("() => view.answered"))
@@ -233,10 +242,11 @@ def returns(info: ModelInfo, latents: np.ndarray, task: float) -> np.ndarray:
 
 def oracles_latents(info: ModelInfo, task: float, n_queries: int) -> np.ndarray:
     """Before any answer, and after those by ``ReturnOracle``."""
-    oracle = ReturnOracle(gym.make(info.env_id), np.array([task]))
+    thresholds = THRESHOLDS[info.name]
+    oracle = ReturnOracle(gym.make(info.env_id), np.array([task]), thresholds=thresholds)
     options: dict[str, Any] = {
         "n_queries": n_queries,
-        "rule": Bayes(noise_model=MistakeNoise(0.05)),
+        "rule": Bayes(question="graded", noise_model="infer"),
     }
     model = load_shown_model(info)
     adapter = PreferenceAdapter(model, info.env_id, oracle=oracle, seed=SEED, **options)
@@ -371,6 +381,69 @@ def test_the_keyboard_alone(
         assert element.evaluate("element => element === document.activeElement")
 
 
+def test_five_answers_by_keys_and_by_clicks(
+    open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
+) -> None:
+    person = begin(open_page, server, point_goal, 1.0)
+    page = person.page
+    buttons = page.get_by_role("group", name="Your answer").get_by_role("button")
+    assert [" ".join(text.split()[1:]) for text in buttons.all_text_contents()] == [
+        "Left much better",
+        "Left a bit better",
+        "Can\u2019t tell",
+        "Right a bit better",
+        "Right much better",
+    ]
+    answers = {
+        "much left": lambda: page.keyboard.press("1"),
+        "left": lambda: page.keyboard.press("ArrowLeft"),
+        "equal": lambda: page.keyboard.press("3"),
+        "right": lambda: buttons.nth(3).click(),
+        "much right": lambda: buttons.nth(4).click(),
+    }
+    for number, answer in enumerate(answers.values()):
+        page.wait_for_function(SHOWN)
+        answer()
+        page.wait_for_function("n => view.answered === n", arg=number + 1)
+    page.wait_for_function(SHOWN)
+    record = page.request.get(f"{page.url}/answers.json").json()
+    assert [answer["preference"] for answer in record["answers"]] == person.stored() == [*answers]
+    assert {answer["question"] for answer in record["answers"]} == {"graded"}
+    page.click("#undo")
+    page.wait_for_function("() => view.answered === 4 && !busy")
+    assert person.stored() == [*answers][:4]
+
+
+def test_a_pair_is_shown_again_where_answers_contradict_each_other(
+    open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
+) -> None:
+    person = begin(open_page, server, point_goal, 2.5)
+    page = person.page
+    assert page.is_hidden("#doubt")
+    films = []
+    while not page.is_visible("#doubt"):
+        films.append(page.evaluate("() => view.turn.id"))
+        answer = person.judge()
+        if len(films) == 1:
+            answer = "much right" if "left" in answer else "much left"
+        person.say(answer)
+    assert "Look at pair 1 again?" in " ".join(page.inner_text("#doubt").split())
+    answered = person.answered()
+    page.click("#again")
+    page.wait_for_function("() => view.turn.repeats === 0 && !busy")
+    assert page.text_content("#task").startswith("Pair 1 once more: which")
+    assert page.is_hidden("#doubt")
+    assert person.answered() == answered
+    first, again = (
+        page.request.get(f"{page.url}/video/{turn}").body()
+        for turn in (films[0], page.evaluate("() => view.turn.id"))
+    )
+    assert first == again
+    person.answer()
+    record = page.request.get(f"{page.url}/answers.json").json()
+    assert [answer["repeats"] for answer in record["answers"]] == [None] * answered + [0]
+
+
 def test_both_halves_of_the_film_are_in_step(
     open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
 ) -> None:
@@ -455,9 +528,7 @@ def test_a_phone(open_page: Callable[..., Any], server: Server, point_goal: Mode
     person.answer(1)
     assert page.evaluate("() => document.documentElement.scrollWidth") <= PHONE["width"]
     for selector in (
-        "[data-preference=left]",
-        "[data-preference=right]",
-        "[data-preference=equal]",
+        *(f'[data-preference="{word}"]' for word in KEYS["graded"]),
         "#play",
         "#race",
         ".speed",
@@ -466,6 +537,7 @@ def test_a_phone(open_page: Callable[..., Any], server: Server, point_goal: Mode
         stage = page.locator(".stage").bounding_box()
         assert box["x"] + box["width"] <= stage["x"] + stage["width"]
         assert box["height"] >= 44 or selector == ".speed"
+        assert box["width"] >= 60 or not selector.startswith("[")
         assert box["y"] + box["height"] <= PHONE["height"]  # all that is needed is in sight
 
 
@@ -473,7 +545,7 @@ def test_a_phone_on_its_side(
     open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
 ) -> None:
     person = begin(open_page, server, point_goal, 2.0, viewport=LANDSCAPE, has_touch=True)
-    needed = ["#play", "[data-preference=left]", "[data-preference=equal]"]
+    needed = ["#play", *(f'[data-preference="{word}"]' for word in KEYS["graded"])]
     for screen in ("#race-screen", "#left-screen"):
         for selector in (screen, *needed):
             box = person.page.locator(selector).bounding_box()
@@ -500,18 +572,18 @@ def test_what_is_said_offline_is_sent_later(
     page.wait_for_function("() => Object.keys(unsent).length === 0")
     # Whoever closes the page while they are offline finds it sent when they come back.
     page.context.set_offline(True)
-    page.click("[data-preference=right]")
+    page.click("[data-preference='much right']")
     page.fill("#wish", "farther")
     page.wait_for_selector("#error:visible")
     address = page.url
     context = page.context
     page.close()
-    assert person.stored() == ["left"]
+    assert person.stored() == ["much left"]
     context.set_offline(False)
     page = context.new_page()
     page.goto(address)
     page.wait_for_function("() => view !== null && view.answered === 2 && !busy")
-    assert person.stored() == ["left", "right"]
+    assert person.stored() == ["much left", "much right"]
     # Who types and closes the page at once loses no word.
     page.wait_for_function(SHOWN)
     page.fill("#wish", "at once")

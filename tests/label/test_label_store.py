@@ -7,6 +7,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -85,7 +86,23 @@ def test_graded_questions_take_five_answers_and_pairs_three(store: Store) -> Non
         answer(store, pairs, "much left")
 
 
-def test_a_store_of_version_1_is_read_and_takes_graded_answers(tmp_path: Path) -> None:
+# Back to how version 1 kept answers.
+ANSWERS_1 = """ALTER TABLE answers RENAME TO newer; DROP INDEX one_answer;
+CREATE TABLE answers (
+    id INTEGER PRIMARY KEY,
+    session INTEGER NOT NULL REFERENCES sessions(id),
+    question INTEGER NOT NULL REFERENCES turns(id),
+    number INTEGER NOT NULL,
+    preference TEXT NOT NULL CHECK (preference IN ('left', 'right', 'equal')),
+    created REAL NOT NULL,
+    undone REAL
+);
+CREATE UNIQUE INDEX one_answer ON answers(session, number) WHERE undone IS NULL;
+INSERT INTO answers SELECT * FROM newer; DROP TABLE newer;"""
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_an_older_store_is_read_and_takes_graded_answers(tmp_path: Path, version: int) -> None:
     store = Store(tmp_path)
     session, _ = begin(store)
     for word in ("left", "equal"):
@@ -94,19 +111,10 @@ def test_a_store_of_version_1_is_read_and_takes_graded_answers(tmp_path: Path) -
     store.close()
     connection = sqlite3.connect(tmp_path / "answers.sqlite")
     connection.executescript(
-        """ALTER TABLE answers RENAME TO newer; DROP INDEX one_answer;
-        CREATE TABLE answers (
-            id INTEGER PRIMARY KEY,
-            session INTEGER NOT NULL REFERENCES sessions(id),
-            question INTEGER NOT NULL REFERENCES turns(id),
-            number INTEGER NOT NULL,
-            preference TEXT NOT NULL CHECK (preference IN ('left', 'right', 'equal')),
-            created REAL NOT NULL,
-            undone REAL
-        );
-        CREATE UNIQUE INDEX one_answer ON answers(session, number) WHERE undone IS NULL;
-        INSERT INTO answers SELECT * FROM newer; DROP TABLE newer; PRAGMA user_version = 1;"""
+        f"ALTER TABLE turns DROP COLUMN repeats; PRAGMA user_version = {version}"
     )
+    if version == 1:
+        connection.executescript(ANSWERS_1)
     kept = connection.execute("SELECT * FROM answers ORDER BY id").fetchall()
     connection.close()
     for _ in range(2):  # read, and read again
@@ -235,3 +243,36 @@ def test_a_kill_loses_no_answer(tmp_path: Path) -> None:
     assert said[:40] == (["left", "right", "equal"] * 14)[:40]
     assert kept[: len(said)] == said
     assert len(kept) <= len(said) + 1  # the one that was kept and not yet said
+
+
+def test_a_contradicted_answers_pair_is_asked_about_once_more(store: Store) -> None:
+    session, _ = begin(store, question="graded")
+    films = [answer(store, session, word) for word in ("left", "much left")]
+    waiting = store.turn(session, "question", 2)
+    assert waiting is not None
+    with pytest.raises(RefusedError, match="no answer is contradicted"):
+        store.ask_again(session, waiting["id"])
+    store.undo(session, 2)
+    contradicted = replace(turn(), belief={"contradicted": 0}, left={"new": True})
+    given = store.add_answer(session, films[1], "much right")
+    waiting = store.add_turn(session, "question", 2, given, contradicted, "new.mp4")
+    assert waiting is not None
+    for _ in range(2):  # what is sent twice counts once
+        store.ask_again(session, waiting)
+    again = store.turn(session, "question", 2)
+    assert again is not None
+    assert (again["repeats"], again["video"]) == (0, "0.mp4")
+    data, first = store.adapter_data(again["id"]), store.whole_turn(films[0])
+    assert data["pending"] == {"left": dict(TRAJECTORY), "right": dict(TRAJECTORY)}
+    assert data["state"] == {"n": 1}
+    assert first is not None
+    with pytest.raises(RefusedError, match="not the one that waits"):
+        store.add_answer(session, waiting, "left")
+    with pytest.raises(RefusedError, match="moved on"):
+        store.ask_again(begin(store)[0], waiting)
+    answer(store, session, "right")
+    assert [row["repeats"] for row in store.records()] == [None, None, None, 0]
+    store.undo(session, 3)
+    assert store.turn(session, "question", 2)["repeats"] == 0  # it waits again
+    store.undo(session, 2)
+    assert store.turn(session, "question", 2) is None

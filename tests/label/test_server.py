@@ -14,9 +14,16 @@ import pytest
 from label_world import make_sessions
 from starlette.testclient import TestClient
 
+from sb3_poem import Bayes
+from sb3_poem.adaptation.noise import MistakeNoise
+from sb3_poem.adaptation.paper import Paper
 from sb3_poem.adaptation.policy import AdaptedPolicy
+from sb3_poem.adaptation.rule import Rule
+from sb3_poem.cli.arguments import build_parser
+from sb3_poem.cli.label import page_options
 from sb3_poem.label.access import MAX_BODY, PAUSE_AFTER_WRONG_PASSWORD, Access, is_loopback
 from sb3_poem.label.families import ModelInfo
+from sb3_poem.label.rendering import session_rule
 from sb3_poem.label.server import make_app
 from sb3_poem.label.store import Store
 
@@ -468,3 +475,22 @@ def test_a_browser_gets_pages_where_something_is_refused(
         assert words in response.text
         assert '<a href="/">Choose a robot</a>' in response.text
         assert response.headers["content-type"] == "text/html; charset=utf-8"
+
+
+@pytest.mark.parametrize(
+    ("words", "rule", "buttons"),
+    [
+        ([], Bayes(question="graded", noise_model="infer"), 5),
+        (["--question", "pair"], Bayes(noise_model="infer"), 3),
+        (["--mistake-rate", "0.1"], Bayes(question="graded", noise_model=MistakeNoise(0.1)), 5),
+        (["--inference", "paper"], Paper(), 3),
+    ],
+)
+def test_what_the_page_asks(
+    store: Store, point_goal: ModelInfo, words: list[str], rule: Rule, buttons: int
+) -> None:
+    options = page_options(build_parser().parse_args(["label", *words]))
+    assert session_rule(options) == rule
+    app = make_app(make_sessions(store, point_goal, options=options))
+    with TestClient(app, base_url=HOST, follow_redirects=False) as client:
+        assert client.get(begin(client)).text.count("data-preference=") == buttons

@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pytest
 from gymnasium.envs.registration import load_env_creator
 from label_world import make_sessions, settled
 
-from sb3_poem import Bayes
+from sb3_poem import Bayes, ReturnOracle
 from sb3_poem.adaptation.adapter import PreferenceAdapter
-from sb3_poem.adaptation.noise import MistakeNoise
+from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.label import rendering
 from sb3_poem.label.families import ModelInfo
 from sb3_poem.label.rendering import load_shown_model
@@ -67,9 +68,7 @@ def test_the_page_asks_what_an_adapter_asks(
 
     session = run_server(life)
     model = load_shown_model(point_goal)
-    adapter = PreferenceAdapter(
-        model, "poem/PointGoal-v0", seed=5, rule=Bayes(noise_model=MistakeNoise(0.05))
-    )
+    adapter = PreferenceAdapter(model, "poem/PointGoal-v0", seed=5, rule=Bayes(noise_model="infer"))
     for number, preference in enumerate(ANSWERS):
         query = adapter.ask()
         kept = contents(store, session, number)
@@ -96,10 +95,10 @@ def test_graded_questions_are_asked_and_what_follows_from_all_five_answers_rende
         assert store.videos / store.turn(session.id, "question", 1)["video"] in ahead
         return session
 
-    options = {"question": "graded", "noise_model": "infer"}
-    session = run_server(life, render_ahead=True, options=options)
+    session = run_server(life, render_ahead=True, options={"question": "graded"})
+    rule = Bayes(question="graded", noise_model="infer")
     adapter = PreferenceAdapter(
-        load_shown_model(point_goal), "poem/PointGoal-v0", seed=5, rule=Bayes(**options)
+        load_shown_model(point_goal), "poem/PointGoal-v0", seed=5, rule=rule
     )
     adapter.ask()
     adapter.tell("much left")
@@ -315,3 +314,39 @@ def test_a_film_made_again_while_crowded_is_described_as_it_is(
         before["fps"] / 2,
         -(-before["frames"] // 2),
     )
+
+
+def test_a_contradiction_is_noticed_and_its_pair_filmed_again_as_it_was(
+    run_server: Callable[..., Any], store: Store, point_goal: ModelInfo
+) -> None:
+    oracle = ReturnOracle(gym.make(point_goal.env_id), np.array([2.5]), thresholds=(1.0, 8.0))
+
+    async def life(sessions: SessionManager) -> None:
+        session, _ = await begin(sessions)
+        view = await settled(sessions, session)
+        while view["belief"]["contradicted"] is None:
+            kept = contents(store, session, view["answered"])
+            sides = [Trajectory.from_dict(json.loads(side)) for side in kept[1:3]]
+            answer = oracle(*sides).value
+            if view["answered"] == 0:
+                answer = "much right" if "left" in answer else "much left"
+            store.add_answer(session.id, view["turn"]["id"], answer)
+            view = await settled(sessions, session)
+        assert view["belief"]["contradicted"] == 0
+        answered = view["answered"]
+        store.ask_again(session.id, view["turn"]["id"])
+        again = await settled(sessions, session)
+        assert (again["answered"], again["turn"]["repeats"]) == (answered, 0)
+        shown, first = contents(store, session, answered), contents(store, session, 0)
+        assert shown[1:3] + shown[5:] == first[1:3] + first[5:]
+        film = sessions.video(session, again["turn"]["id"])
+        assert film is not None
+        film.unlink()
+        await settled(sessions, session)
+        assert contents(store, session, answered) == shown
+        sides = [Trajectory.from_dict(json.loads(side)) for side in shown[1:3]]
+        store.add_answer(session.id, again["turn"]["id"], oracle(*sides).value)
+        view = await settled(sessions, session)
+        assert (view["turn"]["repeats"], view["belief"]["contradicted"]) == (None, None)
+
+    run_server(life, options={"question": "graded"})

@@ -143,11 +143,12 @@ async function show(next) {
   byId("undo-text").textContent = phase === "result" && answered < target ? "Back to the questions" : "Undo the last answer";
   byId("stop").hidden = phase !== "question" || answered === 0;
   for (const button of document.querySelectorAll(".answer")) button.setAttribute("aria-disabled", String(waiting));
+  showDoubt();
   if (waiting) return;
   if (next.turn.id !== shownTurn) {
     await player.load(`${base}/video/${next.turn.id}`, next.turn.fps, next.turn.frames);
     shownTurn = next.turn.id;
-    if (phase === "question") say(`Question ${answered + 1} of ${target}.`);
+    if (phase === "question") say(`Question ${answered + 1} of ${target}. ${byId("doubt").hidden ? "" : byId("doubt").textContent}`);
     else say("This is what it learned. Is this what you meant?");
   }
   byId("board").classList.toggle("single", phase === "result");
@@ -155,7 +156,7 @@ async function show(next) {
   byId("answers").hidden = phase !== "question";
   byId("result").hidden = phase !== "result";
   byId("hint").hidden = phase !== "question" || answered > 2;
-  byId("task").textContent = phase === "question" ? "Which one is closer to what you want?"
+  byId("task").textContent = phase === "question" ? question()
     : accepted ? "This is what it learned." : "This is what it learned. Is this what you meant?";
   byId("left-screen").setAttribute("aria-label", phase === "question" ? "Left video" : "What it learned");
   byId("thanks").hidden = !accepted;
@@ -167,6 +168,19 @@ async function show(next) {
     byId("get-policy").href = `${base}/policy.safetensors`;
   }
 }
+
+function question() {
+  const { repeats } = view.turn;
+  return `${repeats === null ? "Which" : `Pair ${repeats + 1} once more: which`} one is closer to what you want?`;
+}
+
+// Offers to look again at the answer that the others contradict, once.
+function showDoubt() {
+  const number = view.phase === "question" && view.turn.repeats === null ? view.belief.contradicted ?? null : null;
+  byId("doubtful").textContent = number === null ? "" : number + 1;
+  byId("doubt").hidden = number === null;
+}
+byId("again").addEventListener("click", () => act("/again", { question: view.turn.id }));
 
 // Both robots in one picture, instead of the two, where the video has one and it is wanted.
 let wantsRace = (localStorage.getItem("race") ?? byId("board").dataset.race) === "on";
@@ -229,9 +243,6 @@ byId("stop").addEventListener("click", () => act("/stop", {}));
 const KEYS = {
   ArrowLeft: () => answer("left"),
   ArrowRight: () => answer("right"),
-  1: () => answer("left"),
-  2: () => answer("equal"),
-  3: () => answer("right"),
   u: undo,
   U: undo,
   r: race,
@@ -239,6 +250,9 @@ const KEYS = {
   ",": () => player.step(-1),
   ".": () => player.step(1),
 };
+document.querySelectorAll("[data-preference]").forEach((button, index) => {
+  KEYS[index + 1] = () => answer(button.dataset.preference);
+});
 document.addEventListener("keydown", (event) => {
   if (!byId("keys").checked) return;
   if (event.altKey || event.ctrlKey || event.metaKey || event.repeat) return;
