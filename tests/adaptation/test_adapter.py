@@ -378,7 +378,7 @@ def test_what_a_notebook_shows(point_goal):
         r"HumanOracle\(0 asked, videos in preference_queries\)": HumanOracle(),
         r"EpisodeOutcomes\(2 times 3 episodes, mean return -\d+\.\d\)": outcomes,
         r"AdaptationEvaluation\(2 tasks, mean return -\d+\.\d, -\d+\.\d after 0, 1 answers\)": adapted,
-        r"KnownTaskReturn\(2 tasks, mean return -\d+\.\d of the best of 6 latents\)": known_task_return(
+        r"KnownTaskReturn\(2 tasks, mean return -\d+\.\d of the best of 6 latents, refined\)": known_task_return(
             point_goal, env, tasks, 6, 1
         ),
         r"TaskAdaptations\(2 tasks, after 0, 1, 2 answers\)": adapt_tasks(
