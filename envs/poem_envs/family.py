@@ -20,6 +20,12 @@ from poem_envs.headless import has_display
 # Float32 policies and files round: a value so far outside its bounds is clipped, not refused.
 BOUNDS_TOLERANCE = 1e-6
 
+# Standard deviations of a reward feature by which the means of two films must differ for people to
+# tell them apart: about 0.1 m/s of HalfCheetahVel, four pixels of PointGoal's film on the page.
+JUST_VISIBLE = 0.1
+# The same of their lengths, as a share of the longer film.
+JUST_LONGER = 0.1
+
 
 class _NothingToRender:
     """The ``metadata`` of families that cannot be rendered: their classes have none, since SB3 asks
@@ -300,6 +306,24 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
     def _potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
         """Optional, for families whose rewards say where to be rather than how to move."""
         raise NotImplementedError(f"{type(self).__name__} has no _potential(tasks, observations)")
+
+    def visible_difference(self, left: np.ndarray, right: np.ndarray, spread: np.ndarray) -> float:
+        """How different two episodes look to a person who watches their films: 1 is what people can
+        just tell, below which questions about them are asked less readily.
+
+        By default it is the distance between the means of the reward features, in units of a tenth
+        of ``spread``, or the difference of their lengths, in units of a tenth of the longer one,
+        whichever is larger. A family whose features are not what its films show overrides it.
+
+        :param left: reward features ``(steps, reward_feature_dim)``
+        :param right: those of the other episode, which may have another number of steps
+        :param spread: ``(reward_feature_dim,)`` the features' standard deviation over all steps of
+            the films that the person has seen, and of these two
+        """
+        means = left.mean(axis=0) - right.mean(axis=0)
+        apart = float(np.linalg.norm(means / np.maximum(spread, 1e-12))) / JUST_VISIBLE
+        longer = abs(len(left) - len(right)) / max(len(left), len(right)) / JUST_LONGER
+        return max(apart, longer)
 
     @abstractmethod
     def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:

@@ -32,6 +32,10 @@ class LeggedFamily(MujocoFamily):
         (lowest, highest), height = self.healthy_z_range, self._qpos[:, 2]
         return ~(self.within(lowest, height) & self.within(height, highest))
 
+    def visible_difference(self, left: np.ndarray, right: np.ndarray, spread: np.ndarray) -> float:
+        """See :class:`TaskFamily`: of the velocity or place; what actions cost is not seen."""
+        return super().visible_difference(left[:, :-1], right[:, :-1], spread[:-1])
+
     def _marker_place(self, position: np.ndarray) -> np.ndarray:
         """Above the robot, ``(3,)``."""
         return np.array([position[0], position[1], self.marker_height])

@@ -31,6 +31,7 @@ from sb3_poem.adaptation.rule import (
 )
 from sb3_poem.adaptation.state import parse_json, read_json, write_json_atomically
 from sb3_poem.common.checks import check_whole
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
 
@@ -115,7 +116,7 @@ class PreferenceAdapter:
         self.model, self.env = model_and_env(model, env, 1, frames)
         self._owns_env = isinstance(env, str)
         self.library = None if library is None else list(library)
-        setting = Setting(self.n_queries, self.library, self.env)
+        setting = Setting(self.n_queries, self.library, self.env, None, self._visibility)
         self.rule.check(self.model, setting)
         warn_if_untrained(self.model)
         self._take_oracle(oracle)
@@ -123,6 +124,8 @@ class PreferenceAdapter:
         if self.inference.library is not None and self._owns_env:
             self.env.seed(self.seed)  # nothing is rolled out there: draw the task now
             self.env.reset()
+        # What was rolled out to choose a question, by the question's number and latent
+        self._seen: dict[tuple[int, bytes], Trajectory] = {}
         self._pending: Query | None = None
         self._previous: tuple[Snapshot, Query] | None = None
 
@@ -209,6 +212,7 @@ class PreferenceAdapter:
         before = self.inference.snapshot()
         self.inference.tell(answer, query.left, query.right)
         self._pending, self._previous = None, (before, query)
+        self._seen.clear()
 
     def undo(self) -> Query:
         """Take the last answer back; its question waits again. One step back, and only until the
@@ -278,17 +282,46 @@ class PreferenceAdapter:
         """Both rollouts start alike, one after the other in the first copy: other copies may hold
         other tasks.
         """
-        if isinstance(left, Trajectory) and isinstance(right, Trajectory):
-            return Query(left, right, self.rule.question)
         number = self.n_answers if number is None else number
-        seed, frames = rollout_seed(self.seed, number), self._needs_frames
-        by_mode = self.deterministic and not self.rule.explores
-        # Each fills a wave of its own; copies beyond the first repeat it and are not read.
-        first, second = (
-            rollout_latents(self.model, self.env, z[None], None, [seed], by_mode, frames=frames)[0]
-            for z in (latent_of(left), latent_of(right))
-        )
+        frames = self._needs_frames
+        first, second = (self._rolled_out(item, number, frames) for item in (left, right))
         return Query(first, second, self.rule.question)
+
+    def _rolled_out(self, shown: Shown, number: int, frames: int) -> Trajectory:
+        """What is shown of question ``number``."""
+        if isinstance(shown, Trajectory):
+            return shown
+        latent = latent_of(shown)
+        known = self._seen.get((number, latent.tobytes()))
+        if known is not None and (known.frames is not None or not frames):
+            return known
+        seed = rollout_seed(self.seed, number)
+        by_mode = self.deterministic and not self.rule.explores
+        # It fills a wave of its own; copies beyond the first repeat it and are not read.
+        about = (self.model, self.env, latent[None], None, [seed], by_mode)
+        return rollout_latents(*about, frames=frames)[0]
+
+    def _visibility(self, *pair: Shown) -> float:
+        """The share of what a question about these tells that is left when a person has to see
+        their difference: their family's :meth:`~poem_envs.TaskFamily.visible_difference`, up to 1.
+        It is 1 for a simulated oracle.
+        """
+        watched = getattr(self.oracle, "needs_frames", self.render and self.oracle is None)
+        family = FamilyView.of(self.env) if watched else None
+        if family is None:
+            return 1.0
+        # The first pair is nearly always the one that is asked about, so that it is filmed at once.
+        frames = 0 if self._seen else self._needs_frames
+        number = self.n_answers
+        left, right = rolled = [self._rolled_out(item, number, frames) for item in pair]
+        self._seen.update(((number, clip.latent.tobytes()), clip) for clip in rolled)
+        if left.reward_features is None or right.reward_features is None:
+            return 1.0
+        answered = [item for answer in self.answers for item in (answer.left, answer.right)]
+        features = [getattr(item, "reward_features", None) for item in (*answered, *rolled)]
+        spread = np.concatenate([rows for rows in features if rows is not None]).std(axis=0)
+        visible = family.visible_difference(left.reward_features, right.reward_features, spread)
+        return min(1.0, visible)
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as JSON-ready data, for :meth:`from_dict`: rule, answers with their
@@ -379,6 +412,7 @@ class PreferenceAdapter:
             pending = None if waits is None else Query(*_pair_from_dict(waits), kind=kind)
             self.inference.restore(Snapshot.from_dict(data["inference"]), answers)
         self._pending, self._previous = pending, None
+        self._seen.clear()
 
     def to_json(self) -> str:
         """:meth:`to_dict` as a JSON text."""

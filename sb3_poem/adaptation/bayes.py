@@ -4,7 +4,7 @@ they thin out.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -129,6 +129,10 @@ class Bayes(Rule):
     without end, and its odds turn overconfident. So the unit is never taken smaller than a fixed
     share of the spread of S.
 
+    *Where a person answers*, what a question tells is multiplied by how much of the difference can
+    be seen (:func:`~sb3_poem.adaptation.queries.best_pair`), which the family says
+    (:meth:`poem_envs.TaskFamily.visible_difference`). That holds for ``"information-gain"``.
+
     *Thinning*: when half of the particles carry no weight they are resampled and moved by
     elliptical slice sampling around the posterior's own mean and covariance. Moves are bounded. One
     by the decoder evaluates all trajectories that were ever shown, so only as many particles move
@@ -238,7 +242,7 @@ class Bayes(Rule):
         return self.likelihood or ("decoder" if _knows_its_decoder(model) else "similarity")
 
     def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> BayesInference:
-        return BayesInference(self, model, rng, setting.library)
+        return BayesInference(self, model, rng, setting.library, setting.visibility)
 
     def to_dict(self) -> dict[str, Any]:
         data, noise = super().to_dict(), self.noise_model
@@ -264,8 +268,10 @@ class BayesInference(Inference):
         model: Any,
         rng: np.random.Generator,
         library: Sequence[Trajectory] | None = None,
+        visibility: Callable[[Shown, Shown], float] | None = None,
     ) -> None:
         super().__init__(rng)
+        self.visibility = visibility
         self.rule, self.model = rule, model
         self.has_similarity = isinstance(model, HasSimilarity)
         self.likelihood = rule.likelihood_with(model)
@@ -324,11 +330,12 @@ class BayesInference(Inference):
             slope, magnitude, noise = self._return_unit()
             unit = slope * (QUERY_RESOLUTION * self._spread), magnitude, slope * self._spread
             values = slope * similarities
-            first, second = self._most_informative(values, weights, noise, *unit)
+            first, second = self._most_informative(policies, values, weights, noise, *unit)
         return policies[first], policies[second]
 
     def _most_informative(
         self,
+        shown: Sequence[Shown] | np.ndarray,
         values: np.ndarray,
         weights: np.ndarray,
         noise: Any,
@@ -337,14 +344,19 @@ class BayesInference(Inference):
         spread: float,
     ) -> tuple[int, int]:
         """See :func:`queries.most_informative_pair`; and :meth:`People.probabilities`."""
+        see = self.visibility
+        visibility: queries.Visibility | None = (
+            None if see is None else lambda first, second: see(shown[first], shown[second])
+        )
         if self.people is None:
-            return queries.most_informative_pair(values, weights, noise, error, magnitude)
+            unit = error, magnitude
+            return queries.most_informative_pair(values, weights, noise, *unit, visibility)
         people = self.people
         if noise is not self.noise_model:
             people = People(self.rule.question, noise)
         largest = float(np.ptp(values, axis=1).max())
         table = people.table(self.people_shares, largest, error, magnitude, spread)
-        return queries.most_telling_pair(values, weights, *table)
+        return queries.most_telling_pair(values, weights, *table, visibility)
 
     def _ask_about(self, library: list[Trajectory]) -> tuple[int, int]:
         if self.rule.query_rule == "random":
@@ -356,7 +368,7 @@ class BayesInference(Inference):
         error = self._decoder_error(2.0 * float(np.mean([len(item) for item in library])))
         magnitude = float(2.0 * np.abs(returns).mean())
         unit = error, magnitude, self._return_spread(library)
-        return self._most_informative(returns, self.weights, self.noise_model, *unit)
+        return self._most_informative(library, returns, self.weights, self.noise_model, *unit)
 
     def tell(self, preference: Preference, left: Shown, right: Shown) -> None:
         if self.likelihood == "decoder":

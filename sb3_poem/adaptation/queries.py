@@ -4,6 +4,7 @@ nothing loops over pairs.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
@@ -15,6 +16,12 @@ QUERY_RULES = ("worst-case", "information-gain", "random")
 # Differences that are compared at a time: with a thousand candidates all pairs' would take
 # gigabytes.
 BLOCK_ENTRIES = 2**17
+# Pairs that are looked at for one question: each is rolled out.
+MOST_LOOKS = 6
+
+#: The share in [0, 1] of what the answer about a pair of policies tells, given by their numbers,
+#: that is left when a person has to see their difference.
+Visibility = Callable[[int, int], float]
 
 
 def check_epsilon(epsilon: float) -> None:
@@ -77,9 +84,14 @@ def information_gains(probabilities: np.ndarray, weights: np.ndarray) -> np.ndar
 
 
 def most_informative_pair(
-    values: np.ndarray, weights: np.ndarray, noise: NoiseModel, error: float, magnitude: float
+    values: np.ndarray,
+    weights: np.ndarray,
+    noise: NoiseModel,
+    error: float,
+    magnitude: float,
+    visibility: Visibility | None = None,
 ) -> tuple[int, int]:
-    """The pair of n policies whose comparison is expected to tell most.
+    """The pair of n policies whose comparison is expected to tell most (see :func:`best_pair`).
 
     :param values: (m, n) predicted fitness under m latents, in the unit of ``error``, a predicted
         difference's standard deviation, and of ``magnitude``, the typical sum of both returns'
@@ -87,14 +99,19 @@ def most_informative_pair(
     :param weights: (m,) summing to one.
     """
     probabilities = noise.probability_left(pair_differences(values), error, magnitude)
-    return pair_at(int(np.argmax(information_gains(probabilities, weights))), values.shape[1])
+    return best_pair(information_gains(probabilities, weights), values.shape[1], visibility)
 
 
 def most_telling_pair(
-    values: np.ndarray, weights: np.ndarray, differences: np.ndarray, probabilities: np.ndarray
+    values: np.ndarray,
+    weights: np.ndarray,
+    differences: np.ndarray,
+    probabilities: np.ndarray,
+    visibility: Visibility | None = None,
 ) -> tuple[int, int]:
     """The pair of n policies of whose comparison the answer, one of several, is expected to tell
-    most about m latents: its entropy minus its mean entropy under each of them.
+    most about m latents: its entropy minus its mean entropy under each of them (see
+    :func:`best_pair`).
 
     :param values: (m, n) predicted fitness.
     :param weights: (m,) summing to one.
@@ -109,7 +126,26 @@ def most_telling_pair(
     gains = -(_self_information(table).sum(axis=0)[nearest] @ weights)
     for each in table:
         gains += _self_information(each[nearest] @ weights)
-    return pair_at(int(np.argmax(gains)), values.shape[1])
+    return best_pair(gains, values.shape[1], visibility)
+
+
+def best_pair(gains: np.ndarray, n: int, visibility: Visibility | None = None) -> tuple[int, int]:
+    """The pair of n policies with the highest gain times visibility. The pairs of the highest gains
+    are looked at in turn, at most six, and no further than another could still be better.
+
+    :param gains: In the order of :func:`pair_differences`.
+    :param visibility: None counts all as 1.
+    """
+    order = np.argsort(-gains, kind="stable")[:MOST_LOOKS] if visibility else [np.argmax(gains)]
+    best, highest = pair_at(int(order[0]), n), -np.inf
+    for index in order:
+        if gains[index] <= highest:
+            break
+        pair = pair_at(int(index), n)
+        worth = float(gains[index]) * (visibility(*pair) if visibility else 1.0)
+        if worth > highest:
+            best, highest = pair, worth
+    return best
 
 
 def random_pair(n: int, rng: np.random.Generator) -> tuple[int, int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, TypeVar
 
@@ -116,12 +116,15 @@ class Setting:
     :param env: Where rollouts are made; None where none are.
     :param task: (task_dim,) by which a rule that may read rewards reads them; None takes the one in
         effect in ``env``.
+    :param visibility: The share in [0, 1] of a question's information that is left when a person
+        has to see the difference of what is shown; None where nobody looks.
     """
 
     n_queries: int = 10
     library: Sequence[Trajectory] | None = None
     env: VecEnv | None = None
     task: np.ndarray | None = None
+    visibility: Callable[[Shown, Shown], float] | None = None
 
 
 @dataclass(frozen=True, repr=False)

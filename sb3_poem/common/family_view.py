@@ -264,6 +264,14 @@ class FamilyView:
         """Potentials (...) of observations (..., obs_dim) under tasks (..., task_dim)."""
         return self._call("compute_potential", tasks, observations, dtype=None)
 
+    def visible_difference(self, left: np.ndarray, right: np.ndarray, spread: np.ndarray) -> float:
+        """See :meth:`poem_envs.TaskFamily.visible_difference`; infinite where the family does not
+        say.
+        """
+        if not self.env.has_attr("visible_difference"):
+            return np.inf
+        return float(self._call("visible_difference", left, right, spread))
+
     def set_tasks(self, tasks: np.ndarray) -> None:
         """Give copy i the task ``tasks[i]``, from its next reset on."""
         env: Any = self.env

@@ -155,9 +155,10 @@ class _Pages:
         token = await self.sessions.begin(fields.get("model", [""])[0])
         return RedirectResponse(f"/s/{token}{'/instructions' if self.instructions else ''}", 303)
 
-    async def read(self, request: Request, _: Session) -> Response:
+    async def read(self, request: Request, session: Session) -> Response:
         if not self.instructions:
             raise HTTPException(404, "There are no instructions.")
+        await self.sessions.prepare(session)
         values = {"instructions": self.instructions, "token": request.path_params["token"]}
         return self._html("instructions.html", **values)
 

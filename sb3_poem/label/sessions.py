@@ -118,15 +118,24 @@ class SessionManager:
             self._activate(session)
         return session
 
+    async def prepare(self, session: Session) -> None:
+        """Begin what the page will show, for a person who is about to come to it."""
+        self._activate(session)
+        session, answers, kind, turn, _ = await asyncio.to_thread(self._look, session.id)
+        if turn is None:
+            self._begin_turn(session, len(answers), kind)
+
     async def view(self, session: Session) -> dict[str, Any]:
         """All that the page shows, JSON-ready. What is missing for it is begun."""
         active = self._activate(session)
-        session, answered, kind, turn, shown = await asyncio.to_thread(self._look, session.id)
+        session, answers, kind, turn, shown = await asyncio.to_thread(self._look, session.id)
+        answered, names = len(answers), ("question", "preference", "fps", "frames")
         view: dict[str, Any] = {
             "phase": "preparing",
             "question": session.question,
             "model": session.model,
             "answered": answered,
+            "answers": [{name: answer[name] for name in names} for answer in answers],
             "target": session.target,
             "step": session.step,
             "wish": session.wish,
@@ -178,13 +187,16 @@ class SessionManager:
             film_every=film_every,
         )
 
-    def _look(self, number: int) -> tuple[Session, int, str, Any, Any]:
-        """The session, its answers, the turn that is due and its kind, else the question before."""
-        session, answered = self.store.session(number), len(self.store.answers(number))
+    def _look(self, number: int) -> tuple[Session, list[Any], str, Any, Any]:
+        """The session, its answers, the kind of the turn that is due, the turn itself, if there is
+        one, and it or else the question before.
+        """
+        session, answers = self.store.session(number), self.store.answers(number)
+        answered = len(answers)
         kind = "result" if session.stopped or answered >= session.target else "question"
         turn = self.store.turn(number, kind, answered)
         question = partial(self.store.turn, number, "question")
-        return session, answered, kind, turn, turn or question(answered) or question(answered - 1)
+        return session, answers, kind, turn, turn or question(answered) or question(answered - 1)
 
     def _activate(self, session: Session) -> _Active:
         if session.id not in self._active:

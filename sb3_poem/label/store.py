@@ -184,9 +184,12 @@ class Store:
         return [_session(row) for row in self._all("SELECT * FROM sessions ORDER BY id")]
 
     def answers(self, session: int) -> list[sqlite3.Row]:
-        """The rows of the answers in force, in order."""
+        """The rows of the answers in force, in order, with their films' ``fps`` and ``frames``."""
         return self._all(
-            "SELECT * FROM answers WHERE session = ? AND undone IS NULL ORDER BY number", session
+            "SELECT answers.*, turns.fps, turns.frames "
+            "FROM answers JOIN turns ON turns.id = answers.question "
+            "WHERE answers.session = ? AND undone IS NULL ORDER BY answers.number",
+            session,
         )
 
     def turn(self, session: int, kind: str, number: int) -> sqlite3.Row | None:

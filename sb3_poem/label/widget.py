@@ -124,5 +124,5 @@ class LabelWidget:
     def _repr_html_(self) -> str:
         return (
             f'<iframe src="{html.escape(self.url)}" width="100%" height="{self.height}" '
-            f'style="border:0" title="Which one is better?"></iframe>'
+            f'allow="fullscreen" style="border:0" title="Which one is better?"></iframe>'
         )

@@ -16,8 +16,9 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
-from worlds import Blinded, SpeedEnv, SpeedModel, SpeedVecEnv
+from worlds import HORIZON, Blinded, SpeedEnv, SpeedModel, SpeedVecEnv
 
+from poem_envs import TaskFamily
 from sb3_poem import ANOLE, POEMSAC, Bayes, MAMLReward, Paper, set_task
 from sb3_poem.adaptation import (
     BoltzmannNoise,
@@ -39,6 +40,7 @@ from sb3_poem.adaptation import (
 )
 from sb3_poem.adaptation.rule import Answer
 from sb3_poem.common.digest import digest_of
+from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.resources import pretrained_folder
 
@@ -297,6 +299,60 @@ def test_a_digest_is_of_the_numbers_not_of_how_they_are_kept():
     assert digest_of({"a": numbers.reshape(3, 2), "b": torch.ones(1)}) != digest
     assert digest_of({"a": numbers, "c": torch.ones(1)}) != digest
     assert digest_of({"a": numbers + 1e-7, "b": torch.ones(1)}) != digest
+
+
+class WatchedEnv(SpeedEnv):
+    """What people can see of it is what a family's features show."""
+
+    visible_difference = TaskFamily.visible_difference
+
+
+def test_people_are_not_asked_about_what_looks_alike(tmp_path):
+    def episode(speed, feature):
+        rows = np.column_stack([np.zeros(HORIZON + 1), np.full(HORIZON + 1, speed)])
+        seen = feature + np.random.default_rng(0).normal(size=(HORIZON, 1))
+        return Trajectory(rows, np.zeros((HORIZON, 1)), np.full(5, speed), seen)
+
+    # The decoder tells all three apart, a person only the last from the others.
+    library = [episode(1.0, 0.0), episode(2.0, 0.02), episode(2.2, 3.0)]
+
+    def asked(oracle, env=WatchedEnv):
+        a = adapter(env(render_mode="rgb_array"), rule=SMALL, library=library, oracle=oracle)
+        return {a.ask().left, a.ask().right}
+
+    person = HumanOracle(tmp_path)
+    assert asked(ReturnOracle()) == asked(None) == asked(person, SpeedEnv) == set(library[:2])
+    assert asked(person) == {library[0], library[2]}
+
+
+@pytest.mark.parametrize("question", ["pair", "graded"])
+def test_a_question_that_looked_alike_is_replaced_by_the_next_best(tmp_path, question):
+    rule = Bayes(question=question, noise_model=MistakeNoise(0.05))
+    plain = adapter(make_env(render_mode="rgb_array"), rule=rule, render=True)
+    best = {plain.ask().left.latent[0], plain.ask().right.latent[0]}
+    looked = []
+
+    class Watched(SpeedEnv):
+        def visible_difference(self, left, right, spread):
+            speeds = np.sort([SpeedModel.speed([z]) for z in best])
+            looked.append(np.sort([left.mean(), right.mean()]))
+            assert spread == pytest.approx(np.std([left, right]))  # all that the person has seen
+            return 0.0 if np.allclose(looked[-1], speeds, atol=1e-4) else 5.0
+
+    env = Watched(render_mode="rgb_array")
+    a = adapter(env, rule=rule, oracle=HumanOracle(tmp_path, question=question))
+    query = a.ask()
+    assert len(looked) == 2
+    assert {query.left.latent[0], query.right.latent[0]} != best
+    assert len(query.left.frames) == HORIZON
+    again = PreferenceAdapter.from_json(a.to_json(), SpeedModel(), env, oracle=a.oracle).ask()
+    np.testing.assert_array_equal(again.left.observations, query.left.observations)
+    np.testing.assert_array_equal(again.right.frames, query.right.frames)
+    # A simulated oracle sees everything, whether or not there is a film.
+    simulated = ReturnOracle(thresholds=thresholds_of(rule) and (1.0, 2.0))
+    one = adapter(Watched(render_mode="rgb_array"), rule=rule, oracle=simulated, render=True)
+    assert {one.ask().left.latent[0], one.ask().right.latent[0]} == best
+    assert len(looked) == 2
 
 
 def test_a_model_that_was_not_trained(point_goal):

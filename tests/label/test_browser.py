@@ -513,6 +513,89 @@ def test_both_robots_in_one_picture(
     assert page.is_hidden("#race")
 
 
+def test_answers_can_be_looked_at_again(
+    open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
+) -> None:
+    person = begin(open_page, server, point_goal, 2.6)
+    page = person.page
+    picture = "() => [...document.querySelectorAll('canvas')].map(canvas => canvas.toDataURL())"
+    assert page.is_hidden("#past")
+    page.evaluate("() => player.seek(20)")
+    first = page.wait_for_function("() => player.drawn === 20") and page.evaluate(picture)
+    person.answer(2)
+    said = {"much left": "Left much better", "left": "Left a bit better", "equal": "Can"}  # 't tell
+    said |= {"right": "Right a bit better", "much right": "Right much better"}
+    page.click("#past summary")
+    items = page.locator("#past li").all_inner_texts()
+    assert len(items) == 2
+    for item, preference in zip(items, person.stored(), strict=True):
+        assert item.startswith(said[preference])
+    page.get_by_role("button", name="Show pair 1 again").click()
+    page.wait_for_selector(".past #then")
+    page.evaluate("() => player.seek(20)")
+    page.wait_for_function("() => player.drawn === 20")
+    assert page.evaluate(picture) == first
+    assert items[0].split(" Show")[0] in page.text_content("#then")
+    assert page.evaluate("() => document.activeElement.id") == "back"
+    # Nothing is answered here, and nothing changes.
+    assert page.is_hidden("#answers")
+    for key in ("ArrowLeft", "1"):
+        page.keyboard.press(key)
+    assert page.evaluate("() => [view.answered, busy]") == [2, False]
+    page.click("#back")
+    page.wait_for_selector("#answers:visible")
+    assert page.is_hidden("#then")
+    person.answer(1)
+    page.get_by_role("button", name="Show pair 3 again").click()
+    page.wait_for_selector(".past #then")
+    page.keyboard.press("u")  # of the very pair that is shown
+    page.wait_for_function("() => view.answered === 2 && !busy")
+    assert page.is_visible("#answers")
+    assert page.locator("#past li").count() == 2
+    person.answer(3)
+    page.get_by_role("button", name="Show pair 2 again").click()  # from the result
+    page.wait_for_selector(".past #then")
+    assert page.is_hidden("#result")
+    page.click("#back")
+    page.wait_for_selector("#result:visible")
+    assert page.is_hidden("#right-figure")
+
+
+@pytest.mark.parametrize("viewport", [DESKTOP, PHONE, LANDSCAPE])
+def test_the_films_fill_the_screen(
+    open_page: Callable[..., Any], server: Server, point_goal: ModelInfo, viewport: dict[str, int]
+) -> None:
+    person = begin(open_page, server, point_goal, 2.0, viewport=viewport)
+    page, width, height = person.page, viewport["width"], viewport["height"]
+    full = "() => document.fullscreenElement !== null"
+    for screens in (["#race-screen"], ["#left-screen", "#right-screen"]):
+        before = page.locator(screens[0]).bounding_box()["height"]
+        page.keyboard.press("f")
+        page.wait_for_function(full)
+        assert page.get_attribute("#full", "aria-pressed") == "true"
+        seen = page.evaluate("() => [stage.scrollWidth, stage.scrollHeight]")
+        assert seen == [width, height]  # without scrolling
+        boxes = [page.locator(screen).bounding_box() for screen in screens]
+        areas = [min(box["width"] / 4, box["height"] / 3) for box in boxes]
+        assert min(areas) * 3 > (before if viewport is not PHONE else 0.9 * before)
+        assert page.is_hidden("#wish")
+        for name in ("left", "equal", "right"):
+            button = page.locator(f"[data-preference={name}]").bounding_box()
+            assert button["y"] + button["height"] <= height
+            assert button["height"] >= 44
+        page.keyboard.press("r")
+        page.keyboard.press("Escape")
+        page.wait_for_function(f"!({full})()")
+    page.click("#full")
+    page.wait_for_function(full)
+    person.answer(1)
+    person.answer(1, keyboard=True)
+    assert page.evaluate(full)  # from question to question
+    page.click("#full")
+    page.wait_for_function(f"!({full})()")
+    assert page.get_attribute("#full", "aria-pressed") == "false"
+
+
 def test_the_choice_of_robots(open_page: Callable[..., Any], server: Server) -> None:
     page = open_page(server.url)
     assert page.text_content("h2") == "Where should it go?"
@@ -532,6 +615,7 @@ def test_a_phone(open_page: Callable[..., Any], server: Server, point_goal: Mode
         "#play",
         "#race",
         ".speed",
+        "#full",
     ):
         box = page.locator(selector).bounding_box()
         stage = page.locator(".stage").bounding_box()

@@ -65,6 +65,9 @@ def test_a_whole_conversation(served: tuple[TestClient, Store], tmp_path: Path) 
     for number, preference in enumerate(("left", "equal", "right")):
         view = settled(client, session)
         assert (view["phase"], view["answered"], view["target"]) == ("question", number, 3)
+        assert [given["preference"] for given in view["answers"]] == ["left", "equal"][:number]
+        for given in view["answers"]:
+            assert client.get(f"{session}/video/{given['question']}").status_code == 200
         assert len(view["belief"]["points"]) == len(view["belief"]["weights"])
         video = client.get(f"{session}/video/{view['turn']['id']}")
         assert video.headers["content-type"] == "video/mp4"
@@ -316,6 +319,17 @@ def test_instructions_come_before_the_first_question(store: Store, point_goal: M
         assert "Think of <em>one</em> place." in told
         assert "<script" not in told
         assert f'href="{session}"' in told  # onwards
+        # The first question is made meanwhile; the page itself has not asked for it.
+        found = store.find(session.rpartition("/")[2])
+        assert found is not None
+        for _ in range(1500):
+            turn = store.turn(found.id, "question", 0)
+            if turn is not None:
+                break
+            time.sleep(0.02)
+        assert turn is not None
+        assert turn["shown"] is None
+        assert settled(client, session)["turn"]["id"] == turn["id"]
         assert f'href="{page}"' in client.get(session).text  # and back to read again
 
 

@@ -247,3 +247,36 @@ def test_a_split_that_there_is_not(env_id):
         make(env_id, split="test")
     with pytest.raises(ValueError, match=r"split='test'"):
         gym.make_vec(env_id, num_envs=2, vectorization_mode="vector_entry_point", split="test")
+
+
+@pytest.mark.parametrize(
+    ("env_id", "seen"),
+    [
+        ("poem/PointGoal-v0", [1, 1]),
+        ("poem/HalfCheetahVel-v0", [1, 0]),
+        ("poem/AntGoal-v0", [1, 1, 0]),
+        ("poem/HumanoidDir2D-v0", [1, 1, 0]),
+        ("poem/FetchReach-v0", [1, 1, 1]),
+        pytest.param("poem/MetaWorldML1-v0", [1, 1, 1], marks=pytest.mark.metaworld),
+    ],
+)
+def test_what_people_can_tell_apart(env_id, seen, rng):
+    """A tenth of a standard deviation of what films show, or of their length."""
+    env = make(env_id)
+    spread = rng.uniform(0.5, 2.0, size=len(seen))
+    left = rng.normal(size=(100, len(seen)))
+    for feature, is_seen in enumerate(seen):
+        moved = 0.3 * spread * np.eye(len(seen))[feature]
+        assert env.visible_difference(left, left + moved, spread) == pytest.approx(3.0 * is_seen)
+    assert env.visible_difference(left, left, spread) == 0.0
+    assert env.visible_difference(left, np.tile(left.mean(axis=0), (80, 1)), spread) == (
+        pytest.approx(2.0)
+    )
+    env.close()
+
+
+@pytest.mark.metaworld
+def test_what_earns_the_same_may_look_different():
+    env, rewards = make("poem/MetaWorldML1-v0", env_name="push"), np.ones((9, 1))
+    assert env.visible_difference(rewards, rewards, np.ones(1)) == np.inf
+    env.close()

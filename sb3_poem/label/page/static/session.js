@@ -127,6 +127,7 @@ async function follow() {
 
 async function show(next) {
   const changed = view === null || JSON.stringify(next.belief) !== JSON.stringify(view.belief);
+  if (JSON.stringify(next.answers) !== JSON.stringify(view?.answers)) showPast(next.answers);
   view = next;
   const { phase, answered, target, step } = next;
   const waiting = phase === "preparing";
@@ -145,6 +146,7 @@ async function show(next) {
   for (const button of document.querySelectorAll(".answer")) button.setAttribute("aria-disabled", String(waiting));
   showDoubt();
   if (waiting) return;
+  byId("board").classList.remove("past");
   if (next.turn.id !== shownTurn) {
     await player.load(`${base}/video/${next.turn.id}`, next.turn.fps, next.turn.frames);
     shownTurn = next.turn.id;
@@ -168,6 +170,47 @@ async function show(next) {
     byId("get-policy").href = `${base}/policy.safetensors`;
   }
 }
+
+// The answers so far, in the buttons' words. Their films can be seen again; nothing is answered there.
+function showPast(answers) {
+  byId("past").hidden = answers.length === 0;
+  byId("past-list").replaceChildren(...answers.map((given, index) => {
+    const item = document.createElement("li");
+    const again = document.createElement("button");
+    again.type = "button";
+    again.className = "link";
+    again.textContent = "Show again";
+    again.setAttribute("aria-label", `Show pair ${index + 1} again`);
+    again.addEventListener("click", () => lookBack(given, index));
+    item.append(`${inWords(given.preference)} `, again);
+    return item;
+  }));
+}
+
+function inWords(preference) {
+  const words = document.querySelector(`[data-preference="${preference}"]`).cloneNode(true);
+  words.querySelector("kbd")?.remove();
+  return words.textContent.trim();
+}
+
+async function lookBack(given, index) {
+  if (busy || view.phase === "preparing") return;
+  try {
+    await player.load(`${base}/video/${given.question}`, given.fps, given.frames);
+  } catch (error) {
+    return showError(error.message);
+  }
+  shownTurn = given.question; // what waits takes no answer meanwhile
+  byId("board").classList.add("past");
+  byId("board").classList.remove("single");
+  byId("left-screen").setAttribute("aria-label", "Left video");
+  showRace();
+  byId("task").textContent = `Pair ${index + 1}, as you saw it.`;
+  byId("then-text").textContent = `You said: ${inWords(given.preference)}.`;
+  say(`Pair ${index + 1} again. ${byId("then-text").textContent}`);
+  byId("back").focus();
+}
+byId("back").addEventListener("click", () => show(view).then(() => byId("past").firstChild.focus()));
 
 function question() {
   const { repeats } = view.turn;
@@ -200,6 +243,19 @@ function race() {
   say(wantsRace ? "Both in one picture." : "Two pictures.");
 }
 byId("race").addEventListener("click", race);
+
+// Films and answers alone, as large as the screen.
+function fullScreen() {
+  if (document.fullscreenElement) document.exitFullscreen();
+  else if (document.fullscreenEnabled) byId("stage").requestFullscreen().catch((error) => showError(error.message));
+}
+byId("full").hidden = !document.fullscreenEnabled;
+byId("full").addEventListener("click", fullScreen);
+document.addEventListener("fullscreenchange", () => {
+  const full = document.fullscreenElement !== null;
+  byId("full").setAttribute("aria-pressed", String(full));
+  say(full ? "Full screen; Escape leaves it." : "No longer full screen.");
+});
 
 function showProgress(waiting, answered, result) {
   if (!waiting) waitingSince = null;
@@ -247,6 +303,9 @@ const KEYS = {
   U: undo,
   r: race,
   R: race,
+  f: fullScreen,
+  F: fullScreen,
+  Escape: () => document.fullscreenElement && fullScreen(), // where the browser does not leave by itself
   ",": () => player.step(-1),
   ".": () => player.step(1),
 };
