@@ -6,6 +6,7 @@ A test compares, so that no figure stands there that no store has.
 import json
 import re
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 from sb3_poem.benchmark.store import Store
@@ -130,7 +131,7 @@ def family_section(family: str) -> str:
             rows.append([f"{name}, success", *rates])
     lines = [f"## {family}", ""]
     lines += table(["rule", *(f"k = {k}" for k in ANSWERS), "task known"], rows)
-    lines += ["", *([REMARKS[family], ""] if family in REMARKS else [])]
+    lines += ["", *([fill(REMARKS[family], 120), ""] if family in REMARKS else [])]
     links = [
         f"[{text}]({where}/{page}.md)"
         for page, text in PAGES.items()
