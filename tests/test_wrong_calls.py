@@ -204,7 +204,7 @@ ALGORITHMS = [
     argument(made, "ent_coef", -0.1),
     argument(made, "target_entropy", "low", "auto"),
     argument(made, "seed", -1),
-    argument(made, "similarity", "cosine", "two-encoder"),
+    argument(made, "similarity", "dot", "two-encoder"),
     refused(
         "n_train_tasks",
         lambda _: made("poem/HalfCheetahFwdBack-v0", n_train_tasks=3),

@@ -265,6 +265,8 @@ class PreferenceAdapter:
 
     def _take_oracle(self, oracle: Oracle | None) -> None:
         self.oracle = oracle
+        #: Whether somebody looks at the questions, also while answers given before are told again
+        self._watched = getattr(oracle, "needs_frames", self.render and oracle is None)
         bind = getattr(oracle, "bind", None)
         if bind is not None and getattr(oracle, "env", None) is None:
             bind(self.env)
@@ -306,8 +308,7 @@ class PreferenceAdapter:
         their difference: their family's :meth:`~poem_envs.TaskFamily.visible_difference`, up to 1.
         It is 1 for a simulated oracle.
         """
-        watched = getattr(self.oracle, "needs_frames", self.render and self.oracle is None)
-        family = FamilyView.of(self.env) if watched else None
+        family = FamilyView.of(self.env) if self._watched else None
         if family is None:
             return 1.0
         # The first pair is nearly always the one that is asked about, so that it is filmed at once.

@@ -85,7 +85,9 @@ def test_help_explains_every_argument(algorithm: type[PEARLSAC]) -> None:
 def test_the_signature_of_poem_has_the_arguments_of_pearl() -> None:
     of_pearl, of_poem = (inspect.signature(kind).parameters for kind in (PEARLSAC, POEMSAC))
     assert of_pearl.keys() - of_poem.keys() == {"context_relabel_fraction"}
-    own = {"similarity", "context"} | {name for name in of_poem if name.startswith("preference_")}
+    own = {"similarity", "similarity_temperature", "context"} | {
+        name for name in of_poem if name.startswith("preference_")
+    }
     assert of_poem.keys() - of_pearl.keys() == own
     defaults = {
         name: (of_pearl[name].default, of_poem[name].default) for name in of_poem.keys() - own

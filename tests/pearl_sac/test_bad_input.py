@@ -97,7 +97,11 @@ def test_arguments_of_both(
 @pytest.mark.parametrize(
     ("argument", "value", "message"),
     [
-        ("similarity", "cosine", "similarity must be one of 'two-encoder', 'inner', got 'cosine'"),
+        (
+            "similarity",
+            "dot",
+            "similarity must be one of 'two-encoder', 'cosine', 'inner', got 'dot'",
+        ),
         ("context", "rewards", "context must be one of 'optimal', 'pearl', got 'rewards'"),
         (
             "preference_source",

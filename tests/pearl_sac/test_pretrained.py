@@ -230,7 +230,7 @@ def test_an_activation_that_cannot_be_named_is_refused(tmp_path: Path) -> None:
             return x * x
 
     model = small(POEMSAC, policy_kwargs={"net_arch": ARCH, "activation_fn": Squared})
-    with pytest.raises(ValueError, match=r"activation_fn must be one of torch\.nn.*Squared"):
+    with pytest.raises(ValueError, match=r"activation_fn must be in torch\.nn.*Squared"):
         model.save_pretrained(tmp_path / "m")
     assert not (tmp_path / "m").exists()
 
@@ -252,7 +252,7 @@ def test_an_optimiser_that_cannot_be_named_is_refused(tmp_path: Path) -> None:
         pass
 
     model = small(POEMSAC, policy_kwargs={"net_arch": ARCH, "optimizer_class": Mine})
-    with pytest.raises(ValueError, match=r"optimizer_class must be one of torch\.optim.*Mine"):
+    with pytest.raises(ValueError, match=r"optimizer_class must be in torch\.optim.*Mine"):
         model.save_pretrained(tmp_path / "m")
 
 

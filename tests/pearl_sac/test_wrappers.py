@@ -92,7 +92,7 @@ class OwnVec(VecEnvWrapper):
         (wrappers.ClipAction, "ClipAction"),
         (wrappers.TimeAwareObservation, "TimeAwareObservation"),
         (functools.partial(wrappers.RepeatAction, num_repeats=2), "RepeatAction"),
-        (Wet, r"ActionWrapper \(its wrappers: Monitor, Wet, \w*TimeLimit, "),
+        (Wet, r"ActionWrapper \(it is in: Monitor, Wet, \w*TimeLimit, "),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
