@@ -119,7 +119,8 @@ def known_task_return(
     candidates = _draw_latents(model, n_latents, source, rng)
     others = tasks[:0]
     if limits and shared:
-        drawn = family.sample_tasks(OTHER_TASKS, np.random.default_rng([seed, OTHER_TASK_STREAM]))
+        n = OTHER_TASKS if family.all_tasks is None else len(family.all_tasks)
+        drawn = family.sample_tasks(n, np.random.default_rng([seed, OTHER_TASK_STREAM]))
         others = np.unique(drawn, axis=0)
     every = np.concatenate([tasks, others])
 

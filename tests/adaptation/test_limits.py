@@ -14,6 +14,7 @@ from sb3_poem.adaptation import (
     answer_capacity,
     best_codebook,
     information_limit,
+    known_task_return,
     rate_distortion_limit,
 )
 from sb3_poem.adaptation.limits import best_intervals
@@ -281,3 +282,9 @@ class OtherNoise:
 def test_bad_arguments(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_a_finite_family_s_limit_is_chosen_on_all_of_its_tasks() -> None:
+    env_id = "poem/HalfCheetahFwdBack-v0"
+    known = known_task_return("HalfCheetahFwdBack", env_id, 2, n_latents=6, n_episodes=1)
+    assert known.limit(0) < known.limit(1) - 500  # one policy for both ways, or one for each
