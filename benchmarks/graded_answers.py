@@ -1,12 +1,13 @@
 """What graded answers and an inferred person are worth: returns after some answers, by how is asked
 and by who answers.
 
-    python benchmarks/graded_answers.py --models HalfCheetahVel.zip AntDir2D.zip
+    python benchmarks/graded_answers.py --models pretrained/HalfCheetahVel pretrained/AntDir2D
 
 Each model adapts to 30 tasks that no table uses. Questions are pairs or graded ("much better",
 too); the rule is told how the oracle errs, or infers it with the task. Graded oracles call equal
 what differs by less than 0.12, and much better what differs by more than 1 of the family's spread
-of returns ("other thresholds": 0.3 and 1.6). Writes ``<OUT>/answers.md`` and ``answers.json``.
+of returns ("other thresholds": 0.3 and 1.6). Writes ``<OUT>/answers.md`` and ``answers.json``; cells
+that the latter holds are not run again.
 """
 
 import json
@@ -34,14 +35,14 @@ KINDS = (("pair", False), ("pair", True), ("graded", False), ("graded", True))
 def main() -> None:
     args = arguments(
         __doc__,
-        models=[""],
+        models={"nargs": "+", "required": True},
         tasks=30,
         episodes=5,
         seed=300,
         out={"type": Path, "default": RESULTS / "answers"},
     )
-    file = args.out / "cells.json"
-    record = json.loads(file.read_text()) if file.exists() else {}
+    file = args.out / "answers.json"
+    record = json.loads(file.read_text())["results"] if file.exists() else {}
     args.out.mkdir(parents=True, exist_ok=True)
     for path in args.models:
         model = load_model(path)
@@ -68,7 +69,7 @@ def main() -> None:
             )
             record[key] = [round(float(value), 2) for value in evaluation.mean_returns]
             print(key, record[key], flush=True)
-            file.write_text(json.dumps(record, indent=1))
+            file.write_text(json.dumps({"results": record}, indent=1))
         env.close()
     rows = [[*key.split(" | "), *values] for key, values in record.items()]
     head = ["family", "oracle", "question", "how it errs", *(f"{n} answers" for n in ANSWERS)]

@@ -598,7 +598,6 @@ class PEARLSAC(SAC):
         for name in ("relabel_fraction", "context_relabel_fraction"):
             if getattr(self, name) is None:
                 setattr(self, name, 0.5 if family.shared_dynamics else 0.0)
-        for name in ("relabel_fraction", "context_relabel_fraction"):
             if getattr(self, name) > 0 and not family.shared_dynamics:
                 raise ValueError(
                     f"{name} must be 0: the tasks of {family.env_id} do not share dynamics"
