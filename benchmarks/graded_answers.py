@@ -6,8 +6,8 @@ and by who answers.
 Each model adapts to 30 tasks that no table uses. Questions are pairs or graded ("much better",
 too); the rule is told how the oracle errs, or infers it with the task. Graded oracles call equal
 what differs by less than 0.12, and much better what differs by more than 1 of the family's spread
-of returns ("other thresholds": 0.3 and 1.6). Writes ``<OUT>/answers.md`` and ``answers.json``; cells
-that the latter holds are not run again.
+of returns ("other thresholds": 0.3 and 1.6). Writes ``<OUT>/answers.md`` and ``answers.json``;
+cells that the latter holds are not run again.
 """
 
 import json
