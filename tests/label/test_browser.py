@@ -593,7 +593,7 @@ def test_the_films_fill_the_screen(
     assert page.evaluate(full)  # from question to question
     page.click("#full")
     page.wait_for_function(f"!({full})()")
-    assert page.get_attribute("#full", "aria-pressed") == "false"
+    page.wait_for_selector("#full[aria-pressed=false]")
 
 
 def test_the_choice_of_robots(open_page: Callable[..., Any], server: Server) -> None:
