@@ -18,7 +18,6 @@ FAMILIES = (*TABLE_3, "FetchReach", "PointGoal")
 ANSWERS = (0, 1, 2, 5, 10)
 #: How the models were made that are not what a run of their entry gives
 REMARKS = {
-    "FetchReach": "Trained with other hyperparameters, for a third of the steps of the entry.",
     "MetaWorldML1": "Trained with other hyperparameters, for half the steps of the entry.",
     "AntFwdBack": "Trained in three stages, in the last with half of each batch mirrored.",
     "HumanoidDir2D": "Trained in stages with another reward weight, the last on a GPU.",
