@@ -1,16 +1,17 @@
 """One gradient step of POEM with all its losses: ours, a plain implementation's, SB3's SAC, and the
 matrix products alone.
 
-python benchmarks/bench_gradient_step.py [--sizes small paper] [--threads 2] [--device cpu]
+python benchmarks/bench_gradient_step.py [--sizes entries paper] [--threads 2] [--sbx]
 
 Contenders take turns within one run; a figure is the median of their turns. *plain* is the same
 mathematics in eager float32 (`plain_poem.py`; its losses are compared with ours first). *SAC* is
 Stable-Baselines3's own on as many transitions: it has no encoder, decoder, embeddings or
-preferences. *products* is the time of `torch.mm` for every matrix product of our step, on operands
-of the same shapes, strides and type. What happens once an epoch (posteriors, the decoder's error)
-is timed on its own and subtracted. On a GPU, *on the processor* is our step on that machine's
-processor, with the given number of threads, and the matrix products are replayed as one CUDA graph,
-as our step is.
+preferences, and its actor learns in every step. *SBX* (`--sbx`; `pip install 'sb3_poem[sbx]'`) is
+SAC in JAX and float32; *SBX, delayed* trains its actor as seldom as we do. *products* is the time
+of `torch.mm` for every matrix product of our step, on operands of the same shapes, strides and
+type. What happens once an epoch (posteriors, the decoder's error) is timed on its own and
+subtracted. On a GPU, *on the processor* is our step on that machine's processor, with the given
+number of threads, and the matrix products are replayed as one CUDA graph, as our step is.
 """
 
 import statistics
@@ -23,20 +24,23 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from common import DEVICE, arguments, seconds_in_turns, table, write
-from plain_poem import PlainPOEM
+from plain_poem import PlainPOEM, fields
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import configure
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from poem_envs.vector import available_cores
 from sb3_poem import POEMSAC
 from sb3_poem.common.precision import MixedPrecision
 from sb3_poem.pearl_sac.objective import kl_to_prior
 
+#: Of *entries*, the defaults of POEMSAC, with which those of ``zoo_configs/`` train
 SIZES: dict[str, dict[str, Any]] = {
-    "small": {"tasks": 16, "batch": 128, "widths": [256, 256], "steps": 20},
-    "paper": {"tasks": 32, "batch": 256, "widths": [300, 300, 300], "steps": 4},
+    "entries": {"tasks": 20, "batch": 32, "context": 32, "widths": [256, 256], "steps": 40},
+    "small": {"tasks": 16, "batch": 128, "context": 128, "widths": [256, 256], "steps": 20},
+    "paper": {"tasks": 32, "batch": 256, "context": 128, "widths": [300, 300, 300], "steps": 4},
 }
-CONTEXT_SIZE, N_TRAIN_TASKS, HORIZON = 128, 120, 200
+N_TRAIN_TASKS, HORIZON = 120, 200
 #: A GPU's first steps of a call are not captured yet; there should be many more of them, as there
 #: are in training
 STEPS_ON_GPU = {"ours": 1000, "ours, float32": 1000, "SAC": 100}
@@ -46,7 +50,7 @@ def poem(size: dict[str, Any], precision: str, device: str) -> POEMSAC:
     """A model with an epoch of data, ready for gradient steps."""
     settings: dict[str, Any] = {"gradient_steps": 0, "n_train_tasks": N_TRAIN_TASKS, "seed": 0}
     settings |= {"meta_batch_size": size["tasks"], "batch_size": size["batch"]}
-    settings |= {"context_size": CONTEXT_SIZE, "precision": precision, "device": device}
+    settings |= {"context_size": size["context"], "precision": precision, "device": device}
     arch = {"net_arch": {"pi": size["widths"], "qf": size["widths"]}}
     model = POEMSAC("MlpPolicy", "poem/HalfCheetahVel-v0", policy_kwargs=arch, **settings)
     return model.learn(N_TRAIN_TASKS * HORIZON)
@@ -56,7 +60,11 @@ def sac(size: dict[str, Any], device: str) -> SAC:
     """SB3's own SAC with as many transitions in its buffer."""
     settings: dict[str, Any] = {"policy_kwargs": {"net_arch": size["widths"]}, "device": device}
     settings |= {"buffer_size": N_TRAIN_TASKS * HORIZON, "seed": 0}
-    model = SAC("MlpPolicy", gym.make("HalfCheetah-v5"), **settings)
+    return filled(SAC("MlpPolicy", gym.make("HalfCheetah-v5"), **settings))
+
+
+def filled(model: Any) -> Any:
+    """A SAC with random transitions in its buffer."""
     model.set_logger(configure(None, []))
     buffer, rng = model.replay_buffer, np.random.default_rng(0)
     assert buffer is not None
@@ -65,6 +73,23 @@ def sac(size: dict[str, Any], device: str) -> SAC:
         action = rng.uniform(-1, 1, (1, 6))
         buffer.add(obs, next_obs, action, rng.normal(size=1), np.zeros(1), [{}])
     return model
+
+
+def sbx_sac(size: dict[str, Any], steps: int, policy_delay: int) -> Callable[[], None]:
+    """SBX's SAC on as many transitions.
+
+    :raises SystemExit: if the extra is not installed
+    """
+    try:
+        import sbx
+    except ImportError:
+        raise SystemExit(
+            "--sbx measures SBX's SAC, which is not installed: pip install 'sb3_poem[sbx]'"
+        ) from None
+    settings: dict[str, Any] = {"policy_kwargs": {"net_arch": size["widths"]}, "seed": 0}
+    settings |= {"buffer_size": N_TRAIN_TASKS * HORIZON, "policy_delay": policy_delay}
+    model = filled(sbx.SAC("MlpPolicy", gym.make("HalfCheetah-v5"), **settings))
+    return partial(model.train, steps, size["tasks"] * size["batch"])
 
 
 def compare_losses(model: POEMSAC, plain: PlainPOEM, size: dict[str, Any]) -> dict[str, float]:
@@ -76,7 +101,7 @@ def compare_losses(model: POEMSAC, plain: PlainPOEM, size: dict[str, Any]) -> di
     batch = model.make_sampler().sample(1, size["batch"])[0]
     noises = [batch.latent_noise, batch.next_action_noise, batch.action_noise]
     theirs = plain.losses(
-        list(batch.transitions[:5]), batch.context, batch.context_rewards, batch.returns, noises
+        fields(model, batch), batch.context, batch.context_rewards, batch.returns, noises
     )
     with th.no_grad():
         mean, variance = model.policy.encoder(batch.context)
@@ -86,9 +111,9 @@ def compare_losses(model: POEMSAC, plain: PlainPOEM, size: dict[str, Any]) -> di
         actor, log_prob = objective.actor_loss(batch, data, embeddings, alpha)
         ours = {
             "critic": objective.critic_loss(batch, data, embeddings, alpha),
+            "kl": kl_to_prior(mean, variance).mean(),
             "actor": actor,
             "decoder": objective.decoder_loss(batch, data, embeddings),
-            "kl": kl_to_prior(mean, variance).mean(),
             "preference": objective.embedding_loss(batch, embeddings)[1]["preference_loss"],
             "log_prob": log_prob,
         }
@@ -149,14 +174,16 @@ def strided(
 
 
 def products_of_a_step(model: POEMSAC, size: dict[str, Any]) -> Products:
-    """The matrix products of one gradient step."""
-    policy, products = model.policy, Products()
+    """The matrix products of as many gradient steps as there are to one of the actor."""
+    policy, products, delay = model.policy, Products(), model.policy_delay
     networks = [policy.encoder, policy.decoder, policy.actor, policy.critic, policy.critic_target]
     with MixedPrecision(th.nn.ModuleList(networks), model.hidden_dtype) as precision:
         precision.refresh()
         batch = model.make_sampler().sample(1, size["batch"])[0]
+        objective, alpha = model.make_objective(), model.entropy_coefficient.value
         with products:
-            model.make_objective().loss(batch, model.entropy_coefficient.value)[0].backward()
+            for step in range(delay):
+                objective.loss(batch, alpha, whole=step == 0)[0].backward()
     policy.optimizer.zero_grad(set_to_none=True)
     return products
 
@@ -176,7 +203,13 @@ def captured(run: Callable[[], None]) -> Callable[[], None]:
     return replay
 
 
-def measure(name: str, device: str, turns: int) -> dict[str, Any]:
+def repeat(plain: PlainPOEM, size: dict[str, Any]) -> None:
+    """The plain implementation's steps, one of them whole."""
+    for _ in range(plain.settings.policy_delay):
+        plain.step(size["tasks"], size["batch"])
+
+
+def measure(name: str, device: str, turns: int, sbx: bool) -> dict[str, Any]:
     """One size: milliseconds a step of every contender."""
     size = SIZES[name]
     n, steps = size["tasks"] * size["batch"], size["steps"]
@@ -189,7 +222,12 @@ def measure(name: str, device: str, turns: int) -> dict[str, Any]:
         "SAC": (lambda: plain_sac.train(n_steps["SAC"], n), n_steps["SAC"]),
     }
     run = products.contender()
-    contenders["products"] = (run if device == "cpu" else captured(run), 1)
+    contenders["products"] = (run if device == "cpu" else captured(run), fast.policy_delay)
+    if sbx:
+        contenders |= {
+            "SBX": (sbx_sac(size, steps, 1), steps),
+            "SBX, delayed": (sbx_sac(size, steps, fast.policy_delay), steps),
+        }
     ends = {}
 
     def add(key: str, model: POEMSAC, steps: int) -> None:
@@ -201,7 +239,7 @@ def measure(name: str, device: str, turns: int) -> dict[str, Any]:
     add("ours", fast, n_steps["ours"])
     add("ours, float32", exact, n_steps["ours, float32"])
     if device == "cpu":
-        contenders["plain"] = (partial(plain.step, size["tasks"], size["batch"]), 1)
+        contenders["plain"] = (partial(repeat, plain, size), fast.policy_delay)
     else:
         add("on the processor", poem(size, "auto", "cpu"), steps)
 
@@ -218,30 +256,41 @@ def measure(name: str, device: str, turns: int) -> dict[str, Any]:
     milliseconds = {key: 1e3 * seconds[key] / contenders[key][1] for key in contenders}
     ours, nan = milliseconds["ours"], float("nan")
     return {
-        "size": {key: value for key, value in size.items() if key != "steps"}
-        | {"context": CONTEXT_SIZE},
+        "size": {key: value for key, value in size.items() if key != "steps"},
         "arithmetic of hidden layers": str(fast.hidden_dtype),
         "milliseconds": milliseconds,
         "faster than plain": milliseconds.get("plain", nan) / ours,
         "faster than the processor": milliseconds.get("on the processor", nan) / ours,
         "faster than SAC": milliseconds["SAC"] / ours,
         "share of the products rate": milliseconds["products"] / ours,
-        "gigaflop a step": products.operations / 1e9,
+        "gigaflop a step": products.operations / 1e9 / fast.policy_delay,
         "relative differences of the losses from plain": differences,
     }
 
 
 def main() -> None:
     sizes = {"nargs": "+", "choices": SIZES, "default": list(SIZES)}
-    given = arguments(__doc__, sizes=sizes, threads=[1, 2], turns=5, device=DEVICE)
+    flag = {"action": "store_true", "help": "measure SBX's SAC as well, on a processor"}
+    options = {"sizes": sizes, "threads": [1, 2], "turns": 5, "device": DEVICE, "sbx": flag}
+    given = arguments(__doc__, **options)
     on_cpu = given.device == "cpu"
+    if given.sbx and {available_cores()} != set(given.threads):
+        raise SystemExit(
+            f"--sbx: JAX takes all {available_cores()} core(s) that this process may use, but "
+            f"--threads is {given.threads}: ask for that many threads, or pin it by taskset"
+        )
     reference, rival = ("plain", "plain") if on_cpu else ("on the processor", "the processor")
-    columns = ["ours", "ours, float32", reference, "SAC", "products"]
+    columns = ["ours", "ours, float32", reference, "SAC"]
+    columns += ["SBX", "SBX, delayed"] * given.sbx + ["products"]
     rows, results = [], []
     for threads in given.threads:
         th.set_num_threads(threads)
         for name in given.sizes:
-            result = {"name": name, "threads": threads, **measure(name, given.device, given.turns)}
+            result = {
+                "name": name,
+                "threads": threads,
+                **measure(name, given.device, given.turns, given.sbx),
+            }
             results.append(result)
             cells = [f"{result['milliseconds'][key]:.3g}" for key in columns]
             cells += [f"{result[key]:.1f}x" for key in (f"faster than {rival}", "faster than SAC")]
@@ -251,7 +300,7 @@ def main() -> None:
     text = table(["size", "threads", *(f"{key}, ms" for key in columns), *ratios], rows)
     name = "gradient-step" if on_cpu else f"gradient-step-{given.device}"
     settings = {"turns": given.turns, "device": given.device}
-    settings |= {"context": CONTEXT_SIZE, "tasks": N_TRAIN_TASKS}
+    settings |= {"tasks": N_TRAIN_TASKS}
     sections, threads = [DESCRIPTION, text], max(given.threads)
     write(name, "Gradient step", sections, results, given.out, settings, threads)
 

@@ -7,6 +7,7 @@ network, one after another.
 """
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import torch as th
@@ -14,17 +15,30 @@ from torch import nn
 from torch.nn.functional import binary_cross_entropy_with_logits, mse_loss, softplus
 
 from sb3_poem import POEMSAC
+from sb3_poem.pearl_sac.sampler import Bootstraps, MetaBatch
 
 TRANSITIONS_PER_TASK = 2_000
 
 
-class TaskData:
-    """What one task has collected, as numpy arrays."""
+def fields(model: POEMSAC, batch: MetaBatch) -> list[th.Tensor]:
+    """Observations, actions, next observations and rewards; then what the critics' targets are made
+    of: rewards, observations and discounts. Observations are standardised.
+    """
+    data, ahead, standardise = batch.transitions, batch.bootstraps, model.policy.standardise
+    if ahead is None:
+        discounts = model.gamma * (1.0 - data.terminated)
+        ahead = Bootstraps(data.rewards, data.next_observations, discounts)
+    seen = standardise(data.observations), data.actions, standardise(data.next_observations)
+    return [*seen, data.rewards, ahead.rewards, standardise(ahead.observations), ahead.discounts]
 
-    def __init__(self, model: POEMSAC, task: int) -> None:
-        sources = th.full((1, TRANSITIONS_PER_TASK), task, device=model.device)
-        stored = model.replay_buffer.sample_rows(sources, model.generators.torch)
-        self.fields = [field[0].cpu().numpy().copy() for field in stored[:5]]
+
+class TaskData:
+    """What one task has collected, as numpy arrays: the transitions of a meta-batch of all tasks,
+    standardised, relabelled and with their bootstraps already.
+    """
+
+    def __init__(self, model: POEMSAC, task: int, batch: MetaBatch, row: int) -> None:
+        self.fields = [field[row].cpu().numpy().copy() for field in fields(model, batch)]
         assert model.epoch_context is not None
         self.context = model.epoch_context.transitions[task].cpu().numpy().copy()
         self.context_rewards = model.epoch_context.rewards[task].cpu().numpy().copy()
@@ -61,19 +75,24 @@ class PlainPOEM:
         self.alpha_optimizer = th.optim.Adam([self.log_alpha], lr=rate)
         assert model.epoch_context is not None
         self.returns = model.epoch_context.returns.cpu()
-        self.data = [TaskData(model, task) for task in range(len(self.returns))]
+        n_tasks = len(self.returns)
+        sampler = replace(model.make_sampler(), meta_batch_size=n_tasks)
+        (whole,) = sampler.sample(1, TRANSITIONS_PER_TASK)
+        rows = whole.task_ids.argsort().tolist()
+        self.data = [TaskData(model, task, whole, row) for task, row in enumerate(rows)]
+        self.n_updates = 0
         self.rng = np.random.default_rng(seed)
-        self.obs_mean, self.obs_std = policy.obs_norm.mean.cpu(), policy.obs_norm.std.cpu()
         self.reward_mean = policy.reward_norm.mean.cpu()
         self.reward_std = policy.reward_norm.std.cpu()
         self.reward_variance = model.epoch_context.rewards.var().cpu()
 
     def step(self, n_tasks: int, batch_size: int) -> None:
-        """Sample a meta-batch, and update every network once."""
+        """Sample a meta-batch, and update the networks whose turn it is."""
         tasks = self.rng.choice(len(self.data), size=n_tasks, replace=False)
         batches = [self.data[task].sample(self.rng, batch_size) for task in tasks]
         size = self.settings.context_size
         contexts = [self.data[task].sample_context(self.rng, size) for task in tasks]
+        self.n_updates += 1
         batch = [th.stack(field) for field in zip(*batches, strict=True)]
         context, context_rewards = (th.stack(field) for field in zip(*contexts, strict=True))
         noises = [th.randn(n_tasks, self.settings.latent_dim)]
@@ -87,12 +106,17 @@ class PlainPOEM:
         context_rewards: th.Tensor,
         returns: th.Tensor,
         noises: list[th.Tensor],
-    ) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor, th.Tensor, th.Tensor]:
-        """Losses of the critics, actor, decoder, KL and preferences, and the actions' mean
-        log-probability.
+        whole: bool = True,
+    ) -> tuple[th.Tensor, ...]:
+        """Losses of the critics and KL; if ``whole``, of actor, decoder and preferences, too, and
+        the actions' mean log-probability.
+
+        :param batch: What :func:`fields` gives
         """
-        observations, actions, next_observations, rewards, terminated = batch
-        n_tasks, batch_size = rewards.shape
+        n_tasks, batch_size = batch[3].shape
+        obs, acts, next_obs, rewards, ahead, ahead_obs, discounts = (
+            field.flatten(0, 1) for field in batch
+        )
         alpha = self.log_alpha.detach().exp()
         # posterior: a product of Gaussian factors
         mean, raw = self.encoder(context).chunk(2, dim=-1)
@@ -102,33 +126,33 @@ class PlainPOEM:
         kl = 0.5 * (mean**2 + variance - 1.0 - variance.log()).sum(dim=-1).mean()
         z = mean + variance.sqrt() * noises[0]
         z_rows = z.repeat_interleave(batch_size, dim=0)
-        obs, next_obs = (
-            self.standardise(values).flatten(0, 1) for values in (observations, next_observations)
-        )
-        acts, rews, ends = actions.flatten(0, 1), rewards.flatten(), terminated.flatten()
         # critics
         with th.no_grad():
             z_pi = self.policy_embedding(z_rows)
-            next_actions, next_log_prob = self.act(next_obs, z_pi, noises[1].flatten(0, 1))
-            inputs = th.cat([next_obs, next_actions, z_rows], dim=1)
+            next_actions, next_log_prob = self.act(ahead_obs, z_pi, noises[1].flatten(0, 1))
+            inputs = th.cat([ahead_obs, next_actions, z_rows], dim=1)
             next_values = [target(inputs) for target in self.targets]
             next_value = th.min(*next_values).squeeze(1) - alpha * next_log_prob
-            wanted = rews / self.reward_std + self.settings.gamma * (1.0 - ends) * next_value
+            wanted = ahead / self.reward_std + discounts * next_value
         values = [critic(th.cat([obs, acts, z_rows], dim=1)).squeeze(1) for critic in self.critics]
         critic_loss = sum((0.5 * mse_loss(value, wanted) for value in values), th.zeros(()))
+        if not whole:
+            return critic_loss, kl
         # actor
         z_pi = self.policy_embedding(z_rows)
         new_actions, log_prob = self.act(obs, z_pi, noises[2].flatten(0, 1))
         inputs = th.cat([obs, new_actions, z_rows.detach()], dim=1)
         new_values = [critic(inputs) for critic in self.critics]
         actor_loss = (alpha * log_prob - th.min(*new_values).squeeze(1)).mean()
-        # decoder, on the context (eq. 4)
-        obs_dim, action_dim = obs.shape[1], acts.shape[1]
-        z_context = self.reward_embedding(z)[:, None].expand(-1, context.shape[1], -1)
-        inputs = th.cat([context[..., : 2 * obs_dim + action_dim], z_context], dim=-1)
-        decoded = self.decoder(inputs).squeeze(-1)
+        # decoder (eq. 4), on transitions that are relabelled or else on contexts
+        inputs, seen = th.cat([obs, acts, next_obs], dim=1), rewards
+        if self.settings.relabel_fraction == 0:
+            inputs = context[..., : inputs.shape[1]].flatten(0, 1)
+            seen = context_rewards.flatten()
+        z_r = self.reward_embedding(z).repeat_interleave(len(seen) // n_tasks, dim=0)
+        decoded = self.decoder(th.cat([inputs, z_r], dim=1)).squeeze(1)
         decoded = decoded * self.reward_std + self.reward_mean
-        decoder_loss = mse_loss(decoded, context_rewards) / self.reward_variance
+        decoder_loss = mse_loss(decoded, seen) / self.reward_variance
         # preferences (eqs. 6 and 7), task by task
         z_r, z_pi = self.reward_embedding(z), self.policy_embedding(z)
         first, second = th.triu_indices(n_tasks, n_tasks, offset=1)
@@ -139,7 +163,7 @@ class PlainPOEM:
             margin = scores[first] - scores[second]
             loss = binary_cross_entropy_with_logits
             terms.append(loss(margin[distinct], label[distinct], reduction="none"))
-        return critic_loss, actor_loss, decoder_loss, kl, th.cat(terms).mean(), log_prob.mean()
+        return critic_loss, kl, actor_loss, decoder_loss, th.cat(terms).mean(), log_prob.mean()
 
     def update(
         self,
@@ -150,32 +174,30 @@ class PlainPOEM:
         noises: list[th.Tensor],
     ) -> None:
         """One loss after another, one optimiser after another."""
-        settings = self.settings
-        critic, actor, decoder, kl, preference, log_prob = self.losses(
-            batch, context, context_rewards, returns, noises
-        )
+        settings, whole = self.settings, self.n_updates % self.settings.policy_delay == 0
+        critic, kl, *others = self.losses(batch, context, context_rewards, returns, noises, whole)
         for optimizer in self.optimizers:
             optimizer.zero_grad()
-        (settings.policy_coef * actor).backward(retain_graph=True)
-        for network in self.critics:  # the actor's loss must not move the critics
-            network.zero_grad()
-        coefs = (settings.kl_coef, settings.reward_coef, settings.preference_coef)
-        for coef, loss in zip(coefs, (kl, decoder, preference), strict=True):
-            (coef * loss).backward(retain_graph=True)
+        if whole:
+            actor, decoder, preference, log_prob = others
+            (settings.policy_coef * actor).backward(retain_graph=True)
+            for network in self.critics:  # the actor's loss must not move the critics
+                network.zero_grad()
+            (settings.reward_coef * decoder).backward(retain_graph=True)
+            (settings.preference_coef * preference).backward(retain_graph=True)
+        (settings.kl_coef * kl).backward(retain_graph=True)
         critic.backward()
         for optimizer in self.optimizers:
             optimizer.step()
-        self.alpha_optimizer.zero_grad()
-        assert isinstance(settings.target_entropy, float)
-        (-self.log_alpha * (log_prob.detach() + settings.target_entropy)).sum().backward()
-        self.alpha_optimizer.step()
+        if whole:
+            self.alpha_optimizer.zero_grad()
+            assert isinstance(settings.target_entropy, float)
+            (-self.log_alpha * (log_prob.detach() + settings.target_entropy)).sum().backward()
+            self.alpha_optimizer.step()
         with th.no_grad():
             for target, source in zip(self.targets, self.critics, strict=True):
                 for old, new in zip(target.parameters(), source.parameters(), strict=True):
                     old.mul_(1.0 - settings.tau).add_(settings.tau * new)
-
-    def standardise(self, obs: th.Tensor) -> th.Tensor:
-        return ((obs - self.obs_mean) / self.obs_std).clamp(-10.0, 10.0)
 
     def act(self, obs: th.Tensor, z_pi: th.Tensor, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """A squashed Gaussian action and its log-probability."""
