@@ -7,6 +7,8 @@ value is cast twice. Layers that are normalised before the ReLU have only the la
 """
 
 from collections.abc import Sequence
+from functools import partial
+from itertools import chain
 from typing import Any
 
 import torch as th
@@ -15,6 +17,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import linear
 
 ALIGNMENT = 16
+LAYER_NORM_EPS = 1e-5  # of torch's layer_norm
 
 
 class LowPrecisionMLP:
@@ -23,26 +26,30 @@ class LowPrecisionMLP:
     def __init__(
         self, hidden: Sequence[nn.Linear], output: nn.Linear, dtype: th.dtype, layer_norm: bool
     ) -> None:
-        self.output, self.layer_norm, self.dtype = output, layer_norm, dtype
+        self.hidden, self.output, self.layer_norm, self.dtype = hidden, output, layer_norm, dtype
         alignment = 1 if layer_norm else ALIGNMENT
         widths = [*(layer.in_features for layer in hidden), output.in_features]
         padded = [-(-width // alignment) * alignment for width in widths]
         #: Column of each layer's input that is constantly 1, None without padding
         self.ones = [w if w < room else None for w, room in zip(widths, padded, strict=True)]
-        self.parameters: list[th.Tensor] = []
-        #: The float32 parameters and where their copies are
-        self.pairs: list[tuple[th.Tensor, th.Tensor, tuple[slice, ...]]] = []
-        sizes = zip(hidden, padded, padded[1:], self.ones[1:], strict=False)
-        for layer, columns, rows, spare in sizes:
-            weight = layer.weight.new_zeros(rows, columns, dtype=dtype)
-            bias = layer.weight.new_zeros(rows, dtype=dtype)
+        new = partial(output.weight.new_zeros, dtype=dtype)
+        self.weights = [new(*shape) for shape in zip(padded[1:], padded, strict=False)]
+        self.biases = [new(rows) for rows in padded[1:]]
+        self.out_weight = new(output.out_features, padded[-1])
+        for bias, spare in zip(self.biases, self.ones[1:], strict=True):
             if spare is not None:
                 bias[spare] = 1.0
-            for original, copy in ((layer.weight, weight), (layer.bias, bias)):
-                place = tuple(slice(size) for size in original.shape)
-                copy.requires_grad_(original.requires_grad)
-                self.parameters.append(copy)
-                self.pairs.append((original, copy, place))
+        originals = [layer.weight for layer in [*hidden, output]]
+        originals += [layer.bias for layer in hidden]
+        #: The float32 parameters, and the parts of the copies that follow them
+        self.pairs: list[tuple[th.Tensor, th.Tensor]] = [
+            (original.detach(), copy[tuple(map(slice, original.shape))])
+            for original, copy in zip(
+                originals, [*self.weights, self.out_weight, *self.biases], strict=True
+            )
+        ]
+        #: Whether the float32 parameters have a gradient already
+        self.collected = False
         self._constant = th.zeros(padded[0] - widths[0], device=output.weight.device)
         self._constant[:1] = 1.0
 
@@ -54,68 +61,91 @@ class LowPrecisionMLP:
 
     def evaluate(self, x: th.Tensor, frozen: bool) -> th.Tensor:
         """Outputs (..., out_dim), float32, of :meth:`inputs`."""
-        parameters = [self.output.weight, self.output.bias, *self.parameters]
-        if frozen:
-            parameters = [parameter.detach() for parameter in parameters]
         rows = x.reshape(-1, x.shape[-1])
-        if self.layer_norm:
-            out = _normalised_perceptron(rows, *parameters)
+        if th.is_grad_enabled():
+            weight = self.output.weight
+            out = _Perceptron.apply(rows, self, weight.detach() if frozen else weight)
         else:
-            out = _Perceptron.apply(rows, self.ones, *parameters)
+            out = self.layers(rows)[0]
         return out.view(*x.shape[:-1], -1)
 
+    def layers(self, x: th.Tensor) -> tuple[th.Tensor, list[th.Tensor], list[list[th.Tensor]]]:
+        """Outputs of rows (n, padded), every layer's input, and what normalisation remembers."""
+        values, norms = [x], []
+        for weight, bias in zip(self.weights, self.biases, strict=True):
+            if self.layer_norm:
+                h = linear(values[-1], weight, bias)
+                y, *moments = th.native_layer_norm(h, bias.shape, None, None, LAYER_NORM_EPS)
+                norms.append([h, *moments])
+                values.append(th.relu_(y))
+            else:
+                values.append(_linear_relu(values[-1], weight, bias))
+        output = self.output
+        out = linear(values[-1][:, : output.in_features].float(), output.weight, output.bias)
+        return out, values, norms
 
-def _normalised_perceptron(
-    x: th.Tensor, out_weight: th.Tensor, out_bias: th.Tensor, *hidden: th.Tensor
-) -> th.Tensor:
-    for weight, bias in zip(hidden[::2], hidden[1::2], strict=True):
-        x = th.relu_(nn.functional.layer_norm(linear(x, weight, bias), bias.shape))
-    return linear(x.float(), out_weight, out_bias)
+    def gradient(
+        self,
+        grad: th.Tensor,
+        values: Sequence[th.Tensor],
+        norms: Sequence[Sequence[th.Tensor]],
+        trained: bool,
+        wanted: bool,
+    ) -> th.Tensor | None:
+        """From an output's gradient the input's, if ``wanted``, and where ``trained`` those of the
+        float32 parameters: the first since they changed replaces what was there.
+        """
+        g, last, weight = grad.to(self.dtype), values[-1], self.out_weight
+        if self.layer_norm:
+            g, last, weight = grad, last.float(), self.output.weight
+        if trained:
+            self._collect(self.output, th.mm(g.t(), last), grad.sum(dim=0))
+        g = th.mm(g, weight).to(self.dtype)
+        for index in reversed(range(len(self.weights))):
+            g = th.ops.aten.threshold_backward(g, values[index + 1], 0)
+            if self.layer_norm:
+                h, *moments = norms[index]
+                like = (h, h.shape[1:], *moments, None, None, [True, False, False])
+                g = th.ops.aten.native_layer_norm_backward(g, *like)[0]
+            if trained:
+                one, of_weight = self.ones[index], th.mm(g.t(), values[index])
+                of_bias = g.sum(dim=0) if one is None else of_weight[:, one]
+                self._collect(self.hidden[index], of_weight, of_bias)
+            if index or wanted:
+                g = th.mm(g, self.weights[index])
+        self.collected |= trained
+        return g if wanted else None
+
+    def _collect(self, layer: nn.Linear, *gradients: th.Tensor) -> None:
+        """Give a layer's weight and bias their gradients, of which padding is left out."""
+        for parameter, gradient in zip((layer.weight, layer.bias), gradients, strict=True):
+            if gradient.shape != parameter.shape:
+                gradient = gradient[tuple(map(slice, parameter.shape))]
+            if parameter.grad is None:
+                parameter.grad = th.empty_like(parameter)
+            if self.collected:
+                parameter.grad += gradient
+            else:  # as fast again
+                parameter.grad.copy_(gradient)
 
 
 class _Perceptron(th.autograd.Function):
+    """A network's outputs; parameters get their gradients on the way back, if ``weight`` does."""
+
     @staticmethod
-    def forward(
-        ctx: Any,
-        x: th.Tensor,
-        ones: list[int | None],
-        out_weight: th.Tensor,
-        out_bias: th.Tensor,
-        *hidden: th.Tensor,
-    ) -> th.Tensor:
-        weights, biases = hidden[::2], hidden[1::2]
-        values = [x]
-        for weight, bias in zip(weights, biases, strict=True):
-            values.append(_linear_relu(values[-1], weight, bias))
-        ctx.save_for_backward(out_weight, *weights, *values)
-        ctx.ones = ones
-        return linear(values[-1][:, : out_weight.shape[1]].float(), out_weight, out_bias)
+    def forward(ctx: Any, x: th.Tensor, network: LowPrecisionMLP, weight: th.Tensor) -> th.Tensor:
+        out, values, norms = network.layers(x)
+        ctx.network, ctx.n_values = network, len(values)
+        ctx.save_for_backward(*values, *chain(*norms))
+        return out
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: th.Tensor) -> tuple[th.Tensor | None, ...]:  # type: ignore[override]
-        out_weight, *saved = ctx.saved_tensors
-        n_layers = (len(saved) - 1) // 2
-        weights, values = saved[:n_layers], saved[n_layers:]
-        width, room = out_weight.shape[1], values[-1].shape[1]
-        low = grad.to(values[0].dtype)
-        of_parameters: list[th.Tensor | None] = [None] * (2 + 2 * n_layers)
-        trained = ctx.needs_input_grad[2]
-        if trained:
-            of_parameters[0] = (values[-1].t() @ low)[:width].t().float()
-            of_parameters[1] = grad.sum(dim=0)
-        g = low @ nn.functional.pad(out_weight.to(low.dtype), (0, room - width))
-        for index in reversed(range(n_layers)):
-            g = th.ops.aten.threshold_backward(g, values[index + 1], 0)
-            if trained:
-                # (x^T g)^T rather than g^T x: the former is the faster of the two
-                of_weight = (values[index].t() @ g).t()
-                one = ctx.ones[index]
-                of_parameters[2 + 2 * index] = of_weight
-                of_parameters[3 + 2 * index] = g.sum(dim=0) if one is None else of_weight[:, one]
-            if index or ctx.needs_input_grad[0]:
-                g = g @ weights[index]
-        return g if ctx.needs_input_grad[0] else None, None, *of_parameters
+    def backward(ctx: Any, grad: th.Tensor) -> tuple[th.Tensor | None, None, None]:  # type: ignore[override]
+        values, kept = ctx.saved_tensors[: ctx.n_values], ctx.saved_tensors[ctx.n_values :]
+        norms = [kept[start : start + 3] for start in range(0, len(kept), 3)]
+        wanted, _, trained = ctx.needs_input_grad
+        return ctx.network.gradient(grad, values, norms, trained, wanted), None, None
 
 
 def _fused_linear_is_available() -> bool:

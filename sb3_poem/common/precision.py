@@ -31,8 +31,8 @@ class MixedPrecision:
     """Runs the hidden layers of all rectified perceptrons of a module in another arithmetic, on
     weights that stay float32.
 
-    Within the context, copies of the layers compute; :meth:`refresh` brings them up to date, and
-    :meth:`collect_gradients` takes their gradients back. Float32 changes nothing.
+    Within the context, copies of the layers compute; :meth:`refresh` brings them up to date. Their
+    gradients are added to those of the weights. Float32 changes nothing.
     """
 
     def __init__(self, module: nn.Module, dtype: th.dtype) -> None:
@@ -46,9 +46,9 @@ class MixedPrecision:
                 hidden: list[nn.Linear] = list(part.hidden)  # type: ignore[arg-type]
                 low = LowPrecisionMLP(hidden, part.output, dtype, norm)
                 self._networks.append((part, low))
-        self._pairs = [pair for _, network in self._networks for pair in network.pairs]
-        self._originals: list[th.Tensor] = [original for original, _, _ in self._pairs]
-        self._copies: list[th.Tensor] = [copy.detach()[place] for _, copy, place in self._pairs]
+        pairs = [pair for _, network in self._networks for pair in network.pairs]
+        self._originals = [original for original, _ in pairs]
+        self._copies = [copy for _, copy in pairs]
 
     def __enter__(self) -> "MixedPrecision":
         for part, network in self._networks:
@@ -64,19 +64,5 @@ class MixedPrecision:
         if self._copies:
             with th.no_grad():
                 th._foreach_copy_(self._copies, self._originals)
-
-    def collect_gradients(self) -> None:
-        """Move the gradients of the copies to the float32 weights."""
-        targets, sources = [], []
-        for original, copy, place in self._pairs:
-            if copy.grad is None:
-                if copy.requires_grad:
-                    original.grad = None
-                continue
-            if original.grad is None:
-                original.grad = th.empty_like(original)
-            targets.append(original.grad)
-            sources.append(copy.grad[place])
-            copy.grad = None
-        if targets:
-            th._foreach_copy_(targets, sources)
+        for _, network in self._networks:
+            network.collected = False

@@ -117,7 +117,7 @@ class Objective:
         actions, log_prob = self.policy.actor(obs, rows(embeddings.policy, n), batch.action_noise)
         # the latent is a task here, not a decision: the actor must not raise its value by moving it
         z = rows(embeddings.latents.detach(), n)
-        values = self.policy.critic(obs, actions, z, frozen=True).amin(dim=0)
+        values = self.policy.critic(obs, actions, z, frozen=True).min(dim=0).values
         mean_log_prob = log_prob.mean()
         return alpha * mean_log_prob - values.mean(), mean_log_prob
 

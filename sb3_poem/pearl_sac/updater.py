@@ -97,7 +97,6 @@ class Updater:
         optimizer: Any = self.policy.optimizer
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        self._precision.collect_gradients()
         groups = optimizer.param_groups
         gradients = [p.grad for group in groups for p in group["params"] if p.grad is not None]
         # the loss is looked at as well, because a ReLU may turn NaN to 0 on the way to the gradient

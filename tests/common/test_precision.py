@@ -60,12 +60,23 @@ def test_bfloat16_is_close_to_float32_and_is_not_it(mlp: MLP) -> None:
         precision.refresh()
         rounded = mlp(x)
         rounded.pow(2).sum().backward()
-        precision.collect_gradients()
     assert rounded.dtype == th.float32
     assert 0 < (rounded - exact).norm() < 0.02 * exact.norm()
     for name, gradient in gradients(mlp).items():
         assert gradient.dtype == th.float32
         assert 0 < (gradient - expected[name]).norm() < 0.06 * expected[name].norm(), name
+
+
+def test_gradients_of_several_evaluations_add_up_until_the_weights_change(mlp: MLP) -> None:
+    x = th.randn(100, mlp.hidden[0].in_features)
+    with MixedPrecision(mlp, th.bfloat16) as precision:
+        precision.refresh()
+        (mlp(x[:50]).pow(2).sum() + mlp(x[50:]).pow(2).sum()).backward()
+        in_parts = gradients(mlp)
+        precision.refresh()
+        mlp(x).pow(2).sum().backward()
+    for name, gradient in gradients(mlp).items():
+        assert (gradient - in_parts[name]).norm() < 0.01 * gradient.norm(), name
 
 
 def test_hidden_layers_are_those_of_autocast(mlp: MLP) -> None:
@@ -118,7 +129,6 @@ def test_float32_changes_nothing(mlp: MLP) -> None:
         assert th.equal(mlp(x), expected)
         mlp(x).sum().backward()
         gradient = mlp.hidden[0].weight.grad.clone()
-        precision.collect_gradients()
     assert th.equal(mlp.hidden[0].weight.grad, gradient)
 
 
@@ -132,12 +142,10 @@ def test_frozen_and_unused_networks_get_no_gradient(layer_norm: bool) -> None:
         with MixedPrecision(networks, th.bfloat16) as precision:
             precision.refresh()
             networks[0](th.randn(4, 6)).sum().backward()  # the critic is left out
-            precision.collect_gradients()
-        assert all(parameter.grad is None for parameter in networks[1].parameters())
+            assert all(parameter.grad is None for parameter in networks[1].parameters())
         networks.zero_grad(set_to_none=True)
         with MixedPrecision(networks, th.bfloat16) as precision:
             precision.refresh()
             networks[1](obs, obs, obs, frozen=True).sum().backward()
-            precision.collect_gradients()
-        assert all(parameter.grad is None for parameter in networks.parameters())
+            assert all(parameter.grad is None for parameter in networks.parameters())
     assert (obs.grad != 0).all()
