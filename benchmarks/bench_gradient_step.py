@@ -18,6 +18,7 @@ import statistics
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
+from importlib.util import find_spec
 from typing import Any
 
 import gymnasium as gym
@@ -76,16 +77,9 @@ def filled(model: Any) -> Any:
 
 
 def sbx_sac(size: dict[str, Any], steps: int, policy_delay: int) -> Callable[[], None]:
-    """SBX's SAC on as many transitions.
+    """SBX's SAC on as many transitions."""
+    import sbx
 
-    :raises SystemExit: if the extra is not installed
-    """
-    try:
-        import sbx
-    except ImportError:
-        raise SystemExit(
-            "--sbx measures SBX's SAC, which is not installed: pip install 'sb3_poem[sbx]'"
-        ) from None
     settings: dict[str, Any] = {"policy_kwargs": {"net_arch": size["widths"]}, "seed": 0}
     settings |= {"buffer_size": N_TRAIN_TASKS * HORIZON, "policy_delay": policy_delay}
     model = filled(sbx.SAC("MlpPolicy", gym.make("HalfCheetah-v5"), **settings))
@@ -274,6 +268,10 @@ def main() -> None:
     options = {"sizes": sizes, "threads": [1, 2], "turns": 5, "device": DEVICE, "sbx": flag}
     given = arguments(__doc__, **options)
     on_cpu = given.device == "cpu"
+    if given.sbx and not on_cpu:
+        raise SystemExit(f"--sbx is measured on the processor, but --device is {given.device}")
+    if given.sbx and find_spec("sbx") is None:
+        raise SystemExit("--sbx: SBX is not installed; pip install 'sb3_poem[sbx]'")
     if given.sbx and {available_cores()} != set(given.threads):
         raise SystemExit(
             f"--sbx: JAX takes all {available_cores()} core(s) that this process may use, but "
