@@ -195,6 +195,20 @@ def test_results_are_small_and_listed() -> None:
         assert file.name == "manifest.md" or f"({file.name})" in manifest, file.relative_to(TOP)
 
 
+COMMIT = re.compile(r"\b(?=[0-9a-f]*[a-f])(?=[0-9a-f]*[0-9])[0-9a-f]{7,40}\b")
+
+
+def test_only_manifests_name_commits() -> None:
+    pages = [TOP / "CHANGELOG.md", *(page for pattern in LINKED for page in TOP.glob(pattern))]
+    found = [
+        f"{page.relative_to(TOP)}: {commit}"
+        for page in pages
+        if page.name != "manifest.md"
+        for commit in COMMIT.findall(page.read_text())
+    ]
+    assert not found
+
+
 def test_figures_come_from_records() -> None:
     for page, content in runpy.run_path(str(TOP / "docs/tables.py"))["WRITTEN"].items():
         assert page.read_text() == content(), f"{page.name} is not what docs/tables.py writes"
