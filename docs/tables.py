@@ -1,16 +1,19 @@
-"""Writes what README and the results page show from the stores: ``python docs/tables.py``.
+"""Writes what README, the pages of results and performance, and the cards of the models that ship
+show from the stores: ``python docs/tables.py``.
 
 A test compares, so that no figure stands there that no store has.
 """
 
 import json
 import re
+from functools import partial
 from pathlib import Path
 from textwrap import fill
 from typing import Any
 
 from sb3_poem.benchmark.store import Store
 from sb3_poem.benchmark.tables import TABLE_3, make_report
+from sb3_poem.pearl_sac.model_card import model_card
 
 TOP = Path(__file__).resolve().parents[1]
 RESULTS = TOP / "benchmarks/results"
@@ -176,14 +179,48 @@ earlier revision. What is not listed was not measured.
     return "\n".join([head, *(family_section(family) for family in FAMILIES)])
 
 
-def readme() -> str:
-    """README with its table."""
-    text = (TOP / "README.md").read_text()
-    table = rf"\g<1>{summary()}\n\g<2>"
-    return re.sub(r"(<!-- results:.*?-->\n).*?(<!-- end -->)", table, text, flags=re.DOTALL)
+def trainings() -> str:
+    """What the models cost that are as their entries make them."""
+    store = Store(RESULTS / "shipped/benchmark.sqlite", create=False)
+    known = {one.family: one.result for one in store.records() if one.method == "known-task"}
+    rows = [
+        [
+            family,
+            f"{known[family]['training_samples']:,}",
+            f"{known[family]['updates']:,}",
+            f"{known[family]['training_cpu_seconds'] / 60:.1f}",
+        ]
+        for family in FAMILIES
+        if family in known
+    ]
+    return "\n".join(table(["family", "environment steps", "updates", "minutes of a core"], rows))
 
 
-WRITTEN = {TOP / "README.md": readme, TOP / "docs/results.md": results_page}
+def with_table(page: Path, name: str, content: str) -> str:
+    """A page with a table between its marks."""
+    pattern = rf"(<!-- {name}:.*?-->\n).*?(<!-- end -->)"
+    return re.sub(pattern, rf"\g<1>{content}\n\g<2>", page.read_text(), flags=re.DOTALL)
+
+
+def card(folder: Path) -> str:
+    """A shipped model's card, with a picture, as it stands in the tree."""
+    text = model_card(json.loads((folder / "config.json").read_text()))
+    picture = f"../../docs/_static/environments/{folder.name}.webp"
+    shown = f"![The robot after ten answers]({picture})"
+    return text.replace("\n## Use\n", f"\n{shown}\n\n## Use\n", 1)
+
+
+README, PERFORMANCE = TOP / "README.md", TOP / "docs/performance.md"
+WRITTEN = {
+    README: lambda: with_table(README, "results", summary()),
+    PERFORMANCE: lambda: with_table(PERFORMANCE, "trainings", trainings()),
+    TOP / "docs/results.md": results_page,
+    **{
+        folder / "README.md": partial(card, folder)
+        for folder in sorted((TOP / "pretrained").iterdir())
+        if folder.is_dir()
+    },
+}
 
 if __name__ == "__main__":
     for page, content in WRITTEN.items():
