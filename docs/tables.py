@@ -75,7 +75,7 @@ def cell(found: Any, error: bool = False) -> str:
     digits = 0 if abs(found["mean"]) >= 100 else 1
     text = f"{found['mean']:,.{digits}f}"
     if error and found["task_error"] is not None:
-        text += f" ± {found['task_error']:.{digits}f}"
+        text += f"\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{found['task_error']:.{digits}f}"
     return text
 
 
@@ -114,7 +114,7 @@ def summary() -> str:
         known = cell(row(family, "known-task", kind="known"))
         name = family if family in FROM_ENTRIES else f"{family} †"
         rows.append([name, *(quoted or [""] * 4), *ours, *limits, known])
-    head = ["family", "paper: best baseline, 1", "10", "paper: POEM, 1", "10"]
+    head = ["family", "paper: baseline, 1", "10", "paper: POEM, 1", "10"]
     return "\n".join(table([*head, "ours: 1", "10", "limit: 1", "10", "task known"], rows))
 
 
@@ -156,8 +156,8 @@ def results_page() -> str:
 Mean return of the models that ship, over 30 test tasks that no training saw, 10 episodes each,
 after exact answers; one training seed.
 
-- *paper*: Table 3 of [Xu & Zhu 2025](https://proceedings.mlr.press/v267/), of which the best
-  baseline at each number of answers.
+- *paper*: Table 3 of [Xu & Zhu 2025](https://proceedings.mlr.press/v267/); *baseline* is the best
+  of its baselines after so many answers.
 - *ours*: the rule `Bayes()`; ± is the standard error over tasks. [`Paper()`](algorithms/paper.md)
   stands below, by family.
 - *limit*: the best choice of 2^k of the model's policies, all that k answers can tell apart. They
