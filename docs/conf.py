@@ -19,7 +19,6 @@ extensions = [
     "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx-mathjax-offline",
-    "sphinx.ext.viewcode",
 ]
 exclude_patterns = ["_build", "environments/_*"]
 
