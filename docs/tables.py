@@ -21,7 +21,6 @@ FAMILIES = (*TABLE_3, "FetchReach", "PointGoal")
 ANSWERS = (0, 1, 2, 5, 10)
 #: How the models were made that are not what a run of their entry gives
 REMARKS = {
-    "FetchReach": "other hyperparameters, and a third of the steps of the entry.",
     "MetaWorldML1": "other hyperparameters, and half the steps of the entry.",
     "AntFwdBack": "three stages, in the last half of each batch mirrored.",
     "HumanoidDir2D": "stages with another reward weight, the last on a GPU.",
@@ -196,6 +195,15 @@ def trainings() -> str:
     return "\n".join(table(["family", "environment steps", "updates", "minutes of a core"], rows))
 
 
+def models() -> str:
+    """Which models ship, and where each is from."""
+    rows = [
+        [f"[{one}]({one}/README.md)", "its entry" if one in FROM_ENTRIES else "hand"]
+        for one in FAMILIES
+    ]
+    return "\n".join(table(["model", "made by"], rows))
+
+
 def with_table(page: Path, name: str, content: str) -> str:
     """A page with a table between its marks."""
     pattern = rf"(<!-- {name}:.*?-->\n).*?(<!-- end -->)"
@@ -211,7 +219,9 @@ def card(folder: Path) -> str:
 
 
 README, PERFORMANCE = TOP / "README.md", TOP / "docs/performance.md"
+PRETRAINED = TOP / "pretrained/README.md"
 WRITTEN = {
+    PRETRAINED: lambda: with_table(PRETRAINED, "models", models()),
     README: lambda: with_table(README, "results", summary()),
     PERFORMANCE: lambda: with_table(PERFORMANCE, "trainings", trainings()),
     TOP / "docs/results.md": results_page,
