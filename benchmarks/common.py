@@ -131,7 +131,7 @@ def write(
     words = re.sub(r" --out \S+", "", " ".join(["", *sys.argv[1:]]))
     command = f"python benchmarks/{Path(sys.argv[0]).name}{words}"
     origin = {"command": command, "commit": commit(), "machine": machine(), "settings": settings}
-    footer = f"`{command}` at {origin['commit']}, on {origin['machine']}."
+    footer = f"`{command}`, on {origin['machine']}."
     if settings:
         footer += " Settings: " + ", ".join(f"{key} {value}" for key, value in settings.items())
     text = "\n\n".join([f"# {title}", *sections, footer]) + "\n"

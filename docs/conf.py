@@ -19,7 +19,6 @@ extensions = [
     "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx-mathjax-offline",
-    "sphinx.ext.viewcode",
 ]
 exclude_patterns = ["_build", "environments/_*"]
 
@@ -53,9 +52,16 @@ def environment_pages(_app: object) -> None:
         text = re.sub(r"`(\w+)Env`", lambda found: link.get(found[1], found[0]), text)
         picture = f"../_static/environments/{spec.name}.webp"
         shown = f"![{spec.name}]({picture})\n\n" if (folder / picture).exists() else ""
-        facts = f"`gymnasium.make({spec.id!r})`, {spec.max_episode_steps} steps an episode.\n\n"
+        facts = f"`gymnasium.make({spec.id!r})`, {spec.max_episode_steps} steps an episode.\n"
+        if (TOP / "pretrained" / spec.name).exists():
+            card, results = f"../../pretrained/{spec.name}/README.md", "../results.md"
+            facts += f"A trained model ships: [its card]({card}),\n"
+            facts += f"[its results]({results}#{spec.name.lower()})."
+        else:
+            facts += f"Untrained: no model ships. `sb3-poem train --env {spec.id}` makes one,\n"
+            facts += "and no record says what it earns."
         page = folder / f"{spec.name}.md"
-        content = f"# {spec.name}\n\n{facts}{shown}{text}\n"
+        content = f"# {spec.name}\n\n{facts}\n\n{shown}{text}\n"
         if not page.exists() or page.read_text() != content:
             page.write_text(content)
 

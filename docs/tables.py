@@ -1,16 +1,19 @@
-"""Writes what README and the results page show from the stores: ``python docs/tables.py``.
+"""Writes what README, the pages of results and performance, and the cards of the models that ship
+show from the stores: ``python docs/tables.py``.
 
 A test compares, so that no figure stands there that no store has.
 """
 
 import json
 import re
+from functools import partial
 from pathlib import Path
 from textwrap import fill
 from typing import Any
 
 from sb3_poem.benchmark.store import Store
 from sb3_poem.benchmark.tables import TABLE_3, make_report
+from sb3_poem.pearl_sac.model_card import model_card
 
 TOP = Path(__file__).resolve().parents[1]
 RESULTS = TOP / "benchmarks/results"
@@ -18,11 +21,11 @@ FAMILIES = (*TABLE_3, "FetchReach", "PointGoal")
 ANSWERS = (0, 1, 2, 5, 10)
 #: How the models were made that are not what a run of their entry gives
 REMARKS = {
-    "MetaWorldML1": "Trained with other hyperparameters, for half the steps of the entry.",
-    "AntFwdBack": "Trained in three stages, in the last with half of each batch mirrored.",
-    "HumanoidDir2D": "Trained in stages with another reward weight, the last on a GPU.",
-    "MetaWorldML10": "Trained with other hyperparameters than those of the entry. The likelihood "
-    "that `Bayes` has by default here was chosen by the returns on tasks of this table.",
+    "MetaWorldML1": "other hyperparameters, and half the steps of the entry.",
+    "AntFwdBack": "three stages, in the last half of each batch mirrored.",
+    "HumanoidDir2D": "stages with another reward weight, the last on a GPU.",
+    "MetaWorldML10": "other hyperparameters than the entry's. The likelihood that `Bayes` has by "
+    "default here was chosen by the returns on tasks of this table.",
 }
 CAPTIONS = {
     "table3-methods-queries": "Methods, against the number of exact answers",
@@ -37,7 +40,7 @@ PAGES = {
     "ablation": "ablations",
     "epsilon": "tolerances of eq. 9",
     "smoke": "all methods",
-    "adaptation": "earlier measurements of the model",
+    "adaptation": "an earlier record",
 }
 
 
@@ -48,7 +51,7 @@ def rows_of(file: str) -> list[dict[str, Any]]:
     return rows
 
 
-#: Of models as their entry makes them, and of the others, made by hand before
+#: Of models as their entry makes them, and of the others, made by hand
 ROWS = rows_of("benchmark.sqlite")
 FROM_ENTRIES = {one["family"] for one in ROWS}
 ROWS += [one for one in rows_of("by-hand.sqlite") if one["family"] not in FROM_ENTRIES]
@@ -71,7 +74,7 @@ def cell(found: Any, error: bool = False) -> str:
     digits = 0 if abs(found["mean"]) >= 100 else 1
     text = f"{found['mean']:,.{digits}f}"
     if error and found["task_error"] is not None:
-        text += f" ± {found['task_error']:.{digits}f}"
+        text += f"\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{found['task_error']:.{digits}f}"
     return text
 
 
@@ -82,10 +85,12 @@ def rate(found: Any) -> str:
     return f"{100 * found['success_rate']:.0f} %"
 
 
-def steps(family: str) -> str:
-    """What training had; marked where the model is not what the family's entry makes."""
-    trained = int(row(family, "poem-bayes")["samples"])
-    return f"{trained:,}{'' if family in FROM_ENTRIES else ' †'}"
+def training(family: str) -> str:
+    """How the family's model came about."""
+    steps = f"{int(row(family, 'poem-bayes')['samples']):,} environment steps"
+    if family in FROM_ENTRIES:
+        return f"Trained as its entry says, for {steps}."
+    return f"† Made by hand, {steps}: {REMARKS[family]}"
 
 
 def table(head: list[str], rows: list[list[str]]) -> list[str]:
@@ -97,17 +102,19 @@ def summary() -> str:
     """README's table: a row a family."""
     rows = []
     for family in FAMILIES:
-        paper = TABLE_3.get(family, {})
-        best = max(
-            (figures[2][0] for name, figures in paper.items() if name != "POEM"), default=None
-        )
-        theirs = [paper["POEM"][0][0], paper["POEM"][2][0]] if paper else [None, None]
+        paper = dict(TABLE_3.get(family, {}))
+        poem = paper.pop("POEM", None)
+        quoted = []
+        if poem is not None:
+            best = [max(figures[i][0] for figures in paper.values()) for i in (0, 2)]
+            quoted = [f"{figure:,}" for figure in (*best, poem[0][0], poem[2][0])]
         ours = [cell(row(family, "poem-bayes", k), error=True) for k in (1, 10)]
+        limits = [cell(row(family, "known-task", k, "limit")) for k in (1, 10)]
         known = cell(row(family, "known-task", kind="known"))
-        quoted = ["" if figure is None else f"{figure:,}" for figure in (best, *theirs)]
-        rows.append([family, *quoted, *ours, known, steps(family)])
-    head = ["family", "paper: best baseline, 10", "POEM, 1", "POEM, 10"]
-    return "\n".join(table([*head, "ours: 1", "10", "task known", "steps"], rows))
+        name = family if family in FROM_ENTRIES else f"{family} †"
+        rows.append([name, *(quoted or [""] * 4), *ours, *limits, known])
+    head = ["family", "paper: baseline, 1", "10", "paper: POEM, 1", "10"]
+    return "\n".join(table([*head, "ours: 1", "10", "limit: 1", "10", "task known"], rows))
 
 
 def family_section(family: str) -> str:
@@ -127,9 +134,8 @@ def family_section(family: str) -> str:
         rates = [rate(one) for one in (*figures, known)]
         if any(rates):
             rows.append([f"{name}, success", *rates])
-    lines = [f"## {family}", ""]
-    lines += table(["rule", *(f"k = {k}" for k in ANSWERS), "task known"], rows)
-    lines += ["", *([fill(REMARKS[family], 120), ""] if family in REMARKS else [])]
+    lines = [f"## {family}", "", fill(training(family), 120), ""]
+    lines += [*table(["rule", *(f"k = {k}" for k in ANSWERS), "task known"], rows), ""]
     links = [
         f"[{text}]({where}/{page}.md)"
         for page, text in PAGES.items()
@@ -146,32 +152,85 @@ def results_page() -> str:
     """The page docs/results.md."""
     head = f"""# Results
 
-What the models that ship earn, as `sb3-poem benchmark run --suite shipped --models pretrained
---seeds 1` measures it; `python docs/tables.py` writes this page from
-[its stores](../benchmarks/results/shipped/manifest.md). One training seed each. Mean return over 30
-test tasks that no training saw, 10 episodes each, after k exact answers; ± is the standard error
-over tasks; families that know of success have the share of successes below each return. *Task
-known*: the best of the model's policies for each task, found by trying. *Limit*: the best choice of
-2^k of these policies, chosen on other tasks where dynamics are shared, and measured by other
-episodes.
-A model without † is what the family's entry in `zoo_configs/` makes, in one run from nothing; one
-with † was made by hand before, measured by an earlier revision of the code. Comparisons with the
-baselines, over training seeds, stand below each family, as far as they were run; they are of an
-earlier revision of the code and of models of their own. What is not listed was not measured.
+Mean return of the models that ship, over 30 test tasks that no training saw, 10 episodes each,
+after exact answers; one training seed.
+
+- *paper*: Table 3 of [Xu & Zhu 2025](https://proceedings.mlr.press/v267/); *baseline* is the best
+  of its baselines after so many answers.
+- *ours*: the rule `Bayes()`; ± is the standard error over tasks. [`Paper()`](algorithms/paper.md)
+  stands below, by family.
+- *limit*: the best choice of 2^k of the model's policies, all that k answers can tell apart. They
+  are chosen by one episode each, on other tasks where dynamics are shared, and measured by other
+  episodes; so it is an estimate, and a rule that acts on policies outside of that choice may pass
+  it.
+- *task known*: the best of the model's policies for each task, found by trying.
+- A model without † is what the family's entry in `zoo_configs/` makes, in one run from nothing. One
+  with † was made by hand, and measured by revision 1 of the benchmark, which had other limits: they
+  are left out.
+
+`sb3-poem benchmark run --suite shipped --models pretrained --seeds 1` measures, `python
+docs/tables.py` writes this page from [its stores](../benchmarks/results/shipped/manifest.md). The
+figures below a family compare methods over training seeds: they are of models of their own, of an
+earlier revision. What is not listed was not measured.
 
 {summary()}
 """
     return "\n".join([head, *(family_section(family) for family in FAMILIES)])
 
 
-def readme() -> str:
-    """README with its table."""
-    text = (TOP / "README.md").read_text()
-    table = rf"\g<1>{summary()}\n\g<2>"
-    return re.sub(r"(<!-- results:.*?-->\n).*?(<!-- end -->)", table, text, flags=re.DOTALL)
+def trainings() -> str:
+    """What the models cost that are as their entries make them."""
+    store = Store(RESULTS / "shipped/benchmark.sqlite", create=False)
+    known = {one.family: one.result for one in store.records() if one.method == "known-task"}
+    rows = [
+        [
+            family,
+            f"{known[family]['training_samples']:,}",
+            f"{known[family]['updates']:,}",
+            f"{known[family]['training_cpu_seconds'] / 60:.1f}",
+        ]
+        for family in FAMILIES
+        if family in known
+    ]
+    return "\n".join(table(["family", "environment steps", "updates", "minutes of a core"], rows))
 
 
-WRITTEN = {TOP / "README.md": readme, TOP / "docs/results.md": results_page}
+def models() -> str:
+    """Which models ship, and where each is from."""
+    rows = [
+        [f"[{one}]({one}/README.md)", "its entry" if one in FROM_ENTRIES else "hand"]
+        for one in FAMILIES
+    ]
+    return "\n".join(table(["model", "made by"], rows))
+
+
+def with_table(page: Path, name: str, content: str) -> str:
+    """A page with a table between its marks."""
+    pattern = rf"(<!-- {name}:.*?-->\n).*?(<!-- end -->)"
+    return re.sub(pattern, rf"\g<1>{content}\n\g<2>", page.read_text(), flags=re.DOTALL)
+
+
+def card(folder: Path) -> str:
+    """A shipped model's card, with a picture, as it stands in the tree."""
+    text = model_card(json.loads((folder / "config.json").read_text()))
+    picture = f"../../docs/_static/environments/{folder.name}.webp"
+    shown = f"![The robot after ten answers]({picture})"
+    return text.replace("\n## Use\n", f"\n{shown}\n\n## Use\n", 1)
+
+
+README, PERFORMANCE = TOP / "README.md", TOP / "docs/performance.md"
+PRETRAINED = TOP / "pretrained/README.md"
+WRITTEN = {
+    PRETRAINED: lambda: with_table(PRETRAINED, "models", models()),
+    README: lambda: with_table(README, "results", summary()),
+    PERFORMANCE: lambda: with_table(PERFORMANCE, "trainings", trainings()),
+    TOP / "docs/results.md": results_page,
+    **{
+        folder / "README.md": partial(card, folder)
+        for folder in sorted((TOP / "pretrained").iterdir())
+        if folder.is_dir()
+    },
+}
 
 if __name__ == "__main__":
     for page, content in WRITTEN.items():

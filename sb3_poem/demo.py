@@ -16,7 +16,7 @@ from poem_envs.headless import can_draw
 from sb3_poem.cli.needs import check_writable
 
 ADAPTATION = "--oracle return --queries 10 --tasks 30 --record 0 1 2 5 10"
-# one thread, as the time in the README was measured
+# one thread: networks this small gain nothing from more
 TRAINING = "--env poem/PointGoal-v0 --seed 0 --eval-freq -1 --verbose 0 --num-threads 1 -P"
 NEXT = """\
 Next:

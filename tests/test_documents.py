@@ -92,18 +92,38 @@ def test_python_blocks_run(page: str, folder: Path, monkeypatch: pytest.MonkeyPa
         gym.registry.update(registered)
 
 
-def test_examples_in_docstrings_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+EXAMPLES = [
+    ".".join(file.relative_to(root).with_suffix("").parts)
+    for root, package in ((TOP, "sb3_poem"), (TOP / "envs", "poem_envs"))
+    for file in sorted((root / package).rglob("*.py"))
+    if ">>> " in file.read_text()
+]
+
+
+@pytest.mark.parametrize("module", EXAMPLES)
+def test_examples_in_docstrings_run(
+    module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
-    attempted = 0
-    for root, package in ((TOP, "sb3_poem"), (TOP / "envs", "poem_envs")):
-        for file in sorted((root / package).rglob("*.py")):
-            if ">>> " not in file.read_text():
-                continue
-            name = ".".join(file.relative_to(root).with_suffix("").parts)
-            failed, run = doctest.testmod(importlib.import_module(name))
-            assert not failed, f"an example in {name} fails: see the output"
-            attempted += run
-    assert attempted > 50
+    failed, run = doctest.testmod(importlib.import_module(module))
+    assert not failed, "an example fails: see the output"
+    assert run
+
+
+def test_every_public_class_has_an_example() -> None:
+    ours = ("", ".adaptation", ".baselines", ".label", ".pearl_sac", ".poem_sac")
+    for module in ("poem_envs", *(f"sb3_poem{package}" for package in ours)):
+        for name, public in public_classes(module):
+            assert ">>> " in (public.__doc__ or ""), name
+
+
+def public_classes(module: str) -> Iterator[tuple[str, type]]:
+    """What a module exports; without ``__all__`` what it imports."""
+    package = importlib.import_module(module)
+    for name in getattr(package, "__all__", vars(package)):
+        value = getattr(package, name)
+        if isinstance(value, type) and not name.startswith("_"):
+            yield f"{module}.{name}", value
 
 
 def commands(page: str) -> Iterator[str]:
@@ -193,6 +213,20 @@ def test_results_are_small_and_listed() -> None:
     for file in files:
         manifest = (file.parent / "manifest.md").read_text()
         assert file.name == "manifest.md" or f"({file.name})" in manifest, file.relative_to(TOP)
+
+
+COMMIT = re.compile(r"\b(?=[0-9a-f]*[a-f])(?=[0-9a-f]*[0-9])[0-9a-f]{7,40}\b")
+
+
+def test_only_manifests_name_commits() -> None:
+    pages = [TOP / "CHANGELOG.md", *(page for pattern in LINKED for page in TOP.glob(pattern))]
+    found = [
+        f"{page.relative_to(TOP)}: {commit}"
+        for page in pages
+        if page.name != "manifest.md"
+        for commit in COMMIT.findall(page.read_text())
+    ]
+    assert not found
 
 
 def test_figures_come_from_records() -> None:

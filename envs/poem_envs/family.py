@@ -101,24 +101,29 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
 
     A subclass sets ``observation_space``, ``action_space``, ``task_space``, ``reward_feature_dim``
     and defines three methods; unless its tasks are uniform on ``task_space`` or finitely many
-    (``all_tasks``), it defines :meth:`_draw_tasks` too::
+    (``all_tasks``), it defines :meth:`_draw_tasks` too.
 
-        class Walk1D(TaskFamily):
-            observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float64)
-            action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
-            task_space = spaces.Box(-1.0, 1.0, (1,), np.float64)
-            reward_feature_dim = 1
-
-            def _begin_episode(self, rng):           # -> observation
-                self.x = rng.normal(0.0, 0.1, size=1)
-                return self.x.copy()
-
-            def _simulate(self, action):             # -> observation, reward features, terminated
-                self.x = self.x + 0.1 * action
-                return self.x.copy(), self.x.copy(), False
-
-            def _reward(self, tasks, features):      # elementwise, broadcasting
-                return -np.abs(features[..., 0] - tasks[..., 0])
+    >>> class Walk1D(TaskFamily):
+    ...     observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    ...     action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+    ...     task_space = spaces.Box(-1.0, 1.0, (1,), np.float64)
+    ...     reward_feature_dim = 1
+    ...
+    ...     def _begin_episode(self, rng):  # -> observation
+    ...         self.x = rng.normal(0.0, 0.1, size=1)
+    ...         return self.x.copy()
+    ...
+    ...     def _simulate(self, action):  # -> observation, reward features, terminated
+    ...         self.x = self.x + 0.1 * action
+    ...         return self.x.copy(), self.x.copy(), False
+    ...
+    ...     def _reward(self, tasks, features):  # elementwise, broadcasting
+    ...         return -np.abs(features[..., 0] - tasks[..., 0])
+    >>> env = Walk1D()
+    >>> _ = env.reset(seed=0)
+    >>> _, reward, _, _, info = env.step(np.ones(1, np.float32))
+    >>> bool(reward == -abs(info["reward_features"][0] - env.task[0]))
+    True
 
     The base class checks actions and tasks, draws and keeps the task, computes the reward and fills
     in the info.

@@ -39,7 +39,11 @@ class GoalFamily(TaskFamily):
       it;
     - ``"is_success"`` or ``"success"`` of the environment's info is the family's ``"success"``.
 
-    An example::
+    >>> env = GoalFamily("gymnasium_robotics:FetchSlide-v4")
+    >>> env.observation_space.shape, env.task_space.shape, env.max_episode_steps
+    ((28,), (3,), 50)
+
+    So that an id makes it::
 
         slide = {"env": "gymnasium_robotics:FetchSlide-v4"}
         gym.register("my/FetchSlide-v0", entry_point=GoalFamily, kwargs=slide)

@@ -42,6 +42,31 @@ class BatchFamily(TaskFamily):
     A subclass defines the methods below, and ``_reward``. It sets what :class:`TaskFamily` asks for
     in its class, in the constructor, which hands all that it does not know to ``super().__init__``,
     or, as a dataclass whose fields are its arguments, in ``__post_init__``.
+
+    >>> class Drift(BatchFamily):
+    ...     observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    ...     action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+    ...     task_space = spaces.Box(-1.0, 1.0, (1,), np.float64)
+    ...     reward_feature_dim = 1
+    ...
+    ...     def _allocate(self, n):
+    ...         self.x = np.zeros((n, 1))
+    ...
+    ...     def _begin_episodes(self, copies, rngs):
+    ...         self.x[copies] = 0.0
+    ...
+    ...     def _advance(self, actions):
+    ...         self.x += 0.1 * actions
+    ...         return self.x.copy(), np.zeros(len(actions), dtype=bool)
+    ...
+    ...     def _observations(self):
+    ...         return self.x.copy()
+    ...
+    ...     def _reward(self, tasks, features):
+    ...         return -np.abs(features[..., 0] - tasks[..., 0])
+    >>> envs = TaskFamilyVector(Drift, num_envs=3)
+    >>> envs.reset(seed=0)[0].shape
+    (3, 1)
     """
 
     render_mode: str | None = None
@@ -145,6 +170,13 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
 
         vector = functools.partial(TaskFamilyVector, Walk1D)
         gym.register("my/Walk-v0", Walk1D, vector_entry_point=vector, max_episode_steps=50)
+
+    The families that ship are registered so:
+
+    >>> envs = gym.make_vec("poem/PointGoal-v0", 4, vectorization_mode="vector_entry_point")
+    >>> observations, _ = envs.reset(seed=0)
+    >>> observations.shape, envs.tasks.shape
+    ((4, 2), (4, 1))
 
     - A copy whose episode ends is reset in the same step (``AutoresetMode.SAME_STEP``). Then
       ``infos["final_obs"]`` holds ``(num_envs, obs_dim)`` that each copy's step led to, and

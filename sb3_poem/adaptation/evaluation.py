@@ -28,6 +28,11 @@ N_TEST_TASKS = 30
 class EpisodeOutcomes:
     """What the episodes of some latents on some tasks came to.
 
+    >>> import numpy as np
+    >>> outcomes = EpisodeOutcomes(np.array([[-9.0, -7.0]]), np.array([[False, True]]))
+    >>> outcomes.mean_return, outcomes.success_rate
+    (-8.0, 0.5)
+
     :param returns: (n, n_episodes) true returns.
     :param successes: (n, n_episodes), whether an episode was a success; None for a family that does
         not say.
@@ -95,7 +100,12 @@ def evaluate_episodes(
 
 @dataclass(frozen=True, eq=False)
 class AdaptationEvaluation(TaskAdaptations):
-    """True returns of adapted policies.
+    """True returns of adapted policies, which :func:`evaluate_adaptation` measures.
+
+    >>> how = dict(record_at=(0, 2), n_episodes=1)
+    >>> result = evaluate_adaptation("PointGoal", "poem/PointGoal-v0", 3, **how)
+    >>> result.task_returns.shape
+    (3, 2)
 
     :param returns: (n_tasks, len(record_at), n_episodes).
     :param successes: (n_tasks, len(record_at), n_episodes), whether an episode was a success; None

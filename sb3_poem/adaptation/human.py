@@ -56,6 +56,14 @@ class HumanOracle:
     1 (left) and 2 (right) of a pair, and 1 (left is much better) to 5 (right is much better) of a
     graded question; anything else is asked again.
 
+    >>> from sb3_poem import PreferenceAdapter
+    >>> import gymnasium as gym
+    >>> env = gym.make("poem/PointGoal-v0", render_mode="rgb_array", width=48, height=48)
+    >>> oracle = HumanOracle(read=lambda prompt: "l")  # without it, ``input`` asks
+    >>> adapter = PreferenceAdapter("PointGoal", env, oracle=oracle, n_queries=1, seed=0)
+    >>> policy = adapter.adapt()
+    Query 1: preference_queries/query-001.gif
+
     :param folder: Where the videos go; it is made if missing.
     :param video_format: "gif" (any viewer plays it) or "mp4" (smaller).
     :param mistake_rate: How often a person is taken to err, for the Bayesian rule.

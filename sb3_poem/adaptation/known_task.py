@@ -40,7 +40,11 @@ OTHER_TASK_STREAM = 7
 @dataclass(frozen=True, eq=False)
 class KnownTaskReturn(EpisodeOutcomes):
     """What the model's repertoire holds for each task: outcomes of its best latent, on episodes
-    that had no part in choosing it.
+    that had no part in choosing it; :func:`known_task_return` measures it.
+
+    >>> found = known_task_return("PointGoal", "poem/PointGoal-v0", 3, n_latents=20, n_episodes=1)
+    >>> found.returns.shape, found.candidate_returns.shape
+    ((3, 1), (3, 20))
 
     :param tasks: (n_tasks, task_dim).
     :param latents: (n_tasks, latent_dim) the best ones.

@@ -35,6 +35,10 @@ class AnswerLimits:
     theory says (Shannon 1959), with the marginal that is best for the other tasks at that many
     bits. Both are of *these policies*: a method with other ones may earn more.
 
+    >>> limits = AnswerLimits((-9.0, -5.0, -3.0), bits=(0.0, 2.0), returns=(-9.0, -3.0), spread=9.0)
+    >>> limits.after(1), limits.after(10)
+    (-5.0, -3.0)
+
     :param codebooks: Mean return after 0, 1, 2, ... exact answers, until all policies are in.
     :param bits: Ascending from 0, and ``returns``, the mean returns when so much is told.
     :param spread: The largest difference of two policies' returns on a task.

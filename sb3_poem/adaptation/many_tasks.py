@@ -28,7 +28,12 @@ Library = Sequence[Trajectory] | Callable[[np.ndarray], Sequence[Trajectory]]
 class TaskAdaptations:
     """Many tasks, adapted: ``tasks`` (n_tasks, task_dim), the numbers of answers at which estimates
     were kept, ascending, those ``latents`` (n_tasks, len(record_at), latent_dim), and each task's
-    answers in order.
+    answers in order. :func:`adapt_tasks` gives them.
+
+    >>> from sb3_poem import ReturnOracle
+    >>> tasks = np.array([[0.5], [1.5]])
+    >>> adapt_tasks("PointGoal", "poem/PointGoal-v0", tasks, ReturnOracle, record_at=(0, 3))
+    TaskAdaptations(2 tasks, after 0, 3 answers)
     """
 
     tasks: np.ndarray

@@ -16,6 +16,11 @@ class MetaModel(Protocol):
 
     ``POEMSAC`` and ``PEARLSAC`` are such models. A model of your own subclasses this, and then says
     only what is not the same as here.
+
+    >>> import sb3_poem
+    >>> model = sb3_poem.POEMSAC.from_pretrained("PointGoal")
+    >>> latent = model.sample_latents(1, np.random.default_rng(0))[0]
+    >>> action, _ = model.predict([0.0, 0.0], state=latent)
     """
 
     latent_dim: int

@@ -24,7 +24,11 @@ Values = np.ndarray | float
 
 
 class NoiseModel(Protocol):
-    """P(LEFT) from the difference of two returns."""
+    """P(LEFT) from the difference of two returns.
+
+    >>> ExactNoise().to_dict()
+    {'kind': 'exact'}
+    """
 
     def probability_left(self, difference: Values, error: Values, magnitude: Values) -> Any:
         """P(LEFT), given that the oracle says LEFT or RIGHT, in (0, 1); arguments broadcast.
@@ -80,7 +84,12 @@ class _Serialisable:
 
 @dataclass(frozen=True)
 class ExactNoise(_Serialisable):
-    """The larger return always wins; what doubt there is comes from the prediction."""
+    """The larger return always wins; what doubt there is comes from the prediction.
+
+    >>> p = ExactNoise().probability_left(difference=3.0, error=3.0, magnitude=20.0)
+    >>> round(float(p), 2)
+    0.84
+    """
 
     kind = "exact"
     mistakes = 0.0

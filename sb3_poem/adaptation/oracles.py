@@ -21,7 +21,17 @@ ORACLE_STREAM = 8
 
 
 class TaskOracle(ABC):
-    """An oracle that computes true returns from the trajectories' reward features.
+    """An oracle that computes true returns from the trajectories' reward features. A subclass says
+    how it perceives their difference:
+
+    >>> class Spoilt(TaskOracle):
+    ...     def _perceive(self, left, right):  # only the right one can please
+    ...         return left - right - 100.0
+    >>> from sb3_poem import PreferenceAdapter
+    >>> adapter = PreferenceAdapter("PointGoal", "poem/PointGoal-v0", seed=0)
+    >>> query = adapter.ask()
+    >>> Spoilt(adapter.env)(query.left, query.right)
+    <Preference.RIGHT: 'right'>
 
     :param env: A task family: a ``gym.Env``, or an SB3 ``VecEnv`` of them. It can be given later by
         :meth:`bind`.
@@ -129,6 +139,9 @@ class BoltzmannOracle(TaskOracle):
     With the paper's beta (None), ``1 / (|R_left| + |R_right|)``, an answer is right at most 73 % of
     the time, and ten answers carry less than two bits. For the other arguments see
     :class:`TaskOracle`.
+
+    >>> BoltzmannOracle(beta=0.5).noise_model
+    BoltzmannNoise(beta=0.5)
     """
 
     def __init__(

@@ -13,7 +13,11 @@ from sb3_poem.common.trajectory import Trajectory
 
 
 class Preference(Enum):
-    """The answer to "which of the two trajectories is better?"."""
+    """The answer to "which of the two trajectories is better?".
+
+    >>> Preference("left")
+    <Preference.LEFT: 'left'>
+    """
 
     MUCH_LEFT = "much left"
     LEFT = "left"

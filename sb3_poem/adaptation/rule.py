@@ -25,7 +25,15 @@ SelfRule = TypeVar("SelfRule", bound="Rule")
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """One answered question: the answer, and what stood left and right."""
+    """One answered question: the answer, and what stood left and right.
+
+    >>> from sb3_poem import PreferenceAdapter
+    >>> adapter = PreferenceAdapter("PointGoal", "poem/PointGoal-v0", seed=0)
+    >>> _ = adapter.ask()
+    >>> adapter.tell("left")
+    >>> adapter.inference.answers[0].preference
+    <Preference.LEFT: 'left'>
+    """
 
     preference: Preference
     left: Shown
@@ -56,6 +64,13 @@ class Snapshot:
 class Inference(ABC):
     """One task's inference under a rule: ``ask`` says what to compare, ``tell`` takes the answer,
     ``estimate`` gives the latent to act on. ``rng`` is the only source of randomness.
+
+    >>> import sb3_poem
+    >>> model = sb3_poem.POEMSAC.from_pretrained("PointGoal")
+    >>> inference = sb3_poem.Paper().start(model, np.random.default_rng(0), Setting(n_queries=3))
+    >>> left, right = inference.ask()  # the latents whose policies are to be compared
+    >>> inference.estimate().shape
+    (5,)
     """
 
     #: Names of the attributes, arrays, that change while answers come in, beside the answers and
@@ -112,6 +127,9 @@ class Inference(ABC):
 class Setting:
     """What an adaptation is given beside model and rule.
 
+    >>> Setting(n_queries=3).library is None  # questions are new rollouts
+    True
+
     :param library: Trajectories to ask about instead of new rollouts.
     :param env: Where rollouts are made; None where none are.
     :param task: (task_dim,) by which a rule that may read rewards reads them; None takes the one in
@@ -132,7 +150,14 @@ class Rule(ABC):
     """How to ask and how to infer: a rule's own options and nothing else.
 
     A rule of your own is a frozen dataclass that subclasses this, says in ``__post_init__`` which
-    values its options may have, and starts an :class:`Inference`.
+    values its options may have, and starts an :class:`Inference`. Rules that ship show how options
+    are named:
+
+    >>> from sb3_poem import Bayes
+    >>> Bayes(n_particles=100)
+    Bayes(n_particles=100)
+    >>> Rule.from_dict(Bayes(n_particles=100).to_dict()) == Bayes(n_particles=100)
+    True
     """
 
     #: Whether questions show policies with their exploration noise, whatever the adapter says.

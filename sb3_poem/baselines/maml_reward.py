@@ -33,6 +33,13 @@ class MAMLRewardModel(MetaModel):
     to some task; a "latent" names one by its number, and says with its second entry, 1 or -1, with
     which sign exploration noise is added: so two rollouts of one policy from equal seeds differ.
 
+    >>> from sb3_poem import PEARLSAC
+    >>> from sb3_poem.baselines import meta_train_reward
+    >>> small = dict(n_train_tasks=4, gradient_steps=2, seed=0)
+    >>> pearl = PEARLSAC("MlpPolicy", "poem/PointGoal-v0", **small).learn(200)
+    >>> MAMLRewardModel(meta_train_reward(pearl, n_iterations=1), pearl)
+    MAMLRewardModel(poem/PointGoal-v0)
+
     :param reward: The meta-trained reward.
     :param model: The :class:`PEARLSAC` that it was meta-trained with, for spaces and horizon.
     """
@@ -102,6 +109,15 @@ class MAMLReward(Rule):
     (``gradient_steps``; the other options are SAC's too). What is learnt follows from the seed and
     the answers alone, so a saved adaptation keeps no networks: they are learnt again. Questions
     show exploring policies: nothing else brings SAC its experience.
+
+    >>> from sb3_poem import PEARLSAC, PreferenceAdapter, ReturnOracle
+    >>> from sb3_poem.baselines import meta_train_reward
+    >>> env_id, small = "poem/PointGoal-v0", dict(n_train_tasks=4, gradient_steps=2, seed=0)
+    >>> pearl = PEARLSAC("MlpPolicy", env_id, **small).learn(200)
+    >>> model = MAMLRewardModel(meta_train_reward(pearl, n_iterations=1), pearl)
+    >>> rule = MAMLReward(gradient_steps=1)
+    >>> adapter = PreferenceAdapter(model, env_id, rule=rule, oracle=ReturnOracle(), n_queries=1)
+    >>> policy = adapter.adapt()
     """
 
     gradient_steps: int = 200

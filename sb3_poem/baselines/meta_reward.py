@@ -39,6 +39,13 @@ WEIGHTS, CONFIG = "reward.safetensors", "reward.json"
 class MetaReward:
     """A reward network from which a few preferences lead to a task's reward.
 
+    >>> from sb3_poem import PEARLSAC
+    >>> small = dict(n_train_tasks=4, gradient_steps=2, seed=0)
+    >>> pearl = PEARLSAC("MlpPolicy", "poem/PointGoal-v0", **small).learn(200)
+    >>> meta_train_reward(pearl, n_iterations=1).save("reward")
+    >>> MetaReward.load("reward", pearl.policy).inner_steps
+    5
+
     :param policy: Whose standardisation of observations is used.
     :param inner_learning_rate: Step size of MAML's inner loop, which has ``inner_steps``.
     :param fragment_length: Steps of the fragments of the meta-training; None: any.

@@ -47,6 +47,12 @@ class RewardOracle(Rule):
     mislead it. The model is a ``PEARLSAC`` (not a ``POEMSAC`` whose context holds values), and the
     environment a task family, from which rewards are read.
 
+    >>> from sb3_poem import PEARLSAC, PreferenceAdapter, ReturnOracle
+    >>> small = dict(n_train_tasks=4, gradient_steps=2, seed=0)
+    >>> pearl = PEARLSAC("MlpPolicy", "poem/PointGoal-v0", **small).learn(200)
+    >>> who = dict(rule=RewardOracle(), oracle=ReturnOracle(), n_queries=2)
+    >>> policy = PreferenceAdapter(pearl, "poem/PointGoal-v0", **who).adapt()
+
     :param candidates: Where the first question's latents come from, and what is acted on before it:
         "prior" (N(0, I)), or "aggregate", the mean and variance of the training tasks' posteriors.
     """

@@ -360,9 +360,6 @@ def _models(selection: Selection, condition: Condition) -> list[Table]:
         "CPU seconds": [_shown(result.get("training_cpu_seconds"), ",.0f") for result in results],
         "preference accuracy": [_shown(r.get("preference_accuracy"), ".3f") for r in results],
         "Kendall's tau": [_shown(r.get("kendall_tau"), ".3f") for r in results],
-        "commit": [
-            str(model.get("commit") or model.get("card", {}).get("commit", "")) for model in models
-        ],
     }
     if not any(columns["CPU seconds"]):
         del columns["CPU seconds"]

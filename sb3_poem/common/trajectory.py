@@ -36,6 +36,11 @@ def decode_array(data: dict[str, Any]) -> np.ndarray:
 class Trajectory:
     """One episode of a latent-conditioned policy, without rewards: adaptation must not see them.
 
+    >>> from sb3_poem import PreferenceAdapter
+    >>> query = PreferenceAdapter("PointGoal", "poem/PointGoal-v0", seed=0).ask()
+    >>> query.left.observations.shape, query.left.actions.shape, query.left.latent.shape
+    ((26, 2), (25, 2), (5,))
+
     :param observations: (T + 1, obs_dim); the last is the observation after the last action.
     :param actions: (T, act_dim).
     :param latent: (d,) the latent whose policy acted.

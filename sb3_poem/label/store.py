@@ -124,6 +124,11 @@ class Store:
     of answers before it. :class:`~sb3_poem.label.rendering.StorageError` says that the disk is full
     or broken.
 
+    >>> store = Store("label_data")
+    >>> session, token = store.create_session("PointGoal", "poem/PointGoal-v0", 0, {})
+    >>> store.answers(session.id), store.find(token) == session
+    ([], True)
+
     :param folder: It is made if missing, for its owner alone: ``answers.sqlite`` and ``videos/``
     :raises ValueError: If the store is of another version.
     """
@@ -472,6 +477,12 @@ def _session(row: sqlite3.Row) -> Session:
 class StoreRecorder:
     """Keeps what a ``HumanOracle`` is told at a terminal, in the same store as the page's answers:
     ``HumanOracle(record=StoreRecorder(...))``.
+
+    >>> from sb3_poem import HumanOracle
+    >>> recorder = StoreRecorder(Store("label_data"), "PointGoal", "poem/PointGoal-v0", seed=0)
+    >>> oracle = HumanOracle(record=recorder)
+    >>> recorder.kept()
+    []
 
     :param options: Of the adaptation, JSON-ready, as ``seed``
     :param n_queries: How many answers there will be at most.

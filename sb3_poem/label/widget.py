@@ -24,13 +24,15 @@ class LabelWidget:
     """The page on which a person answers, for an adapter in a notebook: the last expression of a
     cell shows it.
 
-    .. code-block:: python
+    >>> import gymnasium as gym
+    >>> from sb3_poem import Bayes, PreferenceAdapter
+    >>> env = gym.make("poem/PointGoal-v0", render_mode="rgb_array")
+    >>> rule = Bayes(question="graded", noise_model="infer")  # five answers, whoever gives them
+    >>> widget = LabelWidget(PreferenceAdapter("PointGoal", env, rule=rule))
+    >>> html = widget._repr_html_()  # the page, which a cell shows below it
+    >>> widget.close()
 
-        env = gym.make("poem/HalfCheetahVel-v0", render_mode="rgb_array")
-        rule = Bayes(question="graded", noise_model="infer")  # five answers, whoever gives them
-        widget = LabelWidget(PreferenceAdapter(model, env, rule=rule))
-        widget                      # answer in the page below the cell
-        policy = widget.policy()    # in a later cell
+    Before that, in a later cell, ``widget.policy()`` is the policy for the answers so far.
 
     The server runs in this process, on loopback: the browser must run on the same machine, or its
     port be forwarded.

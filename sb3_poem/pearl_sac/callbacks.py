@@ -64,6 +64,15 @@ class TrainingCheckpointCallback(EpochCallback):
         model.learn(500_000, callback)  # raises KeyboardInterrupt once the checkpoint is written
         POEMSAC.load_checkpoint("checkpoint.zip", env).resume()  # later
 
+    Otherwise it is a callback like any other:
+
+    >>> from sb3_poem import POEMSAC
+    >>> small = dict(n_train_tasks=4, gradient_steps=2, seed=0)
+    >>> model = POEMSAC("MlpPolicy", "poem/PointGoal-v0", **small)
+    >>> _ = model.learn(100, TrainingCheckpointCallback("checkpoint.zip"))
+    >>> POEMSAC.load_checkpoint("checkpoint.zip", "poem/PointGoal-v0").num_timesteps
+    100
+
     :param path: The file; it is replaced atomically
     :param every: Epochs between two checkpoints; None: at most every 50 times as long as writing
         one takes, and training goes on where it cannot be written. The end of training writes one

@@ -40,6 +40,12 @@ class LatentPolicy(SACPolicy):
     ``predict(obs, state=z)`` acts for latent ``z``; SB3's ``state`` slot carries it from step to
     step. Without a state the prior's mean acts.
 
+    >>> from sb3_poem import PEARLSAC
+    >>> layers = dict(layer_norm=True, net_arch=[64, 64])
+    >>> model = PEARLSAC("MlpPolicy", "poem/PointGoal-v0", n_train_tasks=4, policy_kwargs=layers)
+    >>> isinstance(model.policy, LatentPolicy)
+    True
+
     :param net_arch: Hidden widths of actor and critics, or a dict with keys ``pi``, ``qf``,
         ``encoder``, ``decoder``, ``embedding`` for each
     :param activation_fn: Activation of actor, critics and decoder

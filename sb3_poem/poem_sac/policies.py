@@ -12,6 +12,12 @@ from sb3_poem.pearl_sac.policies import LatentPolicy
 class POEMPolicy(LatentPolicy):
     """Adds the embeddings f_r and f_pi of section 5.1 (Xu & Zhu 2025), if ``two_encoder``; they are
     compared by their inner product, or with a ``temperature`` by the cosine of their angle over it.
+
+    >>> from sb3_poem import POEMSAC
+    >>> layers = dict(layer_norm=True, net_arch=[64, 64])
+    >>> model = POEMSAC("MlpPolicy", "poem/PointGoal-v0", n_train_tasks=4, policy_kwargs=layers)
+    >>> isinstance(model.policy, POEMPolicy)
+    True
     """
 
     def __init__(

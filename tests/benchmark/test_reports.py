@@ -281,6 +281,7 @@ def test_every_format(tmp_path: Path) -> None:
     methods.remove("maml-reward")  # which stands in another table too
     store = fill(tmp_path / "store.sqlite", snapshots=1, methods=methods)
     markdown, _ = make_report(store, ["table3"])
+    assert "abc" not in markdown  # the commit: it is the store's and the manifest's
     line, _ = (one for one in markdown.splitlines() if one.startswith("| POEM (paper) | 3 "))
     cells = [cell.strip() for cell in line.strip("|").split("|")]
     assert cells[:3] == ["POEM (paper)", "3", "-19.0 ± 5.0"]
