@@ -11,6 +11,9 @@ def __getattr__(name: str) -> Any:
     """The widget needs the extra ``[label]``; the store does not."""
     if name != "LabelWidget":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from sb3_poem.label.widget import LabelWidget
-
+    try:
+        from sb3_poem.label.widget import LabelWidget
+    except ModuleNotFoundError as error:
+        needs = "LabelWidget needs the extra: pip install 'sb3_poem[label]'"
+        raise ModuleNotFoundError(f"{needs} ({error})", name=error.name) from error
     return LabelWidget

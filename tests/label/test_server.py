@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -508,3 +509,10 @@ def test_what_the_page_asks(
     app = make_app(make_sessions(store, point_goal, options=options))
     with TestClient(app, base_url=HOST, follow_redirects=False) as client:
         assert client.get(begin(client)).text.count("data-preference=") == buttons
+
+
+def test_the_widget_names_the_extra_that_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "sb3_poem.label.widget", raising=False)
+    monkeypatch.setitem(sys.modules, "sb3_poem.label.server", None)  # as without starlette
+    with pytest.raises(ImportError, match=r"pip install 'sb3_poem\[label\]'"):
+        from sb3_poem.label import LabelWidget  # noqa: F401
