@@ -313,6 +313,44 @@ def test_a_person_says_how_much_better(
         assert " of 3" in capsys.readouterr().out  # those of "equal" are not foretold
 
 
+def test_a_person_says_which_of_four_is_best_and_goes_on_later(
+    model: tuple[POEMSAC, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    four = ["--question", "best-of-four", "--queries", 3, "--n-candidates", 20, *TINY]
+    command = [model[1], "--oracle", "human", *four]
+    answer_by(monkeypatch, tmp_path, "4\n1\n")  # and then standard input ends
+    assert adapt(*command) == 0
+    answer_by(monkeypatch, tmp_path, "left\n0\n")
+    assert adapt(*command, "--resume", "--json", "state.json") == 0
+    assert "'left' is no answer; type a number from 0 to 4." in capsys.readouterr().out
+    kept = PreferenceAdapter.load("state.json", model[0], ENV_ID)
+    assert [answer.preference.value for answer in kept.answers] == ["fourth", "first", "equal"]
+    assert kept.rule.question == "best-of-four"
+    label = ["label", "--store", "label_data"]
+    assert cli.main([*label, "replay", "--model", model[1]]) == 0
+    assert " of 2" in capsys.readouterr().out
+    assert cli.main([*label, "replay", "--model", model[1], "--inference", "paper"]) == 1
+    assert "session 1 asks which of four is best" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("oracle", ["return", "mistake", "boltzmann"])
+def test_a_program_says_which_of_four_is_best(
+    model: tuple[POEMSAC, str], tmp_path: Path, capsys: pytest.CaptureFixture[str], oracle: str
+) -> None:
+    file = tmp_path / "result.json"
+    flags = ["--oracle", oracle, "--question", "best-of-four", "--queries", 2, "--tasks", 3]
+    assert adapt(model[1], *flags, "--episodes", 1, "--n-candidates", 20, "--json", file) == 0
+    result = json.loads(file.read_text())
+    answers = {word for answers in result["answers"] for word in answers}
+    assert answers <= {"first", "second", "third", "fourth", "equal"}
+    assert len(answers) > 1
+    assert result["thresholds"] is None
+    assert "the best 4^answers of those" in capsys.readouterr().out
+
+
 def test_a_program_says_how_much_better(model: tuple[POEMSAC, str], tmp_path: Path) -> None:
     file = tmp_path / "result.json"
     flags = ["--oracle", "mistake", "--question", "graded", "--infer-noise", "--queries", 3]

@@ -554,6 +554,10 @@ COMMANDS = [
     command("PointGaol...PointGoal", "label", "--model", "PointGaol"),
     command("rate...2", "label", "--mistake-rate", 2),
     command("pairs...graded", "label", "--inference", "paper", "--question", "graded"),
+    command("pairs...best-of-four", *ADAPT, "--inference", "paper", "--question", "best-of-four"),
+    command(
+        "worst-case...pairs", *ADAPT, "--query-rule", "worst-case", "--question", "best-of-four"
+    ),
     command("--store...no answers", "label", "export", "--out", "a.jsonl"),
     command("--out a.csv....jsonl", "label", "export", "--out", "a.csv"),
     command("--store...no answers", "label", "replay"),

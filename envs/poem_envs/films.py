@@ -15,8 +15,8 @@ import numpy as np
 
 from poem_envs.mujoco_rendering import FastRenderer
 
-#: Of the first path and of the second, red, green and blue in [0, 1].
-PATH_COLOURS = ((0.10, 0.33, 0.85), (0.90, 0.40, 0.02))
+#: Of the first path, the second and so on, red, green and blue in [0, 1].
+PATH_COLOURS = ((0.10, 0.33, 0.85), (0.90, 0.40, 0.02), (0.00, 0.52, 0.36), (0.62, 0.20, 0.65))
 FLOOR_COLOUR, BANDS = (0.80, 0.82, 0.86), ((0.80, 0.82, 0.86), (0.90, 0.92, 0.95))
 SKY, GREY, INK = (226, 231, 240), (0.45, 0.47, 0.52), (0.10, 0.12, 0.18)
 # How much of their own colours is left to robots in a picture of several, and how solid they are.

@@ -134,7 +134,7 @@ class PointGoalEnv(BatchFamily):
             self._window = None
 
 
-# Of the first path and of the second.
+# Of the first path, the second and so on.
 _COLOURS: list[Colour] = [
     (round(255 * r), round(255 * g), round(255 * b)) for r, g, b in PATH_COLOURS
 ]

@@ -16,7 +16,7 @@ from sb3_poem.adaptation.bayes import Bayes
 from sb3_poem.adaptation.environments import Env, describe_model, model_and_env, warn_if_untrained
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.policy import AdaptedPolicy
-from sb3_poem.adaptation.preference import Preference, Query, as_preference
+from sb3_poem.adaptation.preference import PLACES, Preference, Query, as_preference
 from sb3_poem.adaptation.rule import (
     Answer,
     Rule,
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 FORMAT, FORMAT_VERSION = "sb3_poem.PreferenceAdapter", 3
 
-Oracle = Callable[[Trajectory, Trajectory], Any]
+Oracle = Callable[..., Any]
 
 
 class OtherModelError(ValueError):
@@ -49,7 +49,7 @@ class OtherModelError(ValueError):
 
 class PreferenceAdapter:
     """Adapts a model to the hidden task of an environment by asking which of two trajectories is
-    better.
+    better, or which of four is best.
 
     Nothing blocks: ``ask()`` gives a question, ``tell()`` takes its answer whenever there is one,
     ``policy()`` is usable at any time. The adapter reads no rewards and neither reads nor sets the
@@ -75,9 +75,9 @@ class PreferenceAdapter:
     :param rule: How to ask and to infer: :class:`Bayes`, :class:`Paper` (Algorithm 2 of Xu & Zhu
         2025), or a baseline's, each with its own options; None is ``Bayes()``.
     :param n_queries: How many answers are asked for at most (K).
-    :param oracle: Who answers in :meth:`adapt`; a callable (left, right) -> Preference. If it has
-        ``needs_frames``, trajectories carry frames. If it has ``bind`` and no environment yet, it
-        is bound to ``env``.
+    :param oracle: Who answers in :meth:`adapt`; a callable (left, right) -> Preference, or of as
+        many trajectories as the rule's questions show. If it has ``needs_frames``, trajectories
+        carry frames. If it has ``bind`` and no environment yet, it is bound to ``env``.
     :param seed: Makes everything reproducible; None draws one, kept in ``seed``.
     :param deterministic: Whether policies act by their mode.
     :param library: Trajectories to ask about instead of rolling out new ones, for a rule that can.
@@ -150,23 +150,22 @@ class PreferenceAdapter:
         return self._pending
 
     def ask(self) -> Query:
-        """The next question, two trajectories on the new task; the same again while it waits for
-        its answer. A ``RuntimeError`` if all questions have been answered.
+        """The next question, trajectories on the new task; the same again while it waits for its
+        answer. A ``RuntimeError`` if all questions have been answered.
         """
         if self._pending is None:
             if self.done:
                 answered = f"all {self.n_queries} questions have been answered"
                 raise RuntimeError(f"{answered}; take policy()")
-            self._pending = self._make_query(*self.inference.ask())
+            self._pending = self._make_query(self.inference.ask())
         elif (
             self._needs_frames
-            and self._pending.left.frames is None
+            and self._pending.shown[0].frames is None
             and self.inference.library is None
         ):
             # It comes from a file, which holds no frames; the same seed gives the same rollouts.
-            left, right = self._pending.left.latent, self._pending.right.latent
-            latents = self.inference.same_latents(left, right)
-            self._pending = self._make_query(*latents, self._number_of(self._pending))
+            latents = self.inference.same_latents(*(item.latent for item in self._pending.shown))
+            self._pending = self._make_query(latents, self._number_of(self._pending))
         return self._pending
 
     @property
@@ -177,7 +176,7 @@ class PreferenceAdapter:
         return self.inference.contradicted()
 
     def ask_again(self, number: int) -> Query:
-        """Ask about the same two trajectories as question ``number``, from 0, instead of the one
+        """Ask about the same trajectories as question ``number``, from 0, instead of the one
         that waits, if any. Its answer is one more, beside the first.
 
         :raises RuntimeError: If all questions have been answered.
@@ -190,16 +189,16 @@ class PreferenceAdapter:
                 f"`number` must be that of an answer, from 0 to {self.n_answers - 1}, but is "
                 f"{number!r}"
             )
-        answer = self.inference.answers[number]
-        left, right = trajectories_of("ask_again()", answer.left, answer.right)
-        self._pending = Query(left, right, self.rule.question)
+        shown = trajectories_of("ask_again()", *self.inference.answers[number].shown)
+        self._pending = Query(shown, self.rule.question)
         return self.ask()
 
     def tell(self, preference: Preference | str) -> None:
         """Answer the pending question.
 
         :param preference: A :class:`Preference`, or "left", "right" or "equal"; to a graded
-            question "much left" and "much right", too.
+            question "much left" and "much right", too; of four "first", "second", "third", "fourth"
+            or "equal".
         :raises RuntimeError: If no question waits for an answer.
         :raises TypeError, ValueError: If it is no answer to such a question, which goes on waiting.
         """
@@ -210,7 +209,7 @@ class PreferenceAdapter:
         query = self._pending
         answer = as_preference(preference, query.kind)
         before = self.inference.snapshot()
-        self.inference.tell(answer, query.left, query.right)
+        self.inference.tell(answer, *query.shown)
         self._pending, self._previous = None, (before, query)
         self._seen.clear()
 
@@ -250,7 +249,7 @@ class PreferenceAdapter:
         with tqdm(total=n, initial=self.n_answers, unit="query", disable=shows) as bar:
             while not self.done:
                 query = self.ask()
-                self.tell(oracle(query.left, query.right))
+                self.tell(oracle(*query.shown))
                 bar.update()
         return self.policy()
 
@@ -273,21 +272,20 @@ class PreferenceAdapter:
 
     def _number_of(self, query: Query) -> int:
         """Of the answer about the very trajectories of a question; else the next one's."""
-        asked = (query.left, query.right)
         for number, answer in enumerate(self.answers):
-            pairs = zip(trajectories_of("ask()", answer.left, answer.right), asked, strict=True)
+            pairs = zip(trajectories_of("ask()", *answer.shown), query.shown, strict=True)
             if all(np.array_equal(old.observations, new.observations) for old, new in pairs):
                 return number
         return self.n_answers
 
-    def _make_query(self, left: Shown, right: Shown, number: int | None = None) -> Query:
-        """Both rollouts start alike, one after the other in the first copy: other copies may hold
+    def _make_query(self, shown: Sequence[Shown], number: int | None = None) -> Query:
+        """The rollouts start alike, one after the other in the first copy: other copies may hold
         other tasks.
         """
         number = self.n_answers if number is None else number
         frames = self._needs_frames
-        first, second = (self._rolled_out(item, number, frames) for item in (left, right))
-        return Query(first, second, self.rule.question)
+        rolled = tuple(self._rolled_out(item, number, frames) for item in shown)
+        return Query(rolled, self.rule.question)
 
     def _rolled_out(self, shown: Shown, number: int, frames: int) -> Trajectory:
         """What is shown of question ``number``."""
@@ -318,7 +316,7 @@ class PreferenceAdapter:
         self._seen.update(((number, clip.latent.tobytes()), clip) for clip in rolled)
         if left.reward_features is None or right.reward_features is None:
             return 1.0
-        answered = [item for answer in self.answers for item in (answer.left, answer.right)]
+        answered = [item for answer in self.answers for item in answer.shown]
         features = [getattr(item, "reward_features", None) for item in (*answered, *rolled)]
         spread = np.concatenate([rows for rows in features if rows is not None]).std(axis=0)
         visible = family.visible_difference(left.reward_features, right.reward_features, spread)
@@ -329,7 +327,7 @@ class PreferenceAdapter:
         trajectories, posterior, random state, and the pending question. Frames stay out; model,
         environment, oracle and library too.
         """
-        model, pending = self.model, self._pending
+        model, pending, kind = self.model, self._pending, self.rule.question
         return {
             "format": FORMAT,
             "version": FORMAT_VERSION,
@@ -344,10 +342,10 @@ class PreferenceAdapter:
             "deterministic": self.deterministic,
             "uses_library": self.library is not None,
             "answers": [
-                {"preference": answer.preference.value, **_pair_to_dict(answer)}
+                {"preference": answer.preference.value, **shown_to_dict(kind, answer.shown)}
                 for answer in self.inference.answers
             ],
-            "pending": None if pending is None else _pair_to_dict(pending),
+            "pending": None if pending is None else shown_to_dict(kind, pending.shown),
             "inference": self.inference.snapshot().to_dict(),
         }
 
@@ -404,13 +402,14 @@ class PreferenceAdapter:
         """Go to where another adapter of the same model, rule and seed stood at :meth:`to_dict`;
         broken data raises a ``ValueError``.
         """
+        kind = self.rule.question
         with _complete():
             answers = [
-                Answer(Preference(item["preference"]), *_pair_from_dict(item))
+                Answer(Preference(item["preference"]), shown_from_dict(kind, item))
                 for item in data["answers"]
             ]
-            waits, kind = data["pending"], self.rule.question
-            pending = None if waits is None else Query(*_pair_from_dict(waits), kind=kind)
+            waits = data["pending"]
+            pending = None if waits is None else Query(shown_from_dict(kind, waits), kind)
             self.inference.restore(Snapshot.from_dict(data["inference"]), answers)
         self._pending, self._previous = pending, None
         self._seen.clear()
@@ -447,12 +446,14 @@ def _complete() -> Iterator[None]:
         raise ValueError(f"a saved adaptation that is incomplete or broken: {error!r}") from error
 
 
-def _pair_to_dict(pair: Any) -> dict[str, Any]:
-    return {"left": pair.left.to_dict(), "right": pair.right.to_dict()}
+def shown_to_dict(kind: str, shown: Sequence[Any]) -> dict[str, Any]:
+    """What a question of this kind shows, JSON-ready, by place: "left" and "right", say."""
+    return {place: item.to_dict() for place, item in zip(PLACES[kind], shown, strict=True)}
 
 
-def _pair_from_dict(data: dict[str, Any]) -> tuple[Trajectory, Trajectory]:
-    return Trajectory.from_dict(data["left"]), Trajectory.from_dict(data["right"])
+def shown_from_dict(kind: str, data: dict[str, Any]) -> tuple[Trajectory, ...]:
+    """Read what :func:`shown_to_dict` wrote, other keys aside."""
+    return tuple(Trajectory.from_dict(data[place]) for place in PLACES[kind])
 
 
 def _check_oracle(oracle: Any) -> None:

@@ -4,7 +4,7 @@ they thin out.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -30,7 +30,13 @@ from sb3_poem.adaptation.particles import (
     systematic_resample,
 )
 from sb3_poem.adaptation.people import INFER, People
-from sb3_poem.adaptation.preference import ANSWERS, Preference, preference_log_likelihood
+from sb3_poem.adaptation.preference import (
+    ANSWERS,
+    BEST_OF_FOUR,
+    PLACES,
+    Preference,
+    preference_log_likelihood,
+)
 from sb3_poem.adaptation.priors import SOURCES, make_prior
 from sb3_poem.adaptation.rule import (
     Answer,
@@ -54,8 +60,9 @@ PRIOR_COVERS = 0.3
 
 # Policies that a question may compare: the posterior's own, and as many from the prior. The pair
 # that splits a narrow posterior best usually lies outside it (to tell 1.0 from 1.1 show 0.8 and
-# 1.3), where the two can also be told apart.
-QUERY_POLICIES = 64
+# 1.3), where the two can also be told apart. Four of which each is best for some of a narrow
+# posterior are rarer.
+QUERY_POLICIES = {"pair": 64, "graded": 64, BEST_OF_FOUR: 128}
 # Particles that a question's gain is averaged over.
 QUERY_PARTICLES = 128
 # The prior's policies that tell, at a decision, how widely S spreads.
@@ -117,8 +124,8 @@ class Bayes(Rule):
     fitness.
 
     *Likelihood from the decoder*: the reward decoder predicts, for every particle, the returns of
-    the two trajectories that were shown; the noise model turns the difference into the probability
-    of the answer. The predicted difference is trusted only as far as the decoder's own residual
+    the trajectories that were shown; the noise model turns the difference into the probability of
+    the answer. The predicted difference is trusted only as far as the decoder's own residual
     allows.
 
     *Likelihood from S*: S(z, z_left) - S(z, z_right) takes the place of the returns' difference. S
@@ -166,7 +173,8 @@ class Bayes(Rule):
     :param noise_model: How the oracle errs, or "infer"; None takes ``oracle.noise_model`` where
         there is one, else no error.
     :param epsilon: Tolerated error of eq. 9, in [0, 0.5), for ``query_rule="worst-case"``.
-    :param question: "pair" (left, right or equal), or "graded" (much better, too).
+    :param question: "pair" (left, right or equal), "graded" (much better, too) or "best-of-four":
+        the pair that tells most, and two more that add most to it.
     :raises ValueError: If an option is out of its range.
     """
 
@@ -187,6 +195,11 @@ class Bayes(Rule):
         check_choice("decision", self.decision, DECISIONS)
         queries.check_epsilon(self.epsilon)
         check_choice("question", self.question, tuple(ANSWERS))
+        if self.question == BEST_OF_FOUR and self.query_rule == "worst-case":
+            raise ValueError(
+                'query_rule="worst-case" (eq. 10) chooses pairs: with question="best-of-four" use '
+                '"information-gain" or "random"'
+            )
         needed = "probability_left" if self.question == "pair" else "probability_above"
         if self.noise_model not in (None, INFER) and not hasattr(self.noise_model, needed):
             raise ValueError(
@@ -273,12 +286,13 @@ class BayesInference(Inference):
         super().__init__(rng)
         self.visibility = visibility
         self.rule, self.model = rule, model
+        self.n_shown = len(PLACES[rule.question])
         self.has_similarity = isinstance(model, HasSimilarity)
         self.likelihood = rule.likelihood_with(model)
         noise: Any = rule.noise_model or ExactNoise()
         #: How the oracle errs, if that is told
         self.noise_model: NoiseModel | None = None if noise == INFER else noise
-        grid = noise == INFER or rule.question == "graded"
+        grid = noise == INFER or rule.question != "pair"
         self.people = People(rule.question, self.noise_model) if grid else None
         self.library = None if library is None else list(library)
         far = model.aggregate_to_prior_kl > PRIOR_COVERS
@@ -314,24 +328,24 @@ class BayesInference(Inference):
         """(G,) the posterior of which of :attr:`people` answers."""
         return self.weights @ np.exp(self.people_log_shares.astype(np.float64))
 
-    def ask(self) -> tuple[Shown, Shown]:
+    def ask(self) -> tuple[Shown, ...]:
         if self.library is not None:
-            first, second = self._ask_about(self.library)
-            return self.library[first], self.library[second]
+            return tuple(self.library[i] for i in self._ask_about(self.library))
         policies = self._query_policies()
+        chosen: tuple[int, ...]
         if self.rule.query_rule == "random":
-            first, second = queries.random_pair(len(policies), self.rng)
-            return policies[first], policies[second]
+            chosen = queries.random_set(len(policies), self.n_shown, self.rng)
+            return tuple(policies[list(chosen)])
         particles, weights = self._query_particles()
         similarities = self.model.similarities(particles, policies)
         if self.rule.query_rule == "worst-case":
-            first, second = queries.worst_case_pair(similarities, self.rule.epsilon, weights)
+            chosen = queries.worst_case_pair(similarities, self.rule.epsilon, weights)
         else:
             slope, magnitude, noise = self._return_unit()
             unit = slope * (QUERY_RESOLUTION * self._spread), magnitude, slope * self._spread
             values = slope * similarities
-            first, second = self._most_informative(policies, values, weights, noise, *unit)
-        return policies[first], policies[second]
+            chosen = self._most_informative(policies, values, weights, noise, *unit)
+        return tuple(policies[list(chosen)])
 
     def _most_informative(
         self,
@@ -342,7 +356,7 @@ class BayesInference(Inference):
         error: float,
         magnitude: float,
         spread: float,
-    ) -> tuple[int, int]:
+    ) -> tuple[int, ...]:
         """See :func:`queries.most_informative_pair`; and :meth:`People.probabilities`."""
         see = self.visibility
         visibility: queries.Visibility | None = (
@@ -354,13 +368,21 @@ class BayesInference(Inference):
         people = self.people
         if noise is not self.noise_model:
             people = People(self.rule.question, noise)
-        largest = float(np.ptp(values, axis=1).max())
-        table = people.table(self.people_shares, largest, error, magnitude, spread)
-        return queries.most_telling_pair(values, weights, *table, visibility)
+        shares, largest = self.people_shares, float(np.ptp(values, axis=1).max())
+        table = people.table(shares, largest, error, magnitude, spread)
+        pair = queries.most_telling_pair(values, weights, *table, visibility)
+        if self.n_shown == 2:
+            return pair
 
-    def _ask_about(self, library: list[Trajectory]) -> tuple[int, int]:
+        def said(differences: np.ndarray) -> np.ndarray:
+            told = people.probabilities(differences, error, magnitude, spread)
+            return told @ shares.astype(told.dtype)
+
+        return queries.most_telling_set(pair, self.n_shown, values, weights, said)
+
+    def _ask_about(self, library: list[Trajectory]) -> tuple[int, ...]:
         if self.rule.query_rule == "random":
-            return queries.random_pair(len(library), self.rng)
+            return queries.random_set(len(library), self.n_shown, self.rng)
         if self._library_returns is None:
             returns = self.model.predicted_returns(self.particles, library, DECODED_STEPS)
             self._library_returns = returns
@@ -370,10 +392,10 @@ class BayesInference(Inference):
         unit = error, magnitude, self._return_spread(library)
         return self._most_informative(library, returns, self.weights, self.noise_model, *unit)
 
-    def tell(self, preference: Preference, left: Shown, right: Shown) -> None:
+    def tell(self, preference: Preference, *shown: Shown) -> None:
         if self.likelihood == "decoder":
-            trajectories_of('likelihood="decoder"', left, right)
-        answer = Answer(preference, left, right)
+            trajectories_of('likelihood="decoder"', *shown)
+        answer = Answer(preference, shown)
         told = self._log_likelihoods(self.particles, [answer], new=True)
         if self.people is not None:
             before = self.people_log_shares.astype(np.float64)
@@ -399,7 +421,8 @@ class BayesInference(Inference):
     def agreements(self) -> np.ndarray:
         """(k, 2) how well each answer agrees with the others: P(better on its side, or EQUAL),
         given all others and given all; 1 for EQUAL. The posterior without an answer is that of all,
-        each latent and person divided by their probability of it (Gelfand, Dey & Chang 1992).
+        each latent and person divided by their probability of it (Gelfand, Dey & Chang 1992). Of
+        four it is P(better than another one), on average.
         """
         found = np.ones((len(self.answers), 2))
         if not self.answers:
@@ -407,32 +430,35 @@ class BayesInference(Inference):
         joint = self.weights[:, None]  # (m, 1) or (m, G)
         if self.people is not None:
             joint = joint * np.exp(self.people_log_shares.astype(np.float64))
-        difference, error, magnitude, spread = self._differences(self.particles, self.answers)
-        columns = [np.broadcast_to(x, difference.shape).T for x in (difference, error, magnitude)]
         kinds = ANSWERS[self.rule.question]
         middle = kinds.index(Preference.EQUAL)
-        for i, (answer, d, e, m) in enumerate(zip(self.answers, *columns, strict=True)):
-            place = kinds.index(answer.preference)
+        for i, d, e, m, spread in self._each_difference(self.particles, self.answers):
+            place = kinds.index(self.answers[i].preference)
             if place == middle:
                 continue
             if self.people is not None:
                 said = self.people.probabilities(d, e, m, spread)  # (answers, m, G)
             else:
                 assert self.noise_model is not None
-                left = self.noise_model.probability_left(d, e, m)[:, None]
+                left = self.noise_model.probability_left(d[:, 0], e, m)[:, None]
                 said = np.stack([1.0 - left, np.zeros_like(left), left])
-            side = (said[: middle + 1] if place < middle else said[middle:]).sum(axis=0)
-            given = joint / said[place], joint
-            found[i] = [np.sum(weights * side) / weights.sum() for weights in given]
+            if self.n_shown > 2:
+                side, other = said[place], (said[1:].sum(axis=0) - said[place]) / (len(said) - 2)
+            else:
+                side = (said[: middle + 1] if place < middle else said[middle:]).sum(axis=0)
+                other = 1.0 - side
+            for j, weights in enumerate((joint / said[place], joint)):
+                for_it, against = np.sum(weights * side), np.sum(weights * other)
+                found[i, j] = for_it / (for_it + against)
         return found
 
     def contradicted(self) -> int | None:
         """See :class:`Inference`: the answer that agrees least with all others, see
-        :meth:`agreements`, if that is less than 0.2, and less than 0.5 given all. A pair that was
-        asked about twice is left alone.
+        :meth:`agreements`, if that is less than 0.2, and less than 0.5 given all. What was asked
+        about twice is left alone.
         """
-        pairs = [(*latent_of(a.left), *latent_of(a.right)) for a in self.answers]
-        asked_twice = np.array([pairs.count(pair) > 1 for pair in pairs], dtype=bool)
+        asked = [tuple(np.concatenate([*map(latent_of, a.shown)])) for a in self.answers]
+        asked_twice = np.array([asked.count(latents) > 1 for latents in asked], dtype=bool)
         others, everything = self.agreements().T
         found = np.where(asked_twice | (everything >= BELIEVED), 1.0, others)
         return int(np.argmin(found)) if np.any(found < CONTRADICTED) else None
@@ -489,27 +515,40 @@ class BayesInference(Inference):
     def _differences(
         self, latents: np.ndarray, answers: Sequence[Answer], new: bool = False
     ) -> tuple[np.ndarray, Values, Values, float]:
-        """What each of (m, d) latents predicts of k answers: (m, k) differences, their error and
-        magnitude, as :meth:`NoiseModel.probability_left` takes them, and the family's spread.
+        """What each of (m, d) latents predicts of k answers about n: (m, k, n - 1) differences of
+        the first one's to the others' returns, their error and magnitude, as
+        :meth:`NoiseModel.probability_left` takes them, and the family's spread.
         """
-        shown = [item for answer in answers for item in (answer.left, answer.right)]
+        shown = [item for answer in answers for item in answer.shown]
+        grouped = (-1, len(answers), self.n_shown)
         if self.likelihood == "decoder":
-            values = self.model.predicted_returns(latents, shown, DECODED_STEPS)  # (m, 2 k)
-            left, right = values[:, 0::2], values[:, 1::2]
-            steps = np.array([len(item) for item in shown], dtype=np.float64)
+            values = self.model.predicted_returns(latents, shown, DECODED_STEPS)  # (m, k n)
+            steps = np.array([len(item) for item in shown], dtype=np.float64).reshape(grouped[1:])
             if new:
                 measured = self._measure_thinning(shown, values)
-                self.thinning = np.concatenate([self.thinning, [measured]])
-            intercepts, slopes, errors = self.thinning[-len(answers) :].T
-            error = np.hypot(self._decoder_error(steps[0::2] + steps[1::2]), errors)
-            difference = left - right
+                self.thinning = np.concatenate([self.thinning, measured])
+            fits = self.thinning[-len(answers) * (self.n_shown - 1) :]
+            intercepts, slopes, errors = fits.T.reshape(3, len(answers), self.n_shown - 1)
+            error = np.hypot(self._decoder_error(steps[:, :1] + steps[:, 1:]), errors).mean(axis=1)
+            difference = first_to_others(values.reshape(grouped))
             difference = difference + intercepts + slopes * difference
             if new and self.has_similarity:
                 self._calibrate(latents, shown, values)
-            return difference, error, np.abs(left) + np.abs(right), self._return_spread(shown)
+            magnitude = 2.0 * np.abs(values).reshape(grouped).mean(axis=2)
+            return difference, error, magnitude, self._return_spread(shown)
         values = self.model.similarities(latents, np.stack([latent_of(item) for item in shown]))
         error = float(self.scale[1]) * PROBIT_SLOPE
-        return values[:, 0::2] - values[:, 1::2], error, 2.0 * self._spread, self._spread
+        return first_to_others(values.reshape(grouped)), error, 2.0 * self._spread, self._spread
+
+    def _each_difference(
+        self, latents: np.ndarray, answers: Sequence[Answer], new: bool = False
+    ) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray, float]]:
+        """The number of each answer, and :meth:`_differences` of it, (m, n - 1), (m,) and (m,)."""
+        difference, error, magnitude, spread = self._differences(latents, answers, new)
+        shape = difference.shape[:2]
+        error, magnitude = np.broadcast_to(error, shape), np.broadcast_to(magnitude, shape)
+        for i in range(len(answers)):
+            yield i, difference[:, i], error[:, i], magnitude[:, i], spread
 
     def _log_likelihoods(
         self, latents: np.ndarray, answers: Sequence[Answer], new: bool = False
@@ -517,16 +556,15 @@ class BayesInference(Inference):
         """(m,) log P(answers | latent) of (m, d), or (m, G) for each of the people; what else a new
         answer tells is noted.
         """
-        difference, error, magnitude, spread = self._differences(latents, answers, new)
         if self.people is None:
             assert self.noise_model is not None
-            probability = self.noise_model.probability_left(difference, error, magnitude)
+            difference, *unit, _ = self._differences(latents, answers, new)
+            probability = self.noise_model.probability_left(difference[..., 0], *unit)
             told = [answer.preference for answer in answers]
             return preference_log_likelihood(np.log(probability), np.log1p(-probability), told)
         sums = np.zeros((len(latents), len(self.people)))
-        columns = [np.broadcast_to(x, difference.shape).T for x in (difference, error, magnitude)]
-        for answer, d, e, m in zip(answers, *columns, strict=True):
-            sums += self.people.log_likelihoods(answer.preference, d, e, m, spread)
+        for i, d, e, m, spread in self._each_difference(latents, answers, new):
+            sums += self.people.log_likelihoods(answers[i].preference, d, e, m, spread)
         return sums
 
     def _answer_log_likelihoods(self, latents: np.ndarray) -> np.ndarray:
@@ -534,25 +572,27 @@ class BayesInference(Inference):
         told = self._log_likelihoods(latents, self.answers)
         return told if self.people is None else logsumexp(told + self.people.log_prior, axis=1)
 
-    def _measure_thinning(self, shown: Sequence[Shown], thin: np.ndarray) -> Thinning:
+    def _measure_thinning(self, shown: Sequence[Shown], thin: np.ndarray) -> list[Thinning]:
+        """Of the first one's difference to each other."""
         if max(map(len, shown)) <= DECODED_STEPS:
-            return Thinning()
+            return [Thinning()] * (len(shown) - 1)
         quantiles = (np.arange(FULLY_DECODED) + 0.5) / FULLY_DECODED
         some = np.searchsorted(np.cumsum(self.weights), quantiles).clip(max=len(self.particles) - 1)
         full = self.model.predicted_returns(self.particles[some], shown)
-        return Thinning.fit(thin[some, 0] - thin[some, 1], full[:, 0] - full[:, 1])
+        pairs = zip(first_to_others(thin[some]).T, first_to_others(full).T, strict=True)
+        return [Thinning.fit(*pair) for pair in pairs]
 
     def _calibrate(self, latents: np.ndarray, shown: Sequence[Shown], returns: np.ndarray) -> None:
         shown_latents = np.stack([latent_of(item) for item in shown])
-        similarities = self.model.similarities(latents, shown_latents)
-        s = similarities[:, 0] - similarities[:, 1]
-        magnitude = np.abs(returns).sum(axis=1).mean()
-        self.calibration += [s @ (returns[:, 0] - returns[:, 1]), s @ s, magnitude, 1.0]
+        s = first_to_others(self.model.similarities(latents, shown_latents)).ravel()
+        magnitude = 2.0 * np.abs(returns).mean(axis=1).mean()
+        self.calibration += [s @ first_to_others(returns).ravel(), s @ s, magnitude, 1.0]
 
     def _query_policies(self) -> np.ndarray:
-        """(QUERY_POLICIES, d): draws of the posterior and of the prior."""
-        posterior = self.particles[systematic_resample(self.weights, QUERY_POLICIES // 2, self.rng)]
-        return np.concatenate([posterior, self.prior.sample(QUERY_POLICIES // 2, self.rng)])
+        """(n, d): half of them draws of the posterior, half of the prior."""
+        half = QUERY_POLICIES[self.rule.question] // 2
+        posterior = self.particles[systematic_resample(self.weights, half, self.rng)]
+        return np.concatenate([posterior, self.prior.sample(half, self.rng)])
 
     def _query_particles(self) -> tuple[np.ndarray, np.ndarray]:
         if len(self.particles) <= QUERY_PARTICLES:
@@ -576,7 +616,7 @@ class BayesInference(Inference):
         # One evaluation more than tries: where a particle stands now has to be weighed, too; and
         # another for who answers.
         evaluations = DECODER_TRIES + (1 if self.people is None else 2)
-        shown = [item for answer in self.answers for item in (answer.left, answer.right)]
+        shown = [item for answer in self.answers for item in answer.shown]
         steps = sum(min(len(item), DECODED_STEPS) for item in shown)
         affordable = DECODER_MOVE_STEPS // (steps * evaluations)
         order = self.rng.permutation(len(copies))
@@ -613,6 +653,11 @@ class BayesInference(Inference):
     def restore(self, snapshot: Snapshot, answers: list[Answer]) -> None:
         super().restore(snapshot, answers)
         self._library_returns = None
+
+
+def first_to_others(values: np.ndarray) -> np.ndarray:
+    """(..., n - 1) the first one's value (..., n) minus each other."""
+    return values[..., :1] - values[..., 1:]
 
 
 def _knows_its_decoder(model: MetaModel) -> bool:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sb3_poem.adaptation.noise import MistakeNoise, NoiseModel
-from sb3_poem.adaptation.preference import Preference, Query
+from sb3_poem.adaptation.preference import ANSWERS, BEST_OF_FOUR, Preference, Query
 from sb3_poem.adaptation.rule import check_choice
 from sb3_poem.common.trajectory import Trajectory
 
@@ -16,11 +16,13 @@ PROMPTS = {
     "pair": "Which is better? [l]eft, [r]ight, or [e]qual (can't tell): ",
     "graded": "Which is better? 1 left, much; 2 left, a bit; 3 can't tell; 4 right, a bit; "
     "5 right, much: ",
+    BEST_OF_FOUR: "Which is best? 1, 2, 3 or 4, or 0 (can't tell): ",
 }
+EQUAL_WORDS = dict.fromkeys(("e", "equal", "=", "can't tell", "cant tell", "?"), Preference.EQUAL)
 WORDS = {
     **dict.fromkeys(("l", "left"), Preference.LEFT),
     **dict.fromkeys(("r", "right"), Preference.RIGHT),
-    **dict.fromkeys(("e", "equal", "=", "can't tell", "cant tell", "?"), Preference.EQUAL),
+    **EQUAL_WORDS,
 }
 READ = {
     "pair": {**WORDS, "1": Preference.LEFT, "2": Preference.RIGHT},
@@ -32,6 +34,17 @@ READ = {
         "4": Preference.RIGHT,
         **dict.fromkeys(("5", "rr", "much right"), Preference.MUCH_RIGHT),
     },
+    BEST_OF_FOUR: {
+        **EQUAL_WORDS,
+        "0": Preference.EQUAL,
+        **{str(n): each for n, each in enumerate(ANSWERS[BEST_OF_FOUR][:0:-1], 1)},
+        **{each.value: each for each in ANSWERS[BEST_OF_FOUR][1:]},
+    },
+}
+KEYS = {
+    "pair": "l, r or e",
+    "graded": "a number from 1 to 5",
+    BEST_OF_FOUR: "a number from 0 to 4",
 }
 
 
@@ -40,8 +53,7 @@ class HumanAnswer:
     """An answer with its video, and when (seconds since 1970) it was asked for and shown."""
 
     preference: Preference
-    left: Trajectory
-    right: Trajectory
+    query: Query
     video: Path
     fps: float
     asked: float
@@ -49,12 +61,12 @@ class HumanAnswer:
 
 
 class HumanOracle:
-    """Shows both trajectories side by side in a video file, and asks at the terminal.
+    """Shows a question's trajectories beside each other in a video file, and asks at the terminal.
 
     The n-th question's file is ``query-001.gif`` and so on (or ``.mp4``) within the folder. The
     prompt takes l or left, r or right, and e, equal, = or ?, in upper or lower case; or a number,
-    1 (left) and 2 (right) of a pair, and 1 (left is much better) to 5 (right is much better) of a
-    graded question; anything else is asked again.
+    1 (left) and 2 (right) of a pair, 1 (left is much better) to 5 (right is much better) of a
+    graded question, and 1 to 4, or 0, of a best of four; anything else is asked again.
 
     >>> from sb3_poem import PreferenceAdapter
     >>> import gymnasium as gym
@@ -67,7 +79,7 @@ class HumanOracle:
     :param folder: Where the videos go; it is made if missing.
     :param video_format: "gif" (any viewer plays it) or "mp4" (smaller).
     :param mistake_rate: How often a person is taken to err, for the Bayesian rule.
-    :param question: "pair" or "graded", as the rule's.
+    :param question: "pair", "graded" or "best-of-four", as the rule's.
     :param read: Reads a line after showing a prompt; ``input`` by default.
     :param write: Shows a line; ``print`` by default.
     :param record: Called with each :class:`HumanAnswer` as soon as it is understood;
@@ -99,15 +111,15 @@ class HumanOracle:
     def __repr__(self) -> str:
         return f"HumanOracle({self.n_asked} asked, videos in {self.folder})"
 
-    def __call__(self, left: Trajectory, right: Trajectory) -> Preference:
-        """Write the video of two trajectories with frames, and ask until an answer is understood;
-        an ``EOFError`` if standard input has ended.
+    def __call__(self, *shown: Trajectory) -> Preference:
+        """Write the video of trajectories with frames, as many as a question of its kind shows, and
+        ask until an answer is understood; an ``EOFError`` if standard input has ended.
         """
-        asked = time.time()
+        asked, query = time.time(), Query(shown, self.question)
         name = f"query-{self.n_asked + 1:03d}.{self.video_format}"
-        path = Query(left, right).to_video(self.folder / name, self.fps)
+        path = query.to_video(self.folder / name, self.fps)
         self.n_asked += 1
-        shown = time.time()
+        seen = time.time()
         self._write(f"Query {self.n_asked}: {path}")
         while True:
             try:
@@ -117,7 +129,6 @@ class HumanOracle:
             answer = READ[self.question].get(line.strip().lower())
             if answer is not None:
                 if self._record is not None:
-                    self._record(HumanAnswer(answer, left, right, path, self.fps, asked, shown))
+                    self._record(HumanAnswer(answer, query, path, self.fps, asked, seen))
                 return answer
-            keys = "l, r or e" if self.question == "pair" else "a number from 1 to 5"
-            self._write(f"{line.strip()!r} is no answer; type {keys}.")
+            self._write(f"{line.strip()!r} is no answer; type {KEYS[self.question]}.")

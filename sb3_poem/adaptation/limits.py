@@ -9,6 +9,7 @@ from math import comb
 
 import numpy as np
 from scipy.optimize import minimize_scalar
+from scipy.stats import entropy
 
 from sb3_poem.adaptation.noise import BoltzmannNoise, ExactNoise, MistakeNoise, NoiseModel
 
@@ -125,7 +126,7 @@ def information_limit(
     :param returns: (n_tasks, n_policies) return of each policy on each task (J).
     :param noise_model: How the oracle errs; None is an oracle that does not.
     :param n_answers: Kinds of answers to a question: 2 where left or right is better, 3 with EQUAL
-        beside them, 5 where questions are graded.
+        beside them, 4 where one of four is best, 5 where questions are graded.
     :raises ValueError: If the matrix is empty or not finite, k is negative, or the noise model is
         of an unknown kind.
     """
@@ -210,7 +211,10 @@ def answer_capacity(noise: NoiseModel | None, spread: float, n_answers: int = 2)
     the light of earlier answers adds nothing (Cover & Thomas, Elements of Information Theory,
     7.12). Of more answers a mistake exchanges each with its opposite: a sum of such channels
     (ibid., problem 7.28). A Boltzmann oracle's grades tell no more than the difference that it
-    perceives, whose capacity is found by the algorithm of Blahut and Arimoto.
+    perceives, whose capacity is found by the algorithm of Blahut and Arimoto. Where one of four is
+    best, a mistake is any other one, and a Boltzmann oracle's probabilities are at most a factor
+    apart: the extremes of what questions can bring about have r probable answers and 4 - r others,
+    and as each can be any of the four, the capacity is that of a symmetric channel (ibid., 7.2.1).
 
     >>> from sb3_poem.adaptation import MistakeNoise
     >>> round(answer_capacity(MistakeNoise(0.1), spread=1.0), 2)  # a tenth is wrong
@@ -225,6 +229,15 @@ def answer_capacity(noise: NoiseModel | None, spread: float, n_answers: int = 2)
         raise ValueError(f"`n_answers` must be at least 2, but is {n_answers}")
     if noise is None or isinstance(noise, ExactNoise):
         return float(np.log2(n_answers))
+    if n_answers == 4 and isinstance(noise, (MistakeNoise, BoltzmannNoise)):
+        if isinstance(noise, MistakeNoise):
+            rows = [[1.0 - noise.rate, *[noise.rate / 3] * 3]]
+        else:
+            # Of the paper's exponent, |R_i - R_j| / (2 mean |R|), 2 is the largest.
+            odds = np.exp(min(2.0 if noise.beta is None else noise.beta * spread, 700.0))
+            rows = [[*[odds] * r, *[1.0] * (4 - r)] for r in (1, 2, 3)]
+        said = np.array(rows) / np.sum(rows, axis=1, keepdims=True)
+        return float(2.0 - entropy(said, base=2, axis=1).min())
     if isinstance(noise, MistakeNoise):
         mistake = noise.rate
     elif isinstance(noise, BoltzmannNoise):
@@ -236,7 +249,7 @@ def answer_capacity(noise: NoiseModel | None, spread: float, n_answers: int = 2)
     else:
         known, name = "ExactNoise, MistakeNoise or BoltzmannNoise", type(noise).__name__
         raise ValueError(f"`noise_model` must be {known}, but is of type {name}")
-    told = 1.0 - _binary_entropy(mistake)
+    told = 1.0 - float(entropy([mistake, 1.0 - mistake], base=2))
     return float(np.log2(n_answers // 2 * 2.0**told + n_answers % 2))
 
 
@@ -369,17 +382,12 @@ def _logistic_capacity(amplitude: float) -> float:
     edges = np.linspace(-amplitude - 12.0, amplitude + 12.0, CHANNEL_OUTPUTS - 1)
     below = 1.0 / (1.0 + np.exp(inputs[:, None] - edges))
     channel = np.diff(below, prepend=0.0, append=1.0, axis=1)  # (inputs, outputs)
-    entropy = np.sum(channel * np.log(channel), axis=1)
+    certainty = np.sum(channel * np.log(channel), axis=1)
     shares = np.full(CHANNEL_INPUTS, 1.0 / CHANNEL_INPUTS)
     for _ in range(MAX_ITERATIONS):
-        told = entropy - channel @ np.log(shares @ channel)
+        told = certainty - channel @ np.log(shares @ channel)
         if told.max() - shares @ told < TOLERANCE:
             break
         shares = shares * np.exp(told - told.max())
         shares /= shares.sum()
     return float(told.max() / np.log(2.0))
-
-
-def _binary_entropy(p: float) -> float:
-    """Bits."""
-    return 0.0 if p in (0.0, 1.0) else float(-p * np.log2(p) - (1.0 - p) * np.log2(1.0 - p))

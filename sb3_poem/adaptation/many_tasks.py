@@ -14,13 +14,13 @@ from tqdm import tqdm
 from sb3_poem.adaptation.bayes import Bayes
 from sb3_poem.adaptation.environments import Env, model_and_env, warn_if_untrained
 from sb3_poem.adaptation.meta_model import MetaModel
-from sb3_poem.adaptation.preference import Preference, as_preference
+from sb3_poem.adaptation.preference import PLACES, Preference, as_preference
 from sb3_poem.adaptation.rule import Rule, Setting, as_rule, inference_rng, latent_of, rollout_seed
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
 
-OracleFactory = Callable[..., Callable[[Trajectory, Trajectory], Any]]
+OracleFactory = Callable[..., Callable[..., Any]]
 Library = Sequence[Trajectory] | Callable[[np.ndarray], Sequence[Trajectory]]
 
 
@@ -122,20 +122,23 @@ def adapt_tasks(
         if query == n_queries or query >= kept[-1]:
             break
         asked = [item for inference in inferences for item in inference.ask()]
+        n_shown = len(PLACES[rule.question])
         shown = [item for item in asked if isinstance(item, Trajectory)]
         if not shown:
             shown = rollout_latents(
                 model,
                 vec_env,
                 np.stack([latent_of(item) for item in asked]),
-                np.repeat(tasks, 2, axis=0),
-                np.repeat([rollout_seed(number, query) for number, _ in numbered], 2).tolist(),
+                np.repeat(tasks, n_shown, axis=0),
+                np.repeat(
+                    [rollout_seed(number, query) for number, _ in numbered], n_shown
+                ).tolist(),
                 deterministic and not rule.explores,
             )
         for i, (inference, oracle) in enumerate(zip(inferences, oracles, strict=True)):
-            left, right = shown[2 * i], shown[2 * i + 1]
-            answer = as_preference(oracle(left, right), rule.question)
-            inference.tell(answer, left, right)
+            own = shown[n_shown * i : n_shown * (i + 1)]
+            answer = as_preference(oracle(*own), rule.question)
+            inference.tell(answer, *own)
             preferences[i].append(answer)
     return TaskAdaptations(tasks, kept, latents, preferences)
 

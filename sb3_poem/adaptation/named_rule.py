@@ -28,8 +28,8 @@ def named_rule(
     """
     check_choice("inference", inference, ("bayes", "paper"))
     if inference == "paper":
-        if options.pop("question", "pair") != "pair":
-            raise ValueError('inference="paper" asks about pairs: leave out question="graded"')
+        if (question := options.pop("question", "pair")) != "pair":
+            raise ValueError(f'inference="paper" asks about pairs: leave out question="{question}"')
         options.pop("noise_model", None)
         if n_candidates is not None:
             options["n_candidates"] = n_candidates

@@ -101,8 +101,8 @@ class PaperInference(Inference):
                 first, second = self._most_informative(similarities)
         return self.candidates[first].copy(), self.candidates[second].copy()
 
-    def tell(self, preference: Preference, left: Shown, right: Shown) -> None:
-        self.answers.append(Answer(preference, left, right))
+    def tell(self, preference: Preference, *shown: Shown) -> None:
+        self.answers.append(Answer(preference, shown))
         self.fresh = np.array([False])
 
     def estimate(self) -> np.ndarray:
@@ -130,7 +130,7 @@ class PaperInference(Inference):
 
     def _differences(self, latents: np.ndarray) -> np.ndarray:
         """(m, k) S(z, z_left) - S(z, z_right) of every answered question."""
-        shown = [item for answer in self.answers for item in (answer.left, answer.right)]
+        shown = [item for answer in self.answers for item in answer.shown]
         similarities = self.model.similarities(latents, np.stack([latent_of(z) for z in shown]))
         return similarities[:, 0::2] - similarities[:, 1::2]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -13,7 +14,7 @@ from sb3_poem.common.trajectory import Trajectory
 
 
 class Preference(Enum):
-    """The answer to "which of the two trajectories is better?".
+    """The answer to "which of the trajectories is better?".
 
     >>> Preference("left")
     <Preference.LEFT: 'left'>
@@ -24,51 +25,86 @@ class Preference(Enum):
     EQUAL = "equal"
     RIGHT = "right"
     MUCH_RIGHT = "much right"
+    FIRST = "first"
+    SECOND = "second"
+    THIRD = "third"
+    FOURTH = "fourth"
 
 
-#: What an answer says to a rule that knows no degrees.
-SIGNS = dict(zip(Preference, (1.0, 1.0, 0.0, -1.0, -1.0), strict=True))
-#: The answers that each kind of question has, from right to left.
+_GRADES = tuple(Preference)[:5]
+#: What an answer to a pair, or a graded one, says to a rule that knows no degrees.
+SIGNS = dict(zip(_GRADES, (1.0, 1.0, 0.0, -1.0, -1.0), strict=True))
+BEST_OF_FOUR = "best-of-four"
+#: The answers that each kind of question has, the last one (right, or can't tell) first.
 ANSWERS = {
     "pair": (Preference.RIGHT, Preference.EQUAL, Preference.LEFT),
-    "graded": tuple(reversed(Preference)),
+    "graded": tuple(reversed(_GRADES)),
+    BEST_OF_FOUR: (Preference.EQUAL, *tuple(Preference)[:4:-1]),
+}
+#: How each kind of question calls what it shows, in order.
+PLACES = {
+    **dict.fromkeys(("pair", "graded"), ("left", "right")),
+    BEST_OF_FOUR: ("first", "second", "third", "fourth"),
 }
 
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """A question: which of two trajectories on the new task is better?
+    """A question: which of two trajectories on the new task is better, or of four the best?
 
     >>> from sb3_poem import PreferenceAdapter
     >>> query = PreferenceAdapter("PointGoal", "poem/PointGoal-v0", seed=0).ask()
     >>> query.left.observations.shape, query.right.actions.shape
     ((26, 2), (25, 2))
 
-    :param kind: "pair" (left, right or equal), or "graded" (much better, too).
+    :param shown: Two, left and right, or four.
+    :param kind: "pair" (left, right or equal), "graded" (much better, too) or "best-of-four"
+        (first, second, third, fourth or equal).
     """
 
-    left: Trajectory
-    right: Trajectory
+    shown: tuple[Trajectory, ...]
     kind: str = "pair"
 
     def __post_init__(self) -> None:
         if self.kind not in ANSWERS:
             raise ValueError(f"`kind` must be one of {tuple(ANSWERS)}, but is {self.kind!r}")
+        check_number(self.kind, self.shown)
+
+    @property
+    def left(self) -> Trajectory:
+        """What a pair shows left."""
+        return self.shown[0]
+
+    @property
+    def right(self) -> Trajectory:
+        """What a pair shows right."""
+        return self.shown[1]
 
     def to_video(self, path: str | Path, fps: float = 20.0) -> Path:
-        """Write both side by side, as MP4 or GIF by the file's suffix, and return its path; missing
-        folders are made. A ``ValueError`` if they have no frames, or the suffix is another.
+        """Write both side by side, or four in two rows, as MP4 or GIF by the file's suffix, and
+        return its path; missing folders are made. A ``ValueError`` if they have no frames, or the
+        suffix is another.
         """
-        from sb3_poem.common.video import side_by_side, write_video
+        from sb3_poem.common.video import in_rows, write_video
 
-        if not self.left.frames or not self.right.frames:
+        if not all(each.frames for each in self.shown):
             raise ValueError(
                 "the question has no frames to show: ask for them by PreferenceAdapter(..., "
                 "render=True) or oracle=HumanOracle(), with an environment's id, or an environment "
                 'made with render_mode="rgb_array"'
             )
-        frames = side_by_side(self.left.frames, self.right.frames, ("LEFT", "RIGHT"))
-        return write_video(frames, path, fps)
+        clips = [each.frames or () for each in self.shown]
+        captions = ("LEFT", "RIGHT") if len(clips) == 2 else tuple("1234")
+        return write_video(in_rows(clips, captions), path, fps)
+
+
+def check_number(kind: str, shown: Sequence[Any]) -> None:
+    """Refuse another number of trajectories than this kind of question shows."""
+    if len(shown) != len(PLACES[kind]):
+        raise ValueError(
+            f"a {kind} question is about {len(PLACES[kind])} trajectories, but {len(shown)} were "
+            "given; `query.shown` holds a question's, so that oracle(*query.shown) answers any"
+        )
 
 
 def as_preference(answer: Any, kind: str = "pair") -> Preference:
@@ -81,7 +117,8 @@ def as_preference(answer: Any, kind: str = "pair") -> Preference:
     if isinstance(answer, Preference) and answer in ANSWERS[kind]:
         return answer
     if isinstance(answer, Preference):
-        given = f"{answer.value!r}, which only graded questions have"
+        others = [each for each in ANSWERS if answer in ANSWERS[each]]
+        given = f"{answer.value!r}, which only {' and '.join(others)} questions have"
     elif isinstance(answer, str):
         given = repr(answer)
     else:

@@ -129,6 +129,34 @@ def most_telling_pair(
     return best_pair(gains, values.shape[1], visibility)
 
 
+def most_telling_set(
+    pair: tuple[int, int],
+    size: int,
+    values: np.ndarray,
+    weights: np.ndarray,
+    probabilities: Callable[[np.ndarray], np.ndarray],
+) -> tuple[int, ...]:
+    """A pair of n policies, and others that are added one by one: each time the one with which the
+    answer to which is best is expected to tell most about m latents.
+
+    :param size: How many they are to be, at most n.
+    :param values: (m, n) predicted fitness.
+    :param weights: (m,) summing to one.
+    :param probabilities: Maps differences of the first one's value to others', (rows, others), to
+        P(answer), (answers, rows).
+    """
+    chosen, (m, n) = list(pair), values.shape
+    while len(chosen) < size:
+        differences = np.empty((n, m, len(chosen)), dtype=np.float32)
+        differences[:, :, :-1] = values[:, chosen[:1]] - values[:, chosen[1:]]
+        differences[:, :, -1] = (values[:, chosen[:1]] - values).T
+        said = probabilities(differences.reshape(n * m, -1)).reshape(-1, n, m)
+        gains = (_self_information(said @ weights) - _self_information(said) @ weights).sum(axis=0)
+        gains[chosen] = -np.inf
+        chosen.append(int(np.argmax(gains)))
+    return tuple(chosen)
+
+
 def best_pair(gains: np.ndarray, n: int, visibility: Visibility | None = None) -> tuple[int, int]:
     """The pair of n policies with the highest gain times visibility. The pairs of the highest gains
     are looked at in turn, at most six, and no further than another could still be better.
@@ -150,8 +178,13 @@ def best_pair(gains: np.ndarray, n: int, visibility: Visibility | None = None) -
 
 def random_pair(n: int, rng: np.random.Generator) -> tuple[int, int]:
     """Two different ones of n policies, uniformly."""
-    first, second = rng.choice(n, size=2, replace=False)
-    return int(first), int(second)
+    first, second = random_set(n, 2, rng)
+    return first, second
+
+
+def random_set(n: int, size: int, rng: np.random.Generator) -> tuple[int, ...]:
+    """Different ones of n policies, uniformly."""
+    return tuple(map(int, rng.choice(n, size=size, replace=False)))
 
 
 def pair_differences(values: np.ndarray) -> np.ndarray:

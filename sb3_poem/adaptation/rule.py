@@ -25,7 +25,7 @@ SelfRule = TypeVar("SelfRule", bound="Rule")
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """One answered question: the answer, and what stood left and right.
+    """One answered question: the answer, and what was shown, left and right or in order.
 
     >>> from sb3_poem import PreferenceAdapter
     >>> adapter = PreferenceAdapter("PointGoal", "poem/PointGoal-v0", seed=0)
@@ -36,8 +36,17 @@ class Answer:
     """
 
     preference: Preference
-    left: Shown
-    right: Shown
+    shown: tuple[Shown, ...]
+
+    @property
+    def left(self) -> Shown:
+        """What a pair showed left."""
+        return self.shown[0]
+
+    @property
+    def right(self) -> Shown:
+        """What a pair showed right."""
+        return self.shown[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,18 +93,20 @@ class Inference(ABC):
         self.answers: list[Answer] = []
 
     @abstractmethod
-    def ask(self) -> tuple[Shown, Shown]:
-        """What to compare next: two latents (d,) to roll out, or two trajectories to show."""
+    def ask(self) -> tuple[Shown, ...]:
+        """What to compare next, two or as many as the rule's questions are about: latents (d,) to
+        roll out, or trajectories to show.
+        """
 
-    def same_latents(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def same_latents(self, *latents: np.ndarray) -> tuple[np.ndarray, ...]:
         """The latents of a question from a file; others where a latent means something to one model
         object alone.
         """
-        return left, right
+        return latents
 
     @abstractmethod
-    def tell(self, preference: Preference, left: Shown, right: Shown) -> None:
-        """Take an answer about two trajectories, or their latents where the rule needs no more."""
+    def tell(self, preference: Preference, *shown: Shown) -> None:
+        """Take an answer about trajectories, or their latents where the rule needs no more."""
 
     @abstractmethod
     def estimate(self) -> np.ndarray:
@@ -204,7 +215,8 @@ class Rule(ABC):
             raise ValueError(
                 f'the oracle answers "{kind}" questions, but the rule asks "{self.question}" ones: '
                 'Bayes(question="graded") goes with ReturnOracle(thresholds=(20, 100)) or '
-                f'HumanOracle(question="graded"), say; the oracle is {oracle!r}'
+                'HumanOracle(question="graded"), say, and Bayes(question="best-of-four") with '
+                f'ReturnOracle(question="best-of-four"); the oracle is {oracle!r}'
             )
         return self
 
@@ -255,12 +267,13 @@ def latent_of(shown: Shown) -> np.ndarray:
     return shown.latent if isinstance(shown, Trajectory) else np.asarray(shown, dtype=np.float64)
 
 
-def trajectories_of(name: str, left: Shown, right: Shown) -> list[Trajectory]:
-    """Both, as trajectories, which a rule of that name needs."""
-    if not (isinstance(left, Trajectory) and isinstance(right, Trajectory)):
-        shown = "the two trajectories that were shown, not their latents alone"
-        raise ValueError(f"{name} needs {shown}")
-    return [left, right]
+def trajectories_of(name: str, *shown: Shown) -> tuple[Trajectory, ...]:
+    """What was shown, as trajectories, which a rule of that name needs."""
+    trajectories = tuple(item for item in shown if isinstance(item, Trajectory))
+    if len(trajectories) != len(shown):
+        needed = "the trajectories that were shown, not their latents alone"
+        raise ValueError(f"{name} needs {needed}")
+    return trajectories
 
 
 def inference_rng(seed: int) -> np.random.Generator:
@@ -269,5 +282,5 @@ def inference_rng(seed: int) -> np.random.Generator:
 
 
 def rollout_seed(seed: int, query: int) -> int:
-    """The reset seed of both rollouts of a question, from 0, of an adaptation with this seed."""
+    """The reset seed of the rollouts of a question, from 0, of an adaptation with this seed."""
     return int(np.random.SeedSequence([seed, 1, query]).generate_state(1)[0] >> 1)

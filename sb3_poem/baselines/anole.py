@@ -178,14 +178,14 @@ class ANOLEInference(Inference):
         left = max(0, self.n_queries - len(self.answers) - 1)
         return worst_case_volumes(differences, self.contradictions, left, self.budget)
 
-    def tell(self, preference: Preference, left: Shown, right: Shown) -> None:
-        shown = trajectories_of("ANOLE", left, right)
-        returns = self.model.predicted_returns(self.candidates, shown)
+    def tell(self, preference: Preference, *shown: Shown) -> None:
+        trajectories = trajectories_of("ANOLE", *shown)
+        returns = self.model.predicted_returns(self.candidates, trajectories)
         contradicted = SIGNS[preference] * (returns[:, 0] - returns[:, 1]) < 0
         self.contradictions = self.contradictions + contradicted
         if np.any(self.alive & ~contradicted):
             self.alive = self.alive & ~contradicted
-        self.answers.append(Answer(preference, left, right))
+        self.answers.append(Answer(preference, shown))
 
     def estimate(self) -> np.ndarray:
         """See :class:`Inference`: a candidate of fewest contradictions; for "greedy" one left."""

@@ -178,27 +178,27 @@ class MAMLRewardInference(Inference):
         """See :class:`Inference`: the current policy twice, with opposite exploration noise."""
         return self._both_signs()
 
-    def same_latents(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def same_latents(self, *latents: np.ndarray) -> tuple[np.ndarray, ...]:
         """See :class:`Inference`: the current policy, whose number in the file was another."""
         return self._both_signs()
 
     def _both_signs(self) -> tuple[np.ndarray, np.ndarray]:
         return self.latent.copy(), self.latent * np.array([1.0, -1.0])
 
-    def tell(self, preference: Preference, left: Shown, right: Shown) -> None:
-        trajectories_of("MAML-reward", left, right)
-        self.answers.append(Answer(preference, left, right))
+    def tell(self, preference: Preference, *shown: Shown) -> None:
+        trajectories_of("MAML-reward", *shown)
+        self.answers.append(Answer(preference, shown))
         parameters = self.model.reward.adapted(self.answers)
-        shown = [
+        seen = [
             trajectory
             for answer in self.answers
-            for trajectory in trajectories_of("MAML-reward", answer.left, answer.right)
+            for trajectory in trajectories_of("MAML-reward", *answer.shown)
         ]
-        rewards = [self.model.reward.rewards(parameters, trajectory) for trajectory in shown]
+        rewards = [self.model.reward.rewards(parameters, trajectory) for trajectory in seen]
         # Preferences fix no unit; SAC's entropy needs one.
         scale = max(float(np.concatenate(rewards).std()), 1e-6)
         with _seeded(int(self.seed[0]) + len(self.answers)):
-            self._fill_buffer(shown, [row / scale for row in rewards])
+            self._fill_buffer(seen, [row / scale for row in rewards])
             self.sac.train(self.rule.gradient_steps, self.rule.batch_size)
         self.latent = self.model.add(self.sac.actor)
 
@@ -210,7 +210,7 @@ class MAMLRewardInference(Inference):
         super().restore(snapshot, [])
         self._restart()
         for answer in answers:
-            self.tell(answer.preference, answer.left, answer.right)
+            self.tell(answer.preference, *answer.shown)
 
     def _fill_buffer(self, shown: list[Trajectory], rewards: list[np.ndarray]) -> None:
         buffer, policy = self.sac.replay_buffer, self.model.reward.policy

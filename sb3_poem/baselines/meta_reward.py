@@ -140,7 +140,7 @@ class MetaReward:
         parameters = self.parameters
         if not answers:
             return parameters
-        shown = [trajectories_of("MAML-reward", item.left, item.right) for item in answers]
+        shown = [trajectories_of("MAML-reward", *item.shown) for item in answers]
         longest = max(len(trajectory) for pair in shown for trajectory in pair)
         left, right = (
             th.stack([_filled(self.transitions(trajectory), longest) for trajectory in side])

@@ -112,13 +112,13 @@ class RewardInference(Inference):
         left, right = self.mean + np.sqrt(self.variance) * noise
         return left, right
 
-    def tell(self, preference: Preference, left: Shown, right: Shown) -> None:
+    def tell(self, preference: Preference, *shown: Shown) -> None:
         """See :class:`Inference`. The answer is not looked at, the rewards of both trajectories
         are.
         """
-        shown = trajectories_of("the reward oracle", left, right)
-        rows = np.concatenate([self._context_rows(item) for item in shown])
-        self.answers.append(Answer(preference, left, right))
+        trajectories = trajectories_of("the reward oracle", *shown)
+        rows = np.concatenate([self._context_rows(item) for item in trajectories])
+        self.answers.append(Answer(preference, shown))
         before = [self.transitions] if len(self.transitions) else []
         self.transitions = np.concatenate([*before, rows])
         n = min(self.model.context_size, len(self.transitions))

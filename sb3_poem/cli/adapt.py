@@ -21,13 +21,14 @@ from sb3_poem.adaptation import (
     PreferenceAdapter,
     ReturnOracle,
     TaskOracle,
-    Trajectory,
     evaluate_adaptation,
     evaluate_episodes,
     named_rule,
     return_spread,
 )
+from sb3_poem.adaptation.adapter import shown_from_dict
 from sb3_poem.adaptation.evaluation import evaluation_seed
+from sb3_poem.adaptation.preference import BEST_OF_FOUR
 from sb3_poem.cli.arguments import DEFAULT_STORE
 from sb3_poem.cli.needs import check_output
 from sb3_poem.cli.report import Report, row_text
@@ -113,7 +114,9 @@ class Adaptation:
             "mistake": partial(MistakeOracle, arguments.mistake_rate),
         }
         factory = factories[arguments.oracle]
-        if self.rule.question == "graded":
+        if self.rule.question == BEST_OF_FOUR:
+            factory = partial(factory, question=BEST_OF_FOUR)
+        elif self.rule.question == "graded":
             spread = return_spread(subject.model, subject.env, self.seed)
             equal, much = arguments.thresholds
             factory = partial(factory, thresholds=(equal * spread, much * spread))
@@ -174,7 +177,7 @@ class Adaptation:
         try:
             while not adapter.done:
                 query = adapter.ask()
-                adapter.tell(oracle(query.left, query.right))
+                adapter.tell(oracle(*query.shown))
                 latents.append(adapter.policy().latent)
         except (EOFError, KeyboardInterrupt) as error:
             if not adapter.n_answers:
@@ -188,10 +191,9 @@ class Adaptation:
     def _tell_again(
         self, adapter: PreferenceAdapter, kept: dict[str, Any], recorder: StoreRecorder
     ) -> None:
-        query = adapter.ask()
-        for side in ("left", "right"):
-            was = Trajectory.from_dict(kept[side]).latent
-            if not np.allclose(getattr(query, side).latent, was):
+        shown = adapter.ask().shown
+        for now, was in zip(shown, shown_from_dict(self.rule.question, kept), strict=True):
+            if not np.allclose(now.latent, was.latent):
                 raise ValueError(
                     f"--resume: question {adapter.n_answers + 1} of session {recorder.session.id} "
                     "was another one; was it asked with another model of the name "

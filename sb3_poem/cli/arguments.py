@@ -14,6 +14,7 @@ OUR_ALGORITHMS = ("poem_sac", "pearl_sac")
 COMMANDS = ("train", "enjoy", "record-video", "adapt", "models", "label", "benchmark")
 DEFAULT_STORE = Path("label_data")
 INFERENCES = ("paper", "bayes")
+QUESTIONS = ("pair", "graded", "best-of-four")
 EXAMPLES = """\
 examples:
   sb3-poem models
@@ -196,8 +197,8 @@ def _add_adapt_arguments(parser: argparse.ArgumentParser) -> None:
     beta = "inverse temperature of --oracle boltzmann (default: the paper's)"
     _option(questions, "--beta", beta, float)
     _option(questions, "--mistake-rate", "of --oracle mistake", float, 0.2)
-    told = "left, right or equal; or graded: much better, too (default: pair)"
-    _option(questions, "--question", told, choices=("pair", "graded"))
+    told = "left or right; graded: much better, too; or which of four is best (default: pair)"
+    _option(questions, "--question", told, choices=QUESTIONS)
     told = "from what differences on an oracle says better and much better, as shares of the spread"
     thresholds: dict[str, Any] = {"nargs": 2, "metavar": ("BETTER", "MUCH")}
     _option(questions, "--thresholds", f"{told} of returns", float, [0.1, 0.7], **thresholds)
@@ -241,8 +242,8 @@ def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
     _add_environment(model, "the one that the model was trained on)")
     _option(model, "--queries", "questions before the result", _count(1), 10)
     _option(model, "--inference", "", default="bayes", choices=INFERENCES)
-    told = "left or right; or graded: how much better, too (default: graded; paper: pair)"
-    _option(model, "--question", told, choices=("pair", "graded"))
+    told = "left or right; graded: how much better, too; or which of four is best (default: graded"
+    _option(model, "--question", f"{told}; paper: pair)", choices=QUESTIONS)
     told = "how often people are taken to err (default: inferred from their answers)"
     _option(model, "--mistake-rate", told, float)
     _option(model, "--seed", "of every session (default: each has its own)", _count(0))

@@ -12,6 +12,7 @@ from rich.table import Table
 from scipy.stats import sem
 
 from sb3_poem.adaptation import AdaptationEvaluation, KnownTaskReturn
+from sb3_poem.adaptation.preference import BEST_OF_FOUR
 from sb3_poem.adaptation.state import write_json_atomically
 from sb3_poem.benchmark.provenance import versions
 from sb3_poem.plotting import plot_returns
@@ -38,7 +39,7 @@ class Report:
 
     @property
     def _kinds_of_answers(self) -> int:
-        return 5 if self.settings.get("question") == "graded" else 2
+        return {"graded": 5, BEST_OF_FOUR: 4}.get(self.settings.get("question", "pair"), 2)
 
     def table(self) -> Table:
         """Return, its standard error over tasks, limit and success rate after each answer."""

@@ -80,6 +80,20 @@ def side_by_side(
     if captions is not None:
         left, right = _with_captions((left, right), captions)
     bar = np.full((left[0].shape[0], GAP, 3), 255, dtype=np.uint8)
-    n = max(len(left), len(right))
-    lefts, rights = ([*clip, *[clip[-1]] * (n - len(clip))] for clip in (left, right))
+    lefts, rights = _as_long((left, right))
     return [np.concatenate([a, bar, b], axis=1) for a, b in zip(lefts, rights, strict=True)]
+
+
+def in_rows(clips: Sequence[Sequence[Frame]], captions: Sequence[str]) -> list[Frame]:
+    """An even number of clips, two in a row; see :func:`side_by_side`."""
+    rows = [
+        side_by_side(clips[i], clips[i + 1], (captions[i], captions[i + 1]))
+        for i in range(0, len(clips), 2)
+    ]
+    return [np.concatenate(frames) for frames in zip(*_as_long(rows), strict=True)]
+
+
+def _as_long(clips: Sequence[Sequence[Frame]]) -> list[list[Frame]]:
+    """All as long as the longest one."""
+    longest = max(map(len, clips))
+    return [[*clip, *[clip[-1]] * (longest - len(clip))] for clip in clips]

@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from sb3_poem.adaptation.preference import PLACES
 from sb3_poem.common.files import write_atomically
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.label.store import Session, Store
@@ -21,8 +22,10 @@ FIELDS = {
     "repeats": "int64",
     **{"undone": "bool", "wish": "string", "verdict": "string", "asked": "string"},
     **{"shown": "string", "answered": "string", "seconds": "float64", "video": "string"},
-    **{"fps": "float64", "frames": "int64", "left_latent": "list", "right_latent": "list"},
+    **{"fps": "float64", "frames": "int64"},
 }
+#: Where trajectories are shown, by any kind of question
+ALL_PLACES = tuple(dict.fromkeys(place for places in PLACES.values() for place in places))
 # What one session's records have in common.
 COMMON = ("model", "env_id", "seed", "options", "wish")
 
@@ -43,10 +46,7 @@ def records(
 
 def answer_record(row: sqlite3.Row, videos: Path, trajectories: bool = False) -> dict[str, Any]:
     """The record of a row of :meth:`~sb3_poem.label.store.Store.records`; see :func:`records`."""
-    sides = {
-        side: Trajectory.from_dict(json.loads(row[f"{side}_trajectory"]))
-        for side in ("left", "right")
-    }
+    sides = trajectories_of(row)
     own = {
         "question": json.loads(row["options"]).get("question", "pair"),
         "undone": row["undone"] is not None,
@@ -56,15 +56,21 @@ def answer_record(row: sqlite3.Row, videos: Path, trajectories: bool = False) ->
         # A clock may be set back meanwhile.
         "seconds": max(round(row["answered"] - (row["shown"] or row["asked"]), 3), 0.0),
         "video": str(videos / row["video"]),
-        **{f"{side}_latent": shown.latent.tolist() for side, shown in sides.items()},
     }
     record = {name: own[name] if name in own else row[name] for name in FIELDS}
+    record |= {f"{side}_latent": shown.latent.tolist() for side, shown in sides.items()}
     for side, shown in sides.items() if trajectories else ():
         record[f"{side}_observations"] = shown.observations.tolist()
         record[f"{side}_actions"] = shown.actions.tolist()
         features = shown.reward_features
         record[f"{side}_reward_features"] = None if features is None else features.tolist()
     return record
+
+
+def trajectories_of(row: sqlite3.Row) -> dict[str, Trajectory]:
+    """What the answer of a row is about, by its place: "left" and "right", say."""
+    shown = json.loads(row["trajectories"])
+    return {place: Trajectory.from_dict(item) for place, item in shown.items()}
 
 
 def session_record(store: Store, session: Session) -> dict[str, Any]:
@@ -114,15 +120,13 @@ def _parquet(rows: list[dict[str, Any]], trajectories: bool) -> bytes:
             "Parquet needs pyarrow: pip install 'sb3_poem[label]', or export to .jsonl"
         ) from None
     numbers = pa.list_(pa.float64())
-    types = [
-        (name, numbers if kind == "list" else pa.type_for_alias(kind))
-        for name, kind in FIELDS.items()
-    ]
+    places = [place for place in ALL_PLACES if any(f"{place}_latent" in row for row in rows)]
+    places = places or [*PLACES["pair"]]
+    types = [(name, pa.type_for_alias(kind)) for name, kind in FIELDS.items()]
+    types += [(f"{place}_latent", numbers) for place in places]
     if trajectories:
         parts = ("observations", "actions", "reward_features")
-        types += [
-            (f"{side}_{part}", pa.list_(numbers)) for side in ("left", "right") for part in parts
-        ]
+        types += [(f"{place}_{part}", pa.list_(numbers)) for place in places for part in parts]
     sink = pa.BufferOutputStream()
     parquet.write_table(pa.Table.from_pylist(rows, schema=pa.schema(types)), sink)
     return sink.getvalue().to_pybytes()

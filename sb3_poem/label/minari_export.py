@@ -1,8 +1,7 @@
-"""Recorded answers as Minari data sets: a pair of episodes for each."""
+"""Recorded answers as Minari data sets: the episodes that were compared for each."""
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 import sqlite3
@@ -15,14 +14,14 @@ import numpy as np
 
 from sb3_poem.common.foreign import check_env_id
 from sb3_poem.common.trajectory import Trajectory
-from sb3_poem.label.export import answer_record
+from sb3_poem.label.export import answer_record, trajectories_of
 from sb3_poem.label.store import Store
 
 NAME = re.compile(r"[\w-]+-v\d+", re.ASCII)
 DESCRIPTION = (
-    "Episodes that people compared, two an answer. ALL REWARDS ARE ZERO, since people gave no "
-    "rewards but preferences: `answers` in the data set's metadata has each with its two episodes "
-    "(`left_episode`, `right_episode`) and their latents."
+    "Episodes that people compared, two or four an answer. ALL REWARDS ARE ZERO, since people gave "
+    "no rewards but preferences: `answers` in the data set's metadata has each with its episodes "
+    "(`left_episode` and `right_episode`, or `first_episode` to `fourth_episode`) and latents."
 )
 
 
@@ -79,8 +78,7 @@ def _write(dataset: str, env_id: str, rows: list[sqlite3.Row], videos: Path) -> 
     answers: list[dict[str, Any]] = []
     for row in rows:
         answer = {**answer_record(row, videos), "video": row["video"]}
-        for side in ("left", "right"):
-            shown = Trajectory.from_dict(json.loads(row[f"{side}_trajectory"]))
+        for side, shown in trajectories_of(row).items():
             found = shown.observations.shape[1:], shown.actions.shape[1:]
             if found != shapes:
                 raise ValueError(

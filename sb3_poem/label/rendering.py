@@ -75,8 +75,8 @@ class TurnRequest:
     options: dict[str, Any]
     kind: str  # "question" or "result"
     video: Path  # to write
-    # The turn before, None at the start: its state, the answers before it (``preference``,
-    # ``left``, ``right``), its question (``left``, ``right``) and the answer to that.
+    # The turn before, None at the start: its state, the answers before it (``preference``, and what
+    # was shown by its place, as ``left``), its question (what it shows) and the answer to that.
     state: dict[str, Any] | None = None
     answers: Sequence[dict[str, Any]] = ()
     pending: dict[str, Any] | None = None
@@ -97,8 +97,7 @@ class Turn:
     """
 
     state: dict[str, Any] | None
-    left: dict[str, Any] | None  # the question's trajectory, as ``right``; None in a result
-    right: dict[str, Any] | None
+    shown: dict[str, Any] | None  # the question's trajectories by their place; None in a result
     # As :func:`sb3_poem.label.beliefs.belief` gives it, and the adapter's ``contradicted``
     belief: dict[str, Any] | None
     latent: list[float] | None  # (d,) of the policy that would be taken now
@@ -112,7 +111,7 @@ class _Watches:
     def __init__(self, film_every: int) -> None:
         self.needs_frames = film_every
 
-    def __call__(self, left: Trajectory, right: Trajectory) -> Preference:
+    def __call__(self, *shown: Trajectory) -> Preference:
         raise RuntimeError("a person answers on the page; adapt() cannot ask")
 
 
@@ -139,15 +138,15 @@ class FilmedVecEnv(VecEnvWrapper):
         return self.env_method("film_state") if self.films_states else self.venv.get_images()
 
     def films(self, *clips: Trajectory) -> list[np.ndarray]:
-        """Frames that show every clip, and a race of several, beside each other."""
+        """Frames that show every clip, and a race of two, beside each other."""
         if not self.films_states:
-            return beside(*([*map(fit, clip.frames or ())] for clip in clips))
+            return beside(len(clips), *([*map(fit, clip.frames or ())] for clip in clips))
         paths = [np.array(clip.frames) for clip in clips]
         parts = [self._film(paths, [i]) for i in range(len(paths))]
-        if len(paths) > 1:
+        if len(paths) == 2:
             race = self._film([path[::RACE_EVERY] for path in paths], range(len(paths)))
             parts.append([frame for frame in race for _ in range(RACE_EVERY)])
-        return beside(*parts)
+        return beside(len(paths), *parts)
 
     def _film(self, paths: list[np.ndarray], shown: Sequence[int]) -> list[np.ndarray]:
         self._check_wanted()
@@ -183,7 +182,7 @@ class Renderer:
         if request.kind == "question":
             again = request.repeats
             query = adapter.ask() if again is None else adapter.ask_again(again)
-            clips = [query.left, query.right]
+            clips = [*query.shown]
         else:
             seeds = [rollout_seed(adapter.seed, RESULT_ROLLOUT)]
             about = (self.model, self.env, latent[None], None, seeds, adapter.deterministic)
@@ -191,10 +190,9 @@ class Renderer:
         frames = self.env.films(*clips)
         write_clip(frames, request.video, fps)
         data = adapter.to_dict()
-        sides = data["pending"] or {"left": None, "right": None}
         state = {name: value for name, value in data.items() if name not in CONVERSATION}
         latents = (believed, latent.tolist())
-        return Turn(state, sides["left"], sides["right"], *latents, fps, len(frames))
+        return Turn(state, data["pending"], *latents, fps, len(frames))
 
     def warm_up(self) -> None:
         """Do once what only the first time is slow: the first image, the first action."""
@@ -293,11 +291,11 @@ def write_clip(frames: Sequence[np.ndarray], path: Path, fps: float) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def beside(*clips: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Clips of one size beside each other, as long as the first two: in one file they cannot fall
-    out of step. What is shorter holds its last frame.
+def beside(first: int, *clips: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Clips of one size beside each other, as long as so many first ones: in one file they cannot
+    fall out of step. What is shorter holds its last frame.
     """
-    longest = max(map(len, clips[:2]))
+    longest = max(map(len, clips[:first]))
     held = [[*clip, *repeat(clip[-1], longest - len(clip))][:longest] for clip in clips]
     return [np.concatenate(frames, axis=1) for frames in zip(*held, strict=True)]
 

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from sb3_poem.adaptation.preference import SIGNS, Preference
+from sb3_poem.adaptation.adapter import shown_from_dict
+from sb3_poem.adaptation.preference import BEST_OF_FOUR, PLACES, Preference
 from sb3_poem.adaptation.rule import Setting, inference_rng
 from sb3_poem.common.rollouts import policy_actions
 from sb3_poem.common.trajectory import Trajectory
@@ -28,8 +29,8 @@ def replay(
     seed: int = 0,
     is_own: bool = True,
 ) -> dict[str, Any]:
-    """Feed a session's answers to a model. Before each answer the model foretells it: the side of
-    larger predicted return for the policy that it would take so far.
+    """Feed a session's answers to a model. Before each answer the model foretells it: the one of
+    largest predicted return for the policy that it would take so far.
 
     :param model: A model whose observations and actions are those of the recorded trajectories.
     :param options: Of the adaptation, as a session's; ``mistake_rate`` stands for the noise model.
@@ -40,28 +41,36 @@ def replay(
         "equal"), ``latents`` after 0, 1, ... answers, ``sentence`` (the belief in words) and
         ``action_error``, the root mean squared difference of the actions of such latents from those
         recorded (None where no latents had to be replaced).
-    :raises ValueError: If the model does not fit the recorded trajectories.
+    :raises ValueError: If the model does not fit the recorded trajectories, or the rule asks about
+        pairs and the session about four.
     """
-    options = dict(options or {})
+    options, kind = dict(options or {}), session.question
     if options.get("inference", "bayes") == "bayes":
-        options["question"] = session.question
+        options["question"] = kind
+    elif kind == BEST_OF_FOUR:
+        raise ValueError(
+            f'session {session.id} asks which of four is best, which only inference="bayes" reads, '
+            f"but inference is {options['inference']!r}"
+        )
     rule = session_rule(options)
     rule.check(model, Setting())
     inference = rule.start(model, inference_rng(seed), Setting())
     translator = None if is_own else _Translator(model, np.random.default_rng([seed, 1]))
-    latents, errors, foretold, decided = [inference.estimate()], [], 0, 0
+    errors: list[float] = []
+    latents, foretold, decided = [inference.estimate()], 0, 0
     for item in store.adapter_answers(session.id, before=2**31):
         preference = Preference(item["preference"])
-        left, right = (Trajectory.from_dict(item[side]) for side in ("left", "right"))
-        _check_fits(model, left)
+        shown = shown_from_dict(kind, item)
+        _check_fits(model, shown[0])
         if translator is not None:
-            (left, left_error), (right, right_error) = translator(left), translator(right)
-            errors += [left_error, right_error]
+            shown, off = zip(*map(translator, shown), strict=True)
+            errors += off
         if preference is not Preference.EQUAL:
             decided += 1
-            returns = model.predicted_returns(latents[-1][None, :], [left, right])[0]
-            foretold += bool(np.sign(returns[0] - returns[1]) == SIGNS[preference])
-        inference.tell(preference, left, right)
+            returns = model.predicted_returns(latents[-1][None, :], shown)[0]
+            best = PLACES[kind][int(np.argmax(returns))]
+            foretold += best in preference.value
+        inference.tell(preference, *shown)
         latents.append(inference.estimate())
     replayed: Any = SimpleNamespace(model=model, inference=inference)
     return {

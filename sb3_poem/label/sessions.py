@@ -30,6 +30,8 @@ AT_WORK_SECONDS = 60.0
 # While more people are at work than turns can be made at a time, films show every second step: half
 # the work.
 CROWDED_FILM_EVERY = 2
+# Answers that are rarer than the others.
+UNLIKELY = (Preference.EQUAL, Preference.MUCH_LEFT, Preference.MUCH_RIGHT)
 # Errors that say in words why a turn could not be made.
 WORDED_ERRORS = (RefusedError, OtherModelError, StorageError)
 UNWORDED = "The videos could not be made. It is tried again; your answers are safe."
@@ -276,8 +278,7 @@ class SessionManager:
                 request = self._request(session, key)
             except RefusedError:  # the page says so when the turn is due
                 return
-            likely = preference in (Preference.LEFT, Preference.RIGHT)
-            priority = Priority.LIKELY if likely else Priority.POSSIBLE
+            priority = Priority.POSSIBLE if preference in UNLIKELY else Priority.LIKELY
             active.jobs[key] = self.queue.submit(request, priority)
 
     def _keep_only(self, active: _Active, question: int | None, due: _Key | None = None) -> None:

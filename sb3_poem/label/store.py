@@ -15,13 +15,14 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from sb3_poem.adaptation.adapter import shown_to_dict
 from sb3_poem.adaptation.human import HumanAnswer
 from sb3_poem.adaptation.preference import Preference, as_preference
 from sb3_poem.label.rendering import StorageError, Turn
 
 VERDICTS = ("yes", "not quite")
 MAX_WISH = 2000  # characters
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 SCHEMA = """
 CREATE TABLE sessions (
     id INTEGER PRIMARY KEY,
@@ -44,8 +45,7 @@ CREATE TABLE turns (
     number INTEGER NOT NULL,         -- answers before it
     repeats INTEGER,                 -- number of the question that it asks again
     state TEXT,                      -- JSON, or NULL where nothing continues from it
-    left_trajectory TEXT,            -- JSON
-    right_trajectory TEXT,           -- JSON
+    trajectories TEXT,               -- what a question shows, by its place: JSON
     belief TEXT,                     -- JSON
     latent TEXT,                     -- JSON
     video TEXT NOT NULL,
@@ -71,23 +71,27 @@ CREATE TABLE answers (
 );
 CREATE UNIQUE INDEX one_answer ON answers(session, number) WHERE undone IS NULL;
 """
-# Version 1 takes three answers.
-FROM_VERSION_1 = f"""
-DROP INDEX one_answer;
-ALTER TABLE answers RENAME TO answers_1;
-{ANSWERS_SCHEMA}
-INSERT INTO answers SELECT * FROM answers_1;
-DROP TABLE answers_1;
-"""
-# Version 2 asks nothing again.
+# Version 1 and 2 ask nothing again.
 FROM_VERSION_2 = "ALTER TABLE turns ADD COLUMN repeats INTEGER;"
-# The pair that was asked about, where the waiting question stands.
+# Up to version 3 there are no answers but about two, and in version 1 but three.
+FROM_VERSION_3 = f"""
+DROP INDEX one_answer;
+ALTER TABLE answers RENAME TO answers_3;
+{ANSWERS_SCHEMA}
+INSERT INTO answers SELECT * FROM answers_3;
+DROP TABLE answers_3;
+ALTER TABLE turns RENAME COLUMN left_trajectory TO trajectories;
+UPDATE turns SET trajectories = json_object('left', json(trajectories), 'right',
+    json(right_trajectory)) WHERE trajectories IS NOT NULL;
+ALTER TABLE turns DROP COLUMN right_trajectory;
+"""
+# What was asked about, where the waiting question stands.
 ASK_AGAIN = """
-INSERT INTO turns (session, kind, number, state, left_trajectory, right_trajectory, belief, latent,
-    video, fps, frames, created, repeats)
-SELECT waiting.session, waiting.kind, waiting.number, waiting.state, asked.left_trajectory,
-    asked.right_trajectory, waiting.belief, waiting.latent, asked.video, asked.fps, asked.frames,
-    waiting.dropped, asked.number
+INSERT INTO turns (session, kind, number, state, trajectories, belief, latent, video, fps, frames,
+    created, repeats)
+SELECT waiting.session, waiting.kind, waiting.number, waiting.state, asked.trajectories,
+    waiting.belief, waiting.latent, asked.video, asked.fps, asked.frames, waiting.dropped,
+    asked.number
 FROM turns AS waiting, turns AS asked WHERE waiting.id = :waiting AND asked.id = :asked
 """
 
@@ -114,7 +118,7 @@ class Session:
 
     @property
     def question(self) -> str:
-        """The kind of its questions: "pair" or "graded"."""
+        """The kind of its questions, see :class:`~sb3_poem.adaptation.preference.Query`."""
         return str(self.options.get("question", "pair"))
 
 
@@ -211,24 +215,25 @@ class Store:
         return self._one("SELECT * FROM turns WHERE id = ?", turn)
 
     def adapter_answers(self, session: int, before: int) -> list[dict[str, Any]]:
-        """The first so many answers: ``preference``, ``left`` and ``right`` of each."""
-        query = """SELECT answers.preference, turns.left_trajectory, turns.right_trajectory
+        """The first so many answers: ``preference``, and what was shown by its place, ``left`` and
+        ``right``, say, of each.
+        """
+        query = """SELECT answers.preference, turns.trajectories
             FROM answers JOIN turns ON turns.id = answers.question
             WHERE answers.session = ? AND answers.undone IS NULL AND answers.number < ?
             ORDER BY answers.number"""
         return [
-            {"preference": row[0], "left": json.loads(row[1]), "right": json.loads(row[2])}
+            {"preference": row["preference"], **json.loads(row["trajectories"])}
             for row in self._all(query, session, before)
         ]
 
     def adapter_data(self, turn: int) -> dict[str, Any]:
         """The adapter's dictionary of a turn: ``answers``, ``pending``, the rest as ``state``."""
         row: Any = self.whole_turn(turn)
-        pair = {side: json.loads(row[f"{side}_trajectory"] or "null") for side in ("left", "right")}
         return {
             "state": json.loads(row["state"]),
             "answers": self.adapter_answers(row["session"], row["number"]),
-            "pending": pair if pair["left"] is not None else None,
+            "pending": json.loads(row["trajectories"] or "null"),
         }
 
     def add_turn(
@@ -269,8 +274,7 @@ class Store:
                 kind=kind,
                 number=number,
                 state=_json(turn.state),
-                left_trajectory=_json(turn.left),
-                right_trajectory=_json(turn.right),
+                trajectories=_json(turn.shown),
                 belief=_json(turn.belief),
                 latent=_json(turn.latent),
                 video=video,
@@ -314,8 +318,8 @@ class Store:
             )
 
     def ask_again(self, session: int, question: int) -> None:
-        """Ask once more about the pair whose answer the others contradict, as the waiting question
-        has it, instead of that one. The same wish again changes nothing.
+        """Ask once more about what the answer was to that the others contradict, as the waiting
+        question has it, instead of that one. The same wish again changes nothing.
         """
         with self._transaction() as execute:
             answers = self.answers(session)
@@ -394,7 +398,7 @@ class Store:
                 sessions.seed, sessions.options, sessions.wish, answers.number, answers.preference,
                 turns.repeats,
                 answers.created AS answered, answers.undone, turns.created AS asked, turns.shown,
-                turns.video, turns.fps, turns.frames, turns.left_trajectory, turns.right_trajectory,
+                turns.video, turns.fps, turns.frames, turns.trajectories,
                 (SELECT results.verdict FROM turns AS results
                     WHERE results.session = sessions.id AND results.kind = 'result'
                     AND results.verdict IS NOT NULL AND results.dropped IS NULL
@@ -433,8 +437,8 @@ class Store:
     def _make_tables(self) -> None:
         with self._transaction() as execute:
             version = execute("PRAGMA user_version").fetchone()[0]
-            scripts = {0: SCHEMA + ANSWERS_SCHEMA, 1: FROM_VERSION_1 + FROM_VERSION_2}
-            scripts |= {2: FROM_VERSION_2, SCHEMA_VERSION: ""}
+            scripts = {0: SCHEMA + ANSWERS_SCHEMA, 3: FROM_VERSION_3, SCHEMA_VERSION: ""}
+            scripts |= dict.fromkeys((1, 2), FROM_VERSION_2 + FROM_VERSION_3)
             if version not in scripts:
                 raise ValueError(
                     f"{self.path} is a store of version {version}; "
@@ -517,7 +521,7 @@ class StoreRecorder:
         return None
 
     def kept(self) -> list[dict[str, Any]]:
-        """The session's answers so far: ``preference``, ``left`` and ``right`` of each."""
+        """The session's answers so far, see :meth:`Store.adapter_answers`."""
         return self.store.adapter_answers(self.session.id, 2**31)
 
     def __call__(self, answer: HumanAnswer) -> None:
@@ -527,9 +531,10 @@ class StoreRecorder:
         last, number = before[-1]["id"] if before else None, len(before)
         name = f"{session}-terminal-{number + 1:03d}{answer.video.suffix}"
         shutil.copyfile(answer.video, store.videos / name)
-        left, right = answer.left, answer.right
-        frames = max(len(left.frames or ()), len(right.frames or ()))
-        turn = Turn(None, left.to_dict(), right.to_dict(), None, None, answer.fps, frames)
+        query = answer.query
+        frames = max(len(item.frames or ()) for item in query.shown)
+        shown = shown_to_dict(query.kind, query.shown)
+        turn = Turn(None, shown, None, None, answer.fps, frames)
         question = store.add_turn(
             session, "question", number, last, turn, name, answer.asked, answer.shown
         )

@@ -50,12 +50,15 @@ RULES = [
     Bayes(),
     Bayes(likelihood="similarity"),
     Bayes(question="graded", noise_model="infer"),
+    Bayes(question="best-of-four"),
     Paper(),
 ]
 
 
-def thresholds_of(rule):
-    return (20, 200) if rule.question == "graded" else None
+def kind_of(rule):
+    """What an oracle is given to answer this rule's questions."""
+    four = {"question": "best-of-four"}
+    return {"graded": {"thresholds": (20, 200)}, "best-of-four": four}.get(rule.question, {})
 
 
 def make_env(goal=GOAL, **kwargs):
@@ -64,12 +67,12 @@ def make_env(goal=GOAL, **kwargs):
     return env
 
 
-def outside_oracle(left, right):
+def outside_oracle(*shown):
     """Knows the goal, and sees observations only."""
-    left_miss, right_miss = (
-        np.abs(trajectory.observations[1:, 1] - GOAL).sum() for trajectory in (left, right)
-    )
-    return Preference.LEFT if left_miss < right_miss else Preference.RIGHT
+    misses = [np.abs(trajectory.observations[1:, 1] - GOAL).sum() for trajectory in shown]
+    if len(shown) == 2:
+        return Preference.LEFT if misses[0] < misses[1] else Preference.RIGHT
+    return ("first", "second", "third", "fourth")[int(np.argmin(misses))]
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +89,7 @@ def adapter(env=None, seed=0, model=None, **kwargs):
 def answer(a, times, oracle=outside_oracle):
     for _ in range(times):
         query = a.ask()
-        a.tell(oracle(query.left, query.right))
+        a.tell(oracle(*query.shown))
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -94,10 +97,10 @@ def test_ten_answers_find_the_goal(rule):
     a = adapter(rule=rule)
     while not a.done:
         query = a.ask()
-        assert query.left.frames is None
-        # common random numbers: both start alike
-        np.testing.assert_array_equal(query.left.observations[0], query.right.observations[0])
-        a.tell(outside_oracle(query.left, query.right))
+        assert all(item.frames is None for item in query.shown)
+        # common random numbers: all start alike
+        assert len({item.observations[0].tobytes() for item in query.shown}) == 1
+        a.tell(outside_oracle(*query.shown))
     policy = a.policy()
     assert SpeedModel.speed(policy.latent) == pytest.approx(GOAL[0], abs=0.3)
     assert a.n_answers == 10
@@ -178,7 +181,7 @@ def test_without_a_seed_one_is_drawn_and_kept():
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("pending", [False, True])
 def test_a_saved_adaptation_continues_exactly(tmp_path, rule, pending):
-    rule = rule.answered_by(MistakeOracle(0.1, thresholds=thresholds_of(rule)))
+    rule = rule.answered_by(MistakeOracle(0.1, **kind_of(rule)))
     whole = adapter(rule=rule)
     answer(whole, 8)
 
@@ -349,7 +352,7 @@ def test_a_question_that_looked_alike_is_replaced_by_the_next_best(tmp_path, que
     np.testing.assert_array_equal(again.left.observations, query.left.observations)
     np.testing.assert_array_equal(again.right.frames, query.right.frames)
     # A simulated oracle sees everything, whether or not there is a film.
-    simulated = ReturnOracle(thresholds=thresholds_of(rule) and (1.0, 2.0))
+    simulated = ReturnOracle(**kind_of(rule))
     one = adapter(Watched(render_mode="rgb_array"), rule=rule, oracle=simulated, render=True)
     assert {one.ask().left.latent[0], one.ask().right.latent[0]} == best
     assert len(looked) == 2
@@ -427,7 +430,7 @@ def test_what_a_notebook_shows(point_goal):
         rf"AdaptedPolicy\(POEMSAC on poem/PointGoal-v0, 0 answers, latent={latent}\)": policy,
         r"PreferenceAdapter\(POEMSAC on poem/PointGoal-v0, Bayes\(n_particles=20, noise_model=ExactNoise\(\)\), 0 of 2 answers\)": one,
         r"PreferenceAdapter\(SpeedModel, Paper\(\), 0 of 10 answers\)": adapter(rule=Paper()),
-        rf"Query\(left={trajectory}, right={trajectory}, kind='pair'\)": query,
+        rf"Query\(shown=\({trajectory}, {trajectory}\), kind='pair'\)": query,
         r"ReturnOracle\(task=the environment's\)": ReturnOracle(),
         r"MistakeOracle\(rate=0.7, task=\[1.0\]\)": MistakeOracle(0.7, task=[1.0]),
         r"BoltzmannOracle\(beta=2, task=the environment's\)": BoltzmannOracle(2),
@@ -580,7 +583,7 @@ def test_a_rule_of_ones_own():
             return self.rng.normal(size=(2, len(self.latent)))
 
         def tell(self, preference, left, right):
-            self.answers.append(Answer(preference, left, right))
+            self.answers.append(Answer(preference, (left, right)))
 
         def estimate(self):
             return self.latent
@@ -787,6 +790,35 @@ def test_graded_questions_are_asked_kept_and_answered_by_five_words():
     assert adapter().ask().kind == "pair"
 
 
+def test_the_best_of_four_is_asked_kept_and_answered_by_five_words():
+    words = ["first", "second", "third", "fourth", "equal"]
+    rule = Bayes(n_particles=20, question="best-of-four", noise_model="infer")
+    a = adapter(rule=rule)
+    for word in words:
+        assert len(a.ask().shown) == 4
+        with pytest.raises(
+            ValueError, match=r'"first", .* "equal", but is .left., which only pair'
+        ):
+            a.tell("left")
+        a.tell(word)
+    shown = a.ask().shown
+    assert len({item.latent.tobytes() for item in shown}) == 4
+    again = PreferenceAdapter.from_json(a.to_json(), SpeedModel(), make_env())
+    assert again.rule == rule
+    for kept, item in zip(again.pending.shown, shown, strict=True):
+        np.testing.assert_array_equal(kept.observations, item.observations)
+    assert [answer.preference.value for answer in again.answers] == words
+    np.testing.assert_array_equal(again.policy().latent, a.policy().latent)
+    first = a.ask_again(0)
+    assert [x.latent.tobytes() for x in first.shown] == [
+        x.latent.tobytes() for x in a.answers[0].shown
+    ]
+    for pair in (adapter(), adapter(rule=Paper())):
+        pair.ask()
+        with pytest.raises(ValueError, match="'third', which only best-of-four questions have"):
+            pair.tell("third")
+
+
 @pytest.mark.parametrize("rule", [Bayes(), Bayes(noise_model="infer"), Paper()])
 @pytest.mark.parametrize("graded", ["much left", Preference.MUCH_LEFT])
 def test_a_pair_takes_no_graded_answer(rule, graded):
@@ -801,7 +833,10 @@ def test_a_pair_takes_no_graded_answer(rule, graded):
 
 def test_who_answers_must_know_the_kind_of_the_questions():
     graded, exact = Bayes(question="graded"), ReturnOracle(thresholds=(20, 200))
-    for rule, oracle in ((graded, ReturnOracle()), (Bayes(), exact), (Paper(), exact)):
+    four = ReturnOracle(question="best-of-four")
+    wrong = [(graded, ReturnOracle()), (Bayes(), exact), (Paper(), exact), (Paper(), four)]
+    wrong += [(graded, four), (Bayes(question="best-of-four"), exact)]
+    for rule, oracle in wrong:
         words = f'answers "{oracle.question}" questions, but the rule asks "{rule.question}" ones'
         with pytest.raises(ValueError, match=words):
             adapter(rule=rule, oracle=oracle)
@@ -813,10 +848,10 @@ def test_who_answers_must_know_the_kind_of_the_questions():
     assert adapter(rule=graded, oracle=exact).rule.question == "graded"
 
 
-def test_graded_answers_find_a_task_in_fewer_questions():
-    def misses(oracle, **options):
+def test_answers_that_say_more_find_a_task_in_fewer_questions():
+    def misses(oracle, n_queries=3, **options):
         tasks = np.linspace(0.3, 2.7, 12)[:, None]
-        how = {"rule": Bayes(100, **options), "n_queries": 3}
+        how = {"rule": Bayes(100, **options), "n_queries": n_queries}
         found = adapt_tasks(SpeedModel(), SpeedVecEnv(24), tasks, oracle, **how)
         return np.abs(SpeedModel.speed(found.latents[:, -1]) - tasks[:, 0]).mean()
 
@@ -824,6 +859,8 @@ def test_graded_answers_find_a_task_in_fewer_questions():
     pairs = misses(ReturnOracle)
     assert misses(graded, question="graded") < 0.7 * pairs
     assert misses(graded, question="graded", noise_model="infer") < pairs
+    best = partial(ReturnOracle, question="best-of-four")
+    assert misses(best, 2, question="best-of-four") < pairs
 
 
 def test_numbers_of_numpy_can_be_saved():
@@ -893,7 +930,7 @@ def test_many_tasks_in_lockstep_as_each_alone(rule):
         model,
         DummyVecEnv([SpeedEnv] * 4),
         tasks,
-        partial(MistakeOracle, 0.2, thresholds=thresholds_of(rule)),
+        partial(MistakeOracle, 0.2, **kind_of(rule)),
         n_queries=5,
         seed=7,
         rule=rule,
@@ -901,7 +938,7 @@ def test_many_tasks_in_lockstep_as_each_alone(rule):
     assert together.latents.shape == (3, 6, 5)
     assert together.record_at == (0, 1, 2, 3, 4, 5)
     for i, task in enumerate(tasks):
-        oracle = MistakeOracle(0.2, task=task, seed=7 + i, thresholds=thresholds_of(rule))
+        oracle = MistakeOracle(0.2, task=task, seed=7 + i, **kind_of(rule))
         alone = PreferenceAdapter(
             model, make_env(task), oracle=oracle, seed=7 + i, n_queries=5, rule=rule
         )

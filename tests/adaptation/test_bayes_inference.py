@@ -3,11 +3,13 @@
 import math
 from functools import partial
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from scipy.special import ndtr, ndtri
 from worlds import HORIZON, STEP_WEIGHT, SpeedEnv, SpeedModel
 
+from sb3_poem import set_task
 from sb3_poem.adaptation import MistakeOracle, PreferenceAdapter, ReturnOracle
 from sb3_poem.adaptation.bayes import (
     DECODED_STEPS,
@@ -29,7 +31,9 @@ from sb3_poem.adaptation.preference import ANSWERS as ANSWERS_OF
 from sb3_poem.adaptation.preference import Preference, preference_log_likelihood
 from sb3_poem.adaptation.priors import AggregatePrior, GaussianPrior
 from sb3_poem.adaptation.rule import Answer, Setting, Snapshot
+from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
+from sb3_poem.common.vec_env import make_task_vec_env
 
 LEFT, RIGHT, EQUAL = Preference.LEFT, Preference.RIGHT, Preference.EQUAL
 
@@ -156,9 +160,59 @@ def test_latent_and_person_have_a_joint_posterior(question, noise, likelihood):
         assert np.corrcoef(np.log(weights), inference.log_weights)[0, 1] > 0.98
 
 
-@pytest.mark.parametrize("question", ["pair", "graded"])
+@pytest.mark.parametrize("noise", [ExactNoise(), MistakeNoise(0.1), BoltzmannNoise()])
+def test_the_best_of_four_on_point_goal_against_enumeration(noise):
+    """The posterior over particles after each of three answers, from formulas alone."""
+    task = np.array([2.0])  # the goal's angle
+    env = gym.make("poem/PointGoal-v0")
+    set_task(env, task)
+    oracle = ReturnOracle(env, task, question="best-of-four")
+    rule = Bayes(300, question="best-of-four", noise_model=noise)
+    adapter = PreferenceAdapter("PointGoal", env, rule=rule, n_queries=3, seed=0)
+    inference, model = adapter.inference, adapter.model
+    inference._rejuvenate = lambda: None  # the weights alone
+    widths = np.array([0.0, 0.12, 0.4])
+    joint = np.tile(np.log([0.4, 0.4, 0.2]), (300, 1))
+    while not adapter.done:
+        query = adapter.ask()
+        answer = oracle(*query.shown)
+        best = ["first", "second", "third", "fourth"].index(answer.value)
+        adapter.tell(answer)
+        values = model.predicted_returns(inference.particles, query.shown)
+        cross, square = inference.calibration[:2]
+        spread = inference._spread * cross / square
+        error = model.predicted_rewards_error * math.sqrt(2 * 25 * ERROR_CORRELATION)
+        if isinstance(noise, BoltzmannNoise):
+            beta = 1 / (2 * np.abs(values).mean(axis=1, keepdims=True))
+            slope = beta / np.sqrt(1 + np.pi / 8 * (beta * error) ** 2)
+        else:
+            slope = 1.702 / error
+        odds = np.exp(slope * (values - values.max(axis=1, keepdims=True)))
+        handicap = np.exp(slope * spread * widths)
+        winner = np.stack([odds[:, i, None] for i in range(4)])  # (4, m, 1)
+        p = winner / (winner + handicap * (odds.sum(axis=1)[None, :, None] - winner))
+        rate = getattr(noise, "rate", 0.0)
+        p = (1 - rate) * p[best] + rate / 3 * (p.sum(axis=0) - p[best])
+        joint += np.log((1 - LAPSE) * p + LAPSE / 5)
+        expected = np.exp(joint).sum(axis=1)
+        np.testing.assert_allclose(inference.weights, expected / expected.sum(), rtol=0.02)
+    goal = np.array([np.cos(task[0]), np.sin(task[0])])
+    near = np.linalg.norm(_ends(model, inference.particles) - goal, axis=1) < 0.35
+    grew = inference.weights[near].sum() / near.mean()
+    assert grew > (1.05 if isinstance(noise, BoltzmannNoise) else 2.5)
+
+
+def _ends(model, latents):
+    """(m, 2) where PointGoal's policies come to."""
+    env = make_task_vec_env("poem/PointGoal-v0", 50)
+    clips = rollout_latents(model, env, latents, None, [0] * len(latents), True)
+    return np.stack([clip.observations[-1] for clip in clips])
+
+
+@pytest.mark.parametrize("question", ["pair", "graded", "best-of-four"])
 def test_who_answers_is_found_out(question):
-    thresholds = {"thresholds": (20.0, 200.0)} if question == "graded" else {}
+    kinds = {"graded": {"thresholds": (20.0, 200.0)}, "best-of-four": {"question": question}}
+    told = kinds.get(question, {})
 
     def mistakes(oracle):
         rates = []
@@ -173,8 +227,8 @@ def test_who_answers_is_found_out(question):
             rates.append(inference.people_shares @ inference.people.mistakes)
         return np.mean(rates)
 
-    exact = mistakes(partial(ReturnOracle, **thresholds))
-    often = mistakes(partial(MistakeOracle, 0.25, **thresholds))
+    exact = mistakes(partial(ReturnOracle, **told))
+    often = mistakes(partial(MistakeOracle, 0.25, **told))
     assert exact < 0.02 < 0.05 < often  # 0.05 before the first answer
 
 
@@ -206,7 +260,7 @@ def test_the_probability_of_an_answer_given_the_others(question, noise):
         for each in side if others.people is None else (*side, EQUAL):
             if each not in ANSWERS_OF[question]:
                 continue
-            answer = Answer(each, *(np.full(5, side) for side in sides))
+            answer = Answer(each, tuple(np.full(5, side) for side in sides))
             likelihood = np.exp(others._log_likelihoods(others.particles, [answer]))
             if others.people is not None:
                 shares = np.exp(others.people_log_shares.astype(np.float64))
@@ -244,6 +298,22 @@ def test_what_the_other_answers_contradict_is_found_and_asked_again(question, se
     assert kept == [asked.preference, opposite[asked.preference]]  # the first stays
     with pytest.raises(RuntimeError, match="all 10 questions"):
         adapter.ask_again(wrong)
+
+
+def test_a_choice_that_the_others_contradict_is_found():
+    env = SpeedEnv()
+    oracle = ReturnOracle(env, question="best-of-four")
+    for turned in (None, 3):
+        rule = Bayes(question="best-of-four", noise_model="infer")
+        adapter = PreferenceAdapter(SpeedModel(), env, rule=rule, seed=1)
+        for number in range(8):
+            shown = adapter.ask().shown
+            worst = int(np.argmin([oracle.true_return(item) for item in shown]))
+            wrong = ["first", "second", "third", "fourth"][worst]
+            adapter.tell(wrong if number == turned else oracle(*shown))
+        assert adapter.contradicted == turned
+        agreements = adapter.inference.agreements()
+        assert np.all((agreements >= 0) & (agreements <= 1))
 
 
 def test_the_likelihood_from_s_is_the_direct_formula():
@@ -608,7 +678,7 @@ def test_bad_options(model, arguments, message):
 
 
 def test_the_decoder_needs_trajectories():
-    with pytest.raises(ValueError, match="needs the two trajectories"):
+    with pytest.raises(ValueError, match="needs the trajectories"):
         make().tell(LEFT, np.zeros(5), np.ones(5))
 
 

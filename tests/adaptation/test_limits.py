@@ -232,6 +232,30 @@ def test_boltzmann_grades_tell_no_more_than_their_bound(beta):
             assert told < bound < np.log2(5)
 
 
+def test_the_best_of_four_tells_up_to_two_bits():
+    assert answer_capacity(None, 1.0, 4) == 2.0
+    assert answer_capacity(MistakeNoise(0.0), 1.0, 4) == pytest.approx(2.0)
+    rng = np.random.default_rng(0)
+    for noise, exponent in ((BoltzmannNoise(0.1), 3.0), (BoltzmannNoise(), 2.0)):
+        bound, most = answer_capacity(noise, 30.0, 4), 0.0
+        for _ in range(300):  # inputs in any permutation, as a symmetric channel has them
+            values = exponent * rng.integers(0, 2, size=4) if rng.random() < 0.5 else None
+            values = exponent * rng.random(4) if values is None else values
+            p = np.exp(values) / np.exp(values).sum()
+            most = max(most, 2 + np.sum(p * np.log2(p)))
+        assert most <= bound + 1e-12
+        assert most == pytest.approx(bound, abs=1e-9)
+    # A mistake is any other one: three equally probable ones at 0.75 tell nothing.
+    p = np.array([0.8, *[0.2 / 3] * 3])
+    told = 2 + np.sum(p * np.log2(p))
+    assert answer_capacity(MistakeNoise(0.2), 1.0, 4) == pytest.approx(told)
+    returns = SPEEDS[::8, ::8]
+    best = returns[:, best_codebook(returns, 4, ordered=True)].max(axis=1).mean()
+    assert information_limit(returns, 1, n_answers=4, ordered=True) == pytest.approx(best)
+    noisy = information_limit(returns, 2, n_answers=4, noise_model=MistakeNoise(0.2))
+    assert noisy < information_limit(returns, 2, n_answers=4)
+
+
 def test_fair_limits_do_not_profit_from_luck():
     """Policies that are all alike: what they earned was luck, and a limit by it would lie above."""
     rng = np.random.default_rng(0)

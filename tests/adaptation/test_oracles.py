@@ -218,6 +218,60 @@ def test_a_person_says_how_much_better(tmp_path):
         HumanOracle(tmp_path, question="numbers")
 
 
+FOUR = [Preference.FIRST, Preference.SECOND, Preference.THIRD, Preference.FOURTH]
+
+
+def test_the_best_of_four_wins_at_the_rates_that_are_claimed():
+    env, speeds = env_with_goal(2.0), (1.0, 1.9, 2.3, 2.8)
+    shown, how = [at_speed(speed) for speed in speeds], {"question": "best-of-four"}
+    exact = ReturnOracle(env, **how)
+    assert exact(*shown) is Preference.SECOND
+    assert exact(*shown[::-1]) is Preference.THIRD
+    assert exact(at_speed(1.9), at_speed(1.0), at_speed(2.1), at_speed(0.0)) is EQUAL
+    assert ReturnOracle(env, thresholds=(41, 50), **how)(*shown) is EQUAL  # 20 against 60
+    assert ReturnOracle(env, thresholds=(39, 50), **how)(*shown) is Preference.SECOND
+    mistaken = MistakeOracle(0.3, env, seed=0, **how)
+    said = [mistaken(*shown) for _ in range(1500)]
+    counts = np.array([said.count(each) for each in FOUR]) / 1500
+    np.testing.assert_allclose(counts, [0.1, 0.7, 0.1, 0.1], atol=0.03)
+    returns = -200.0 * np.abs(np.array(speeds) - 2.0)
+    for beta in (None, 0.01):
+        noisy = BoltzmannOracle(beta, env, seed=0, **how)
+        said = [noisy(*shown) for _ in range(1500)]
+        counts = np.array([said.count(each) for each in FOUR]) / 1500
+        odds = np.exp((beta or 1 / (2 * np.abs(returns).mean())) * returns)
+        np.testing.assert_allclose(counts, odds / odds.sum(), atol=0.04)
+    with pytest.raises(ValueError, match=r"about 4 trajectories, but 2 .* oracle\(\*query.shown\)"):
+        exact(*shown[:2])
+    with pytest.raises(ValueError, match="a pair question is about 2 trajectories, but 4"):
+        ReturnOracle(env)(*shown)
+    with pytest.raises(ValueError, match=r"`question` must be None, .pair. .* but is 'graded'"):
+        ReturnOracle(env, question="graded")
+
+
+@pytest.mark.parametrize("video_format", ["gif", "mp4"])
+def test_a_person_sees_four_in_two_rows(tmp_path, video_format):
+    import imageio.v3 as imageio
+
+    terminal = Terminal("1", "2", "3", "4", "0", "e", "fourth", "l", "third")
+    lines = []
+    oracle = HumanOracle(
+        tmp_path, video_format, read=terminal.read, write=lines.append, question="best-of-four"
+    )
+    shown = [at_speed(1.0, n, [frames(1, 60 * i)[0] for i in range(n)]) for n in (2, 3, 2, 1)]
+    words = [oracle(*shown).value for _ in range(8)]
+    assert words == ["first", "second", "third", "fourth", "equal", "equal", "fourth", "third"]
+    assert "'l' is no answer; type a number from 0 to 4." in lines
+    assert set(terminal.prompts) == {PROMPTS["best-of-four"]}
+    film = imageio.imread(tmp_path / f"query-001.{video_format}")
+    one = shown[0].frames[0].shape
+    assert len(film) == 3
+    assert film[0].shape[0] > 2 * one[0]
+    assert film[0].shape[1] >= 2 * one[1]
+    with pytest.raises(ValueError, match="a best-of-four question is about 4"):
+        oracle(*shown[:2])
+
+
 def test_a_persons_terminal_and_frames_are_needed(tmp_path):
     with pytest.raises(ValueError, match="no frames to show"):
         HumanOracle(tmp_path)(at_speed(1.0), at_speed(2.0))

@@ -21,6 +21,7 @@ from sb3_poem.adaptation.queries import (
     information_gains,
     most_informative_pair,
     most_telling_pair,
+    most_telling_set,
     pair_differences,
     random_pair,
     tolerance,
@@ -149,6 +150,63 @@ def test_people_answer_as_they_are_simulated(noise):
     perceived *= np.where(rng.random(100_000) < people.mistakes[g], -1.0, 1.0)
     counts = np.bincount(np.digitize(perceived, spread * people.thresholds[g]), minlength=5)
     np.testing.assert_allclose(said[:, 0], 0.99 * counts / 100_000 + 0.002, atol=0.006)
+
+
+@pytest.mark.parametrize("noise", [None, MistakeNoise(0.2), BoltzmannNoise(0.3)])
+def test_people_choose_the_best_as_they_are_simulated(noise):
+    people, values, n = People("best-of-four", noise), np.array([3.0, -2.0, 5.0, 4.0]), 200_000
+    differences = values[:1] - values[1:]
+    said = people.probabilities(differences[None], 2.0, 1.0, 10.0)[::-1, 0]  # (5, G), EQUAL last
+    np.testing.assert_allclose(said.sum(axis=0), 1.0)
+    error = 1 / 0.3 * np.sqrt(1 + np.pi / 8 * 0.6**2)
+    rng = np.random.default_rng(0)
+    for g in range(len(people)):
+        if not isinstance(noise, BoltzmannNoise):
+            error = np.hypot(2.0, 10.0 * people.doubts[g]) / 1.702
+        # Gumbel errors: who is ahead of all others, each handicapped by the width
+        perceived = values + rng.gumbel(scale=error, size=(n, 4))
+        ahead = np.sort(perceived)[:, -1] - np.sort(perceived)[:, -2]
+        best = np.argmax(perceived, axis=1)
+        wrong = rng.random(n) < people.mistakes[g]
+        best[wrong] = (best[wrong] + rng.integers(1, 4, size=wrong.sum())) % 4
+        if -people.thresholds[g, 0] == 0.0:
+            counts = np.append(np.bincount(best, minlength=4), 0)
+            np.testing.assert_allclose(said[:, g], 0.99 * counts / n + 0.002, atol=0.005)
+        else:  # Luce's rule with a width is another family of errors, near this one
+            assert abs(said[4, g] - np.mean(ahead < 10.0 * people.thresholds[g, -1])) < 0.06
+
+
+@pytest.mark.parametrize("noise", [None, MistakeNoise(0.2), BoltzmannNoise(0.3)])
+def test_the_best_of_two_is_a_pair(noise):
+    two, pair = People("best-of-four", noise), People("pair", noise)
+    np.testing.assert_array_equal(two.log_prior, pair.log_prior)
+    about = np.linspace(-9, 9, 7), 2.0, 4.0, 10.0
+    np.testing.assert_allclose(two.probabilities(*about), pair.probabilities(*about)[[1, 0, 2]])
+
+
+def test_what_is_added_to_a_pair_adds_the_most_mutual_information():
+    people, rng = People("best-of-four", MistakeNoise(0.1)), np.random.default_rng(2)
+    values, weights = rng.normal(size=(30, 7)), rng.dirichlet([1] * 30)
+
+    def said(differences):
+        return people.probabilities(differences, 0.2, 1.0, 1e-9)[:, :, 0]
+
+    def told(chosen):
+        """Nats, of exact choice by Luce's rule, by hand."""
+        odds = np.exp(1.702 / 0.2 * values[:, chosen])
+        best = odds / odds.sum(axis=1, keepdims=True)
+        best = 0.9 * best + 0.1 * (1 - best) / (len(chosen) - 1)
+        p = np.column_stack([np.zeros(30), best]) * 0.99 + 0.01 / (len(chosen) + 1)
+        joint, marginal = weights[:, None] * p, weights @ p
+        return np.sum(joint * np.log(p / marginal))
+
+    chosen = most_telling_set((2, 5), 4, values, weights, said)
+    assert chosen[:2] == (2, 5)
+    assert len(set(chosen)) == 4
+    third = {j: told([2, 5, j]) for j in range(7) if j not in (2, 5)}
+    assert chosen[2] == max(third, key=third.get)
+    fourth = {j: told([*chosen[:3], j]) for j in third if j != chosen[2]}
+    assert chosen[3] == max(fourth, key=fourth.get)
 
 
 def test_random_pairs_differ_and_cover():

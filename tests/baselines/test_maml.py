@@ -97,7 +97,7 @@ def judged(fragments, goal, n, seed):
             (-np.abs(t.reward_features[:, 0] - goal)).sum() * sign
             for t, sign in ((left, 1), (right, -1))
         )
-        answers.append(Answer(Preference.LEFT if better > 0 else Preference.RIGHT, left, right))
+        answers.append(Answer(Preference.LEFT if better > 0 else Preference.RIGHT, (left, right)))
     return answers
 
 
@@ -130,7 +130,7 @@ def test_ten_answers_tell_the_meta_trained_reward_its_task(trained):
 def test_answers_about_episodes_that_ended_early(trained):
     meta = MetaReward(trained.policy, (8,))
     long, short = (replay_fragments(trained, 1, n, np.random.default_rng(0))[0] for n in (9, 4))
-    answers = [Answer(Preference.LEFT, long, short), Answer(Preference.EQUAL, short, short)]
+    answers = [Answer(Preference.LEFT, (long, short)), Answer(Preference.EQUAL, (short, short))]
     adapted = meta.adapted(answers)
     # One step of gradient descent after the other, each pair by itself and nothing filled up.
     parameters = meta.parameters
@@ -161,7 +161,7 @@ def test_a_whole_rollout_weighs_as_much_as_a_fragment_of_the_meta_training(train
         return Trajectory(observations, np.zeros((steps, 1), np.float32), np.zeros(5))
 
     short, long = (
-        meta.adapted([Answer(Preference.LEFT, standing(0.5, n), standing(-0.2, n))])
+        meta.adapted([Answer(Preference.LEFT, (standing(0.5, n), standing(-0.2, n)))])
         for n in (5, 15)
     )
     assert any(not th.equal(value, meta.parameters[name]) for name, value in short.items())
@@ -191,7 +191,7 @@ def test_a_meta_reward_is_saved_and_read(tmp_path):
     loaded = MetaReward.load(tmp_path / "reward", model.policy)
     assert (loaded.net_arch, loaded.inner_learning_rate, loaded.inner_steps) == ((8, 4), 0.2, 2)
     left, right = replay_fragments(model, 2, 10, np.random.default_rng(0))
-    answers = [Answer(Preference.LEFT, left, right)]
+    answers = [Answer(Preference.LEFT, (left, right))]
     for judged in ([], answers):
         np.testing.assert_array_equal(
             loaded.rewards(loaded.adapted(judged), right), meta.rewards(meta.adapted(judged), right)

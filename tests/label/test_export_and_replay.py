@@ -49,11 +49,8 @@ def answered(run_server: Callable[..., Any], store: Store, point_goal: ModelInfo
             view = await settled(sessions, session)
             row = store.whole_turn(view["turn"]["id"])
             assert row is not None
-            sides = [
-                Trajectory.from_dict(json.loads(row[f"{side}_trajectory"]))
-                for side in ("left", "right")
-            ]
-            right = oracle(*sides).value
+            shown = map(Trajectory.from_dict, json.loads(row["trajectories"]).values())
+            right = oracle(*shown).value
             wrong = {"left": "right", "right": "left", "equal": "left"}[right]
             store.add_answer(session.id, view["turn"]["id"], wrong if wrong_first else right)
             if wrong_first:
@@ -87,7 +84,7 @@ def test_both_formats_hold_the_same_answers(
         assert line["asked"] <= line["answered"]
     with_undone = list(records(store, undone=True))
     assert [record["undone"] for record in with_undone] == [True, False, False, False, False]
-    assert set(with_undone[0]) == set(FIELDS)
+    assert set(with_undone[0]) == {*FIELDS, "left_latent", "right_latent"}
 
 
 def test_minari_reads_the_episodes_with_preferences_and_latents(
@@ -141,8 +138,9 @@ def test_minari_reads_the_episodes_with_preferences_and_latents(
     fields = whole.observations[:-1], whole.actions[:-1], whole.latent, whole.reward_features[:-1]
     question = store.answers(answered.id)[0]["question"]
     with sqlite3.connect(store.path) as connection:
-        changed = (json.dumps(Trajectory(*fields).to_dict()), question)
-        connection.execute("update turns set left_trajectory = ? where id = ?", changed)
+        shown = {"left": Trajectory(*fields).to_dict(), "right": kept[0]["right"]}
+        changed = (json.dumps(shown), question)
+        connection.execute("update turns set trajectories = ? where id = ?", changed)
     assert cli.main([*command, "shorter-v0"]) == 0
     short, other = list(minari.load_dataset("poem/PointGoal/shorter-v0"))[:2]
     assert short.terminations.tolist() == [False] * (len(whole) - 2) + [True]
@@ -286,6 +284,50 @@ def test_the_terminals_answers_are_in_the_same_store(
     ]
     assert kept[1]["left_latent"] == adapter.answers[1].left.latent.tolist()
     assert Path(kept[0]["video"]).read_bytes().startswith(b"GIF8")
+
+
+def test_the_best_of_four_is_exported_beside_pairs_and_replayed(
+    answered: Session, store: Store, point_goal: ModelInfo, tmp_path: Path
+) -> None:
+    from pyarrow import parquet
+
+    replies, options = iter(["3", "0", "first"]), {"question": "best-of-four"}
+    recorder = StoreRecorder(store, "PointGoal", point_goal.env_id, 3, options)
+    oracle = HumanOracle(
+        tmp_path / "gifs",
+        read=lambda _: next(replies),
+        write=lambda _: None,
+        record=recorder,
+        **options,
+    )
+    model, rule = load_shown_model(point_goal), Bayes(noise_model="infer", **options)
+    env = gym.make(point_goal.env_id, render_mode="rgb_array", width=64, height=48)
+    adapter = PreferenceAdapter(model, env, rule=rule, oracle=oracle, seed=3, n_queries=3)
+    adapter.adapt()
+    kinds = ["pair"] * 4 + ["best-of-four"] * 3
+    assert export(store, tmp_path / "a.parquet", trajectories=True) == 7
+    assert export(store, tmp_path / "a.jsonl", trajectories=True) == 7
+    lines = [json.loads(line) for line in (tmp_path / "a.jsonl").read_text().splitlines()]
+    rows = parquet.read_table(tmp_path / "a.parquet").to_pylist()
+    assert [row["question"] for row in rows] == [line["question"] for line in lines] == kinds
+    for row, line in zip(rows, lines, strict=True):
+        assert {name: value for name, value in row.items() if value is not None} == {
+            name: value for name, value in line.items() if value is not None
+        }
+    for line, given in zip(lines[4:], adapter.answers, strict=True):
+        assert line["preference"] == given.preference.value
+        assert "left_latent" not in line
+        places = ("first", "second", "third", "fourth")
+        for place, shown in zip(places, given.shown, strict=True):
+            assert line[f"{place}_latent"] == shown.latent.tolist()
+            np.testing.assert_array_equal(line[f"{place}_actions"], shown.actions)
+    result = replay(store, recorder.session, model, seed=3)
+    np.testing.assert_allclose(result["latents"][-1], adapter.policy().latent, atol=0.1)
+    assert (result["decided"], len(result["latents"])) == (2, 4)
+    other = replay(store, recorder.session, model, seed=3, is_own=False)
+    assert other["action_error"] < 0.2
+    with pytest.raises(ValueError, match=r'which of four is best, which only inference="bayes"'):
+        replay(store, recorder.session, model, {"inference": "paper"})
 
 
 def test_the_widget_moves_the_adapter(point_goal: ModelInfo, tmp_path: Path) -> None:

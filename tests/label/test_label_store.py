@@ -15,11 +15,11 @@ import pytest
 from sb3_poem.label.rendering import Turn
 from sb3_poem.label.store import RefusedError, Store
 
-TRAJECTORY = {"observations": None}
+SHOWN = {"left": {"observations": None}, "right": {"observations": [1e-300, 0.1]}}
 
 
 def turn() -> Turn:
-    return Turn({"n": 1}, dict(TRAJECTORY), dict(TRAJECTORY), {"sentence": "x"}, [0.0], 20.0, 5)
+    return Turn({"n": 1}, SHOWN, {"sentence": "x"}, [0.0], 20.0, 5)
 
 
 def begin(store: Store, step: int = 10, **options: str) -> tuple[int, str]:
@@ -86,6 +86,21 @@ def test_graded_questions_take_five_answers_and_pairs_three(store: Store) -> Non
         answer(store, pairs, "much left")
 
 
+def test_the_best_of_four_takes_five_answers(store: Store) -> None:
+    session, _ = begin(store, question="best-of-four")
+    words = ["first", "second", "third", "fourth", "equal"]
+    for word in words:
+        answer(store, session, word)
+    assert preferences(store, session) == words
+    with pytest.raises(RefusedError, match=r"'left', which only pair and graded questions have"):
+        answer(store, session, "left")
+
+
+# Back to how version 3 kept what is shown.
+SHOWN_3 = """ALTER TABLE turns RENAME COLUMN trajectories TO left_trajectory;
+ALTER TABLE turns ADD COLUMN right_trajectory TEXT;
+UPDATE turns SET right_trajectory = json_extract(left_trajectory, '$.right'),
+    left_trajectory = json_extract(left_trajectory, '$.left');"""
 # Back to how version 1 kept answers.
 ANSWERS_1 = """ALTER TABLE answers RENAME TO newer; DROP INDEX one_answer;
 CREATE TABLE answers (
@@ -101,8 +116,8 @@ CREATE UNIQUE INDEX one_answer ON answers(session, number) WHERE undone IS NULL;
 INSERT INTO answers SELECT * FROM newer; DROP TABLE newer;"""
 
 
-@pytest.mark.parametrize("version", [1, 2])
-def test_an_older_store_is_read_and_takes_graded_answers(tmp_path: Path, version: int) -> None:
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_an_older_store_is_read_and_takes_all_answers(tmp_path: Path, version: int) -> None:
     store = Store(tmp_path)
     session, _ = begin(store)
     for word in ("left", "equal"):
@@ -110,9 +125,9 @@ def test_an_older_store_is_read_and_takes_graded_answers(tmp_path: Path, version
     store.undo(session, 2)
     store.close()
     connection = sqlite3.connect(tmp_path / "answers.sqlite")
-    connection.executescript(
-        f"ALTER TABLE turns DROP COLUMN repeats; PRAGMA user_version = {version}"
-    )
+    connection.executescript(f"{SHOWN_3} PRAGMA user_version = {version}")
+    if version < 3:
+        connection.executescript("ALTER TABLE turns DROP COLUMN repeats")
     if version == 1:
         connection.executescript(ANSWERS_1)
     kept = connection.execute("SELECT * FROM answers ORDER BY id").fetchall()
@@ -120,6 +135,7 @@ def test_an_older_store_is_read_and_takes_graded_answers(tmp_path: Path, version
     for _ in range(2):  # read, and read again
         store = Store(tmp_path)
         assert preferences(store, session) == ["left"]
+        assert store.adapter_answers(session, 9) == [{"preference": "left", **SHOWN}]
         store.close()
     connection = sqlite3.connect(tmp_path / "answers.sqlite")
     assert connection.execute("SELECT * FROM answers ORDER BY id").fetchall() == kept
@@ -128,6 +144,8 @@ def test_an_older_store_is_read_and_takes_graded_answers(tmp_path: Path, version
     graded, _ = begin(store, question="graded")
     answer(store, graded, "much left")
     assert preferences(store, graded) == ["much left"]
+    four, _ = begin(store, question="best-of-four")
+    answer(store, four, "third")
     store.close()
 
 
@@ -253,7 +271,7 @@ def test_a_contradicted_answers_pair_is_asked_about_once_more(store: Store) -> N
     with pytest.raises(RefusedError, match="no answer is contradicted"):
         store.ask_again(session, waiting["id"])
     store.undo(session, 2)
-    contradicted = replace(turn(), belief={"contradicted": 0}, left={"new": True})
+    contradicted = replace(turn(), belief={"contradicted": 0}, shown={"left": {"new": True}})
     given = store.add_answer(session, films[1], "much right")
     waiting = store.add_turn(session, "question", 2, given, contradicted, "new.mp4")
     assert waiting is not None
@@ -263,7 +281,7 @@ def test_a_contradicted_answers_pair_is_asked_about_once_more(store: Store) -> N
     assert again is not None
     assert (again["repeats"], again["video"]) == (0, "0.mp4")
     data, first = store.adapter_data(again["id"]), store.whole_turn(films[0])
-    assert data["pending"] == {"left": dict(TRAJECTORY), "right": dict(TRAJECTORY)}
+    assert data["pending"] == SHOWN
     assert data["state"] == {"n": 1}
     assert first is not None
     with pytest.raises(RefusedError, match="not the one that waits"):

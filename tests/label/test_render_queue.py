@@ -27,7 +27,7 @@ from sb3_poem.label.rendering import (
     renderer_of,
 )
 
-TURN = Turn(None, None, None, None, None, 20.0, 1)
+TURN = Turn(None, None, None, None, 20.0, 1)
 
 
 def request(info: ModelInfo, folder: Path, name: str) -> TurnRequest:

@@ -54,7 +54,7 @@ def contents(
     assert turn is not None
     row = store.whole_turn(turn["id"])
     assert row is not None
-    columns = ("state", "left_trajectory", "right_trajectory", "belief", "latent", "fps", "frames")
+    columns = ("state", "trajectories", "belief", "latent", "fps", "frames")
     return (*(row[name] for name in columns), (store.videos / row["video"]).read_bytes())
 
 
@@ -72,37 +72,38 @@ def test_the_page_asks_what_an_adapter_asks(
     for number, preference in enumerate(ANSWERS):
         query = adapter.ask()
         kept = contents(store, session, number)
-        assert json.loads(kept[1]) == query.left.to_dict()
-        assert json.loads(kept[2]) == query.right.to_dict()
+        sides = {"left": query.left.to_dict(), "right": query.right.to_dict()}
+        assert json.loads(kept[1]) == sides
         adapter.tell(preference)
-    assert json.loads(contents(store, session, len(ANSWERS))[4]) == adapter.policy().latent.tolist()
+    assert json.loads(contents(store, session, len(ANSWERS))[3]) == adapter.policy().latent.tolist()
 
 
-def test_graded_questions_are_asked_and_what_follows_from_all_five_answers_rendered_ahead(
-    run_server: Callable[..., Any], store: Store, point_goal: ModelInfo
+@pytest.mark.parametrize(("kind", "word"), [("graded", "much left"), ("best-of-four", "third")])
+def test_questions_are_asked_and_what_follows_from_all_five_answers_rendered_ahead(
+    run_server: Callable[..., Any], store: Store, point_goal: ModelInfo, kind: str, word: str
 ) -> None:
     async def life(sessions: SessionManager) -> Session:
         session, _ = await begin(sessions)
         view = await settled(sessions, session)
-        assert view["question"] == "graded"
+        assert view["question"] == kind
         first = store.videos / store.turn(session.id, "question", 0)["video"]
         ahead: set[Path] = set()
         while len(ahead) < 5:
             await asyncio.sleep(0.02)
             ahead = set(store.videos.glob("[0-9]*.mp4")) - {first}
-        store.add_answer(session.id, view["turn"]["id"], "much left")
+        store.add_answer(session.id, view["turn"]["id"], word)
         await settled(sessions, session)
         assert store.videos / store.turn(session.id, "question", 1)["video"] in ahead
         return session
 
-    session = run_server(life, render_ahead=True, options={"question": "graded"})
-    rule = Bayes(question="graded", noise_model="infer")
+    session = run_server(life, render_ahead=True, options={"question": kind})
+    rule = Bayes(question=kind, noise_model="infer")
     adapter = PreferenceAdapter(
         load_shown_model(point_goal), "poem/PointGoal-v0", seed=5, rule=rule
     )
     adapter.ask()
-    adapter.tell("much left")
-    assert json.loads(contents(store, session, 1)[4]) == adapter.policy().latent.tolist()
+    adapter.tell(word)
+    assert json.loads(contents(store, session, 1)[3]) == adapter.policy().latent.tolist()
 
 
 def test_a_new_server_continues_at_the_same_question_with_the_same_posterior(
