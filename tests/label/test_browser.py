@@ -45,6 +45,7 @@ KEYS = {
     "pair": {"left": "ArrowLeft", "equal": "2", "right": "ArrowRight"},
     "graded": {"much left": "1", "left": "2", "equal": "3", "right": "ArrowRight"}
     | {"much right": "5"},
+    "best-of-four": {"first": "1", "second": "2", "third": "3", "fourth": "4", "equal": "0"},
 }
 SHOWN = "() => typeof view !== 'undefined' && view !== null && view.phase !== 'preparing' && !busy"
 
@@ -85,8 +86,8 @@ class Server:
 class ForkedServer:
     """The same in a fork of this process, which need not import everything anew."""
 
-    def __init__(self, store: Path, info: ModelInfo) -> None:
-        self.store, self.info = store, info
+    def __init__(self, store: Path, info: ModelInfo, **options: str) -> None:
+        self.store, self.info, self.options = store, info, options
         self.listener = bind("127.0.0.1", 0)
         self.port = self.listener.getsockname()[1]
         self.url = f"http://127.0.0.1:{self.port}"
@@ -97,7 +98,8 @@ class ForkedServer:
         self.process.start()
 
     def serve(self) -> None:
-        app = make_app(make_sessions(Store(self.store), self.info, n_queries=5))
+        how = {"n_queries": 5, "options": self.options}
+        app = make_app(make_sessions(Store(self.store), self.info, **how))
         make_server(app, "127.0.0.1", self.port).run(sockets=[self.listener])
 
     def kill(self) -> None:
@@ -158,8 +160,9 @@ class Person:
         self.token = page.url.rpartition("/s/")[2]
         self.task = np.array([task])
         self.question = page.evaluate("() => view.question")
-        graded = {"thresholds": THRESHOLDS[info.name]} if self.question == "graded" else {}
-        self.oracle = ReturnOracle(gym.make(info.env_id), self.task, **graded)
+        kinds = {"graded": {"thresholds": THRESHOLDS[info.name]}, "pair": {}}
+        how = kinds.get(self.question, {"question": self.question})
+        self.oracle = ReturnOracle(gym.make(info.env_id), self.task, **how)
         self.store = server.store
 
     def judge(self) -> str:
@@ -172,11 +175,8 @@ class Person:
         row = store.whole_turn(turn["id"])
         store.close()
         assert row is not None
-        sides = [
-            Trajectory.from_dict(json.loads(row[f"{side}_trajectory"]))
-            for side in ("left", "right")
-        ]
-        return self.oracle(*sides).value
+        shown = map(Trajectory.from_dict, json.loads(row["trajectories"]).values())
+        return self.oracle(*shown).value
 
     def answer(self, times: int = 1, keyboard: bool = False) -> None:
         for _ in range(times):
@@ -412,6 +412,84 @@ def test_five_answers_by_keys_and_by_clicks(
     page.click("#undo")
     page.wait_for_function("() => view.answered === 4 && !busy")
     assert person.stored() == [*answers][:4]
+
+
+@pytest.fixture
+def of_four(point_goal: ModelInfo, tmp_path: Path) -> Iterator[ForkedServer]:
+    server = ForkedServer(tmp_path, point_goal, question="best-of-four")
+    yield server
+    server.kill()
+
+
+def test_the_best_of_four_is_found_by_keys_and_by_clicks(
+    open_page: Callable[..., Any], of_four: ForkedServer, point_goal: ModelInfo
+) -> None:
+    person = begin(open_page, of_four, point_goal, 2.2)
+    page = person.page
+    assert page.text_content("#task") == "Which one is closest to what you want?"
+    films = page.get_by_role("img", name=re.compile("^Video"))
+    assert [film.get_attribute("aria-label") for film in films.all()] == [
+        f"Video {n}" for n in (1, 2, 3, 4)
+    ]
+    boxes = [film.bounding_box() for film in films.all()]
+    assert [(round(box["x"]), round(box["y"])) for box in boxes] == [
+        (round(boxes[column]["x"]), round(boxes[2 * row]["y"]))
+        for row in (0, 1)
+        for column in (0, 1)
+    ]
+    assert boxes[0]["y"] < boxes[2]["y"]
+    assert boxes[0]["x"] < boxes[1]["x"]
+    pictures = page.evaluate("() => screens.map(screen => screen.toDataURL())")
+    assert len(set(pictures)) == 4
+    assert page.is_hidden("#race")
+    for key in ("ArrowLeft", "5", "0"):  # no answer, can't tell, can't tell
+        page.keyboard.press(key)
+        page.wait_for_function("n => view.answered === n && !busy", arg=int(key in "50"))
+        page.wait_for_function(SHOWN)
+        if person.answered():
+            page.click("#undo")
+            page.wait_for_function("() => view.answered === 0 && !busy")
+    person.answer(2, keyboard=True)
+    person.answer(3)
+    page.wait_for_selector("#result:visible")
+    assert [film.is_visible() for film in films.all()] == []  # one film, of what it learned
+    assert page.get_by_role("img", name="What it learned").is_visible()
+    page.click("#past summary")
+    assert re.match(r"[1-4] is best Show again", page.inner_text("#past-list li >> nth=0"))
+    page.click("#past-list li >> nth=0 >> button")
+    page.wait_for_function("() => player.parts === 4")
+    assert page.text_content("#task") == "Question 1, as you saw it."
+    assert all(film.is_visible() for film in films.all())
+    record = page.request.get(f"{page.url}/answers.json").json()
+    assert {answer["question"] for answer in record["answers"]} == {"best-of-four"}
+    assert [answer["preference"] for answer in record["answers"]] == person.stored()
+    before, after = returns(point_goal, np.stack([np.zeros(5), person.learned()]), 2.2)
+    assert after > before
+
+
+@pytest.mark.parametrize("viewport", [PHONE, LANDSCAPE], ids=["upright", "on its side"])
+def test_four_on_a_phone(
+    open_page: Callable[..., Any],
+    of_four: ForkedServer,
+    point_goal: ModelInfo,
+    viewport: dict[str, int],
+) -> None:
+    person = begin(open_page, of_four, point_goal, 2.0, viewport=viewport, has_touch=True)
+    page = person.page
+    person.answer(1)
+    assert page.evaluate("() => document.documentElement.scrollWidth") <= viewport["width"]
+    needed = [page.locator(f'[data-preference="{word}"]') for word in KEYS["best-of-four"]]
+    for element in (*page.locator("canvas").all(), page.locator("#play"), *needed):
+        box = element.bounding_box()
+        assert 0 <= box["x"] <= viewport["width"] - box["width"]
+        assert box["y"] + box["height"] <= viewport["height"]  # all that is needed is in sight
+        assert min(box["width"], box["height"]) >= 44
+    assert page.locator("canvas >> nth=0").bounding_box()["width"] >= 160
+    page.click("#full")
+    page.wait_for_function("() => document.fullscreenElement !== null")
+    boxes = [canvas.bounding_box() for canvas in page.locator("canvas").all()]
+    assert boxes[0]["y"] == boxes[1]["y"] < boxes[2]["y"] == boxes[3]["y"]
+    assert boxes[3]["y"] + boxes[3]["height"] <= viewport["height"]
 
 
 def test_a_pair_is_shown_again_where_answers_contradict_each_other(

@@ -6,8 +6,12 @@ const RETRY_MILLISECONDS = 1000;
 const SLOW_AFTER_MILLISECONDS = 4000;
 const base = window.location.pathname.replace(/\/+$/, "");
 const byId = (id) => document.getElementById(id);
+const four = document.querySelector('[data-preference="first"]') !== null;
+const [films, closer, what] = four ? ["four", "closest", "Question"] : ["two", "closer", "Pair"];
+const screens = [...document.querySelectorAll("#screens canvas")];
+const firstLabel = screens[0].getAttribute("aria-label");
 const player = new Player(
-  [byId("left-screen"), byId("right-screen"), byId("race-screen")],
+  screens,
   { play: byId("play"), frame: byId("frame"), speed: byId("speed"), moment: byId("moment"), icon: byId("play-icon") },
   showError,
 );
@@ -160,7 +164,7 @@ async function show(next) {
   byId("hint").hidden = phase !== "question" || answered > 2;
   byId("task").textContent = phase === "question" ? question()
     : accepted ? "This is what it learned." : "This is what it learned. Is this what you meant?";
-  byId("left-screen").setAttribute("aria-label", phase === "question" ? "Left video" : "What it learned");
+  screens[0].setAttribute("aria-label", phase === "question" ? firstLabel : "What it learned");
   byId("thanks").hidden = !accepted;
   byId("more").textContent = `Not quite – ask me ${step} more`;
   document.querySelector('[data-verdict="yes"]').hidden = accepted;
@@ -180,7 +184,7 @@ function showPast(answers) {
     again.type = "button";
     again.className = "link";
     again.textContent = "Show again";
-    again.setAttribute("aria-label", `Show pair ${index + 1} again`);
+    again.setAttribute("aria-label", `Show ${what.toLowerCase()} ${index + 1} again`);
     again.addEventListener("click", () => lookBack(given, index));
     item.append(`${inWords(given.preference)} `, again);
     return item;
@@ -203,18 +207,18 @@ async function lookBack(given, index) {
   shownTurn = given.question; // what waits takes no answer meanwhile
   byId("board").classList.add("past");
   byId("board").classList.remove("single");
-  byId("left-screen").setAttribute("aria-label", "Left video");
+  screens[0].setAttribute("aria-label", firstLabel);
   showRace();
-  byId("task").textContent = `Pair ${index + 1}, as you saw it.`;
+  byId("task").textContent = `${what} ${index + 1}, as you saw it.`;
   byId("then-text").textContent = `You said: ${inWords(given.preference)}.`;
-  say(`Pair ${index + 1} again. ${byId("then-text").textContent}`);
+  say(`${what} ${index + 1} again. ${byId("then-text").textContent}`);
   byId("back").focus();
 }
 byId("back").addEventListener("click", () => show(view).then(() => byId("past").firstChild.focus()));
 
 function question() {
   const { repeats } = view.turn;
-  return `${repeats === null ? "Which" : `Pair ${repeats + 1} once more: which`} one is closer to what you want?`;
+  return `${repeats === null ? "Which" : `${what} ${repeats + 1} once more: which`} one is ${closer} to what you want?`;
 }
 
 // Offers to look again at the answer that the others contradict, once.
@@ -229,14 +233,14 @@ byId("again").addEventListener("click", () => act("/again", { question: view.tur
 let wantsRace = (localStorage.getItem("race") ?? byId("board").dataset.race) === "on";
 
 function showRace() {
-  const has = player.parts > 2;
+  const has = player.parts === 3;
   byId("race").hidden = !has;
   byId("race").setAttribute("aria-pressed", String(wantsRace));
   byId("board").classList.toggle("racing", has && wantsRace);
 }
 
 function race() {
-  if (player.parts < 3) return;
+  if (player.parts !== 3) return;
   wantsRace = !wantsRace;
   localStorage.setItem("race", wantsRace ? "on" : "off");
   showRace();
@@ -262,7 +266,7 @@ function showProgress(waiting, answered, result) {
   else if (waitingSince === null) waitingSince = performance.now();
   byId("progress").hidden = !waiting;
   const slow = waiting && performance.now() - waitingSince > SLOW_AFTER_MILLISECONDS;
-  const what = result ? "Filming what it learned" : answered === 0 ? "Preparing the first two videos" : "Preparing the next two videos";
+  const what = result ? "Filming what it learned" : `Preparing the ${answered === 0 ? "first" : "next"} ${films} videos`;
   byId("progress-text").textContent = slow ? `${what}. Your answers are safe; this takes a few seconds…` : `${what}…`;
 }
 
@@ -280,6 +284,7 @@ function showCount(answered, target, result) {
 function answer(preference) {
   if (busy || view === null || view.phase !== "question" || view.turn.id !== shownTurn) return;
   const button = document.querySelector(`[data-preference="${preference}"]`);
+  if (button === null) return; // this kind of question has no such answer
   button.classList.add("chosen");
   setTimeout(() => button.classList.remove("chosen"), 400);
   act("/answer", { question: view.turn.id, preference });
@@ -312,6 +317,7 @@ const KEYS = {
 document.querySelectorAll("[data-preference]").forEach((button, index) => {
   KEYS[index + 1] = () => answer(button.dataset.preference);
 });
+if (four) KEYS[0] = () => answer("equal");
 document.addEventListener("keydown", (event) => {
   if (!byId("keys").checked) return;
   if (event.altKey || event.ctrlKey || event.metaKey || event.repeat) return;
