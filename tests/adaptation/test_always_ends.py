@@ -18,7 +18,8 @@ from sb3_poem.adaptation import (
     Preference,
     PreferenceAdapter,
 )
-from sb3_poem.adaptation.bayes import DECODER_MOVE_STEPS
+from sb3_poem.adaptation.bayes import DECODER_MOVE_STEPS, SPREAD_LATENTS
+from sb3_poem.adaptation.preference import ANSWERS, PLACES
 from sb3_poem.adaptation.rule import Setting
 from sb3_poem.common.trajectory import Trajectory
 
@@ -87,6 +88,8 @@ rules = st.sampled_from(
         Bayes(likelihood="similarity"),
         Bayes(question="graded"),
         Bayes(question="graded", noise_model="infer", likelihood="similarity"),
+        Bayes(question="best-of-four"),
+        Bayes(question="best-of-four", noise_model="infer", likelihood="similarity"),
         Bayes(candidates="aggregate", query_rule="worst-case"),
         Bayes(candidates="aggregate", likelihood="similarity", decision="posterior-mean"),
         Bayes(query_rule="random", decision="most-likely"),
@@ -95,7 +98,7 @@ rules = st.sampled_from(
 
 
 @given(
-    answers=st.lists(st.sampled_from(list(Preference)), min_size=1, max_size=12),
+    answers=st.lists(st.integers(0, 4), min_size=1, max_size=12),
     rule=rules,
     noise=st.sampled_from([ExactNoise(), MistakeNoise(0.2), BoltzmannNoise()]),
     seed=st.integers(0, 2**31 - 1),
@@ -110,18 +113,22 @@ def test_any_answers_end_in_a_finite_latent_with_bounded_work(
     rule = rule.answered_by(SimpleNamespace(noise_model=noise))
     inference = rule.start(model, np.random.default_rng(seed), Setting())
     n_candidates = rule.n_candidates if isinstance(rule, Paper) else rule.n_particles
-    for number, preference in enumerate(answers, 1):
+    kinds = ANSWERS["graded" if rule.question == "pair" else rule.question]
+    for number, answer in enumerate(answers, 1):
         model.similarity_rows = model.decoder_steps = 0
-        left, right = inference.ask()
-        assert not np.array_equal(left, right)
-        shown = [Trajectory(np.ones((6, 2)), np.zeros((5, 1)), z) for z in (left, right)]
-        inference.tell(preference, *shown)
+        asked = inference.ask()
+        assert len({latent.tobytes() for latent in asked}) == len(PLACES[rule.question])
+        shown = [Trajectory(np.ones((6, 2)), np.zeros((5, 1)), z) for z in asked]
+        inference.tell(kinds[answer], *shown)
         latent = inference.estimate()
         assert latent.shape == (dim,)
         assert np.all(np.isfinite(latent))
         # Bounded whatever the answers are, and in the number of answers at most linear.
         assert model.similarity_rows <= 40_000 + 200 * number
-        assert model.decoder_steps <= 2 * n_candidates * 5 + DECODER_MOVE_STEPS
+        decoded = 5 * len(shown)
+        # The spread of returns where S does not tell it, once and in each evaluation of a move
+        spread = 5 * SPREAD_LATENTS * decoded * number if len(shown) > 2 else 0
+        assert model.decoder_steps <= decoded * n_candidates + DECODER_MOVE_STEPS + spread
 
 
 @pytest.mark.parametrize(
