@@ -1,13 +1,13 @@
-"""What graded answers and an inferred person are worth: returns after some answers, by how is asked
-and by who answers.
+"""What graded answers, the best of four and an inferred person are worth: returns after some
+answers, and after some films watched, by how is asked and by who answers.
 
     python benchmarks/graded_answers.py --models pretrained/HalfCheetahVel pretrained/AntDir2D
 
-Each model adapts to 30 tasks that no table uses. Questions are pairs or graded ("much better",
-too); the rule is told how the oracle errs, or infers it with the task. Graded oracles call equal
-what differs by less than 0.12, and much better what differs by more than 1 of the family's spread
-of returns ("other thresholds": 0.3 and 1.6). Writes ``<OUT>/answers.md`` and ``answers.json``;
-cells that the latter holds are not run again.
+Each model adapts to 30 tasks that no table uses. Questions are pairs, graded ("much better", too)
+or about the best of four; the rule is told how the oracle errs, or infers it with the task. Graded
+oracles call equal what differs by less than 0.12, and much better what differs by more than 1 of
+the family's spread of returns ("other thresholds": 0.3 and 1.6). Writes ``<OUT>/answers.md`` and
+``answers.json``; cells that the latter holds are not run again.
 """
 
 import json
@@ -18,6 +18,7 @@ from common import RESULTS, arguments, table, write
 
 from sb3_poem import Bayes, BoltzmannOracle, MistakeOracle, ReturnOracle
 from sb3_poem.adaptation import evaluate_adaptation, return_spread
+from sb3_poem.adaptation.preference import PLACES
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.loading import load_model
 
@@ -29,13 +30,16 @@ ORACLES = {
 }
 USUAL, OTHER = (0.12, 1.0), (0.3, 1.6)
 ANSWERS = (0, 1, 2, 5, 10)
-KINDS = (("pair", False), ("pair", True), ("graded", False), ("graded", True))
+# Films watched that answers of either number of films, 2 or 4, come to
+FILMS = (4, 20)
+KINDS = tuple(PLACES)
 
 
 def main() -> None:
     args = arguments(
         __doc__,
         models={"nargs": "+", "required": True},
+        oracles=[*ORACLES],
         tasks=30,
         episodes=5,
         seed=300,
@@ -48,20 +52,23 @@ def main() -> None:
         model = load_model(path)
         env = make_task_vec_env(model.env_id, 30)
         spread = return_spread(model, env)
-        cells = [(who, kind, infer, USUAL) for who in ORACLES for kind, infer in KINDS]
-        cells += [("exact", "graded", infer, OTHER) for infer in (False, True)]
+        ways = [(kind, infer) for infer in (False, True) for kind in KINDS]
+        cells = [(who, *way, USUAL) for who in args.oracles for way in ways]
+        if "exact" in args.oracles:
+            cells += [("exact", "graded", infer, OTHER) for infer in (False, True)]
         for who, kind, infer, shares in cells:
             name = who + (", other thresholds" if shares is OTHER else "")
             key = f"{model.env_id} | {name} | {kind} | {'inferred' if infer else 'told'}"
             if key in record:
                 continue
-            graded = kind == "graded"
-            thresholds = tuple(spread * share for share in shares) if graded else None
+            how = {"question": kind} if len(PLACES[kind]) > 2 else {}
+            if kind == "graded":
+                how["thresholds"] = tuple(spread * share for share in shares)
             evaluation = evaluate_adaptation(
                 model,
                 env,
                 args.tasks,
-                partial(ORACLES[who], thresholds=thresholds),
+                partial(ORACLES[who], **how),
                 rule=Bayes(question=kind, noise_model="infer" if infer else None),
                 record_at=ANSWERS,
                 n_episodes=args.episodes,
@@ -71,11 +78,20 @@ def main() -> None:
             print(key, record[key], flush=True)
             file.write_text(json.dumps({"results": record}, indent=1))
         env.close()
-    rows = [[*key.split(" | "), *values] for key, values in record.items()]
+    rows = [
+        [*key.split(" | "), *values, *after_films(key, values)] for key, values in record.items()
+    ]
     head = ["family", "oracle", "question", "how it errs", *(f"{n} answers" for n in ANSWERS)]
+    head += [f"{n} films" for n in FILMS]
     settings = {"tasks": args.tasks, "episodes": args.episodes, "seed": args.seed}
-    title = "Graded answers and an inferred person"
+    title = "Graded answers, the best of four and an inferred person"
     write("answers", title, [table(head, rows)], record, args.out, settings)
+
+
+def after_films(key: str, values: list[float]) -> list[float]:
+    """A row's returns after :data:`FILMS`."""
+    films = len(PLACES[key.split(" | ")[2]])
+    return [values[ANSWERS.index(n // films)] for n in FILMS]
 
 
 if __name__ == "__main__":
