@@ -68,13 +68,14 @@ def row(family: str, method: str, queries: int | None = None, kind: str = "metho
 
 
 def cell(found: Any, error: bool = False) -> str:
-    """A return, with its standard error over tasks."""
+    """A return, with its deviation over training seeds, or the standard error over tasks of one."""
     if found is None:
         return ""
     digits = 0 if abs(found["mean"]) >= 100 else 1
     text = f"{found['mean']:,.{digits}f}"
-    if error and found["task_error"] is not None:
-        text += f"\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{found['task_error']:.{digits}f}"
+    spread = found["task_error" if found["n_seeds"] == 1 else "deviation"]
+    if error and spread is not None:
+        text += f"\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{spread:.{digits}f}"
     return text
 
 
@@ -111,9 +112,10 @@ def summary() -> str:
         ours = [cell(row(family, "poem-bayes", k), error=True) for k in (1, 10)]
         limits = [cell(row(family, "known-task", k, "limit")) for k in (1, 10)]
         known = cell(row(family, "known-task", kind="known"))
+        seeds = str(row(family, "poem-bayes", 10)["n_seeds"])
         name = family if family in FROM_ENTRIES else f"{family} †"
-        rows.append([name, *(quoted or [""] * 4), *ours, *limits, known])
-    head = ["family", "paper: baseline, 1", "10", "paper: POEM, 1", "10"]
+        rows.append([name, *(quoted or [""] * 4), seeds, *ours, *limits, known])
+    head = ["family", "paper: baseline, 1", "10", "paper: POEM, 1", "10", "seeds"]
     return "\n".join(table([*head, "ours: 1", "10", "limit: 1", "10", "task known"], rows))
 
 
@@ -152,12 +154,13 @@ def results_page() -> str:
     """The page docs/results.md."""
     head = f"""# Results
 
-Mean return of the models that ship, over 30 test tasks that no training saw, 10 episodes each,
-after exact answers; one training seed.
+Mean return of the families' models, over 30 test tasks that no training saw, 10 episodes each,
+after exact answers. Of *seeds* trainings seed 0 ships.
 
 - *paper*: Table 3 of [Xu & Zhu 2025](https://proceedings.mlr.press/v267/); *baseline* is the best
   of its baselines after so many answers.
-- *ours*: the rule `Bayes()`; ± is the standard error over tasks. [`Paper()`](algorithms/paper.md)
+- *ours*: the rule `Bayes()`; ± is the deviation over seeds, or of one seed the standard error over
+  tasks. [`Paper()`](algorithms/paper.md)
   stands below, by family.
 - *limit*: the best choice of 2^k of the model's policies, all that k answers can tell apart. They
   are chosen by one episode each, on other tasks where dynamics are shared, and measured by other
@@ -181,7 +184,8 @@ earlier revision. What is not listed was not measured.
 def trainings() -> str:
     """What the models cost that are as their entries make them."""
     store = Store(RESULTS / "shipped/benchmark.sqlite", create=False)
-    known = {one.family: one.result for one in store.records() if one.method == "known-task"}
+    records = [one for one in store.records() if (one.method, one.seed) == ("known-task", 0)]
+    known = {one.family: one.result for one in records}
     rows = [
         [
             family,

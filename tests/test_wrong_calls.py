@@ -323,6 +323,9 @@ ADAPTERS = [
         r"oracle...class ReturnOracle...ReturnOracle\(\)",
     ),
     argument(adapter, "oracle", "return"),
+    refused(
+        "an oracle's environment by its id", lambda _: ReturnOracle(CHEETAH), r"env...gym\.make"
+    ),
     argument(adapter, "seed", -1),
     refused("library empty", lambda _: adapter(library=[]), "library...2"),
     refused("adapter argument misspelt", lambda _: adapter(queries=5), "'queries'"),

@@ -73,6 +73,8 @@ class TaskOracle(ABC):
                 f'`question` must be None, "{usual}" with thresholds={thresholds} or '
                 f'"{BEST_OF_FOUR}", but is {question!r}'
             )
+        if isinstance(env, str):
+            raise TypeError(f"`env` must be an environment, gym.make({env!r}) say, but is its id")
         self.question = question or usual
         self.env = env
         self.task = None if task is None else np.asarray(task, dtype=np.float64)
