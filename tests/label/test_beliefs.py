@@ -221,7 +221,7 @@ def test_the_papers_candidates_weigh_the_same() -> None:
 def test_clips_beside_each_other_last_as_long_as_the_longer() -> None:
     left = [np.full((HEIGHT, WIDTH, 3), value, dtype=np.uint8) for value in (10, 20)]
     right = [np.full((HEIGHT, WIDTH, 3), 99, dtype=np.uint8)] * 5
-    both = beside(left, right, [*right, right[0]])
+    both = beside(2, left, right, [*right, right[0]])
     assert len(both) == 5
     assert both[0].shape == (HEIGHT, 3 * WIDTH, 3)
     assert [int(frame[0, 0, 0]) for frame in both] == [10, 20, 20, 20, 20]
