@@ -21,7 +21,6 @@ FAMILIES = (*TABLE_3, "FetchReach", "PointGoal")
 ANSWERS = (0, 1, 2, 5, 10)
 #: How the models were made that are not what a run of their entry gives
 REMARKS = {
-    "MetaWorldML1": "other hyperparameters, and half the steps of the entry.",
     "AntFwdBack": "three stages, in the last half of each batch mirrored.",
     "HumanoidDir2D": "stages with another reward weight, the last on a GPU.",
     "MetaWorldML10": "other hyperparameters than the entry's. The likelihood that `Bayes` has by "
