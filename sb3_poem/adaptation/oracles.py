@@ -151,7 +151,7 @@ class BoltzmannOracle(TaskOracle):
 
     With the paper's beta (None), ``1 / (|R_left| + |R_right|)``, an answer is right at most 73 % of
     the time, and ten answers carry less than two bits. Of four each wins with a probability
-    proportional to exp(beta R), where the paper's beta becomes 1 / (2 mean |R|). For the other
+    proportional to exp(beta R), where the paper's beta becomes ``1 / (2 mean |R|)``. For the other
     arguments see :class:`TaskOracle`.
 
     >>> BoltzmannOracle(beta=0.5).noise_model
