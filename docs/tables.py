@@ -159,8 +159,7 @@ after exact answers. Of *seeds* trainings seed 0 ships.
 - *paper*: Table 3 of [Xu & Zhu 2025](https://proceedings.mlr.press/v267/); *baseline* is the best
   of its baselines after so many answers.
 - *ours*: the rule `Bayes()`; ± is the deviation over seeds, or of one seed the standard error over
-  tasks. [`Paper()`](algorithms/paper.md)
-  stands below, by family.
+  tasks. [`Paper()`](algorithms/paper.md) stands below, by family.
 - *limit*: the best choice of 2^k of the model's policies, all that k answers can tell apart. They
   are chosen by one episode each, on other tasks where dynamics are shared, and measured by other
   episodes; so it is an estimate, and a rule that acts on policies outside of that choice may pass
@@ -170,9 +169,9 @@ after exact answers. Of *seeds* trainings seed 0 ships.
   with † was made by hand, and measured by revision 1 of the benchmark, which had other limits: they
   are left out.
 
-`sb3-poem benchmark run --suite shipped --models pretrained --seeds 1` measures, `python
-docs/tables.py` writes this page from [its stores](../benchmarks/results/shipped/manifest.md). The
-figures below a family compare methods over training seeds: they are of models of their own, of an
+`sb3-poem benchmark run --suite shipped --families FAMILY --seeds N` trains and measures (with
+`--models pretrained --seeds 1` it measures what ships), `python docs/tables.py` writes this page
+from [its stores](../benchmarks/results/shipped/manifest.md). The figures below a family compare methods over training seeds: they are of models of their own, of an
 earlier revision. What is not listed was not measured.
 
 {summary()}
