@@ -171,7 +171,8 @@ after exact answers. Of *seeds* trainings seed 0 ships.
 
 `sb3-poem benchmark run --suite shipped --families FAMILY --seeds N` trains and measures (with
 `--models pretrained --seeds 1` it measures what ships), `python docs/tables.py` writes this page
-from [its stores](../benchmarks/results/shipped/manifest.md). The figures below a family compare methods over training seeds: they are of models of their own, of an
+from [its stores](../benchmarks/results/shipped/manifest.md). The figures below a family compare
+methods over training seeds: they are of models of their own, of an
 earlier revision. What is not listed was not measured.
 
 {summary()}
