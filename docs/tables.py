@@ -22,7 +22,6 @@ ANSWERS = (0, 1, 2, 5, 10)
 #: How the models were made that are not what a run of their entry gives
 REMARKS = {
     "AntFwdBack": "three stages, in the last half of each batch mirrored.",
-    "HumanoidDir2D": "stages with another reward weight, the last on a GPU.",
     "MetaWorldML10": "other hyperparameters than the entry's. The likelihood that `Bayes` has by "
     "default here was chosen by the returns on tasks of this table.",
 }
