@@ -39,6 +39,8 @@ PAGES = {
     "epsilon": "tolerances of eq. 9",
     "smoke": "all methods",
     "adaptation": "an earlier record",
+    "metaworld-evaluation-test": "Meta-World's own evaluation, held-out manipulations",
+    "metaworld-evaluation-train": "the ten to train on",
 }
 
 
