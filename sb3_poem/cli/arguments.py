@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium
 
 from sb3_poem import __version__
-from sb3_poem.cli.benchmark_arguments import add_benchmark
+from sb3_poem.benchmark.suites import SUITES
 
 OUR_ALGORITHMS = ("poem_sac", "pearl_sac")
 COMMANDS = ("train", "enjoy", "record-video", "adapt", "models", "label", "benchmark")
@@ -23,6 +23,15 @@ examples:
   sb3-poem record-video --model HalfCheetahVel --out vel.mp4
   sb3-poem train --env poem/HalfCheetahVel-v0 --eval-freq 50000 -P
   sb3-poem label
+"""
+
+BENCHMARK_EXAMPLES = """\
+examples:
+  sb3-poem benchmark run --suite smoke
+  sb3-poem benchmark run --suite table3 --families HalfCheetahVel --models pretrained --list
+  sb3-poem benchmark run --suite shipped --families HalfCheetahVel --export pretrained
+  sb3-poem benchmark report --suite smoke --out results
+  sb3-poem benchmark verify --cell 1f0c9a
 """
 
 Group = argparse._ActionsContainer
@@ -79,20 +88,17 @@ def build_parser() -> argparse.ArgumentParser:
         "Open a web page on which people teach a trained agent their task by comparing videos.",
     )
     _add_label_arguments(label)
-    add_benchmark(commands, _count)
+    _add_benchmark(commands)
     return parser
 
 
 def _add_command(
-    commands: Any, example: str, summary: str, description: str, prefix: str = "sb3-poem"
+    commands: Any, example: str, summary: str, description: str | None = None, of: str = ""
 ) -> argparse.ArgumentParser:
-    """Add the command that the example begins with."""
-    parser: argparse.ArgumentParser = commands.add_parser(
-        example.split()[0],
-        help=summary,
-        description=description,
-        epilog=f"example: {prefix} {example}",
-    )
+    """Add the command that the example begins with, ``of`` another one if it is a part."""
+    epilog = f"example: sb3-poem {of}{example}"
+    name, texts = example.split()[0], {"help": summary, "description": description}
+    parser: argparse.ArgumentParser = commands.add_parser(name, epilog=epilog, **texts)
     return parser
 
 
@@ -109,8 +115,12 @@ def _switch(group: Group, flag: str, told: str) -> None:
     group.add_argument(flag, help=told, action="store_true")
 
 
-def _file(group: Group, flag: str, told: str, **how: Any) -> None:
-    group.add_argument(flag, help=told, type=Path, **{"metavar": "FILE", **how})
+def _file(group: Group, flag: str, told: str, metavar: str = "FILE", **how: Any) -> None:
+    _option(group, flag, told, Path, metavar=metavar, **how)
+
+
+def _several(group: Group, flag: str, told: str, metavar: str) -> None:
+    _option(group, flag, told, nargs="+", default=[], metavar=metavar)
 
 
 def _count(minimum: int) -> Callable[[str], int]:
@@ -126,10 +136,8 @@ def _count(minimum: int) -> Callable[[str], int]:
 
 def _add_environment(group: Group, default: str, kwargs: str = "") -> Any:
     env = _option(group, "--env", f"environment id (default: {default}")
-    told = f"arguments of the environment{kwargs}"
-    _option(group, "--env-kwargs", told, default=[], nargs="+", metavar="KEY:VALUE")
-    told = "modules that register environments"
-    _option(group, "--gym-packages", told, default=[], nargs="+", metavar="MODULE")
+    _several(group, "--env-kwargs", f"arguments of the environment{kwargs}", "KEY:VALUE")
+    _several(group, "--gym-packages", "modules that register environments", "MODULE")
     return env
 
 
@@ -226,7 +234,7 @@ def _add_adapt_arguments(parser: argparse.ArgumentParser) -> None:
 
     output = parser.add_argument_group("output")
     told = "where the answers of --oracle human are kept, as those of the page"
-    _file(output, "--store", f"{told} (default: {DEFAULT_STORE})", metavar="FOLDER")
+    _file(output, "--store", f"{told} (default: {DEFAULT_STORE})", "FOLDER")
     told = "go on with the answers that the same command has in --store, if any"
     _switch(output, "--resume", told)
     _file(output, "--save", "write the policy of the one task that was adapted (.safetensors)")
@@ -261,12 +269,11 @@ def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
     told = "read them from a file (default: from SB3_POEM_AUTH, if that is set)"
     _file(password, "--auth-file", told)
     _switch(server, "--token", "let in only who has the link with the token, which is printed")
-    told = "further names of this server"
-    _option(server, "--allow-host", told, default=[], nargs="+", metavar="NAME")
+    _several(server, "--allow-host", "further names of this server", "NAME")
     _option(server, "--max-sessions", "people who may be at work at once", _count(1), 16)
     _option(server, "--workers", "processes that render", _count(1), 2)
-    store = f"where answers and videos are (default: {DEFAULT_STORE})"
-    _file(server, "--store", store, default=DEFAULT_STORE, metavar="FOLDER")
+    store = "where answers and videos are"
+    _file(server, "--store", store, "FOLDER", default=DEFAULT_STORE)
 
     commands = parser.add_subparsers(dest="label_command", metavar="{export,replay}")
     # Of what the page has too, no defaults: they would overwrite what was given before the part.
@@ -276,9 +283,10 @@ def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
         "export --out answers.jsonl answers.parquet",
         "write all answers as a data set",
         "Write all answers.",
-        "sb3-poem label",
+        "label ",
     )
-    _file(export, "--store", store, metavar="FOLDER", **own)
+    store += f" (default: {DEFAULT_STORE})"
+    _file(export, "--store", store, "FOLDER", **own)
     told = "ends in .jsonl or .parquet; with --format minari a data set's name, as answers-v0"
     _file(export, "--out", told, nargs="+", required=True)
     told = "minari: a data set of pairs of episodes for each environment (default: --out's suffix)"
@@ -292,12 +300,104 @@ def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
         "feed recorded answers to another model or rule",
         "Feed the recorded answers to a model and a rule, and say how well these would have "
         "foretold them.",
-        "sb3-poem label",
+        "label ",
     )
-    _file(replay, "--store", store, metavar="FOLDER", **own)
+    _file(replay, "--store", store, "FOLDER", **own)
     told = "a model's .zip, a pretrained folder, or a shipped model (default: each session's own)"
     _option(replay, "--model", told, **own)
     _option(replay, "--inference", "default: bayes", choices=INFERENCES, **own)
     _option(replay, "--mistake-rate", "default: inferred", float, **own)
     _option(replay, "--seed", "of the inference (default: 0)", _count(0), **own)
     _file(replay, "--json", "write what was foretold, and the latents after each answer")
+
+
+def _add_benchmark(commands: Any) -> None:
+    parser = commands.add_parser(
+        "benchmark",
+        help="run the paper's comparisons and ablations, and report them",
+        description="Run suites of comparisons into a store of results, make tables and figures of "
+        "it, and run what it holds again.",
+        epilog=BENCHMARK_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parts = parser.add_subparsers(dest="part", required=True, metavar="{run,report,verify}")
+    told = "train what is missing, adapt, evaluate; goes on where it was interrupted"
+    _add_run_arguments(_add_command(parts, "run --suite smoke", told, of="benchmark "))
+    report = _add_command(
+        parts,
+        "report --suite smoke --out results",
+        "write the tables and figures of what the store holds",
+        of="benchmark ",
+    )
+    suites, everything = "all of which the store holds cells", "default: all that the store holds"
+    _option(report, "--suite", f"default: {suites}", nargs="+", choices=SUITES)
+    _option(report, "--families", everything, nargs="+", metavar="FAMILY")
+    _option(report, "--seeds", everything, _count(0), nargs="+", metavar="SEED")
+    _option(report, "--format", "", default="md", choices=("md", "latex", "csv", "json"))
+    _file(report, "--out", "write tables, and figures as PNG and PDF (default: print)", "FOLDER")
+    _add_results(report)
+    verify = _add_command(
+        parts,
+        "verify --cell 1f0c9a --models pretrained",
+        "run a finished cell again, and say what differs",
+        "Run a finished cell again, and compare every number that the store holds of it, but for "
+        "times: on the same kind of machine they are the same bit for bit. The exit status is 1 "
+        "if anything differs.",
+        of="benchmark ",
+    )
+    told = "its key, or the beginning of it (default: only list the store's cells)"
+    _option(verify, "--cell", told, metavar="ID")
+    _add_models(verify)
+    _add_results(verify)
+
+
+def _add_results(group: Group) -> None:
+    _file(group, "--store", "results", default=Path("benchmark.sqlite"))
+
+
+def _add_models(group: Group) -> None:
+    _several(group, "--gym-packages", "modules that register environments", "MODULE")
+    told = "trainings and checkpoints"
+    _option(group, "--runs", told, default="logs/benchmark", metavar="FOLDER")
+    told = "take trained models: <FOLDER>/<Family>/<variant>/seed<seed>[.zip], or <FOLDER>/<Family>"
+    _several(group, "--models", f"{told} as in pretrained/", "FOLDER")
+    told = "take this trained model: a .zip, a checkpoint, or a folder with one or with a"
+    _several(group, "--model", f"{told} pretrained model", "FAMILY:VARIANT:SEED=PATH")
+
+
+def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
+    what = parser.add_argument_group("what to run")
+    _option(what, "--suite", "", choices=SUITES, required=True)
+    told = "such as HalfCheetahVel, or ids (default: the suite's)"
+    _option(what, "--families", told, nargs="+", metavar="FAMILY")
+    told = "only these (default: all of the suite)"
+    _option(what, "--methods", told, nargs="+", metavar="METHOD")
+    _option(what, "--seeds", "how many", _count(1), 3)
+    _option(what, "--first-seed", "", _count(0), 0)
+    _switch(what, "--list", "only show the plan, and what must be trained for it")
+
+    models = parser.add_argument_group("models")
+    _add_models(models)
+    told = "with --suite shipped: write the first seed's models to <FOLDER>/<Family>, as in"
+    _file(models, "--export", f"{told} pretrained/", "FOLDER")
+
+    budget = parser.add_argument_group("budget, which every record notes")
+    told = "test tasks (default: the suite's, 30 but for smoke)"
+    _option(budget, "--tasks", told, _count(1))
+    told = "per task and measurement (default: the suite's, 10 but for smoke)"
+    _option(budget, "--episodes", told, _count(1))
+    told = "of every training (default: zoo_configs/)"
+    _option(budget, "--timesteps", told, _count(1))
+    _several(budget, "--params", "hyperparameters of every training", "KEY:VALUE")
+    told = "measure after every Nth part of a training; 1: at its end only"
+    _option(budget, "--snapshots", told, _count(1), metavar="N")
+
+    where = parser.add_argument_group("where to run")
+    _add_results(where)
+    _option(where, "--device", "PyTorch device", default="cpu")
+    _option(where, "--num-threads", "of PyTorch", _count(1), 1)
+    _option(where, "--backend", "", default="local", choices=("local", "ray"))
+    _option(where, "--address", "of a Ray cluster (default: one on this machine)")
+    _option(where, "--cpus-per-trial", "with --backend ray", float, 1.0)
+    _option(where, "--gpus-per-trial", "with --backend ray", float, 0.0)
+    _option(where, "--max-failures", "retries of a trial with --backend ray", _count(0), 3)
