@@ -31,12 +31,13 @@ from sb3_poem.adaptation.evaluation import evaluation_seed
 from sb3_poem.adaptation.preference import BEST_OF_FOUR
 from sb3_poem.cli.arguments import DEFAULT_STORE
 from sb3_poem.cli.needs import check_output
-from sb3_poem.cli.report import Report, row_text
+from sb3_poem.cli.report import row_text, write_report
 from sb3_poem.cli.subject import (
     COPIES,
     COPIES_FOR_ONE_TASK,
     POLICY_SUFFIX,
     Subject,
+    after,
     describe_task,
     say,
 )
@@ -52,10 +53,8 @@ def run_adapt(arguments: argparse.Namespace) -> int:
     check_output("--plot", arguments.plot, (".png", ".pdf", ".svg"))
     check_output("--video", arguments.video, (".mp4", ".gif"))
     check_output("--save", arguments.save, (POLICY_SUFFIX,))
-    n_tasks = _check_tasks(arguments)
-    if arguments.record and (most := max(arguments.record)) > arguments.queries:
-        raise ValueError(f"--record {most} is more than --queries {arguments.queries}")
     human = arguments.oracle == "human"
+    n_tasks = _check_tasks(arguments)
     subject = Subject(arguments, Console(), n_tasks, COPIES_FOR_ONE_TASK if human else COPIES)
     if subject.latent is not None:
         what = "a policy that is adapted already; name the model instead"
@@ -70,24 +69,22 @@ def run_adapt(arguments: argparse.Namespace) -> int:
 def _check_tasks(arguments: argparse.Namespace) -> int:
     """How many tasks there are; refuses what does not go with so many, or with who answers."""
     human, named = arguments.oracle == "human", arguments.task is not None
-    if (named or human) and arguments.tasks not in (None, 1):
+    n_tasks: int = 1 if human or named else arguments.tasks or DEFAULT_TASKS
+    if (arguments.tasks or n_tasks) != n_tasks:
         one = "--task is" if named else "--oracle human answers for"
         raise ValueError(f"{one} one task, but --tasks asks for {arguments.tasks}")
-    n_tasks: int = 1 if human or named else arguments.tasks or DEFAULT_TASKS
     if arguments.save is not None and n_tasks > 1:
-        raise ValueError(
-            f"--save keeps the policy of one task, but {n_tasks} are adapted: add --tasks 1, or "
-            "--task X"
-        )
+        adapted = f"{n_tasks} are adapted: add --tasks 1, or --task X"
+        raise ValueError(f"--save keeps the policy of one task, but {adapted}")
     if human and not named and arguments.plot is not None:
-        raise ValueError(
-            "--plot needs returns, and with --oracle human only --task says by which goal to "
-            "measure them"
-        )
+        only = "with --oracle human only --task says by which goal to measure them"
+        raise ValueError(f"--plot needs returns, and {only}")
     for flag in ("store", "resume"):
         if getattr(arguments, flag) and not human:
             what = f"about a person's answers, but --oracle is {arguments.oracle}"
             raise ValueError(f"--{flag} is {what}")
+    if (last := max(arguments.record or (0,))) > arguments.queries:
+        raise ValueError(f"--record {last} is more than --queries {arguments.queries}")
     return n_tasks
 
 
@@ -95,14 +92,11 @@ class Adaptation:
     """How the arguments say to adapt the subject's model to its tasks."""
 
     def __init__(self, arguments: argparse.Namespace, subject: Subject) -> None:
-        self.arguments = arguments
-        self.subject = subject
-        self.seed = subject.seed
+        self.arguments, self.subject = arguments, subject
         names = ("inference", "query_rule", "candidates", "n_candidates", "question")
         chosen = {name: getattr(arguments, name) for name in names}
+        chosen["noise_model"] = "infer" if arguments.infer_noise else None
         self.options = {name: value for name, value in chosen.items() if value is not None}
-        if arguments.infer_noise:
-            self.options["noise_model"] = "infer"
         self.rule = named_rule(**self.options)
 
     def ask_oracle(self) -> int:
@@ -117,7 +111,7 @@ class Adaptation:
         if self.rule.question == BEST_OF_FOUR:
             factory = partial(factory, question=BEST_OF_FOUR)
         elif self.rule.question == "graded":
-            spread = return_spread(subject.model, subject.env, self.seed)
+            spread = return_spread(subject.model, subject.env, subject.seed)
             equal, much = arguments.thresholds
             factory = partial(factory, thresholds=(equal * spread, much * spread))
         measured: list[AdaptationEvaluation] = []
@@ -131,7 +125,7 @@ class Adaptation:
         known = None
         try:
             about = (subject.model, subject.env, subject.tasks, factory)
-            how: dict[str, Any] = {"n_episodes": arguments.episodes, "seed": self.seed}
+            how: dict[str, Any] = {"n_episodes": arguments.episodes, "seed": subject.seed}
             how |= {"rule": self.rule, "record_at": record_at, "progress_bar": True}
             evaluate_adaptation(*about, on_record=show, **how)
             known = self._known_task_return()
@@ -155,29 +149,29 @@ class Adaptation:
         answers and the posterior, from which :meth:`PreferenceAdapter.load` continues.
         """
         arguments, subject = self.arguments, self.subject
-        folder = arguments.store or DEFAULT_STORE
+        store = Store(arguments.store or DEFAULT_STORE)
         name, n_queries = Path(arguments.model).name, arguments.queries
-        about = (name, subject.env_id, self.seed, self.options, n_queries)
-        recorder = StoreRecorder(Store(folder), *about, resume=arguments.resume)
+        about = (name, subject.env_id, subject.seed, self.options, n_queries)
+        recorder = StoreRecorder(store, *about, resume=arguments.resume)
+        number, kept = recorder.session.id, recorder.kept()
         if arguments.resume:
             nothing = "There is nothing to go on with; beginning"
             found = "Going on with" if recorder.resumed else nothing
-            say(f"{found} session {recorder.session.id} of {folder}")
+            say(f"{found} session {number} of {store.folder}")
         oracle = HumanOracle(record=recorder, question=self.rule.question)
         env = subject.make_env("rgb_array", show_task=False)
-        how: dict[str, Any] = {"oracle": oracle, "n_queries": n_queries, "seed": self.seed}
+        how: dict[str, Any] = {"oracle": oracle, "n_queries": n_queries, "seed": subject.seed}
         adapter = PreferenceAdapter(subject.model, env, rule=self.rule, **how)
-        latents = [adapter.policy().latent]
-        oracle.needs_frames = False
-        for kept in recorder.kept():
-            self._tell_again(adapter, kept, recorder)
-            latents.append(adapter.policy().latent)
-        oracle.needs_frames, oracle.n_asked = True, adapter.n_answers
-        stopped = ""
+        latents, stopped = [adapter.policy().latent], ""
         try:
             while not adapter.done:
-                query = adapter.ask()
-                adapter.tell(oracle(*query.shown))
+                oracle.n_asked = adapter.n_answers
+                oracle.needs_frames = adapter.n_answers >= len(kept)
+                shown = adapter.ask().shown
+                if oracle.needs_frames:
+                    adapter.tell(oracle(*shown))
+                else:
+                    self._tell_again(adapter, kept[adapter.n_answers], recorder)
                 latents.append(adapter.policy().latent)
         except (EOFError, KeyboardInterrupt) as error:
             if not adapter.n_answers:
@@ -211,7 +205,7 @@ class Adaptation:
         interrupted = stopped == "Interrupted"
         if stopped:
             say(f"\n{stopped} after {adapter.n_answers} of {arguments.queries} answers.")
-        self._save(latent := adapter.policy().latent, adapter.n_answers)
+        self._save(latents[-1], adapter.n_answers)
         if arguments.json is not None and arguments.task is None:
             adapter.save(arguments.json)
             say(f"Wrote {arguments.json}")
@@ -221,7 +215,8 @@ class Adaptation:
             self._film(latents, (0, adapter.n_answers))
         believed = belief(adapter, subject.env_id)
         if believed["picture"] == "projection":  # whose sentence is about the picture
-            believed["sentence"] = f"It takes the policy of the latent ({describe_task(latent)})."
+            task = describe_task(latents[-1])
+            believed["sentence"] = f"It takes the policy of the latent ({task})."
         say(f"\n{believed['sentence']}")
         say(f"The answers are in {recorder.store.folder}, session {recorder.session.id}. Next:")
         words = [word for word in arguments.given if word != "--resume"]
@@ -241,7 +236,7 @@ class Adaptation:
         tasks = np.repeat(subject.tasks, len(latents), axis=0)
         with subject.console.status("Measuring the returns"):
             about = (subject.model, subject.env, latents, tasks, self.arguments.episodes)
-            outcomes = evaluate_episodes(*about, evaluation_seed(self.seed))
+            outcomes = evaluate_episodes(*about, evaluation_seed(subject.seed))
         successes = None if outcomes.successes is None else outcomes.successes[None]
         answers = [answer.preference for answer in adapter.answers]
         records = tuple(range(len(latents)))
@@ -256,31 +251,30 @@ class Adaptation:
 
     def _report(self, evaluation: AdaptationEvaluation, known: KnownTaskReturn | None) -> None:
         """Print and write what was measured; without ``known`` it was interrupted."""
-        arguments, subject = self.arguments, self.subject
+        arguments, subject, oracle = self.arguments, self.subject, self.arguments.oracle
         settings = {
             "model": arguments.model,
             "env_id": subject.env_id,
             "env_kwargs": subject.env_kwargs,
-            "oracle": arguments.oracle,
-            "beta": arguments.beta if arguments.oracle == "boltzmann" else None,
-            "mistake_rate": arguments.mistake_rate if arguments.oracle == "mistake" else None,
+            "oracle": oracle,
+            "beta": arguments.beta if oracle == "boltzmann" else None,
+            "mistake_rate": arguments.mistake_rate if oracle == "mistake" else None,
             "thresholds": arguments.thresholds if self.rule.question == "graded" else None,
             **self.options,
             "episodes": arguments.episodes,
-            "seed": self.seed,
+            "seed": subject.seed,
             "complete": known is not None,
         }
         n_tasks = len(subject.tasks)
-        title = f"{subject.env_id}, {n_tasks} task{'s' * (n_tasks > 1)}, {arguments.oracle} oracle"
+        title = f"{subject.env_id}, {n_tasks} task{'s' * (n_tasks > 1)}, {oracle} oracle"
         title += ", incomplete" * (known is None)
-        report = Report(title, settings, evaluation, known)
-        report.write(subject.console, arguments.json, arguments.plot)
+        write_report(title, settings, evaluation, known, arguments.json, arguments.plot)
 
     def _film(self, latents: np.ndarray, answers: Sequence[int]) -> None:
         """Film the policies (n_records, latent_dim) after the fewest and the most answers."""
-        captions = [f"after {n} answer{'s' * (n != 1)}" for n in (answers[0], answers[-1])]
+        captions = (after(answers[0]), after(answers[-1]))
         task_matters = self.arguments.oracle != "human" or self.arguments.task is not None
-        self.subject.film([latents[0], latents[-1]], captions, self.arguments.video, task_matters)
+        self.subject.film((latents[0], latents[-1]), captions, self.arguments.video, task_matters)
 
     def _save(self, latent: np.ndarray, n_answers: int) -> None:
         if self.arguments.save is not None:

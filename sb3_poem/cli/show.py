@@ -13,7 +13,7 @@ from sb3_poem.adaptation import evaluate_adaptation
 from sb3_poem.cli.experiment import CHECKPOINT
 from sb3_poem.cli.needs import check_output
 from sb3_poem.cli.resume import last_run
-from sb3_poem.cli.subject import COPIES_FOR_ONE_TASK, Subject, describe_task, say
+from sb3_poem.cli.subject import COPIES_FOR_ONE_TASK, Subject, after, describe_task, say
 
 
 def run_enjoy(arguments: argparse.Namespace) -> None:
@@ -84,7 +84,7 @@ class Shown:
             how: dict[str, Any] = {"n_episodes": n_episodes, "seed": subject.seed}
             measured = evaluate_adaptation(*about, record_at=record_at, **how)
         self.latents = list(measured.latents[0])
-        self.captions = [f"after {n} answer{'s' * (n != 1)}" for n in measured.record_at]
+        self.captions = list(map(after, measured.record_at))
         earned = zip(measured.mean_returns, self.captions, strict=True)
         returns = ", ".join(f"return {mean:.1f} {when}" for mean, when in earned)
         say(f"Policy of {arguments.model}, adapted by the oracle that knows the return: {returns}")

@@ -52,6 +52,11 @@ def describe_task(task: Sequence[float] | np.ndarray) -> str:
     return ", ".join(f"{value:.3g}" for value in task)
 
 
+def after(n_answers: int) -> str:
+    """When a policy was adapted so far."""
+    return f"after {n_answers} answer{'s' * (n_answers != 1)}"
+
+
 def say(text: str) -> None:
     """Print a line as it is, and at once."""
     print(text, flush=True)
@@ -99,10 +104,9 @@ class Subject:
 
     def known_task_return(self, n_episodes: int, limits: bool = True) -> KnownTaskReturn:
         """The best of the model's policies for each task, measured on so many episodes."""
-        how: dict[str, Any] = {"selection_episodes": min(n_episodes, SELECTION_EPISODES)}
-        how["limits"] = limits
-        about = (self.model, self.env, self.tasks)
-        return known_task_return(*about, n_episodes=n_episodes, seed=self.seed, **how)
+        about = (self.model, self.env, self.tasks, None, n_episodes, self.seed)
+        selection = min(n_episodes, SELECTION_EPISODES)
+        return known_task_return(*about, selection_episodes=selection, limits=limits)
 
     def make_env(self, render_mode: str | None, show_task: bool) -> DummyVecEnv:
         """A single environment with the first task, which is drawn too if it is shown."""
