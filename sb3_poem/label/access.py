@@ -39,6 +39,8 @@ CONTENT_POLICY = (
 )
 # Seconds for a request, headers and body, and between two requests.
 DEADLINE = 10.0
+# How often a connection is looked at within them.
+LOOKS = 20
 MAX_CONNECTIONS = 256
 # Of one address: a browser opens six, and a class behind one router has one address.
 MAX_OF_ADDRESS = 64
@@ -215,27 +217,26 @@ class Connection(H11Protocol):
         self.deadline = deadline
         self.network = ""
         self.since = 0.0
-        self.awaited: str | None = None
-        self._timer: asyncio.TimerHandle | None = None
-        self._untaken = 0  # bytes
+        self._steps = 0  # answers that were made, and parts of them that were taken
+        self._state: object = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
         self.network = network_of(self.client[0] if self.client else "")
-        self._watch()
+        self._look()
         self.loop.call_later(GRACE, self._make_room)
 
     def connection_lost(self, exc: Exception | None) -> None:
         super().connection_lost(exc)
-        self._await(None)
-
-    def data_received(self, data: bytes) -> None:
-        super().data_received(data)
-        self._watch()
+        self._timer.cancel()
 
     def on_response_complete(self) -> None:
         super().on_response_complete()
-        self._watch()
+        self._steps += 1
+
+    def resume_writing(self) -> None:
+        super().resume_writing()
+        self._steps += 1
 
     def send_400_response(self, msg: str) -> None:
         """See uvicorn, which goes on with the answer that it had begun."""
@@ -246,52 +247,31 @@ class Connection(H11Protocol):
         else:
             self._end()
 
-    def pause_writing(self) -> None:
-        super().pause_writing()
-        self._watch()
-
-    def resume_writing(self) -> None:
-        super().resume_writing()
-        self._await(None)  # a part was taken; the next has its own time
-        self._watch()
-
-    def _awaited_from_client(self) -> str | None:
-        if self.transport.get_write_buffer_size() > 0:
-            return "answer taken"
-        if self.conn.their_state is h11.SEND_BODY:
-            return "request"
-        if self.conn.their_state is h11.IDLE:
+    def _awaited(self) -> str | None:
+        """What the server waits for from the client; notes since when."""
+        untaken, awaited = self.transport.get_write_buffer_size(), None
+        if untaken > 0:
+            awaited = "answer taken"
+        elif self.conn.their_state is h11.SEND_BODY:
+            awaited = "request"
+        elif self.conn.their_state is h11.IDLE:
             has_begun = self.cycle is None or self.conn.trailing_data[0]
-            return "request" if has_begun else "another request"
-        return None
+            awaited = "request" if has_begun else "another request"
+        state = (awaited, self._steps, untaken)
+        if state != self._state:
+            self._state, self.since = state, self.loop.time()
+        return awaited
 
-    def _watch(self) -> None:
-        awaited = self._awaited_from_client()
-        if awaited != self.awaited:
-            self._await(awaited)
-
-    def _await(self, awaited: str | None) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
-        self.awaited, self.since = awaited, self.loop.time()
-        if awaited is not None:
-            self._start_timer()
-
-    def _start_timer(self) -> None:
-        self._untaken = self.transport.get_write_buffer_size()
-        seconds = self.deadline * (3 if self._untaken else 1)
-        self._timer = self.loop.call_later(seconds, self._too_late)
-
-    def _too_late(self) -> None:
-        if self._awaited_from_client() != self.awaited:  # an answer that was taken without a word
-            self._watch()
-        elif 0 < self.transport.get_write_buffer_size() < self._untaken:
-            self._start_timer()
-        else:
-            if self.conn.their_state is h11.SEND_BODY and self.conn.our_state is h11.SEND_RESPONSE:
-                self.transport.write(TOO_SLOW)
-            self._end()
+    def _look(self) -> None:
+        """End the connection if nothing has changed for too long, else look again."""
+        awaited = self._awaited()
+        limit = self.deadline * (3 if awaited == "answer taken" else 1)
+        if awaited is None or self.loop.time() < self.since + limit:
+            self._timer = self.loop.call_later(self.deadline / LOOKS, self._look)
+            return
+        if self.conn.their_state is h11.SEND_BODY and self.conn.our_state is h11.SEND_RESPONSE:
+            self.transport.write(TOO_SLOW)
+        self._end()
 
     def _end(self) -> None:
         self.connections.discard(self)
@@ -304,7 +284,7 @@ class Connection(H11Protocol):
             crowd = neighbours
         elif len(crowd) <= MAX_CONNECTIONS:
             return
-        awaited = [one for one in crowd if one.awaited is not None]
+        awaited = [one for one in crowd if one._awaited() is not None]
         if awaited:
             min(awaited, key=lambda one: one.since)._end()
         else:  # all answers are being made: this one's next request is told to come later
