@@ -124,9 +124,8 @@ def _parquet(rows: list[dict[str, Any]], trajectories: bool) -> bytes:
     places = places or [*PLACES["pair"]]
     types = [(name, pa.type_for_alias(kind)) for name, kind in FIELDS.items()]
     types += [(f"{place}_latent", numbers) for place in places]
-    if trajectories:
-        parts = ("observations", "actions", "reward_features")
-        types += [(f"{place}_{part}", pa.list_(numbers)) for place in places for part in parts]
+    parts = ("observations", "actions", "reward_features") if trajectories else ()
+    types += [(f"{place}_{part}", pa.list_(numbers)) for place in places for part in parts]
     sink = pa.BufferOutputStream()
     parquet.write_table(pa.Table.from_pylist(rows, schema=pa.schema(types)), sink)
     return sink.getvalue().to_pybytes()

@@ -86,22 +86,15 @@ def _write(dataset: str, env_id: str, rows: list[sqlite3.Row], videos: Path) -> 
                     f"the environment's are {shapes}"
                 )
             answer[f"{side}_episode"] = len(episodes)
-            metadata.append(
-                {
-                    "answer": len(answers),
-                    "side": side,
-                    "preference": row["preference"],
-                    "latent": shown.latent,
-                }
-            )
+            about = {"preference": row["preference"], "latent": shown.latent}
+            metadata.append({"answer": len(answers), "side": side, **about})
             episodes.append(EpisodeBuffer(**_steps(shown, limit)))
         answers.append(answer)
     with warnings.catch_warnings():
         # of authors and reference scores that are not given
         warnings.simplefilter("ignore", UserWarning)
-        made = minari.create_dataset_from_buffers(
-            dataset, episodes, env=env, description=DESCRIPTION
-        )
+        create = minari.create_dataset_from_buffers
+        made = create(dataset, episodes, env=env, description=DESCRIPTION)
     made.storage.update_metadata({"answers": answers})
     made.storage.update_episode_metadata(metadata, range(len(episodes)))
     env.close()
@@ -113,7 +106,7 @@ def _steps(shown: Trajectory, limit: int) -> dict[str, Any]:
     is_cut, features = len(shown) >= limit, shown.reward_features
     infos = {}
     if features is not None:
-        infos["reward_features"] = np.concatenate([np.full_like(features[:1], np.nan), features])
+        infos["reward_features"] = np.pad(features, ((1, 0), (0, 0)), constant_values=np.nan)
     return {
         "observations": shown.observations,
         "actions": shown.actions,

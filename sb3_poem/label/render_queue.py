@@ -59,18 +59,17 @@ class Job:
 
 
 class RenderQueue:
-    """Makes turns on an executor (None: processes), by priority; belongs to one event loop."""
+    """Makes turns on an executor, by priority; belongs to one event loop."""
 
     def __init__(
         self,
-        n_workers: int = 2,
-        make_executor: Callable[[], Executor] | None = None,
+        n_workers: int,
+        make_executor: Callable[[], Executor],
         make: Callable[[TurnRequest], Turn] = make_turn,
     ) -> None:
         self.n_workers = n_workers
-        self._make_executor = make_executor or (lambda: process_pool(n_workers))
-        self._make = make
-        self._executor = self._make_executor()
+        self._make_executor, self._make = make_executor, make
+        self._executor = make_executor()
         self._waiting: list[Job] = []
         self._running: set[asyncio.Task[None]] = set()
         self._closed = False
@@ -112,7 +111,7 @@ class RenderQueue:
         while self._waiting and len(self._running) < self.n_workers and not self._closed:
             job = min(self._waiting, key=lambda job: job.priority)  # of several the first
             self._waiting.remove(job)
-            task = asyncio.get_running_loop().create_task(self._run(job))
+            task = asyncio.create_task(self._run(job))
             self._running.add(task)
             task.add_done_callback(self._finished)
 

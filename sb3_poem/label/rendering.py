@@ -6,8 +6,8 @@ Any process may compute any turn of any session, ahead of time or again, bit for
 from __future__ import annotations
 
 import contextlib
-import os
 import subprocess
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -25,6 +25,7 @@ from sb3_poem.adaptation.people import INFER
 from sb3_poem.adaptation.preference import Preference
 from sb3_poem.adaptation.rule import Rule, rollout_seed
 from sb3_poem.common.family_view import FamilyView
+from sb3_poem.common.files import write_atomically
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.common.vec_env import make_shown_env
@@ -191,8 +192,8 @@ class Renderer:
         write_clip(frames, request.video, fps)
         data = adapter.to_dict()
         state = {name: value for name, value in data.items() if name not in CONVERSATION}
-        latents = (believed, latent.tolist())
-        return Turn(state, data["pending"], *latents, fps, len(frames))
+        about = (believed, latent.tolist(), fps, len(frames))
+        return Turn(state, data["pending"], *about)
 
     def warm_up(self) -> None:
         """Do once what only the first time is slow: the first image, the first action."""
@@ -271,24 +272,20 @@ def write_clip(frames: Sequence[np.ndarray], path: Path, fps: float) -> None:
     from imageio_ffmpeg import get_ffmpeg_exe
 
     height, width = frames[0].shape[:2]
-    size = f"{width}x{height}"
-    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", f"{fps:.02f}", "-i", "-"]
-    temporary = path.with_name(f".writing-{path.name}")
-    command = [get_ffmpeg_exe(), "-y", "-v", "error", *source, *ENCODER, str(temporary)]
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
+    pixels = b"".join(frame.tobytes() for frame in frames)
     try:
-        # Not imageio's writer, which takes no notice when ffmpeg fails at the end.
-        pixels = b"".join(frame.tobytes() for frame in frames)
-        done = subprocess.run(command, input=pixels, capture_output=True, check=False)
-        if done.returncode != 0:
-            words = done.stderr.decode(errors="replace").partition("\n")[0]
-            raise OSError(f"ffmpeg ended with status {done.returncode} {words}")
-        with open(temporary, "rb") as file:
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
+        with tempfile.NamedTemporaryFile(suffix=".mp4") as file:
+            # Not imageio's writer, which takes no notice when ffmpeg fails at the end.
+            command = [get_ffmpeg_exe(), "-y", "-v", "error", *source, "-r", f"{fps:.02f}"]
+            command += ["-i", "-", *ENCODER, file.name]
+            done = subprocess.run(command, input=pixels, capture_output=True, check=False)
+            if done.returncode != 0:
+                words = done.stderr.decode(errors="replace").partition("\n")[0]
+                raise OSError(f"ffmpeg ended with status {done.returncode} {words}")
+            write_atomically(path, file.read())
     except OSError as error:
         raise StorageError(f"{path} cannot be written: {error}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def beside(first: int, *clips: Sequence[np.ndarray]) -> list[np.ndarray]:

@@ -55,15 +55,19 @@ def replay(
     rule = session_rule(options)
     rule.check(model, Setting())
     inference = rule.start(model, inference_rng(seed), Setting())
-    translator = None if is_own else _Translator(model, np.random.default_rng([seed, 1]))
+    if not is_own:
+        rng = np.random.default_rng([seed, 1])
+        others = model.sample_latents(N_CANDIDATES, rng, source="aggregate")
+        candidates = np.concatenate([np.asarray(model.task_latents, dtype=np.float64), others])
     errors: list[float] = []
     latents, foretold, decided = [inference.estimate()], 0, 0
-    for item in store.adapter_answers(session.id, before=2**31):
+    for item in store.adapter_answers(session.id):
         preference = Preference(item["preference"])
         shown = shown_from_dict(kind, item)
         _check_fits(model, shown[0])
-        if translator is not None:
-            shown, off = zip(*map(translator, shown), strict=True)
+        if not is_own:
+            alike = (_most_alike(model, candidates, clip) for clip in shown)
+            shown, off = zip(*alike, strict=True)
             errors += off
         if preference is not Preference.EQUAL:
             decided += 1
@@ -84,26 +88,17 @@ def replay(
     }
 
 
-class _Translator:
-    """Gives a trajectory the latent of this model whose policy acts most as it was acted."""
-
-    def __init__(self, model: Any, rng: np.random.Generator) -> None:
-        self.model = model
-        training = np.asarray(model.task_latents, dtype=np.float64)
-        others = model.sample_latents(N_CANDIDATES, rng, source="aggregate")
-        self.latents = np.concatenate([training, others])
-
-    def __call__(self, trajectory: Trajectory) -> tuple[Trajectory, float]:
-        errors = [self._error(trajectory, latent) for latent in self.latents]
-        best = int(np.argmin(errors))
-        return replace(trajectory, latent=self.latents[best].copy()), errors[best]
-
-    def _error(self, trajectory: Trajectory, latent: np.ndarray) -> float:
-        """Root mean squared, of the actions."""
-        observations = trajectory.observations[:-1]
-        latents = np.tile(latent, (len(observations), 1))
-        actions = policy_actions(self.model, observations, latents, deterministic=True)
-        return float(np.sqrt(np.mean(np.square(actions - trajectory.actions))))
+def _most_alike(model: Any, latents: np.ndarray, recorded: Trajectory) -> tuple[Trajectory, float]:
+    """The trajectory, with that of the latents (n, d) whose policy acts most as it was acted, and
+    the root mean squared difference of the actions.
+    """
+    seen = recorded.observations[:-1]
+    errors = []
+    for latent in latents:
+        actions = policy_actions(model, seen, np.tile(latent, (len(seen), 1)), deterministic=True)
+        errors.append(float(np.sqrt(np.mean(np.square(actions - recorded.actions)))))
+    best = int(np.argmin(errors))
+    return replace(recorded, latent=latents[best].copy()), errors[best]
 
 
 def _check_fits(model: Any, trajectory: Trajectory) -> None:

@@ -25,13 +25,7 @@ from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import (
-    FileResponse,
-    HTMLResponse,
-    JSONResponse,
-    RedirectResponse,
-    Response,
-)
+from starlette.responses import FileResponse, HTMLResponse, JSONResponse, RedirectResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
@@ -144,7 +138,7 @@ class _Pages:
 
     async def start_page(self, _: Request) -> Response:
         groups: dict[str, list[ModelInfo]] = {group: [] for group in GROUPS}
-        for model in self.sessions.models.values():
+        for model in self.sessions.models:
             groups[model.description.group].append(model)
         pictures = {file.stem for file in ROBOTS.iterdir()}
         n_queries = self.sessions.n_queries
@@ -197,7 +191,7 @@ class _Pages:
     def _adapted_policy(self, session: Session) -> bytes:
         answered = len(self.store.answers(session.id))
         turn = self.store.turn(session.id, "result", answered)
-        info = self.sessions.models.get(session.model)
+        info = self.sessions.model(session.model)
         if turn is None or info is None:
             raise RefusedError("the policy can be downloaded once its result is shown")
         model = self.sessions.load(info)

@@ -7,7 +7,7 @@ import json
 import logging
 import secrets
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -62,9 +62,10 @@ class _Active:
     jobs: dict[_Key, Job] = field(default_factory=dict)
     task: asyncio.Task[None] | None = None
     failed: Exception | None = None
-    failed_at: float = 0.0
+    retry_at: float = 0.0
 
 
+@dataclass
 class SessionManager:
     """All sessions of a server. Its methods belong to one event loop.
 
@@ -78,36 +79,28 @@ class SessionManager:
     :param render_ahead: Whether what follows from each answer is made while the person watches.
     """
 
-    def __init__(
-        self,
-        store: Store,
-        queue: RenderQueue,
-        models: list[ModelInfo],
-        options: dict[str, Any] | None = None,
-        n_queries: int = 10,
-        max_sessions: int = 16,
-        seed: int | None = None,
-        load: Callable[[ModelInfo], Any] = load_shown_model,
-        render_ahead: bool = True,
-    ) -> None:
-        self.store = store
-        self.queue = queue
-        self.models = {info.name: info for info in models}
-        self.options = dict(options or {})
-        self.n_queries = n_queries
-        self.max_sessions = max_sessions
-        self.load = load
-        self.render_ahead = render_ahead
-        self._seed = seed
-        self._active: dict[int, _Active] = {}
+    store: Store
+    queue: RenderQueue
+    models: Sequence[ModelInfo]
+    options: dict[str, Any] = field(default_factory=dict)
+    n_queries: int = 10
+    max_sessions: int = 16
+    seed: int | None = None
+    load: Callable[[ModelInfo], Any] = load_shown_model
+    render_ahead: bool = True
+    _active: dict[int, _Active] = field(default_factory=dict, init=False)
+
+    def model(self, name: str) -> ModelInfo | None:
+        """The model of a name, if it may be chosen."""
+        return next((info for info in self.models if info.name == name), None)
 
     async def begin(self, model: str) -> str:
         """Begin a session with a model of this name, if there is room; its link's token."""
-        info = self.models.get(model)
+        info = self.model(model)
         if info is None:
             raise RefusedError("there is no model of this name here; choose one from the list")
         self._make_room()
-        seed = secrets.randbelow(2**31) if self._seed is None else self._seed
+        seed = secrets.randbelow(2**31) if self.seed is None else self.seed
         about = (info.name, info.env_id, seed, self.options, self.n_queries)
         session, token = await asyncio.to_thread(self.store.create_session, *about)
         self._activate(session)
@@ -171,23 +164,20 @@ class SessionManager:
 
     def _request(self, session: Session, key: _Key) -> TurnRequest:
         """What a turn is made from; refuses a session whose model is not this server's."""
-        info = self.models.get(session.model)
+        info = self.model(session.model)
         if info is None or info.env_id != session.env_id:
             raise RefusedError(
                 f"this session needs the model {session.model!r} in {session.env_id!r}, "
                 "which this server was not started with"
             )
-        film_every = CROWDED_FILM_EVERY if self._is_crowded() else 1
+        since = time.monotonic() - AT_WORK_SECONDS
+        at_work = sum(active.seen > since for active in list(self._active.values()))
+        film_every = CROWDED_FILM_EVERY if at_work > self.queue.n_workers else 1
         video = self.store.videos / f"{session.id}-{secrets.token_hex(12)}.mp4"
         about = (info, session.seed, session.options, key.kind, video)
         before = {} if key.question is None else self.store.adapter_data(key.question)
-        return TurnRequest(
-            *about,
-            **before,
-            preference=key.preference,
-            repeats=key.repeats,
-            film_every=film_every,
-        )
+        before |= {"preference": key.preference, "repeats": key.repeats}
+        return TurnRequest(*about, **before, film_every=film_every)
 
     def _look(self, number: int) -> tuple[Session, list[Any], str, Any, Any]:
         """The session, its answers, the kind of the turn that is due, the turn itself, if there is
@@ -207,11 +197,6 @@ class SessionManager:
         self._active[session.id].seen = time.monotonic()
         return self._active[session.id]
 
-    def _is_crowded(self) -> bool:
-        since = time.monotonic() - AT_WORK_SECONDS
-        at_work = sum(active.seen > since for active in list(self._active.values()))
-        return at_work > self.queue.n_workers
-
     def _make_room(self) -> None:
         now = time.monotonic()
         for number, active in list(self._active.items()):
@@ -227,12 +212,9 @@ class SessionManager:
 
     def _begin_turn(self, session: Session, answered: int, kind: str) -> None:
         active = self._active[session.id]
-        if active.task is not None and not active.task.done():
-            return
-        if active.failed is not None and time.monotonic() - active.failed_at < RETRY_SECONDS:
-            return
-        turn = self._make_turn(session, answered, kind)
-        active.task = asyncio.get_running_loop().create_task(turn)
+        is_at_it = active.task is not None and not active.task.done()
+        if not is_at_it and time.monotonic() >= active.retry_at:
+            active.task = asyncio.create_task(self._make_turn(session, answered, kind))
 
     async def _make_turn(self, session: Session, answered: int, kind: str) -> None:
         """Have the turn made that the page waits for, or take the one rendered ahead; keep it."""
@@ -258,12 +240,12 @@ class SessionManager:
             active.jobs.pop(key, None)
             if not is_kept:
                 video.unlink(missing_ok=True)
-            active.failed = None
+            active.failed, active.retry_at = None, 0.0
         except Exception as error:
             words = "session %d: the %s after %d answers could not be made: %s"
             trace = None if isinstance(error, WORDED_ERRORS) else error
             _logger.error(words, session.id, kind, answered, error, exc_info=trace)
-            active.failed, active.failed_at = error, time.monotonic()
+            active.failed, active.retry_at = error, time.monotonic() + RETRY_SECONDS
 
     def _render_ahead(self, session: Session, answered: int, question: int) -> None:
         """Begin what follows from each of the question's answers."""

@@ -22,6 +22,8 @@ from sb3_poem.label.rendering import StorageError, Turn
 
 VERDICTS = ("yes", "not quite")
 MAX_WISH = 2000  # characters
+LOOK_AGAIN = "look again at the page"
+MOVED_ON = f"the conversation has moved on; {LOOK_AGAIN}"
 SCHEMA_VERSION = 4
 SCHEMA = """
 CREATE TABLE sessions (
@@ -214,8 +216,8 @@ class Store:
         """The whole row of a turn, whether it counts or not."""
         return self._one("SELECT * FROM turns WHERE id = ?", turn)
 
-    def adapter_answers(self, session: int, before: int) -> list[dict[str, Any]]:
-        """The first so many answers: ``preference``, and what was shown by its place, ``left`` and
+    def adapter_answers(self, session: int, before: int = 2**31) -> list[dict[str, Any]]:
+        """The answers, or the first so many: ``preference``, and what was shown by its place, ``left`` and
         ``right``, say, of each.
         """
         query = """SELECT answers.preference, turns.trajectories
@@ -259,30 +261,18 @@ class Store:
             here = [answer["id"] for answer in self.answers(session)]
             if number > len(here) or (here[number - 1] if number else None) != last_answer:
                 return None
+            film = {"video": video, "fps": turn.fps, "frames": turn.frames}
             kept = self.turn(session, kind, number)
             if kept is not None:
                 if (self.videos / kept["video"]).is_file():
                     return None
-                execute(
-                    "UPDATE turns SET video = ?, fps = ?, frames = ? WHERE id = ?",
-                    (video, turn.fps, turn.frames, kept["id"]),
-                )
+                put = "UPDATE turns SET video = :video, fps = :fps, frames = :frames WHERE id = :id"
+                execute(put, {**film, "id": kept["id"]})
                 return int(kept["id"])
-            return self._insert(
-                "turns",
-                session=session,
-                kind=kind,
-                number=number,
-                state=_json(turn.state),
-                trajectories=_json(turn.shown),
-                belief=_json(turn.belief),
-                latent=_json(turn.latent),
-                video=video,
-                fps=turn.fps,
-                frames=turn.frames,
-                created=time.time() if created is None else created,
-                shown=shown,
-            )
+            about = {"session": session, "kind": kind, "number": number, "shown": shown}
+            made = {name: _json(getattr(turn, name)) for name in ("state", "belief", "latent")}
+            made |= {"trajectories": _json(turn.shown), "created": created or time.time()}
+            return self._insert("turns", **about, **made, **film)
 
     def mark_shown(self, turn: int) -> None:
         """Note that a turn has been shown, the first time."""
@@ -304,18 +294,13 @@ class Store:
                 if answer["question"] == question and answer["preference"] == preference:
                     return int(answer["id"])
             current = self.turn(session, "question", len(answers))
-            if current is None or current["id"] != question:
-                raise RefusedError(
-                    "this question is not the one that waits for an answer; look again at the page"
-                )
-            about = self.session(session)
-            if about.stopped or len(answers) >= about.target:
-                raise RefusedError("the questions are over for now; the result is shown")
-            about_answer = {"question": question, "preference": preference}
-            now = time.time()
-            return self._insert(
-                "answers", session=session, number=len(answers), created=now, **about_answer
-            )
+            waits = current is not None and current["id"] == question
+            _insist(waits, f"this question is not the one that waits for an answer; {LOOK_AGAIN}")
+            about, number = self.session(session), len(answers)
+            is_over = about.stopped or number >= about.target
+            _insist(not is_over, "the questions are over for now; the result is shown")
+            given = {"session": session, "question": question, "preference": preference}
+            return self._insert("answers", number=number, created=time.time(), **given)
 
     def ask_again(self, session: int, question: int) -> None:
         """Ask once more about what the answer was to that the others contradict, as the waiting
@@ -327,10 +312,9 @@ class Store:
             if waiting is not None and waiting["repeats"] is not None:
                 return
             if waiting is None or waiting["id"] != question:
-                raise RefusedError("the conversation has moved on; look again at the page")
+                raise RefusedError(MOVED_ON)
             number = json.loads(waiting["belief"] or "{}").get("contradicted")
-            if number is None:
-                raise RefusedError("no answer is contradicted by the others")
+            _insist(number is not None, "no answer is contradicted by the others")
             execute("UPDATE turns SET dropped = ? WHERE id = ?", (time.time(), question))
             execute(ASK_AGAIN, {"waiting": question, "asked": answers[number]["question"]})
 
@@ -340,20 +324,15 @@ class Store:
         """
         with self._transaction() as execute:
             answers = self.answers(session)
-            if answered != len(answers):
-                raise RefusedError("the conversation has moved on; look again at the page")
+            _insist(answered == len(answers), MOVED_ON)
             if self.session(session).stopped:
                 execute("UPDATE sessions SET stopped = 0 WHERE id = ?", (session,))
                 return
-            if not answers:
-                raise RefusedError("there is no answer to take back")
+            _insist(answers, "there is no answer to take back")
             now = time.time()
             execute("UPDATE answers SET undone = ? WHERE id = ?", (now, answers[-1]["id"]))
-            execute(
-                "UPDATE turns SET dropped = ? "
-                "WHERE session = ? AND number >= ? AND dropped IS NULL",
-                (now, session, answered),
-            )
+            which = "session = ? AND number >= ? AND dropped IS NULL"
+            execute(f"UPDATE turns SET dropped = ? WHERE {which}", (now, session, answered))
 
     def stop(self, session: int) -> None:
         """Show the result after the answers so far."""
@@ -364,30 +343,23 @@ class Store:
         """Keep what the person says of the result that is shown; "not quite" asks for more
         questions. The same verdict again changes nothing.
         """
-        if verdict not in VERDICTS:
-            raise RefusedError('a verdict must be "yes" or "not quite"')
+        _insist(verdict in VERDICTS, 'a verdict must be "yes" or "not quite"')
         with self._transaction() as execute:
             about, answered = self.session(session), len(self.answers(session))
             current = self.turn(session, "result", answered)
             is_over = about.stopped or answered >= about.target
-            if current is None or current["id"] != result or not is_over:
-                raise RefusedError(
-                    "this result is not the one that is shown; look again at the page"
-                )
-            execute(
-                "UPDATE turns SET verdict = ?, verdict_time = ? WHERE id = ?",
-                (verdict, time.time(), result),
-            )
+            is_shown = is_over and current is not None and current["id"] == result
+            _insist(is_shown, f"this result is not the one that is shown; {LOOK_AGAIN}")
+            given = (verdict, time.time(), result)
+            execute("UPDATE turns SET verdict = ?, verdict_time = ? WHERE id = ?", given)
             if verdict == "not quite":
-                execute(
-                    "UPDATE sessions SET stopped = 0, target = ? WHERE id = ?",
-                    (answered + about.step, session),
-                )
+                more = (answered + about.step, session)
+                execute("UPDATE sessions SET stopped = 0, target = ? WHERE id = ?", more)
 
     def set_wish(self, session: int, wish: str) -> None:
         """Keep what the person wants, in their own words; a wish that is too long is refused."""
-        if len(wish) > MAX_WISH:
-            raise RefusedError(f"what you wish for may be {MAX_WISH} characters long at most")
+        fits = len(wish) <= MAX_WISH
+        _insist(fits, f"what you wish for may be {MAX_WISH} characters long at most")
         with self._transaction() as execute:
             execute("UPDATE sessions SET wish = ? WHERE id = ?", (wish, session))
 
@@ -411,8 +383,8 @@ class Store:
     def remove_orphans(self) -> int:
         """Delete videos that no turn names, as of answers that were not given; returns how many."""
         kept = {row["video"] for row in self._all("SELECT video FROM turns")}
-        files = [file for file in self.videos.iterdir() if file.is_file()]
-        orphans = [file for file in files if file.name not in kept]
+        files = self.videos.iterdir()
+        orphans = [file for file in files if file.is_file() and file.name not in kept]
         for file in orphans:
             file.unlink(missing_ok=True)
         return len(orphans)
@@ -463,6 +435,11 @@ class Store:
             return self._connection.execute(query, arguments).fetchall()
 
 
+def _insist(fits: object, otherwise: str) -> None:
+    if not fits:
+        raise RefusedError(otherwise)
+
+
 def _hash(token: str) -> str:
     return hashlib.sha256(token.encode("utf-8", "surrogatepass")).hexdigest()
 
@@ -507,22 +484,19 @@ class StoreRecorder:
     ) -> None:
         self.store = store
         about = (model, env_id, seed, options or {}, n_queries)
-        found = self._last_session(*about) if resume else None
-        self.resumed = found is not None
-        self.session = found or store.create_session(*about, source="terminal")[0]
+        found = [one for one in store.sessions() if resume and self._agrees(one, about)]
+        self.resumed = bool(found)
+        self.session = found[-1] if found else store.create_session(*about, source="terminal")[0]
         if wish:
             store.set_wish(self.session.id, wish)
 
-    def _last_session(self, *about: Any) -> Session | None:
-        for session in reversed(self.store.sessions()):
-            facts = (session.model, session.env_id, session.seed, session.options, session.step)
-            if session.source == "terminal" and facts == about and self.store.answers(session.id):
-                return session
-        return None
+    def _agrees(self, one: Session, about: tuple[Any, ...]) -> bool:
+        facts = (one.source, one.model, one.env_id, one.seed, one.options, one.step)
+        return facts == ("terminal", *about) and bool(self.store.answers(one.id))
 
     def kept(self) -> list[dict[str, Any]]:
         """The session's answers so far, see :meth:`Store.adapter_answers`."""
-        return self.store.adapter_answers(self.session.id, 2**31)
+        return self.store.adapter_answers(self.session.id)
 
     def __call__(self, answer: HumanAnswer) -> None:
         """Keep an answer; it is on the disk when this returns."""
