@@ -192,8 +192,7 @@ class Renderer:
         write_clip(frames, request.video, fps)
         data = adapter.to_dict()
         state = {name: value for name, value in data.items() if name not in CONVERSATION}
-        about = (believed, latent.tolist(), fps, len(frames))
-        return Turn(state, data["pending"], *about)
+        return Turn(state, data["pending"], believed, latent.tolist(), fps, len(frames))
 
     def warm_up(self) -> None:
         """Do once what only the first time is slow: the first image, the first action."""

@@ -217,8 +217,8 @@ class Store:
         return self._one("SELECT * FROM turns WHERE id = ?", turn)
 
     def adapter_answers(self, session: int, before: int = 2**31) -> list[dict[str, Any]]:
-        """The answers, or the first so many: ``preference``, and what was shown by its place, ``left`` and
-        ``right``, say, of each.
+        """The answers, or the first so many: ``preference``, and what was shown by its place,
+        ``left`` and ``right``, say, of each.
         """
         query = """SELECT answers.preference, turns.trajectories
             FROM answers JOIN turns ON turns.id = answers.question
@@ -271,8 +271,9 @@ class Store:
                 return int(kept["id"])
             about = {"session": session, "kind": kind, "number": number, "shown": shown}
             made = {name: _json(getattr(turn, name)) for name in ("state", "belief", "latent")}
-            made |= {"trajectories": _json(turn.shown), "created": created or time.time()}
-            return self._insert("turns", **about, **made, **film)
+            made["trajectories"] = _json(turn.shown)
+            now = time.time()
+            return self._insert("turns", created=created or now, **about, **made, **film)
 
     def mark_shown(self, turn: int) -> None:
         """Note that a turn has been shown, the first time."""
