@@ -28,7 +28,7 @@ from sb3_poem.adaptation import (
     known_task_return,
     named_rule,
 )
-from sb3_poem.cli.subject import parse_env_kwargs
+from sb3_poem.cli.needs import parse_pairs
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.label import Store
 
@@ -548,7 +548,7 @@ def test_a_folder_that_cannot_be_written_is_refused(
 
 
 def test_environment_arguments_are_literals_or_text() -> None:
-    assert parse_env_kwargs(["a:1.5", "b:True", "c:human", "d:a:b", "e:(1, 2)"]) == {
+    assert parse_pairs("--env-kwargs", ["a:1.5", "b:True", "c:human", "d:a:b", "e:(1, 2)"]) == {
         "a": 1.5,
         "b": True,
         "c": "human",

@@ -1,8 +1,10 @@
 """``sb3-poem benchmark``: run suites into a store, report what it holds, and verify it."""
 
 import argparse
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sb3_poem.benchmark.methods import VARIANTS
 from sb3_poem.benchmark.suites import (
@@ -14,10 +16,12 @@ from sb3_poem.benchmark.suites import (
     family_name,
     hashable,
 )
-from sb3_poem.cli.needs import check_writable, import_packages
+from sb3_poem.cli.needs import check_writable, import_packages, parse_pairs
 
 if TYPE_CHECKING:
     from sb3_poem.benchmark.models import ModelLibrary
+
+_say = partial(print, flush=True)
 
 
 def run_benchmark(arguments: argparse.Namespace) -> int:
@@ -39,7 +43,8 @@ def _run(arguments: argparse.Namespace) -> int:
 
     import_packages(arguments.gym_packages)
     suite = SUITES[arguments.suite]
-    training = Training(arguments.timesteps, tuple(sorted(_parse_params(arguments.params).items())))
+    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+    training = Training(arguments.timesteps, _parse_params(arguments.params))
     if not training.is_default and (arguments.models or arguments.model):
         raise ValueError(
             "--models and --model hand over models that were trained already: leave out "
@@ -47,8 +52,8 @@ def _run(arguments: argparse.Namespace) -> int:
         )
     if arguments.export is not None and (suite.name != "shipped" or arguments.methods):
         raise ValueError("--export is for --suite shipped with all of its methods")
-    _check_models(arguments)
     library = _library(arguments, arguments.device, arguments.num_threads)
+    _check_models(arguments.model, library, arguments.families or suite.families, seeds)
     store = Store(arguments.store) if not arguments.list or arguments.store.exists() else None
     plan = make_plan(
         suite,
@@ -56,7 +61,7 @@ def _run(arguments: argparse.Namespace) -> int:
         store,
         arguments.families,
         arguments.methods,
-        _seeds(arguments),
+        seeds,
         Budget(arguments.tasks or suite.budget.tasks, arguments.episodes or suite.budget.episodes),
         training,
         arguments.snapshots,
@@ -66,7 +71,7 @@ def _run(arguments: argparse.Namespace) -> int:
         return 0
     for folder in filter(None, (arguments.runs, arguments.export)):
         check_writable(folder)
-    print(f"{plan}; results in {arguments.store}", flush=True)
+    _say(f"{plan}; results in {arguments.store}")
     if arguments.backend == "ray":
         from sb3_poem.benchmark.ray_backend import RayOptions, run_with_ray
 
@@ -89,28 +94,19 @@ def _run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _seeds(arguments: argparse.Namespace) -> range:
-    return range(arguments.first_seed, arguments.first_seed + arguments.seeds)
-
-
-def _check_models(arguments: argparse.Namespace) -> None:
+def _check_models(
+    given: Sequence[str], library: "ModelLibrary", names: Sequence[str], seeds: range
+) -> None:
     """Refuse what would quietly be trained instead of being taken."""
-    names = arguments.families or SUITES[arguments.suite].families
     families = {family_id(name) for name in names}
-    seeds = _seeds(arguments)
-    for text in arguments.model:
-        family, _, seed, _ = _parse_named(text)
+    for text, (family, _, seed, _) in zip(given, library.workplace.named, strict=True):
         if family not in families:
             known = ", ".join(sorted(map(family_label, families)))
-            raise ValueError(
-                f"--model {text}: {family_label(family)} is none of the families of this run: "
-                f"{known}"
-            )
+            what = f"{family_label(family)} is none of the families of this run: {known}"
+            raise ValueError(f"--model {text}: {what}")
         if seed not in seeds:
-            raise ValueError(
-                f"--model {text}: {seed} is none of the seeds of this run: "
-                f"{', '.join(map(str, seeds))}"
-            )
+            known = ", ".join(map(str, seeds))
+            raise ValueError(f"--model {text}: {seed} is none of the seeds of this run: {known}")
 
 
 def _report(arguments: argparse.Namespace) -> int:
@@ -162,24 +158,14 @@ def _library(arguments: argparse.Namespace, device: str, num_threads: int) -> "M
     return ModelLibrary(Workplace(*place, device, num_threads))
 
 
-def _say(line: str) -> None:
-    print(line, flush=True)
-
-
-def _parse_params(pairs: list[str]) -> dict[str, Any]:
-    from sb3_poem.cli.subject import parse_env_kwargs
-
-    try:
-        given = parse_env_kwargs(pairs)
-    except ValueError as error:
-        raise ValueError(str(error).replace("--env-kwargs", "--params")) from error
-    values = {}
-    for name, value in given.items():
+def _parse_params(pairs: list[str]) -> tuple[tuple[str, object], ...]:
+    values = []
+    for name, value in sorted(parse_pairs("--params", pairs).items()):
         try:
-            values[name] = hashable(value)
+            values.append((name, hashable(value)))
         except ValueError as error:
             raise ValueError(f"--params {name}: {error}") from error
-    return values
+    return tuple(values)
 
 
 def _parse_named(text: str) -> tuple[str, str, int, str]:
@@ -190,9 +176,8 @@ def _parse_named(text: str) -> tuple[str, str, int, str]:
         raise ValueError(f"--model {text}: must have the form FAMILY:VARIANT:SEED=PATH")
     family, variant, seed = parts
     if variant not in VARIANTS:
-        raise ValueError(
-            f"--model {text}: there is no variant {variant!r}; there are: {', '.join(VARIANTS)}"
-        )
+        known = ", ".join(VARIANTS)
+        raise ValueError(f"--model {text}: there is no variant {variant!r}; there are: {known}")
     if not Path(path).exists():
         raise ValueError(f"--model {text}: there is no such file or folder")
     return family_id(family), variant, int(seed), path

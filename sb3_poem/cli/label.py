@@ -9,8 +9,8 @@ from typing import Any
 
 from rich.console import Console
 
-from sb3_poem.cli.needs import check_output, import_packages
-from sb3_poem.cli.subject import parse_env_kwargs, say
+from sb3_poem.cli.needs import check_output, import_packages, parse_pairs
+from sb3_poem.cli.subject import say
 
 SHORTEST_PASSWORD = 12
 AUTH_VARIABLE = "SB3_POEM_AUTH"
@@ -48,7 +48,8 @@ def run_page(arguments: argparse.Namespace) -> None:
     import_packages(packages)
     options = page_options(arguments)
     session_rule(options)  # says now what is out of range
-    models = find_models(arguments.model, arguments.env, parse_env_kwargs(arguments.env_kwargs))
+    env_kwargs = parse_pairs("--env-kwargs", arguments.env_kwargs)
+    models = find_models(arguments.model, arguments.env, env_kwargs)
     listener = bind(arguments.host, arguments.port)
     port = listener.getsockname()[1]
     store = Store(arguments.store)

@@ -1,11 +1,13 @@
 """What a command will need, checked before it spends its time."""
 
+import ast
 import importlib
 import os
 import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 
 def check_writable(folder: str | Path) -> None:
@@ -26,6 +28,20 @@ def check_output(flag: str, path: Path | None, suffixes: Sequence[str]) -> None:
     if path.suffix not in suffixes:
         raise ValueError(f"{flag} {path}: the name must end in {' or '.join(suffixes)}")
     check_writable(path.parent)
+
+
+def parse_pairs(flag: str, pairs: Sequence[str]) -> dict[str, Any]:
+    """Read a flag's ``KEY:VALUE`` arguments; a value is a Python literal, or else a string."""
+    values: dict[str, Any] = {}
+    for pair in pairs:
+        key, colon, text = pair.partition(":")
+        if not colon or not key.isidentifier():
+            raise ValueError(f"{flag} {pair}: must have the form KEY:VALUE")
+        try:
+            values[key] = ast.literal_eval(text)
+        except (ValueError, SyntaxError):
+            values[key] = text
+    return values
 
 
 def check_device(name: str) -> None:

@@ -25,10 +25,8 @@ def resumed(arguments: Sequence[str]) -> list[str] | None:
     parser.add_argument("-i", "--trained-agent")
     given, _ = parser.parse_known_args(arguments)
     if given.trained_agent:
-        raise ValueError(
-            "--resume finds the checkpoint by itself: leave out either --resume or "
-            "-i/--trained-agent"
-        )
+        either = "leave out either --resume or -i/--trained-agent"
+        raise ValueError(f"--resume finds the checkpoint by itself: {either}")
     rest = [argument for argument in arguments if argument != "--resume"]
     folder, env_name = Path(given.log_folder) / given.algo, given.env.replace("/", "-")
     run = last_run(folder, env_name, given.seed)
@@ -37,10 +35,8 @@ def resumed(arguments: Sequence[str]) -> list[str] | None:
         print(f"--resume: {folder} has no checkpoint of {which}; training begins from zero")
         return rest
     if is_complete(run / f"{env_name}.zip"):
-        print(
-            f"{run} has finished already; start another run without --resume, or train it further "
-            "with -i"
-        )
+        other = "start another run without --resume, or train it further with -i"
+        print(f"{run} has finished already; {other}")
         return None
     return [*rest, "-i", str(run / CHECKPOINT)]
 

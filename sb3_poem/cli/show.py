@@ -23,10 +23,8 @@ def run_enjoy(arguments: argparse.Namespace) -> None:
         raise OSError(f"there is no display to draw on: film it by `{film}`, or add --no-render")
     shown = Shown(arguments)
     subject, steps = shown.subject, arguments.n_timesteps
-    if arguments.no_render:
-        env = subject.make_env(None, show_task=False)
-    else:
-        env = subject.make_env("human", show_task=shown.has_task)
+    mode = None if arguments.no_render else "human"
+    env = subject.make_env(mode, show_task=shown.has_task and mode is not None)
     episodes = arguments.episodes if steps is None else ceil(steps / subject.model.horizon)
     try:
         for number in range(episodes):
@@ -57,10 +55,8 @@ class Shown:
         self.subject = subject = Subject(arguments, Console(), 1, COPIES_FOR_ONE_TASK)
         self.has_task = subject.latent is None or arguments.task is not None
         if subject.latent is not None and arguments.known_task:
-            raise ValueError(
-                "--known-task chooses a policy of a model, but --model "
-                f"{arguments.model} is a policy"
-            )
+            what = f"but --model {arguments.model} is a policy"
+            raise ValueError(f"--known-task chooses a policy of a model, {what}")
         self.captions: list[str] = []
         if self.has_task:
             say(f"Task of {subject.env_id}: {describe_task(subject.tasks[0])}")
@@ -77,12 +73,11 @@ class Shown:
             self._adapt(arguments)
 
     def _adapt(self, arguments: argparse.Namespace) -> None:
-        subject = self.subject
-        with subject.console.status(f"Asking {arguments.queries} questions"):
-            record_at, n_episodes = (0, arguments.queries), arguments.episodes
+        subject, asked = self.subject, arguments.queries
+        with subject.console.status(f"Asking {asked} questions"):
             about = (subject.model, subject.env, subject.tasks)
-            how: dict[str, Any] = {"n_episodes": n_episodes, "seed": subject.seed}
-            measured = evaluate_adaptation(*about, record_at=record_at, **how)
+            how: dict[str, Any] = {"n_episodes": arguments.episodes, "seed": subject.seed}
+            measured = evaluate_adaptation(*about, record_at=(0, asked), **how)
         self.latents = list(measured.latents[0])
         self.captions = list(map(after, measured.record_at))
         earned = zip(measured.mean_returns, self.captions, strict=True)
@@ -93,10 +88,8 @@ class Shown:
 def _last_run(arguments: argparse.Namespace) -> str:
     """The file with the model of the last run, or its checkpoint if it has not finished."""
     if arguments.env is None:
-        raise ValueError(
-            "name a model by --model, or by --env the environment whose last run in --folder is "
-            "shown"
-        )
+        last = "by --env the environment whose last run in --folder is shown"
+        raise ValueError(f"name a model by --model, or {last}")
     name, number = arguments.env.replace("/", "-"), arguments.exp_id
     folder = Path(arguments.folder) / arguments.algo
     run = folder / f"{name}_{number}" if number else last_run(folder, name, seed=-1)

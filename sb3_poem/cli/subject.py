@@ -1,11 +1,9 @@
 """What ``adapt``, ``enjoy`` and ``record-video`` work on: a model, its environment, test tasks."""
 
 import argparse
-import ast
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_poem.adaptation import AdaptedPolicy, KnownTaskReturn, Trajectory, known_task_return
 from sb3_poem.adaptation.evaluation import evaluation_seed
-from sb3_poem.cli.needs import check_device, import_packages
+from sb3_poem.cli.needs import check_device, import_packages, parse_pairs
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.foreign import environment_of
 from sb3_poem.common.rollouts import rollout_latents
@@ -31,20 +29,6 @@ COPIES, COPIES_FOR_ONE_TASK = 60, 20
 # Episodes per latent when looking for a task's best: the fewer, the more luck counts in the limit.
 SELECTION_EPISODES = 3
 POLICY_SUFFIX = ".safetensors"
-
-
-def parse_env_kwargs(pairs: list[str]) -> dict[str, Any]:
-    """Read ``KEY:VALUE`` arguments; a value is a Python literal, or else a string."""
-    kwargs = {}
-    for pair in pairs:
-        key, colon, text = pair.partition(":")
-        if not colon or not key.isidentifier():
-            raise ValueError(f"--env-kwargs {pair}: must have the form KEY:VALUE")
-        try:
-            kwargs[key] = ast.literal_eval(text)
-        except (ValueError, SyntaxError):
-            kwargs[key] = text
-    return kwargs
 
 
 def describe_task(task: Sequence[float] | np.ndarray) -> str:
@@ -81,7 +65,7 @@ class Subject:
                 self.model, self.latent = policy.model, policy.latent
             else:
                 self.model = load_model(arguments.model, arguments.device)
-        given = parse_env_kwargs(arguments.env_kwargs)
+        given = parse_pairs("--env-kwargs", arguments.env_kwargs)
         self.env_id, self.env_kwargs = environment_of(
             arguments.model, self.model.env_id, self.model.env_kwargs, arguments.env, given
         )

@@ -71,38 +71,38 @@ OTHER_HINT = "Think of what it should do. Your answers show it."
 FETCH_HAND, SAWYER_HAND = (1.342, 0.749, 0.535), (0.0, 0.6, 0.2)
 
 ANT, CHEETAH, ARM = "A four-legged robot", "A running cheetah", "A robot arm"
+
+
+def _speed(title: str) -> Description:
+    return Description(f"{title}: how fast?", SPEED_HINT, "speed", "m/s", 3.0)
+
+
+def _direction(title: str, look: Look) -> Description:
+    return Description(f"{title}: in which direction?", DIRECTION_HINT, "direction", look=look)
+
+
+def _place(title: str, hint: str, extent: float, look: Look, origin: Any = None) -> Description:
+    return Description(title, hint, "place", "m", extent, look, origin)
+
+
 DESCRIPTIONS = {
     "PointGoal": Description("A dot that goes to a place", PLACE_HINT, "place", extent=1.35),
-    "HalfCheetahVel": Description(f"{CHEETAH}: how fast?", SPEED_HINT, "speed", "m/s", 3.0),
+    "HalfCheetahVel": _speed(CHEETAH),
     "HalfCheetahFwdBack": Description(f"{CHEETAH}: which way?", WAY_HINT, "direction"),
-    "AntVel": Description(f"{ANT}: how fast?", SPEED_HINT, "speed", "m/s", 3.0),
+    "AntVel": _speed(ANT),
     "AntFwdBack": Description(f"{ANT}: which way?", WAY_HINT, "direction"),
-    "AntDir2D": Description(
-        f"{ANT}: in which direction?", DIRECTION_HINT, "direction", look=AntDir2DEnv.look
+    "AntDir2D": _direction(ANT, AntDir2DEnv.look),
+    "HumanoidDir2D": _direction("A humanoid", HumanoidDir2DEnv.look),
+    "AntGoal": _place(f"{ANT} that goes to a place", PLACE_HINT, 3.5, AntGoalEnv.look),
+    "FetchReach": _place(
+        f"{ARM} that reaches for a place", REACH_HINT, 0.3, FetchReachEnv.look, FETCH_HAND
     ),
-    "HumanoidDir2D": Description(
-        "A humanoid: in which direction?", DIRECTION_HINT, "direction", look=HumanoidDir2DEnv.look
-    ),
-    "AntGoal": Description(
-        f"{ANT} that goes to a place", PLACE_HINT, "place", "m", 3.5, AntGoalEnv.look
-    ),
-    "FetchReach": Description(
-        f"{ARM} that reaches for a place",
-        REACH_HINT,
-        "place",
-        "m",
-        0.3,
-        FetchReachEnv.look,
-        FETCH_HAND,
-    ),
-    "FetchPush": Description(
-        f"{ARM} that pushes a box", BOX_HINT, "place", "m", 0.3, FetchPushEnv.look, FETCH_HAND
-    ),
-    "MetaWorldML1": Description(
-        f"{ARM} at a table: where?", REACH_HINT, "place", "m", 0.4, MetaWorldEnv.look, SAWYER_HAND
+    "FetchPush": _place(f"{ARM} that pushes a box", BOX_HINT, 0.3, FetchPushEnv.look, FETCH_HAND),
+    "MetaWorldML1": _place(
+        f"{ARM} at a table: where?", REACH_HINT, 0.4, MetaWorldEnv.look, SAWYER_HAND
     ),
     "MetaWorldML10": Description(f"{ARM} at a table: what, and where?", ARM_HINT, "projection"),
-    "AntMaze": Description(f"{ANT} in a maze", PLACE_HINT, "place", "m", 6.5, AntMazeEnv.look),
+    "AntMaze": _place(f"{ANT} in a maze", PLACE_HINT, 6.5, AntMazeEnv.look),
 }
 
 
