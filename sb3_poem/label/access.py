@@ -1,7 +1,5 @@
 """Who gets in, and with how much: names, passwords, cross-site requests, sizes, waiting, crowds."""
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import hmac

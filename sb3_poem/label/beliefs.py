@@ -1,7 +1,5 @@
 """What the system believes, as a picture and a sentence: the posterior over latents, as tasks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Recorded answers as a data set: JSON Lines and Parquet."""
 
-from __future__ import annotations
-
 import json
 import sqlite3
 from collections.abc import Iterator

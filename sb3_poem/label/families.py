@@ -1,7 +1,5 @@
 """Models that a person may choose from, their families in words, and how tasks are drawn."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

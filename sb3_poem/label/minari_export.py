@@ -1,7 +1,5 @@
 """Recorded answers as Minari data sets: the episodes that were compared for each."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import sqlite3

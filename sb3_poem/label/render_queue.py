@@ -1,7 +1,5 @@
 """The queue of turns to render: what somebody waits for first, then what may be wanted next."""
 
-from __future__ import annotations
-
 import asyncio
 import faulthandler
 import importlib

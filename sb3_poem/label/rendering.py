@@ -3,8 +3,6 @@ after and its video, which is small, quick to encode, and to the frame seekable 
 Any process may compute any turn of any session, ahead of time or again, bit for bit.
 """
 
-from __future__ import annotations
-
 import contextlib
 import subprocess
 import tempfile

@@ -1,7 +1,5 @@
 """Recorded answers, fed to another model or another rule of inference."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """The web server: the pages, the few requests that they make, and running it all."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import ipaddress

@@ -1,7 +1,5 @@
 """The sessions of a server: which question is next, what is rendered ahead, what the page shows."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import logging

@@ -1,7 +1,5 @@
 """Where sessions, questions and answers are kept: a kill at any moment loses no answer."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import secrets

@@ -1,7 +1,5 @@
 """The page within a Jupyter notebook."""
 
-from __future__ import annotations
-
 import html
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
