@@ -128,7 +128,7 @@ class Adaptation:
             how: dict[str, Any] = {"n_episodes": arguments.episodes, "seed": subject.seed}
             how |= {"rule": self.rule, "record_at": record_at, "progress_bar": True}
             evaluate_adaptation(*about, on_record=show, **how)
-            known = self._known_task_return()
+            known = subject.known_task_return(arguments.episodes)
         except KeyboardInterrupt:
             if not measured:
                 raise
@@ -153,11 +153,11 @@ class Adaptation:
         name, n_queries = Path(arguments.model).name, arguments.queries
         about = (name, subject.env_id, subject.seed, self.options, n_queries)
         recorder = StoreRecorder(store, *about, resume=arguments.resume)
-        number, kept = recorder.session.id, recorder.kept()
+        session, kept = f"session {recorder.session.id}", recorder.kept()
         if arguments.resume:
             nothing = "There is nothing to go on with; beginning"
             found = "Going on with" if recorder.resumed else nothing
-            say(f"{found} session {number} of {store.folder}")
+            say(f"{found} {session} of {store.folder}")
         oracle = HumanOracle(record=recorder, question=self.rule.question)
         env = subject.make_env("rgb_array", show_task=False)
         how: dict[str, Any] = {"oracle": oracle, "n_queries": n_queries, "seed": subject.seed}
@@ -171,7 +171,7 @@ class Adaptation:
                 if oracle.needs_frames:
                     adapter.tell(oracle(*shown))
                 else:
-                    self._tell_again(adapter, kept[adapter.n_answers], recorder)
+                    self._tell_again(adapter, kept[adapter.n_answers], session)
                 latents.append(adapter.policy().latent)
         except (EOFError, KeyboardInterrupt) as error:
             if not adapter.n_answers:
@@ -182,16 +182,14 @@ class Adaptation:
             env.close()
         return self._conclude(adapter, recorder, np.array(latents), stopped)
 
-    def _tell_again(
-        self, adapter: PreferenceAdapter, kept: dict[str, Any], recorder: StoreRecorder
-    ) -> None:
+    def _tell_again(self, adapter: PreferenceAdapter, kept: dict[str, Any], about: str) -> None:
         shown = adapter.ask().shown
         for now, was in zip(shown, shown_from_dict(self.rule.question, kept), strict=True):
             if not np.allclose(now.latent, was.latent):
                 raise ValueError(
-                    f"--resume: question {adapter.n_answers + 1} of session {recorder.session.id} "
-                    "was another one; was it asked with another model of the name "
-                    f"{recorder.session.model}? Leave out --resume to begin anew"
+                    f"--resume: question {adapter.n_answers + 1} of {about} was another one; was "
+                    f"it asked with another model of the name {Path(self.arguments.model).name}? "
+                    "Leave out --resume to begin anew"
                 )
         adapter.tell(kept["preference"])
 
@@ -210,7 +208,8 @@ class Adaptation:
             adapter.save(arguments.json)
             say(f"Wrote {arguments.json}")
         if arguments.task is not None and not interrupted:
-            self._report(self._measure(latents, adapter), self._known_task_return())
+            known = subject.known_task_return(arguments.episodes)
+            self._report(self._measure(latents, adapter), known)
         if arguments.video is not None and not interrupted:
             self._film(latents, (0, adapter.n_answers))
         believed = belief(adapter, subject.env_id)
@@ -243,11 +242,6 @@ class Adaptation:
         return AdaptationEvaluation(
             subject.tasks, records, latents[None], [answers], outcomes.returns[None], successes
         )
-
-    def _known_task_return(self) -> KnownTaskReturn:
-        what = "Looking for the best policy of every task, as if it were known"
-        with self.subject.console.status(what):
-            return self.subject.known_task_return(self.arguments.episodes)
 
     def _report(self, evaluation: AdaptationEvaluation, known: KnownTaskReturn | None) -> None:
         """Print and write what was measured; without ``known`` it was interrupted."""

@@ -44,27 +44,31 @@ class TrainingInterrupted(KeyboardInterrupt):
 
 
 @contextlib.contextmanager
+def handled(handler: Any, *numbers: signal.Signals) -> Iterator[None]:
+    """Let signals be handled so within."""
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, own in before.items():
+            signal.signal(number, own)
+
+
+@contextlib.contextmanager
 def stopping_between_epochs(checkpoint: TrainingCheckpointCallback) -> Iterator[None]:
     """Let the first Ctrl-C (or SIGTERM) end training after this epoch, the second at once."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-
-    def restore() -> None:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    both = (signal.SIGINT, signal.SIGTERM)
+    heard = [number for number in both if signal.getsignal(number) is not signal.SIG_IGN]
 
     def stop(number: int, frame: FrameType | None) -> None:
-        restore()
+        first.close()
         checkpoint.stop()
         with contextlib.suppress(OSError):  # and not print, which this signal may have interrupted
             os.write(2, b"\nStopping after this epoch, to save it. Ctrl-C again stops at once.\n")
 
-    for number, handler in before.items():
-        if handler is not signal.SIG_IGN:
-            signal.signal(number, stop)
-    try:
+    with contextlib.ExitStack() as first:
+        first.enter_context(handled(stop, *heard))
         yield
-    finally:
-        restore()
 
 
 def make_experiment(
@@ -143,11 +147,8 @@ class PoemExperiment(FamilyExperiment):
 
     def create_envs(self, *args: Any, **kwargs: Any) -> VecEnv:
         # Ctrl-C reaches the processes of --vec-env subproc too, which must last an epoch
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-        try:
+        with handled(signal.SIG_IGN, signal.SIGINT):
             return super().create_envs(*args, **kwargs)
-        finally:
-            signal.signal(signal.SIGINT, before)
 
     def setup_experiment(self) -> tuple[Any, dict[str, Any]] | None:
         results = super().setup_experiment()
@@ -159,18 +160,20 @@ class PoemExperiment(FamilyExperiment):
     def _add_callbacks(self, model: PEARLSAC) -> None:
         """Those which count in epochs, whose length the model knows."""
         if self.steps_per_evaluation > 0:
-            evaluation = AdaptationEvalCallback(
-                every=_epochs(model, self.steps_per_evaluation),
-                n_episodes=self.n_eval_episodes,
-                best_model_save_path=self.save_path,
-                env_kwargs=self._eval_env_kwargs_args,
-                verbose=self.verbose,
-            )
-            self.callbacks.append(evaluation)
+            how = self._evaluation(model, self.steps_per_evaluation, self.save_path)
+            self.callbacks.append(AdaptationEvalCallback(verbose=self.verbose, **how))
         steps = self.steps_per_checkpoint
         every = _epochs(model, steps) if steps > 0 else None
         self.checkpoint = TrainingCheckpointCallback(Path(self.save_path) / CHECKPOINT, every)
         self.callbacks.append(self.checkpoint)
+
+    def _evaluation(self, model: PEARLSAC, steps: int, folder: str | None) -> dict[str, Any]:
+        return {
+            "every": _epochs(model, steps),
+            "n_episodes": self.n_eval_episodes,
+            "best_model_save_path": folder,
+            "env_kwargs": self._eval_env_kwargs_args,
+        }
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> Any:
         if not is_checkpoint(self.trained_agent):
@@ -238,13 +241,9 @@ class PoemExperiment(FamilyExperiment):
             hyperparams = {**self._hyperparams, **sampled}
             model = ALGORITHMS[self.algo](env=env, device=self.device, **hyperparams)
             log = self.optimization_log_path
-            evaluation = TrialAdaptationCallback(
-                trial,
-                every=_epochs(model, self.n_timesteps // self.n_evaluations),
-                n_episodes=self.n_eval_episodes,
-                best_model_save_path=log and Path(log) / f"trial_{trial.number}",
-                env_kwargs=self._eval_env_kwargs_args,
-            )
+            folder = log and os.path.join(log, f"trial_{trial.number}")
+            how = self._evaluation(model, self.n_timesteps // self.n_evaluations, folder)
+            evaluation = TrialAdaptationCallback(trial, **how)
             own = get_callback_list({"callback": self.specified_callbacks})
             try:
                 model.learn(self.n_timesteps, [*own, evaluation])

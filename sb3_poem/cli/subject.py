@@ -80,17 +80,16 @@ class Subject:
         if task is not None and len(task) != width:
             raise ValueError(f"--task needs {width} numbers for {self.env_id}, got {len(task)}")
         #: (n_tasks, task_dim)
-        self.tasks = (
-            self.family.test_tasks(n_tasks, self.seed)
-            if task is None
-            else np.array([task], dtype=np.float64)
-        )
+        self.tasks = np.array([task], dtype=np.float64)
+        if task is None:
+            self.tasks = self.family.test_tasks(n_tasks, self.seed)
 
     def known_task_return(self, n_episodes: int, limits: bool = True) -> KnownTaskReturn:
         """The best of the model's policies for each task, measured on so many episodes."""
         about = (self.model, self.env, self.tasks, None, n_episodes, self.seed)
         selection = min(n_episodes, SELECTION_EPISODES)
-        return known_task_return(*about, selection_episodes=selection, limits=limits)
+        with self.console.status("Looking for the best policy of every task, as if it were known"):
+            return known_task_return(*about, selection_episodes=selection, limits=limits)
 
     def make_env(self, render_mode: str | None, show_task: bool) -> DummyVecEnv:
         """A single environment with the first task, which is drawn too if it is shown."""

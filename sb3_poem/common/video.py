@@ -80,7 +80,7 @@ def side_by_side(
     if captions is not None:
         left, right = _with_captions((left, right), captions)
     bar = np.full((left[0].shape[0], GAP, 3), 255, dtype=np.uint8)
-    lefts, rights = _as_long((left, right))
+    lefts, rights = as_long((left, right))
     return [np.concatenate([a, bar, b], axis=1) for a, b in zip(lefts, rights, strict=True)]
 
 
@@ -90,10 +90,10 @@ def in_rows(clips: Sequence[Sequence[Frame]], captions: Sequence[str]) -> list[F
         side_by_side(clips[i], clips[i + 1], (captions[i], captions[i + 1]))
         for i in range(0, len(clips), 2)
     ]
-    return [np.concatenate(frames) for frames in zip(*_as_long(rows), strict=True)]
+    return [np.concatenate(frames) for frames in zip(*as_long(rows), strict=True)]
 
 
-def _as_long(clips: Sequence[Sequence[Frame]]) -> list[list[Frame]]:
+def as_long(clips: Sequence[Sequence[Frame]]) -> list[list[Frame]]:
     """All as long as the longest one."""
     longest = max(map(len, clips))
     return [[*clip, *[clip[-1]] * (longest - len(clip))] for clip in clips]

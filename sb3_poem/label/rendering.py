@@ -9,7 +9,6 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,7 @@ from sb3_poem.common.files import write_atomically
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.common.vec_env import make_shown_env
+from sb3_poem.common.video import as_long
 from sb3_poem.label.beliefs import belief
 from sb3_poem.label.families import ModelInfo
 from sb3_poem.loading import BY_CLASS_NAME
@@ -290,7 +290,7 @@ def beside(first: int, *clips: Sequence[np.ndarray]) -> list[np.ndarray]:
     fall out of step. What is shorter holds its last frame.
     """
     longest = max(map(len, clips[:first]))
-    held = [[*clip, *repeat(clip[-1], longest - len(clip))][:longest] for clip in clips]
+    held = as_long([clip[:longest] for clip in clips])
     return [np.concatenate(frames, axis=1) for frames in zip(*held, strict=True)]
 
 
