@@ -49,10 +49,8 @@ def load_model(name: str | Path, device: th.device | str = "auto") -> PEARLSAC:
     path = Path(name)
     archive = path if path.is_file() else path.with_name(f"{path.name}.zip")
     if archive.suffix == ".safetensors":
-        raise ValueError(
-            f"{name} holds no whole model: AdaptedPolicy.load reads a policy, and of a model name "
-            "the folder"
-        )
+        instead = "AdaptedPolicy.load reads a policy, and of a model name the folder"
+        raise ValueError(f"{name} holds no whole model: {instead}")
     if archive.is_file():
         # where that cannot be told, POEMSAC.load says what is wrong with the file
         kind = BY_CLASS_NAME.get(algorithm_of(archive), POEMSAC)

@@ -46,10 +46,8 @@ def _run(arguments: argparse.Namespace) -> int:
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     training = Training(arguments.timesteps, _parse_params(arguments.params))
     if not training.is_default and (arguments.models or arguments.model):
-        raise ValueError(
-            "--models and --model hand over models that were trained already: leave out "
-            "--timesteps and --params"
-        )
+        trained = "--models and --model hand over models that were trained already"
+        raise ValueError(f"{trained}: leave out --timesteps and --params")
     if arguments.export is not None and (suite.name != "shipped" or arguments.methods):
         raise ValueError("--export is for --suite shipped with all of its methods")
     library = _library(arguments, arguments.device, arguments.num_threads)

@@ -102,10 +102,8 @@ def read_password(auth: str | None, file: Path | None) -> tuple[str | None, str 
     if not user or not colon:
         raise ValueError(f"{source} must have the form USER:PASSWORD")
     if len(password) < SHORTEST_PASSWORD:
-        raise ValueError(
-            f"{source}: the password must have at least {SHORTEST_PASSWORD} characters, "
-            f"but has {len(password)}"
-        )
+        least = f"at least {SHORTEST_PASSWORD} characters, but has {len(password)}"
+        raise ValueError(f"{source}: the password must have {least}")
     return user, password
 
 
@@ -164,10 +162,8 @@ def run_replay(arguments: argparse.Namespace) -> None:
         except FileNotFoundError:
             if given is not None:
                 raise
-            say(
-                f"Session {session.id} was recorded with a model {session.model!r} that does not "
-                "ship: name it by --model"
-            )
+            recorded = f"was recorded with a model {session.model!r} that does not ship"
+            say(f"Session {session.id} {recorded}: name it by --model")
             continue
         # the store knows a model by its folder's name
         is_own = given is None or Path(given).resolve().name == session.model

@@ -144,18 +144,14 @@ class AccessMiddleware:
                 response = RedirectResponse("/" + request.scope["path"].lstrip("/"), 303)
                 # Not "strict": a link that is clicked in somebody's mail would not be let in.
                 # Requests of other sites that write are refused in any case.
-                response.set_cookie(
-                    name, access.token, httponly=True, samesite="lax", max_age=30 * 86400
-                )
+                how: dict[str, Any] = {"httponly": True, "samesite": "lax"}
+                response.set_cookie(name, access.token, max_age=30 * 86400, **how)
                 return response
         if authorization or cookie or given:
             await asyncio.sleep(PAUSE_AFTER_WRONG_PASSWORD)
         asks = {"WWW-Authenticate": 'Basic realm="sb3-poem", charset="UTF-8"'}
-        raise HTTPException(
-            401,
-            "this page needs the link with its token, or the password, of whoever started it",
-            asks if access.password is not None else None,
-        )
+        needs = "this page needs the link with its token, or the password, of whoever started it"
+        raise HTTPException(401, needs, None if access.password is None else asks)
 
 
 async def _body(request: Request) -> bytes:

@@ -79,10 +79,8 @@ def _write(dataset: str, env_id: str, rows: list[sqlite3.Row], videos: Path) -> 
         for side, shown in trajectories_of(row).items():
             found = shown.observations.shape[1:], shown.actions.shape[1:]
             if found != shapes:
-                raise ValueError(
-                    f"observations and actions recorded in {env_id} have the shapes {found}, but "
-                    f"the environment's are {shapes}"
-                )
+                recorded = f"observations and actions recorded in {env_id} have the shapes {found}"
+                raise ValueError(f"{recorded}, but the environment's are {shapes}")
             answer[f"{side}_episode"] = len(episodes)
             about = {"preference": row["preference"], "latent": shown.latent}
             metadata.append({"answer": len(answers), "side": side, **about})

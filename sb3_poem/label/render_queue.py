@@ -170,12 +170,8 @@ def process_pool(
     n_workers: int, models: Sequence[ModelInfo] = (), packages: Sequence[str] = ()
 ) -> ProcessPoolExecutor:
     """Worker processes, which end with this one, import ``packages``, and load ``models``."""
-    return ProcessPoolExecutor(
-        n_workers,
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_begin_worker,
-        initargs=(tuple(models), tuple(packages)),
-    )
+    spawn, about = multiprocessing.get_context("spawn"), (tuple(models), tuple(packages))
+    return ProcessPoolExecutor(n_workers, spawn, _begin_worker, about)
 
 
 def _begin_worker(models: tuple[ModelInfo, ...], packages: tuple[str, ...]) -> None:

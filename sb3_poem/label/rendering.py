@@ -161,10 +161,8 @@ class Renderer:
 
     def __init__(self, model: Any, env: VecEnv, env_id: str) -> None:
         if env.render_mode != "rgb_array":
-            raise ValueError(
-                '`env` must be made with render_mode="rgb_array" to be shown, but has '
-                f"{env.render_mode!r}"
-            )
+            must = '`env` must be made with render_mode="rgb_array" to be shown'
+            raise ValueError(f"{must}, but has {env.render_mode!r}")
         self.model = model
         self.env = FilmedVecEnv(env)
         self.env_id = env_id

@@ -46,10 +46,8 @@ def replay(
     if options.get("inference", "bayes") == "bayes":
         options["question"] = kind
     elif kind == BEST_OF_FOUR:
-        raise ValueError(
-            f'session {session.id} asks which of four is best, which only inference="bayes" reads, '
-            f"but inference is {options['inference']!r}"
-        )
+        only = f'which only inference="bayes" reads, but inference is {options["inference"]!r}'
+        raise ValueError(f"session {session.id} asks which of four is best, {only}")
     rule = session_rule(options)
     rule.check(model, Setting())
     inference = rule.start(model, inference_rng(seed), Setting())

@@ -51,6 +51,7 @@ ERROR_TITLES = {
     503: "All places are taken",
     507: "This could not be kept",
 }
+SAID_IN_WORDS = (HTTPException, RefusedError, FullError, StorageError)
 LARGEST = 2**63 - 1  # of SQLite's whole numbers
 # Addresses of nobody, to ask the system from which of its own it would speak to the world.
 ELSEWHERE = {socket.AF_INET: "192.0.2.1", socket.AF_INET6: "2001:db8::1"}
@@ -75,6 +76,7 @@ class _Pages:
         self.instructions = Markup(MarkdownIt("commonmark", {"html": False}).render(instructions))
         self.store = sessions.store
         self.templates = jinja2.Environment(loader=jinja2.FileSystemLoader(PAGE), autoescape=True)
+        self.templates.globals |= {"instructions": self.instructions, "max_wish": MAX_WISH}
 
     def application(self, access: Access) -> Starlette:
         store, post = self.store, self.action
@@ -97,9 +99,7 @@ class _Pages:
                 Mount("/static", StaticFiles(directory=PAGE / "static")),
             ],
             middleware=[Middleware(AccessMiddleware, access=access)],
-            exception_handlers=dict.fromkeys(
-                (HTTPException, RefusedError, FullError, StorageError), self.error
-            ),
+            exception_handlers=dict.fromkeys(SAID_IN_WORDS, self.error),
             lifespan=self.lifespan,
         )
         app.router.redirect_slashes = False  # to http://, behind a proxy with TLS
@@ -151,18 +151,11 @@ class _Pages:
         if not self.instructions:
             raise HTTPException(404, "There are no instructions.")
         await self.sessions.prepare(session)
-        values = {"instructions": self.instructions, "token": request.path_params["token"]}
-        return self._html("instructions.html", **values)
+        return self._html("instructions.html", token=request.path_params["token"])
 
     async def page(self, request: Request, session: Session) -> Response:
-        return self._html(
-            "session.html",
-            session=session,
-            description=describe(session.env_id),
-            instructions=self.instructions,
-            token=request.path_params["token"],
-            max_wish=MAX_WISH,
-        )
+        token, description = request.path_params["token"], describe(session.env_id)
+        return self._html("session.html", session=session, token=token, description=description)
 
     async def state(self, _: Request, session: Session) -> Response:
         return JSONResponse(await self.sessions.view(session))
@@ -268,10 +261,9 @@ def bind(host: str, port: int) -> socket.socket:
         raise ValueError(f"--port {port}: must be between 0 and 65535")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     both = family is socket.AF_INET6 and socket.has_dualstack_ipv6()
+    how: dict[str, Any] = {"family": family, "backlog": 128, "dualstack_ipv6": both}
     try:
-        return socket.create_server(
-            (host.strip("[]"), port), family=family, backlog=128, dualstack_ipv6=both
-        )
+        return socket.create_server((host.strip("[]"), port), **how)
     except OSError as error:
         raise OSError(f"--host {host} --port {port}: {error.strerror or error}") from error
 
@@ -294,9 +286,8 @@ class BackgroundServer:
         self._listener = bind("127.0.0.1", port)
         self.port: int = self._listener.getsockname()[1]
         self._server = make_server(app, "127.0.0.1", self.port, deadline)
-        self._thread = threading.Thread(
-            target=self._server.run, args=([self._listener],), daemon=True
-        )
+        run = partial(self._server.run, [self._listener])
+        self._thread = threading.Thread(target=run, daemon=True)
         self._thread.start()
         give_up = time.monotonic() + 10.0
         while not self._server.started:

@@ -164,9 +164,9 @@ class SessionManager:
         """What a turn is made from; refuses a session whose model is not this server's."""
         info = self.model(session.model)
         if info is None or info.env_id != session.env_id:
+            needs = f"the model {session.model!r} in {session.env_id!r}"
             raise RefusedError(
-                f"this session needs the model {session.model!r} in {session.env_id!r}, "
-                "which this server was not started with"
+                f"this session needs {needs}, which this server was not started with"
             )
         since = time.monotonic() - AT_WORK_SECONDS
         at_work = sum(active.seen > since for active in list(self._active.values()))
@@ -203,10 +203,8 @@ class SessionManager:
                     self.queue.cancel(job)
                 del self._active[number]
         if len(self._active) >= self.max_sessions:
-            raise FullError(
-                f"{self.max_sessions} people are at work already, which is as many as this server "
-                "takes; come later"
-            )
+            all_places = "which is as many as this server takes; come later"
+            raise FullError(f"{self.max_sessions} people are at work already, {all_places}")
 
     def _begin_turn(self, session: Session, answered: int, kind: str) -> None:
         active = self._active[session.id]

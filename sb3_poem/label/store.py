@@ -411,10 +411,8 @@ class Store:
             scripts = {0: SCHEMA + ANSWERS_SCHEMA, 3: FROM_VERSION_3, SCHEMA_VERSION: ""}
             scripts |= dict.fromkeys((1, 2), FROM_VERSION_2 + FROM_VERSION_3)
             if version not in scripts:
-                raise ValueError(
-                    f"{self.path} is a store of version {version}; "
-                    f"this program reads {SCHEMA_VERSION}"
-                )
+                reads = f"this program reads {SCHEMA_VERSION}"
+                raise ValueError(f"{self.path} is a store of version {version}; {reads}")
             for statement in scripts[version].split(";"):
                 execute(statement)
             execute(f"PRAGMA user_version = {SCHEMA_VERSION}")

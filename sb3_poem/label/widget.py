@@ -51,19 +51,16 @@ class LabelWidget:
         port: int = 0,
     ) -> None:
         if not isinstance(adapter, PreferenceAdapter):
-            raise TypeError(
-                f"`adapter` must be a PreferenceAdapter, but is a {type(adapter).__name__}"
-            )
+            kind = type(adapter).__name__
+            raise TypeError(f"`adapter` must be a PreferenceAdapter, but is a {kind}")
         if adapter.answers or adapter.pending is not None:
             raise ValueError("`adapter` has been asked already; give the widget a fresh one")
         if adapter.library is not None:
             raise ValueError("`adapter` asks from a library; the page shows new rollouts")
-        self.adapter = adapter
-        self.height = height
+        self.adapter, self.height = adapter, height
         env_id = getattr(adapter.model, "env_id", None) or "?"
-        start = {
-            name: value for name, value in adapter.to_dict().items() if name not in CONVERSATION
-        }
+        data = adapter.to_dict()
+        start = {name: value for name, value in data.items() if name not in CONVERSATION}
         renderer = Renderer(adapter.model, adapter.env, env_id)
 
         def make(request: TurnRequest) -> Turn:
@@ -81,13 +78,10 @@ class LabelWidget:
         queue = RenderQueue(1, lambda: self._thread, make)
         info = ModelInfo("notebook", Path(), env_id)
         options = {**adapter.rule.to_dict(), "question": adapter.rule.question}
-        n_queries = adapter.n_queries
-        sessions = SessionManager(
-            self._store, queue, [info], options, n_queries, 1, load=lambda _: adapter.model
-        )
-        self._session, token = self._store.create_session(
-            info.name, env_id, adapter.seed, options, n_queries, source="notebook"
-        )
+        how = (options, adapter.n_queries)
+        sessions = SessionManager(self._store, queue, [info], *how, 1, load=lambda _: adapter.model)
+        about = (info.name, env_id, adapter.seed, *how)
+        self._session, token = self._store.create_session(*about, source="notebook")
         self._server = BackgroundServer(make_app(sessions, Access(embedded=True)), port)
         self.url = f"http://127.0.0.1:{self._server.port}/s/{token}"
 
@@ -102,10 +96,8 @@ class LabelWidget:
         answered = len(store.answers(session))
         turn = store.turn(session, "question", answered) or store.turn(session, "result", answered)
         if turn is None:
-            raise RuntimeError(
-                "the page is still preparing what follows from the last answer; try again in a "
-                "moment"
-            )
+            preparing = "the page is still preparing what follows from the last answer"
+            raise RuntimeError(f"{preparing}; try again in a moment")
         data = store.adapter_data(turn["id"])
         self.adapter.restore({**data.pop("state"), **data})
         return self.adapter
