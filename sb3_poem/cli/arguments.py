@@ -79,8 +79,7 @@ def build_parser() -> argparse.ArgumentParser:
         "after each.",
     )
     _add_adapt_arguments(adapt)
-    told = "List the trained models that ship."
-    _add_command(commands, "models", "list the trained models that ship", told)
+    _add_command(commands, "models", "list the trained models that ship")
     label = _add_command(
         commands,
         "label --model HalfCheetahVel --port 8000",
@@ -97,7 +96,8 @@ def _add_command(
 ) -> argparse.ArgumentParser:
     """Add the command that the example begins with, ``of`` another one if it is a part."""
     epilog = f"example: sb3-poem {of}{example}"
-    name, texts = example.split()[0], {"help": summary, "description": description}
+    told = description or f"{summary[0].upper()}{summary[1:]}."
+    name, texts = example.split()[0], {"help": summary, "description": told}
     parser: argparse.ArgumentParser = commands.add_parser(name, epilog=epilog, **texts)
     return parser
 
@@ -282,8 +282,7 @@ def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
         commands,
         "export --out answers.jsonl answers.parquet",
         "write all answers as a data set",
-        "Write all answers.",
-        "label ",
+        of="label ",
     )
     store += f" (default: {DEFAULT_STORE})"
     _file(export, "--store", store, "FOLDER", **own)
@@ -300,7 +299,7 @@ def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
         "feed recorded answers to another model or rule",
         "Feed the recorded answers to a model and a rule, and say how well these would have "
         "foretold them.",
-        "label ",
+        of="label ",
     )
     _file(replay, "--store", store, "FOLDER", **own)
     told = "a model's .zip, a pretrained folder, or a shipped model (default: each session's own)"

@@ -46,14 +46,15 @@ class Priority(IntEnum):
 
 @dataclass(eq=False)
 class Job:
-    """A turn that is being made, or will be; its priority may change while it waits."""
+    """A turn that is being made, or will be, unless ``done`` is cancelled; its priority may change
+    while it waits.
+    """
 
     request: TurnRequest
     priority: Priority
     done: asyncio.Future[Turn] = field(
         default_factory=lambda: asyncio.get_running_loop().create_future()
     )
-    cancelled: bool = False
 
 
 class RenderQueue:
@@ -86,12 +87,10 @@ class RenderQueue:
 
     def cancel(self, job: Job) -> None:
         """Nobody will want a job's turn: do not start it, or stop it soon, and delete its video."""
-        job.cancelled = True
-        if job in self._waiting:
-            self._waiting.remove(job)
-            job.done.cancel()
-        elif job.done.done():
+        if not job.done.cancel():  # it is made
             job.request.video.unlink(missing_ok=True)
+        elif job in self._waiting:
+            self._waiting.remove(job)
         else:
             job.request.marker.unlink(missing_ok=True)
 
@@ -122,10 +121,7 @@ class RenderQueue:
         try:
             request.marker.touch()
             turn = await self._attempt(request)
-        except asyncio.CancelledError:
-            job.done.cancel()
-            raise
-        except RenderCancelledError:
+        except (asyncio.CancelledError, RenderCancelledError):
             job.done.cancel()
             return
         except Exception as error:
@@ -137,9 +133,9 @@ class RenderQueue:
             return
         finally:
             request.marker.unlink(missing_ok=True)
-        if job.cancelled:
+        if job.done.cancelled():
             request.video.unlink(missing_ok=True)
-        if not job.done.done():
+        else:
             job.done.set_result(turn)
 
     async def _attempt(self, request: TurnRequest, attempts: int = ATTEMPTS) -> Turn:
