@@ -44,7 +44,6 @@ def adapt(model: str | Path, name: str, out: Path, *arguments: object) -> None:
 
 
 def main() -> None:
-    """Run the demonstration."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     what = "folder for what is written (default: %(default)s)"
     parser.add_argument("--out", type=Path, default=Path("out"), help=what)

@@ -48,7 +48,6 @@ DEFAULT_TASKS = 30
 
 
 def run_adapt(arguments: argparse.Namespace) -> int:
-    """Run the command, and return the exit status."""
     check_output("--json", arguments.json, (".json",))
     check_output("--plot", arguments.plot, (".png", ".pdf", ".svg"))
     check_output("--video", arguments.video, (".mp4", ".gif"))

@@ -53,17 +53,10 @@ def _run(arguments: argparse.Namespace) -> int:
     library = _library(arguments, arguments.device, arguments.num_threads)
     _check_models(arguments.model, library, arguments.families or suite.families, seeds)
     store = Store(arguments.store) if not arguments.list or arguments.store.exists() else None
-    plan = make_plan(
-        suite,
-        library,
-        store,
-        arguments.families,
-        arguments.methods,
-        seeds,
-        Budget(arguments.tasks or suite.budget.tasks, arguments.episodes or suite.budget.episodes),
-        training,
-        arguments.snapshots,
-    )
+    usual = suite.budget
+    budget = Budget(arguments.tasks or usual.tasks, arguments.episodes or usual.episodes)
+    about = (suite, library, store, arguments.families, arguments.methods, seeds)
+    plan = make_plan(*about, budget, training, arguments.snapshots)
     if store is None or arguments.list:
         print("\n".join(describe(plan, library)))
         return 0

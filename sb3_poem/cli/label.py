@@ -17,7 +17,6 @@ AUTH_VARIABLE = "SB3_POEM_AUTH"
 
 
 def run_label(arguments: argparse.Namespace) -> None:
-    """Run the command."""
     commands = {"export": run_export, "replay": run_replay, None: run_page}
     commands[arguments.label_command](arguments)
 
@@ -108,7 +107,6 @@ def read_password(auth: str | None, file: Path | None) -> tuple[str | None, str 
 
 
 def read_instructions(file: Path | None) -> str:
-    """Read what people are told first."""
     if file is None:
         return ""
     try:
@@ -121,7 +119,6 @@ def read_instructions(file: Path | None) -> str:
 
 
 def run_export(arguments: argparse.Namespace) -> None:
-    """Write all answers."""
     from sb3_poem.label.export import export
     from sb3_poem.label.minari_export import export_minari
 

@@ -150,12 +150,10 @@ class ModelInfo:
 
     @property
     def description(self) -> Description:
-        """The family in words."""
         return describe(self.env_id)
 
     @property
     def family(self) -> str:
-        """The environment's name, without namespace and version."""
         return family_of(self.env_id)
 
 

@@ -79,7 +79,6 @@ class RenderQueue:
             self._executor.submit(os.getpid)
 
     def submit(self, request: TurnRequest, priority: Priority) -> Job:
-        """Have a turn made."""
         job = Job(request, priority)
         self._waiting.append(job)
         self._start_jobs()

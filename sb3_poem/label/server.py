@@ -296,7 +296,6 @@ class BackgroundServer:
             time.sleep(0.01)
 
     def close(self) -> None:
-        """Stop it."""
         self._server.should_exit = True
         self._thread.join(timeout=10.0)
         self._listener.close()

@@ -85,15 +85,9 @@ UPDATE turns SET trajectories = json_object('left', json(trajectories), 'right',
     json(right_trajectory)) WHERE trajectories IS NOT NULL;
 ALTER TABLE turns DROP COLUMN right_trajectory;
 """
-# What was asked about, where the waiting question stands.
-ASK_AGAIN = """
-INSERT INTO turns (session, kind, number, state, trajectories, belief, latent, video, fps, frames,
-    created, repeats)
-SELECT waiting.session, waiting.kind, waiting.number, waiting.state, asked.trajectories,
-    waiting.belief, waiting.latent, asked.video, asked.fps, asked.frames, waiting.dropped,
-    asked.number
-FROM turns AS waiting, turns AS asked WHERE waiting.id = :waiting AND asked.id = :asked
-"""
+# Of a question that is asked again: where the conversation stands, and what is shown.
+STANDS = ("session", "kind", "number", "state", "belief", "latent")
+SHOWS = ("trajectories", "video", "fps", "frames")
 
 
 class RefusedError(ValueError):
@@ -314,8 +308,12 @@ class Store:
                 raise RefusedError(MOVED_ON)
             number = json.loads(waiting["belief"] or "{}").get("contradicted")
             _insist(number is not None, "no answer is contradicted by the others")
-            execute("UPDATE turns SET dropped = ? WHERE id = ?", (time.time(), question))
-            execute(ASK_AGAIN, {"waiting": question, "asked": answers[number]["question"]})
+            stands: Any = self.whole_turn(question)
+            shows: Any = self.whole_turn(answers[number]["question"])
+            again = {name: stands[name] for name in STANDS} | {name: shows[name] for name in SHOWS}
+            now = time.time()
+            execute("UPDATE turns SET dropped = ? WHERE id = ?", (now, question))
+            self._insert("turns", created=now, repeats=shows["number"], **again)
 
     def undo(self, session: int, answered: int) -> None:
         """Take the last of ``answered`` answers back, as many as there were where it was asked for;
