@@ -63,7 +63,7 @@ class _Active:
     retry_at: float = 0.0
 
 
-@dataclass
+@dataclass(eq=False)
 class SessionManager:
     """All sessions of a server. Its methods belong to one event loop.
 
