@@ -1,58 +1,33 @@
 """The results: one SQLite file, one row per finished cell."""
 
-from __future__ import annotations
-
 import json
+import sqlite3
 import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
-
-import sqlalchemy as sa
-from sqlalchemy.dialects.sqlite import insert
-from sqlalchemy.pool import NullPool
-from sqlalchemy.schema import CreateTable
+from typing import Any, Self
 
 from sb3_poem import __version__
 
 SCHEMA = "3"
 BUSY_SECONDS = 120
-
-
-class _Packed(sa.types.TypeDecorator[dict[str, Any]]):
-    """JSON, compressed: a record's result is mostly a matrix of returns."""
-
-    impl = sa.LargeBinary
-    cache_ok = True
-
-    def process_bind_param(self, value: Any, dialect: sa.Dialect) -> bytes:
-        return zlib.compress(json.dumps(value, sort_keys=True, allow_nan=False).encode(), 9)
-
-    def process_result_value(self, value: Any, dialect: sa.Dialect) -> dict[str, Any]:
-        return json.loads(zlib.decompress(value))
-
-
-_METADATA = sa.MetaData()
-_ABOUT = sa.Table(
-    "about",
-    _METADATA,
-    sa.Column("name", sa.String, primary_key=True),
-    sa.Column("value", sa.String, nullable=False),
-)
-_CELLS = sa.Table(
-    "cells",
-    _METADATA,
-    sa.Column("key", sa.String, primary_key=True),
-    sa.Column("family", sa.String, nullable=False),
-    sa.Column("method", sa.String, nullable=False),
-    sa.Column("seed", sa.Integer, nullable=False),
-    sa.Column("created", sa.String, nullable=False),
-    sa.Column("identity", _Packed, nullable=False),
-    sa.Column("result", _Packed, nullable=False),
-    sa.Column("provenance", _Packed, nullable=False),
-)
+TABLES = """
+CREATE TABLE IF NOT EXISTS about (name TEXT PRIMARY KEY NOT NULL, value TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS cells (
+    key TEXT PRIMARY KEY NOT NULL,
+    family TEXT NOT NULL,
+    method TEXT NOT NULL,
+    seed INTEGER NOT NULL,
+    created TEXT NOT NULL,
+    identity BLOB NOT NULL,
+    result BLOB NOT NULL,
+    provenance BLOB NOT NULL
+);
+"""
+#: Columns that hold JSON, compressed: a result is mostly a matrix of returns
+PACKED = ("identity", "result", "provenance")
 
 
 @dataclass(frozen=True)
@@ -89,14 +64,12 @@ class Store:
                     f"--store {path}: there is no such file; `sb3-poem benchmark run` makes it"
                 )
             self.path.parent.mkdir(parents=True, exist_ok=True)
-        patience = {"timeout": BUSY_SECONDS}
-        url = f"sqlite:///{self.path}"
-        self._engine = sa.create_engine(url, poolclass=NullPool, connect_args=patience)
+        self._database = sqlite3.connect(self.path, timeout=BUSY_SECONDS)
         try:
-            about = self._open(create)
-        except sa.exc.DatabaseError as error:
+            about = self._about(create)
+        except sqlite3.DatabaseError as error:
             raise ValueError(
-                f"--store {path} cannot be used as a store of the benchmark: {error.orig}"
+                f"--store {path} cannot be used as a store of the benchmark: {error}"
             ) from error
         if about.get("schema") != SCHEMA:
             raise ValueError(
@@ -105,52 +78,56 @@ class Store:
                 f"{SCHEMA!r}; use that version, or another file"
             )
 
-    def _open(self, create: bool) -> dict[str, str]:
+    def _about(self, create: bool) -> dict[str, str]:
         """What the file says about itself; it is made, or completed, first."""
-        with self._engine.connect() as connection:
-            tables = set(sa.inspect(connection).get_table_names())
+        tables = {name for (name,) in self._database.execute("SELECT name FROM sqlite_master")}
         if "about" not in tables and (tables or not create):
             raise ValueError(
                 f"--store {self.path} is a database of another program: it has no table `about`"
             )
-        with self._engine.begin() as connection:
-            if create:  # another process may be doing the same: what is there already stays
-                for table in _METADATA.sorted_tables:
-                    connection.execute(CreateTable(table, if_not_exists=True))
-                facts = {"schema": SCHEMA, "version": __version__}
-                rows = [{"name": name, "value": value} for name, value in facts.items()]
-                connection.execute(insert(_ABOUT).on_conflict_do_nothing(), rows)
-            return {row.name: row.value for row in connection.execute(sa.select(_ABOUT))}
+        if create:  # another process may be doing the same: what is there already stays
+            facts = {"schema": SCHEMA, "version": __version__}.items()
+            with self._database:
+                self._database.executescript(TABLES)
+                self._database.executemany("INSERT OR IGNORE INTO about VALUES (?, ?)", facts)
+        return dict(self._database.execute("SELECT name, value FROM about"))
 
-    def __enter__(self) -> Store:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:
-        self._engine.dispose()
+        self._database.close()
 
     def __contains__(self, key: str) -> bool:
         return key in self.keys()
 
     def keys(self) -> set[str]:
-        with self._engine.connect() as connection:
-            return set(connection.execute(sa.select(_CELLS.c.key)).scalars())
+        return {key for (key,) in self._database.execute("SELECT key FROM cells")}
 
     def add(self, record: Record) -> bool:
         """Keep a finished cell, and tell whether it is new; if not, what is there stays."""
-        row = record.to_dict()
+        row = record.to_dict() | {name: _pack(getattr(record, name)) for name in PACKED}
         row["created"] = record.created or datetime.now(UTC).isoformat(timespec="seconds")
-        with self._engine.begin() as connection:
-            return connection.execute(insert(_CELLS).on_conflict_do_nothing(), row).rowcount == 1
+        names = f"({', '.join(row)}) VALUES (:{', :'.join(row)})"
+        with self._database:
+            added = self._database.execute(f"INSERT OR IGNORE INTO cells {names}", row)
+        return added.rowcount == 1
 
     def records(self, keys: Iterable[str] | None = None) -> Iterator[Record]:
         """Finished cells, in the order of their names; all, or those of some keys."""
         wanted = None if keys is None else set(keys)
-        order = (_CELLS.c.family, _CELLS.c.method, _CELLS.c.seed, _CELLS.c.key)
-        with self._engine.connect() as connection:
-            rows = connection.execute(sa.select(_CELLS).order_by(*order)).mappings().all()
-        for row in rows:
+        order = "SELECT * FROM cells ORDER BY family, method, seed, key"
+        found = self._database.execute(order)
+        names = [column[0] for column in found.description]
+        for values in found.fetchall():
+            row = dict(zip(names, values, strict=True))
             if wanted is None or row["key"] in wanted:
-                yield Record(**row)
+                packed = {name: json.loads(zlib.decompress(row[name])) for name in PACKED}
+                yield Record(**row | packed)
+
+
+def _pack(value: dict[str, Any]) -> bytes:
+    return zlib.compress(json.dumps(value, sort_keys=True, allow_nan=False).encode(), 9)

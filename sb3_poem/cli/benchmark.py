@@ -26,14 +26,7 @@ _say = partial(print, flush=True)
 
 def run_benchmark(arguments: argparse.Namespace) -> int:
     """Run the command, and return the exit status: 1 if a cell failed or differs."""
-    try:
-        return {"run": _run, "report": _report, "verify": _verify}[arguments.part](arguments)
-    except ModuleNotFoundError as error:
-        if error.name != "sqlalchemy":
-            raise
-        raise ValueError(
-            f"the benchmark's packages are missing: pip install 'sb3_poem[benchmark]' ({error})"
-        ) from error
+    return {"run": _run, "report": _report, "verify": _verify}[arguments.part](arguments)
 
 
 def _run(arguments: argparse.Namespace) -> int:

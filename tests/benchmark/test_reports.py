@@ -229,7 +229,7 @@ def test_the_table_of_what_ships(tmp_path: Path) -> None:
             rates = [0.5] * 4 if known else [[0.25] * 7] * 4
             extra = {**facts, "task_success_rates": rates, **(matrix(cell) if known else {})}
             store.add(finished(cell, ladder, **extra))
-    text, _ = make_report(store, ["shipped"])
+        text, _ = make_report(store, ["shipped"])
     # Seeds' means are -25 and -20; tasks are 10 apart, so their error is 12.9 / 2.
     row = next(line for line in text.splitlines() if line.startswith("| POEM (Bayes) | 2 |"))
     assert row.split(" | ")[2:6] == ["-22.5 ± 3.5", "6.5", "-21.5 ± 3.5", "6.5"]
