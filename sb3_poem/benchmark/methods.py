@@ -16,6 +16,18 @@ DEFAULT_QUERY_RULE = {"paper": "worst-case", "bayes": "information-gain"}
 ANOLES = {"ANOLE": "berlekamp", "ANOLE-greedy": "greedy", "ANOLE-random": "random"}
 CANDIDATES = {"prior": "prior", "aggregate": "training tasks"}
 INFERENCE_LABELS = {"paper": "POEM (paper)", "bayes": "POEM (Bayes)"}
+#: What ends the name of a method, and its label, that takes candidates from the training tasks
+FORMS: dict[str, tuple[str, dict[str, Any]]] = {
+    "": ("", {}),
+    "-aggregate": (", training tasks", {"candidates": "aggregate"}),
+}
+ABLATIONS = {
+    "poem-inner": "inner product",
+    "poem-cosine": "cosine",
+    "poem-pearl-context": "PEARL's context",
+    "poem-no-preferences": "no preference loss",
+    **{f"poem-d{d}": f"d = {d}" for d in LATENT_DIMS},
+}
 
 # Outer steps of MAML-reward's meta-training, with what differs for a family.
 META_ITERATIONS = 500
@@ -114,22 +126,31 @@ VARIANTS = {
 
 
 def _methods() -> Iterator[Method]:
-    yield Method("poem-bayes", "POEM (Bayes)", "poem", "Bayes", paper_row="POEM")
-    yield Method("poem-paper", "POEM (paper)", "poem", "Paper", paper_row="POEM")
-    for name, strategy in ANOLES.items():
-        yield Method(name.lower(), name, "pearl", "ANOLE", {"strategy": strategy}, name)
+    for suffix, (of, own) in FORMS.items():
+        for rule, poem in sorted(INFERENCE_LABELS.items()):
+            row = None if suffix else "POEM"
+            yield Method(f"poem-{rule}{suffix}", poem + of, "poem", rule.capitalize(), own, row)
+        for name, strategy in ANOLES.items():
+            options, row = {"strategy": strategy, **own}, None if suffix else name
+            yield Method(name.lower() + suffix, name + of, "pearl", "ANOLE", options, row)
+        yield Method(f"reward-oracle{suffix}", f"reward oracle{of}", "pearl", "RewardOracle", own)
+        name, label = f"anole-rollouts{suffix}", f"ANOLE on rollouts{of}"
+        options = {"strategy": "berlekamp", **own}
+        yield Method(name, label, "pearl", "ANOLE", options, library=True)
+        name, label = f"pearl-bayes{suffix}", f"Bayes, PEARL's model{of}"
+        options = {"candidates": "prior", "likelihood": "decoder", **own}
+        yield Method(name, label, "pearl", "Bayes", options, library=True)
+        name, label = f"poem-bayes-untold{suffix}", f"POEM (Bayes), not told the noise{of}"
+        yield Method(name, label, "poem", "Bayes", {"noise_model": "infer", **own})
     yield Method("maml-reward", "MAML-reward", "maml-reward", "MAMLReward", paper_row="MAML-reward")
-    yield Method("reward-oracle", "reward oracle", "pearl", "RewardOracle")
     yield Method("known-task", "task known (POEM's policies)", "poem")
     yield Method("known-task-pearl", "task known (PEARL's policies)", "pearl")
-    yield from _informed()
-    ablations = {
-        "poem-inner": "inner product",
-        "poem-cosine": "cosine",
-        "poem-pearl-context": "PEARL's context",
-        "poem-no-preferences": "no preference loss",
-    }
-    for variant, label in (ablations | {f"poem-d{d}": f"d = {d}" for d in LATENT_DIMS}).items():
+    for source, of in CANDIDATES.items():
+        for likelihood, by in (("similarity", "S"), ("decoder", "decoder")):
+            options = {"candidates": source, "likelihood": likelihood}
+            name, label = f"poem-bayes-{source}-{likelihood}", f"POEM (Bayes), {of}, {by}"
+            yield Method(name, label, "poem", "Bayes", options)
+    for variant, label in ABLATIONS.items():
         yield Method(f"known-task-{variant}", f"task known ({label})", variant)
         for rule, poem in INFERENCE_LABELS.items():
             yield Method(f"{variant}-{rule}", f"{poem}, {label}", variant, rule.capitalize())
@@ -144,43 +165,6 @@ def _methods() -> Iterator[Method]:
             tolerant = {} if epsilon == 0.1 else {"epsilon": epsilon}
             name, label = f"{variant}-paper-epsilon-{epsilon:g}", f"epsilon = {epsilon:g}{of}"
             yield Method(name, label, variant, "Paper", tolerant)
-
-
-def _informed() -> Iterator[Method]:
-    """Methods that are told more, or less, than their default form is."""
-    own = {"candidates": "aggregate"}
-    for rule, poem in INFERENCE_LABELS.items():
-        name, label = f"poem-{rule}-aggregate", f"{poem}, training tasks"
-        yield Method(name, label, "poem", rule.capitalize(), own)
-    for name, strategy in ANOLES.items():
-        options = {"strategy": strategy, **own}
-        yield Method(
-            f"{name.lower()}-aggregate", f"{name}, training tasks", "pearl", "ANOLE", options
-        )
-    yield Method(
-        "reward-oracle-aggregate", "reward oracle, training tasks", "pearl", "RewardOracle", own
-    )
-    for suffix, options, of in (("", {}, ""), ("-aggregate", own, ", training tasks")):
-        asked = {"strategy": "berlekamp", **options}
-        name, label = f"anole-rollouts{suffix}", f"ANOLE on rollouts{of}"
-        yield Method(name, label, "pearl", "ANOLE", asked, library=True)
-        name, label = f"pearl-bayes{suffix}", f"Bayes, PEARL's model{of}"
-        options = {"candidates": "prior", "likelihood": "decoder", **options}
-        yield Method(name, label, "pearl", "Bayes", options, library=True)
-    for source, of in CANDIDATES.items():
-        for likelihood, by in (("similarity", "S"), ("decoder", "decoder")):
-            options = {"candidates": source, "likelihood": likelihood}
-            name, label = f"poem-bayes-{source}-{likelihood}", f"POEM (Bayes), {of}, {by}"
-            yield Method(name, label, "poem", "Bayes", options)
-    untold = {"noise_model": "infer"}
-    yield Method("poem-bayes-untold", "POEM (Bayes), not told the noise", "poem", "Bayes", untold)
-    yield Method(
-        "poem-bayes-untold-aggregate",
-        "POEM (Bayes), not told the noise, training tasks",
-        "poem",
-        "Bayes",
-        {**untold, **own},
-    )
 
 
 METHODS = {method.name: method for method in _methods()}

@@ -30,51 +30,28 @@ rule, how tasks and seeds are drawn), not for what only takes less time, nor for
 whose hyperparameters are in the identity by themselves. 0 stands for all that was recorded before
 revisions were counted.
 """
-TABLE_METHODS = (
-    "poem-bayes",
-    "poem-paper",
-    "anole",
-    "anole-greedy",
-    "anole-random",
-    "maml-reward",
-    "reward-oracle",
-)
+POEMS = ("poem-bayes", "poem-paper")
+ANOLES = ("anole", "anole-greedy", "anole-random")
+TABLE_METHODS = (*POEMS, *ANOLES, "maml-reward", "reward-oracle")
 #: The same with candidates from the training tasks, where a method has candidates, and ANOLE
 #: with questions about rollouts on the new task
 INFORMED_METHODS = (
-    "poem-bayes-aggregate",
-    "poem-paper-aggregate",
-    "anole-aggregate",
-    "anole-greedy-aggregate",
-    "anole-random-aggregate",
-    "anole-rollouts",
-    "anole-rollouts-aggregate",
-    "maml-reward",
-    "reward-oracle-aggregate",
+    *(f"{name}-aggregate" for name in (*POEMS, *ANOLES)),
+    *("anole-rollouts", "anole-rollouts-aggregate", "maml-reward", "reward-oracle-aggregate"),
 )
 #: What makes the difference between the paper's row and the other: rule, candidates, likelihood,
 #: model, preference loss
 PARTS = (
-    "poem-bayes",
-    "poem-paper",
-    "poem-paper-aggregate",
+    *(*POEMS, "poem-paper-aggregate"),
     *(f"poem-bayes-{c}-{s}" for c in ("prior", "aggregate") for s in ("similarity", "decoder")),
-    "pearl-bayes",
-    "pearl-bayes-aggregate",
-    "poem-no-preferences-bayes",
-    "poem-no-preferences-paper",
+    *("pearl-bayes", "pearl-bayes-aggregate"),
+    *("poem-no-preferences-bayes", "poem-no-preferences-paper"),
 )
 #: Methods that are not told how answers err: POEM infers it or does not ask, ANOLE takes a fifth to
 #: be wrong whoever answers
 UNTOLD_METHODS = (
-    "poem-bayes-untold",
-    "poem-bayes-untold-aggregate",
-    "poem-paper",
-    "poem-paper-aggregate",
-    "anole",
-    "anole-aggregate",
-    "anole-rollouts-aggregate",
-    "maml-reward",
+    *("poem-bayes-untold", "poem-bayes-untold-aggregate", "poem-paper", "poem-paper-aggregate"),
+    *("anole", "anole-aggregate", "anole-rollouts-aggregate", "maml-reward"),
 )
 #: Methods whose differences from all others tables show
 SUBJECTS = (
@@ -397,10 +374,9 @@ def family_id(name: str) -> str:
 
 
 _ABLATED = ("poem-inner", "poem-cosine", "poem-pearl-context", "poem-d2", "poem-d10")
-_BOTH = ("poem-bayes", "poem-paper")
-_DESIGNS = (*_BOTH, *(f"{variant}-{rule}" for variant in _ABLATED for rule in ("bayes", "paper")))
+_DESIGNS = (*POEMS, *(f"{variant}-{rule}" for variant in _ABLATED for rule in ("bayes", "paper")))
 # A rule's own way of asking has no name of its own.
-_ASKING = (*_BOTH, *(name for b in _BOTH for q in QUERY_RULES if (name := f"{b}-{q}") in METHODS))
+_ASKING = (*POEMS, *(name for b in POEMS for q in QUERY_RULES if (name := f"{b}-{q}") in METHODS))
 _TABLE = Entry("methods", "Methods", TABLE_METHODS, curves=(EXACT,))
 _INFORMED = Entry("informed", "Methods with candidates from the training tasks", INFORMED_METHODS)
 
@@ -418,7 +394,7 @@ SUITES = {
             "shipped",
             "The models that ship",
             (*PAPER_FAMILIES, "FetchReach", "PointGoal"),
-            (Entry("rules", "Inference rules", _BOTH, shown=(0, 1, 2, 5, 10), by_task=True),),
+            (Entry("rules", "Inference rules", POEMS, shown=(0, 1, 2, 5, 10), by_task=True),),
             ("known-task",),
             snapshots=1,
         ),
@@ -445,7 +421,7 @@ SUITES = {
                     by_inference=True,
                 ),
                 Entry("rules", "Query rules", _ASKING, by_inference=True),
-                Entry("queries", "Number of queries", _BOTH, record_at=tuple(range(21))),
+                Entry("queries", "Number of queries", POEMS, record_at=tuple(range(21))),
             ),
             ("known-task", *(f"known-task-{variant}" for variant in _ABLATED)),
         ),
