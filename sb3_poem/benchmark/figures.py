@@ -75,7 +75,8 @@ def _queries_figure(
     for axes, condition, series in panels:
         for one in series:
             if one.snapshot is None:
-                _draw(axes, one.queries, one.returns.mean(axis=1), one.label, _style(entry, one))
+                by_seed = list(one.returns.mean(axis=1).T)
+                _draw(axes, one.queries, by_seed, one.label, _style(entry, one))
         has_poem = any(METHODS[one.method].variant == "poem" for one in series)
         for reference in selection.references(condition):
             if has_poem and METHODS[reference.method].variant == "poem":
@@ -88,10 +89,11 @@ def _queries_figure(
 def _draw_yardsticks(axes: Axes, reference: Reference, entry: Entry, oracle: OracleSpec) -> None:
     measured = [reference.limits(k, oracle) for k in entry.record_at]
     limits = [np.nan if values is None else float(values.mean()) for values in measured]
-    limit = {"color": "0.25", "linestyle": "--", "label": "limit (POEM's policies)"}
-    known = {"color": "0.5", "linestyle": ":", "label": "task known (POEM's policies)"}
-    axes.plot(entry.record_at, limits, linewidth=1.2, **limit)  # type: ignore[arg-type]
-    axes.axhline(float(reference.known.mean()), linewidth=1.2, **known)  # type: ignore[arg-type]
+    thin: dict[str, Any] = {"linewidth": 1.2}
+    limit = thin | {"color": "0.25", "linestyle": "--", "label": "limit (POEM's policies)"}
+    known = thin | {"color": "0.5", "linestyle": ":", "label": "task known (POEM's policies)"}
+    axes.plot(entry.record_at, limits, **limit)
+    axes.axhline(float(reference.known.mean()), **known)
 
 
 def _samples_figure(
@@ -101,20 +103,16 @@ def _samples_figure(
     last = max(entry.record_at)
     for axes, _, series in panels:
         for method in dict.fromkeys(one.method for one in series):
-            points = [
-                (one.samples, returns.mean(axis=1), one)
-                for one in series
-                if one.method == method and (returns := one.at(last)) is not None
-            ]
-            samples, by_seed, mine = zip(*sorted(points, key=lambda point: point[0]), strict=True)
-            style = _style(entry, mine[0])
+            mine = [one for one in series if one.method == method]
+            mine.sort(key=lambda one: one.samples)
+            by_seed = [one.at(last).mean(axis=1) for one in mine]
+            style, label = _style(entry, mine[0]), mine[0].label
             if len(mine) == 1 and mine[0].snapshot is None:  # not measured along the training
-                level, label = float(by_seed[0].mean()), f"{mine[0].label}, at the end"
-                axes.axhline(
-                    level, color=style["color"], linestyle="-.", linewidth=1.4, label=label
-                )
+                line: dict[str, Any] = {"linestyle": "-.", "linewidth": 1.4}
+                line |= {"color": style["color"], "label": f"{label}, at the end"}
+                axes.axhline(float(by_seed[0].mean()), **line)
             else:
-                _draw(axes, samples, by_seed, mine[0].label, style)
+                _draw(axes, [one.samples for one in mine], by_seed, label, style)
         axes.set_xlabel("environment steps of the training, thousands")
         axes.xaxis.set_major_formatter(lambda steps, position: f"{steps / 1000:g}")
     return _finish(figure, f"{entry.title}, {oracle.label}; return after {last} queries")
@@ -124,31 +122,29 @@ def _tolerance_figure(entry: Entry, found: dict[Condition, list[Series]]) -> Fig
     figure, panels = _grid(entry, {one: series for one, series in found.items() if series}, True)
     for axes, _, series in panels:
         for number, queries in enumerate((1, 5, 10)):
-            points = [
-                (float(METHODS[one.method].options.get("epsilon", 0.1)), returns.mean(axis=1))
-                for one in series
-                if (returns := one.at(queries)) is not None
-            ]
-            if points:
-                epsilons, by_seed = zip(*points, strict=True)
+            epsilons = [METHODS[one.method].options.get("epsilon", 0.1) for one in series]
+            if series:
                 style = {"color": f"C{number}", "marker": MARKERS[number]}
                 label = f"{queries} quer{'ies' if queries > 1 else 'y'}"
-                _draw(axes, epsilons, by_seed, label, style)
+                _draw(
+                    axes, epsilons, [one.at(queries).mean(axis=1) for one in series], label, style
+                )
         axes.set_xlabel("tolerance epsilon")
     return _finish(figure, entry.title)
 
 
-def _draw(axes: Axes, x: Sequence[float], by_seed: Any, label: str, style: dict[str, str]) -> None:
-    """A line with the deviation over seeds: for each x their returns, or (n_seeds, n_points)."""
-    columns = by_seed.T if isinstance(by_seed, np.ndarray) else by_seed
-    means = np.array([column.mean() for column in columns])
-    deviations = np.array([column.std(ddof=1) if len(column) > 1 else 0.0 for column in columns])
-    axes.plot(x, means, markersize=4, linewidth=1.6, label=label, zorder=3, **style)  # type: ignore[arg-type]
+def _draw(
+    axes: Axes, x: Sequence[float], by_seed: list[np.ndarray], label: str, style: dict[str, Any]
+) -> None:
+    """A line with the deviation over seeds, of whose returns there is an array for each x."""
+    means = np.array([returns.mean() for returns in by_seed])
+    deviations = np.array([some.std(ddof=1) if len(some) > 1 else 0.0 for some in by_seed])
+    axes.plot(x, means, markersize=4, linewidth=1.6, label=label, zorder=3, **style)
     bounds = (means - deviations, means + deviations)
     axes.fill_between(x, *bounds, color=style["color"], alpha=0.1, linewidth=0)
 
 
-def _style(entry: Entry, series: Series) -> dict[str, str]:
+def _style(entry: Entry, series: Series) -> dict[str, Any]:
     """With a row for each inference rule the same change looks the same in both."""
 
     def change(method: str) -> str:

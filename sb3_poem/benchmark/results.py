@@ -114,21 +114,18 @@ class Series(_Measured):
         rates = _success_rates(self.records)
         return None if rates is None else rates.mean(axis=(0, 1)).tolist()
 
-    def at(self, queries: int) -> np.ndarray | None:
-        """(n_seeds, n_tasks) after so many answers; None if that was not measured."""
-        return self.returns[:, :, self.queries.index(queries)] if queries in self.queries else None
+    def at(self, queries: int) -> np.ndarray:
+        """(n_seeds, n_tasks) after so many answers."""
+        return self.returns[:, :, self.queries.index(queries)]
 
     def against(self, other: Series, queries: int) -> Comparison | None:
-        """After so many answers, on the seeds that both have; None if there is nothing of it."""
-        seeds = [[record.seed for record in series.records] for series in (self, other)]
-        common = sorted(set(seeds[0]) & set(seeds[1]))
-        mine, theirs = self.at(queries), other.at(queries)
-        if mine is None or theirs is None or not common:
+        """After so many answers, on the seeds that both have; None if there are none."""
+        both = self, other
+        seeds = [[record.seed for record in series.records] for series in both]
+        _, *rows = np.intersect1d(*seeds, return_indices=True)
+        if not len(rows[0]):
             return None
-        one, two = (
-            returns[[own.index(seed) for seed in common]]
-            for returns, own in ((mine, seeds[0]), (theirs, seeds[1]))
-        )
+        one, two = (series.at(queries)[own] for series, own in zip(both, rows, strict=True))
         return compare(one, two)
 
 

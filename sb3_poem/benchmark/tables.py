@@ -27,7 +27,7 @@ TABLE_3: dict[str, dict[str, list[list[int]]]] = json.loads(
 QUERIES = (1, 5, 10)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Row:
     """A method, or a yardstick, after some number of answers; what CSV and JSON hold. For the
     figures see :class:`Summary`.
@@ -47,9 +47,9 @@ class Row:
     method: str
     label: str
     kind: str
-    queries: int | None
-    snapshot: float | None
-    samples: float | None
+    queries: int | None = None
+    snapshot: float | None = None
+    samples: float | None = None
     n_seeds: int
     mean: float
     deviation: float | None = None
@@ -74,9 +74,9 @@ class Table:
     """A table to be printed: title, names of the columns, cells, and notes below."""
 
     title: str
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    notes: tuple[str, ...] = ()
+    header: Sequence[str]
+    rows: Sequence[tuple[str, ...]]
+    notes: Sequence[str] = ()
 
 
 def make_report(
@@ -125,30 +125,30 @@ def make_report(
 
 def suite_rows(selection: Selection) -> list[Row]:
     """Everything of a suite in long form."""
-    return [
-        row
-        for condition in selection.conditions
-        for entry in selection.suite.entries
-        for oracle in entry.oracles
-        for row in _rows(selection, condition, entry, oracle)
-    ]
+    return [row for *_, rows in _each_table(selection) for row in rows]
 
 
 def suite_tables(selection: Selection) -> list[Table]:
     """A table for each family, comparison and oracle; and one of the models."""
-    tables: list[Table] = []
+    tables: dict[Condition, list[Table]] = {one: [] for one in selection.conditions}
+    for condition, entry, oracle, rows in _each_table(selection):
+        some = tables[condition]
+        if rows:
+            some.append(_comparison(condition, entry, oracle, rows))
+        if any(row.kind == "difference" for row in rows):
+            some.append(_differences(condition, entry, oracle, rows))
+        if entry.by_task and any(row.success_rate is not None for row in rows):
+            some.append(_successes(condition, entry, rows))
+    return [one for each in tables for one in (*tables[each], *_models(selection, each))]
+
+
+def _each_table(
+    selection: Selection,
+) -> Iterator[tuple[Condition, Entry, OracleSpec, list[Row]]]:
     for condition in selection.conditions:
         for entry in selection.suite.entries:
             for oracle in entry.oracles:
-                rows = list(_rows(selection, condition, entry, oracle))
-                if rows:
-                    tables.append(_comparison(condition, entry, oracle, rows))
-                if any(row.kind == "difference" for row in rows):
-                    tables.append(_differences(condition, entry, oracle, rows))
-                if entry.by_task and any(row.success_rate is not None for row in rows):
-                    tables.append(_successes(condition, entry, rows))
-        tables += _models(selection, condition)
-    return tables
+                yield condition, entry, oracle, list(_rows(selection, condition, entry, oracle))
 
 
 def format_tables(title: str, tables: Sequence[Table], kind: str) -> str:
@@ -174,8 +174,8 @@ def paper_figure(family: str, row: str | None, queries: int) -> tuple[float, flo
     figures = TABLE_3.get(family, {}).get(row or "")
     if figures is None or queries not in QUERIES:
         return None
-    mean, deviation = figures[QUERIES.index(queries)]
-    return float(mean), float(deviation)
+    mean, deviation = map(float, figures[QUERIES.index(queries)])
+    return mean, deviation
 
 
 def _rows(
@@ -217,7 +217,7 @@ def _rows(
     for reference in selection.references(condition):
         if METHODS[reference.method].variant not in variants:
             continue
-        of = {**place, "method": reference.method, "snapshot": None, "samples": None}
+        of = {**place, "method": reference.method}
         limit = reference.label.replace("task known", "limit")
         for queries in entry.record_at:
             measured = reference.limits(queries, oracle)
@@ -225,7 +225,7 @@ def _rows(
                 values = _over_seeds(measured)
                 yield Row(**of, label=limit, kind="limit", queries=queries, **values)
         values = {**_over_seeds(reference.known), "success_rate": reference.success_rate}
-        yield Row(**of, label=reference.label, kind="known", queries=None, **values)
+        yield Row(**of, label=reference.label, kind="known", **values)
 
 
 def _paired(place: dict[str, Any], entry: Entry, found: dict[str, Series]) -> Iterator[Row]:
@@ -235,13 +235,12 @@ def _paired(place: dict[str, Any], entry: Entry, found: dict[str, Series]) -> It
         for other, theirs in found.items():
             if other in subjects[: position + 1]:
                 continue
-            mine = found[name]
+            of = {**place, "method": name, "label": found[name].label, "against": other}
             for k in filter(entry.record_at.__contains__, entry.shown):
-                versus = mine.against(theirs, k)
+                versus = found[name].against(theirs, k)
                 if versus is not None:
-                    of = {**place, "method": name, "label": mine.label, "against": other}
-                    of |= {"snapshot": None, "samples": None, "claim": versus.claim}
-                    yield Row(**of, kind="difference", queries=k, **vars(versus))
+                    of |= {"queries": k, "claim": versus.claim, **vars(versus)}
+                    yield Row(**of, kind="difference")
 
 
 def _over_seeds(values: np.ndarray) -> dict[str, Any]:
@@ -267,16 +266,11 @@ def _comparison(
         for label in dict.fromkeys(row.label for row in final if row.kind == kind):
             mine = {row.queries: row for row in final if row.label == label and row.kind == kind}
             cells = [label, str(next(iter(mine.values())).n_seeds)]
-            for k in queries:
-                row = mine.get(k)
-                if row is None:
-                    cells += [""] * (2 + has_paper)
-                    continue
+            for row in map(mine.__getitem__, queries):
                 interval = (row.iqm_low, row.iqm_high)
                 spread = _number(row.task_error) if entry.by_task else _number(row.iqm, *interval)
                 cells += [_number(row.mean, row.deviation), spread]
-                if has_paper:
-                    cells.append(_number(row.paper_mean, row.paper_deviation))
+                cells += [_number(row.paper_mean, row.paper_deviation)] * has_paper
             body.append(tuple(cells))
     also = (
         "standard error over tasks of their means over seeds"
@@ -295,7 +289,7 @@ def _comparison(
             "oracle, which sees more than answers."
         )
     title = f"{condition}; {entry.title.lower()}, {oracle.label}"
-    return Table(title, tuple(header), tuple(body), tuple(notes))
+    return Table(title, header, body, notes)
 
 
 def _differences(
@@ -309,13 +303,9 @@ def _differences(
     body = []
     paired = {(r.label, r.against, r.queries): r for r in rows if r.kind == "difference"}
     for label, against in dict.fromkeys(key[:2] for key in paired):
-        some = [paired.get((label, against, k)) for k in queries]
-        seeds = max(row.n_seeds for row in some if row is not None)
-        cells = [label, METHODS[against or ""].label, str(seeds)]
+        some = [paired[label, against, k] for k in queries]
+        cells = [label, METHODS[against or ""].label, str(some[0].n_seeds)]
         for row in some:
-            if row is None:
-                cells += [""] * 4
-                continue
             chance = _shown(row.probability, ".2f")
             if row.probability_low is not None:
                 chance += f" [{row.probability_low:.2f}, {row.probability_high:.2f}]"
@@ -329,7 +319,7 @@ def _differences(
         "the mean say so.",
     )
     title = f"{condition}; differences of {entry.title.lower()}, {oracle.label}"
-    return Table(title, tuple(header), tuple(body), notes)
+    return Table(title, header, body, notes)
 
 
 def _successes(condition: Condition, entry: Entry, rows: Sequence[Row]) -> Table:
@@ -339,7 +329,7 @@ def _successes(condition: Condition, entry: Entry, rows: Sequence[Row]) -> Table
         body.append((label, *(f"{mine[k]:.2f}" for k in entry.shown)))
     notes = [f"{row.label}: {row.success_rate:.2f}" for row in rows if row.kind == "known"]
     header = ("method", *map(_after, entry.shown))
-    return Table(f"{condition}; success rates", header, tuple(body), tuple(notes))
+    return Table(f"{condition}; success rates", header, body, notes)
 
 
 def _models(selection: Selection, condition: Condition) -> list[Table]:
@@ -364,14 +354,9 @@ def _models(selection: Selection, condition: Condition) -> list[Table]:
     if not any(columns["CPU seconds"]):
         del columns["CPU seconds"]
     machines = sorted({record.provenance["machine"] for record in records})
-    return [
-        Table(
-            f"{condition.family}: the models{condition.version}",
-            tuple(columns),
-            tuple(zip(*columns.values(), strict=True)),
-            (f"Measured on: {'; '.join(machines)}.",),
-        )
-    ]
+    title, note = f"{condition.family}: the models{condition.version}", "; ".join(machines)
+    rows = list(zip(*columns.values(), strict=True))
+    return [Table(title, list(columns), rows, [f"Measured on: {note}."])]
 
 
 def _after(k: int) -> str:
