@@ -1,9 +1,11 @@
-"""One cell: load the model, adapt, measure, and note everything."""
+"""One cell: load the model, adapt, measure, and note everything; and again, to see whether it comes
+to the same.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
@@ -21,8 +23,8 @@ from sb3_poem.baselines.anole import has_experience
 from sb3_poem.baselines.fragments import default_fragment_length
 from sb3_poem.benchmark.models import ModelLibrary, Say
 from sb3_poem.benchmark.provenance import provenance
-from sb3_poem.benchmark.store import Record
-from sb3_poem.benchmark.suites import Cell, OracleSpec
+from sb3_poem.benchmark.store import Record, Store
+from sb3_poem.benchmark.suites import REVISION, Cell, OracleSpec
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
@@ -31,6 +33,8 @@ from sb3_poem.common.vec_env import make_task_vec_env
 SELECTION_EPISODES = 3
 SEED_STRIDE = 10_000
 DIGITS = 4  # of returns in the store
+#: What a result holds that is another at each run
+TIMES = ("seconds", "training_seconds", "training_cpu_seconds")
 
 
 def run_cell(cell: Cell, library: ModelLibrary, say: Say = print) -> Record:
@@ -53,8 +57,7 @@ def run_cell(cell: Cell, library: ModelLibrary, say: Say = print) -> Record:
     else:
         samples, updates = model.num_timesteps, model._n_updates
     result |= {"training_samples": int(samples), "updates": int(updates)}
-    result["training_seconds"] = training.get("seconds")
-    result["training_cpu_seconds"] = training.get("cpu_seconds")
+    result |= {f"training_{name}": training.get(name) for name in ("seconds", "cpu_seconds")}
     place = library.workplace
     about = {**provenance(), "device": place.device, "num_threads": place.num_threads}
     which = (cell.key, cell.family, cell.method, cell.seed, cell.identity())
@@ -104,17 +107,10 @@ def _measure_adaptation(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) 
             fragments = rollout_fragments(model, env, 2 * rule.n_pairs, length, cell.seed)
         shown = {"fragments": source, "fragment_length": length}
         rolled_out = 0  # on the new tasks
-    evaluation = evaluate_adaptation(
-        model,
-        env,
-        tasks,
-        make_oracle_factory(cell.oracle),
-        rule=rule,
-        record_at=budget.record_at,
-        n_episodes=budget.episodes,
-        seed=_episode_seed(cell),
-        library=fragments,
-    )
+    how: dict[str, Any] = {"rule": rule, "record_at": budget.record_at, "library": fragments}
+    how |= {"n_episodes": budget.episodes, "seed": _episode_seed(cell)}
+    oracles = make_oracle_factory(cell.oracle)
+    evaluation = evaluate_adaptation(model, env, tasks, oracles, **how)
     answers = [[answer.value for answer in row] for row in evaluation.preferences]
     data: dict[str, Any] = {
         "queries": list(evaluation.record_at),
@@ -136,14 +132,8 @@ def _measure_known(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) -> di
     """
     budget = cell.budget
     episodes = min(budget.episodes, SELECTION_EPISODES)
-    known = known_task_return(
-        model,
-        env,
-        tasks,
-        n_episodes=budget.episodes,
-        seed=_episode_seed(cell),
-        selection_episodes=episodes,
-    )
+    how: dict[str, Any] = {"n_episodes": budget.episodes, "selection_episodes": episodes}
+    known = known_task_return(model, env, tasks, seed=_episode_seed(cell), **how)
     data: dict[str, Any] = {
         "tasks": _rounded(tasks),
         "task_returns": _rounded(known.returns.mean(axis=1)),
@@ -164,3 +154,83 @@ def _rounded(values: Any) -> Any:
 def _number(value: float) -> float | None:
     """JSON has no NaN."""
     return None if np.isnan(value) else round(value, 6)
+
+
+def find_record(store: Store, cell_id: str) -> Record:
+    """The finished cell of a key, or of a beginning of one that no other has."""
+    found = [record for record in store.records() if record.key.startswith(cell_id)]
+    if len(found) != 1:
+        many = f"is the beginning of {len(found)} keys" if found else "is no cell's key"
+        raise ValueError(
+            f"--cell {cell_id} {many} in {store.path}; `sb3-poem benchmark verify` without --cell "
+            "lists the cells that there are"
+        )
+    return found[0]
+
+
+def verify_cell(record: Record, library: ModelLibrary, say: Say = print) -> list[str]:
+    """Run a finished cell again and compare with its record, number by number as the store holds
+    them, times left out. What differs, a line each; nothing if nothing does.
+
+    :raises ValueError: If the record is of another revision of the code, its identity does not have
+        its key, or its model is not there.
+    """
+    if record.identity["revision"] != REVISION:
+        raise ValueError(
+            f"cell {record.key} is of revision {record.identity['revision']} of the code, and this "
+            f"is {REVISION}: check out commit {record.provenance.get('commit')}"
+        )
+    cell = Cell.of_identity(record.method, record.identity)
+    if cell.key != record.key:
+        raise ValueError(
+            f"the identity of cell {record.key} has the key {cell.key}: it was changed after the "
+            "cell was run"
+        )
+    origin = library.origin(cell.model_key)
+    if origin != cell.model:
+        raise ValueError(
+            f"cell {record.key} needs the model of {cell.model!r}, but for {cell.model_key} there "
+            f"is that of {origin!r}: say where it is by --runs, --models or --model"
+        )
+    again = run_cell(cell, library, say)
+    lines = [
+        line
+        for name in sorted((record.result.keys() | again.result.keys()) - set(TIMES))
+        for line in _differences(name, record.result.get(name), again.result.get(name))
+    ]
+    if lines:
+        lines += _other_places(record.provenance, again.provenance)
+    return lines
+
+
+def _differences(name: str, kept: Any, found: Any) -> Iterator[str]:
+    if kept == found:
+        return
+    if isinstance(kept, dict) and isinstance(found, dict):
+        for part in sorted(kept.keys() | found.keys()):
+            yield from _differences(f"{name}.{part}", kept.get(part), found.get(part))
+        return
+    try:
+        one, other = np.array(kept, dtype=np.float64), np.array(found, dtype=np.float64)
+        assert one.shape == other.shape
+    except (TypeError, ValueError, AssertionError):  # text, or of another length
+        yield f"{name}: the store has {_short(kept)}, and this run {_short(found)}"
+        return
+    gaps = np.abs(one - other)
+    place = np.unravel_index(np.argmax(gaps), gaps.shape)
+    yield (
+        f"{name}: {np.count_nonzero(gaps)} of {gaps.size} numbers differ, the most at "
+        f"{[int(i) for i in place]}: the store has {one[place]:g}, and this run {other[place]:g}"
+    )
+
+
+def _other_places(kept: dict[str, Any], found: dict[str, Any]) -> Iterator[str]:
+    """What may be why: other code, versions or machines."""
+    for name in ("commit", "machine", "device", "num_threads", "versions"):
+        if kept.get(name) != found.get(name):
+            yield f"  {name}: {_short(kept.get(name))} then, {_short(found.get(name))} here"
+
+
+def _short(value: Any, limit: int = 200) -> str:
+    text = str(value)
+    return text if len(text) <= limit else f"{text[:limit]}..."

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import os
 import re
 import time
@@ -47,7 +46,7 @@ Say = Callable[[str], None]
 
 
 @contextlib.contextmanager
-def locked(path: Path, on_wait: Callable[[], None] | None = None) -> Iterator[int]:
+def locked(path: Path, on_wait: Callable[[], object] = lambda: None) -> Iterator[int]:
     """Hold a lock, after waiting (``on_wait`` is called once before) for whoever holds it. The
     system lets go of it when its holder dies, however it dies. The context's value is the file's
     descriptor: a child process that inherits it holds the lock as well.
@@ -55,8 +54,7 @@ def locked(path: Path, on_wait: Callable[[], None] | None = None) -> Iterator[in
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a") as file:
         if not lock_descriptor(file.fileno(), blocking=False):
-            if on_wait is not None:
-                on_wait()
+            on_wait()
             lock_descriptor(file.fileno())
         yield file.fileno()
 
@@ -126,8 +124,12 @@ class ModelLibrary:
             for candidate in (place, place.with_suffix(".zip")):
                 if candidate.is_file() or (candidate.is_dir() and _contents(candidate)):
                     return candidate
-            if (pretrained / CONFIG).is_file() and _is_variant(read_config(pretrained), key):
-                return pretrained
+            if (pretrained / CONFIG).is_file():
+                config, wanted = read_config(pretrained), VARIANTS[key.variant]
+                own = config["algorithm"] == ALGORITHMS[wanted.algorithm].__name__
+                facts = {"seed": None, **config["arguments"], "env_id": config["env_id"]}
+                if own and wanted.base is None and not _departures(facts, key):
+                    return pretrained
         return None
 
     def state(self, key: ModelKey) -> str:
@@ -150,13 +152,11 @@ class ModelLibrary:
         base = VARIANTS[key.variant].base
         if base is not None:
             return self.origin(replace(key, variant=base))
-        made = {"hyperparameters": _as_json(training_plan(key).hyperparameters)}
-        begun = self.folder(key) / BEGUN
-        if self.state(key) == "missing":
-            found = {**made, "revision": REVISION}
-        else:
+        hyperparameters, begun = training_plan(key).hyperparameters, self.folder(key) / BEGUN
+        found = {"hyperparameters": hyperparameters, "revision": REVISION}
+        if self.state(key) != "missing":
             found = read_json(begun) if begun.exists() else {"hyperparameters": None}
-        if found["hyperparameters"] != made["hyperparameters"]:
+        if found["hyperparameters"] != hyperparameters:
             raise ValueError(
                 f"{begun.parent} was trained with other hyperparameters than zoo_configs/ has for "
                 f"{key} now: take another folder for --runs, or remove it"
@@ -227,8 +227,8 @@ class ModelLibrary:
         elif is_checkpoint(file):
             read = algorithm.load_checkpoint
         model = read(file, env, device=self.workplace.device)
-        if path is not None:
-            _check_variant(model, key, path)
+        if path is not None and (wrong := _departures(vars(model), key)):
+            raise ValueError(f"{path} was handed over as {key}, but has {', '.join(wrong)}")
         return model
 
     def snapshot_file(self, key: ModelKey, snapshot: float) -> Path:
@@ -254,7 +254,7 @@ class ModelLibrary:
         begun = folder / BEGUN
         state = "training" if self.state(key) == "missing" else "resuming"
         if state == "training":
-            made = {"hyperparameters": _as_json(plan.hyperparameters), "revision": REVISION}
+            made = {"hyperparameters": plan.hyperparameters, "revision": REVISION}
             write_json_atomically(begun, made)
         say(
             f"{state} {key}: {plan.timesteps:,} steps, {plan.updates:,} updates; "
@@ -325,10 +325,6 @@ def _zip_name(env_id: str) -> str:
     return env_id.replace("/", "-") + ".zip"
 
 
-def _as_json(data: Any) -> Any:
-    return json.loads(json.dumps(data))
-
-
 def _contents(folder: Path) -> list[Path]:
     """What a folder holds that can be loaded: the checkpoint first, for its replay buffer."""
     return [folder / name for name in (CHECKPOINT, MODEL, CONFIG) if (folder / name).is_file()]
@@ -340,34 +336,23 @@ def _content(path: Path) -> Path:
     return _contents(path)[0] if path.is_dir() else path
 
 
-def _is_variant(config: dict[str, Any], key: ModelKey) -> bool:
-    variant, arguments = VARIANTS[key.variant], config["arguments"]
-    if variant.base is not None or config["algorithm"] != ALGORITHMS[variant.algorithm].__name__:
-        return False
-    return (config["env_id"], arguments.get("seed"), _facts(arguments)) == _expected(key)
+def _departures(found: Mapping[str, Any], key: ModelKey) -> list[str]:
+    """What a model has, by its arguments or attributes, that its family's entry does not make."""
+    variant = VARIANTS[key.variant]
+    made = zoo_entry(config_file(variant.algorithm), key.env_id, **overrides(key))
+    if variant.algorithm == "poem_sac":
+        made = {"similarity": "two-encoder", "context": "optimal", **made}
+    expected = {"env_id": key.env_id, "seed": key.seed}
+    both = [(name, found[name], value) for name, value in expected.items()]
+    kinds = "(similarity, context, latent_dim, without preferences)"
+    both.append((kinds, _kind(found), _kind(made)))
+    return [f"{name} {one!r} instead of {other!r}" for name, one, other in both if one != other]
 
 
-def _check_variant(model: Any, key: ModelKey, path: Path) -> None:
-    names = ("env_id", "seed", "(similarity, context, latent_dim, without preferences)")
-    both = zip(names, (model.env_id, model.seed, _facts(vars(model))), _expected(key), strict=True)
-    wrong = [f"{name} {one!r} instead of {other!r}" for name, one, other in both if one != other]
-    if wrong:
-        raise ValueError(f"{path} was handed over as {key}, but has {', '.join(wrong)}")
-
-
-def _facts(values: Mapping[str, Any]) -> tuple[Any, ...]:
-    """What tells variants apart, of arguments or a model's attributes."""
+def _kind(values: Mapping[str, Any]) -> tuple[Any, ...]:
+    """What tells variants apart."""
     kinds = values.get("similarity"), values.get("context"), int(values.get("latent_dim", 5))
     return (*kinds, values.get("preference_coef") == 0)
-
-
-def _expected(key: ModelKey) -> tuple[str, int, tuple[Any, ...]]:
-    """Environment, seed, and :func:`_facts` of a model: as its family's entry makes it."""
-    variant = VARIANTS[key.variant]
-    given = zoo_entry(config_file(variant.algorithm), key.env_id, **overrides(key))
-    if variant.algorithm == "poem_sac":
-        given = {"similarity": "two-encoder", "context": "optimal", **given}
-    return key.env_id, key.seed, _facts(given)
 
 
 def _describe_given(path: Path) -> dict[str, Any]:

@@ -120,13 +120,9 @@ class Series(_Measured):
 
     def against(self, other: Series, queries: int) -> Comparison | None:
         """After so many answers, on the seeds that both have; None if there are none."""
-        both = self, other
-        seeds = [[record.seed for record in series.records] for series in both]
-        _, *rows = np.intersect1d(*seeds, return_indices=True)
-        if not len(rows[0]):
-            return None
-        one, two = (series.at(queries)[own] for series, own in zip(both, rows, strict=True))
-        return compare(one, two)
+        mine, theirs = ([record.seed for record in each.records] for each in (self, other))
+        common, one, two = np.intersect1d(mine, theirs, return_indices=True)
+        return compare(self.at(queries)[one], other.at(queries)[two]) if len(common) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,19 +176,12 @@ class Selection:
             if record.identity["snapshot"] is not None:
                 some.add(record.identity["snapshot"])
         order = {name: position for position, name in enumerate(suite.families)}
-        self._shares = dict(
-            sorted(
-                shares.items(),
-                key=lambda item: (
-                    order.get(item[0].family, len(order)),
-                    item[0].env_id,
-                    str(item[0]),
-                ),
-            )
-        )
-        self.conditions = list(self._shares)
+
+        def place(one: Condition) -> tuple[int, str, str]:
+            return order.get(one.family, len(order)), one.env_id, str(one)
+
+        self._shares, self.conditions = shares, sorted(shares, key=place)
         self.seeds = sorted({record.seed for record in self.records.values()})
-        self._references: dict[Condition, list[Reference]] = {}
 
     def series(self, entry: Entry, condition: Condition) -> list[Series]:
         """The finished cells of an entry under a condition, those along the training too."""
@@ -207,22 +196,16 @@ class Selection:
 
     def references(self, condition: Condition) -> list[Reference]:
         """What the models' policies could earn under a condition, in the order of the suite."""
-        if condition not in self._references:
-            found: dict[str, list[Record]] = {name: [] for name in self.suite.references}
-            for cell, record in self._cells(Entry("", "", self.suite.references), condition):
-                found[cell.method].append(record)
-            # always the same objects, whose limits are kept
-            self._references[condition] = [
-                Reference(method, tuple(records)) for method, records in found.items() if records
-            ]
-        return self._references[condition]
+        found: dict[str, list[Record]] = {name: [] for name in self.suite.references}
+        for cell, record in self._cells(Entry("", "", self.suite.references), condition):
+            found[cell.method].append(record)
+        return [Reference(method, tuple(records)) for method, records in found.items() if records]
 
     def _cells(self, entry: Entry, condition: Condition) -> Iterator[tuple[Cell, Record]]:
         shares = sorted(self._shares[condition])
         for seed in self.seeds:
-            for cell in self.suite.entry_cells(
-                entry, condition.env_id, seed, condition.budget, condition.training, shares
-            ):
+            where = condition.env_id, seed, condition.budget, condition.training, shares
+            for cell in self.suite.entry_cells(entry, *where):
                 key = replace(cell, revision=condition.revision).key
                 if key in self.records:
                     yield cell, self.records[key]

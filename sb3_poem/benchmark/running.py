@@ -107,16 +107,9 @@ def make_plan(
             plan.skipped.append((cell, reason))
         else:
             plan.todo.append(cell)
-    # By family and seed as they come, then by model, the final cells first
-    places = list(dict.fromkeys((cell.env_id, cell.seed) for cell in plan.todo))
-    models = list(dict.fromkeys(cell.model_key for cell in plan.todo))
-    plan.todo.sort(
-        key=lambda cell: (
-            places.index((cell.env_id, cell.seed)),
-            models.index(cell.model_key),
-            cell.snapshot is not None,
-        )
-    )
+    # By model as they come (family by family, and seed by seed), the final cells first
+    order = list(dict.fromkeys(cell.model_key for cell in plan.todo))
+    plan.todo.sort(key=lambda cell: (order.index(cell.model_key), cell.snapshot is not None))
     return plan
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import json
 import os
 import runpy
 import signal
@@ -104,16 +105,16 @@ def training_plan(key: ModelKey) -> TrainingPlan:
     changes = overrides(key)
     hyperparameters = {**entries.get(key.env_id, entries["default"]), **changes}
     timesteps = int(key.training.timesteps or hyperparameters["n_timesteps"])
-    hyperparameters["n_timesteps"] = timesteps
+    # as JSON has them
+    hyperparameters = json.loads(json.dumps({**hyperparameters, "n_timesteps": timesteps}))
     facts, tasks = family_facts(key.env_id), hyperparameters.get("n_train_tasks")
     if tasks is None:
         tasks = min(DEFAULT_TRAIN_TASKS, facts.n_tasks or DEFAULT_TRAIN_TASKS)
     epoch_steps = tasks * hyperparameters.get("trajectories_per_task", 1) * facts.horizon
     per_epoch = int(hyperparameters.get("gradient_steps", 1000))
     updates = -(-timesteps // epoch_steps) * (epoch_steps if per_epoch < 0 else per_epoch)
-    return TrainingPlan(
-        variant.algorithm, hyperparameters, changes, timesteps, int(epoch_steps), updates
-    )
+    sizes = timesteps, int(epoch_steps), updates
+    return TrainingPlan(variant.algorithm, hyperparameters, changes, *sizes)
 
 
 def train_arguments(key: ModelKey, plan: TrainingPlan) -> list[str]:
@@ -191,8 +192,8 @@ def timed(session: Path) -> Iterator[None]:
     def look() -> None:
         seen = last_checkpoint()
         while not over.wait(LOOK_SECONDS):
-            if last_checkpoint() > seen:
-                seen = last_checkpoint()
+            if (saved := last_checkpoint()) > seen:
+                seen = saved
                 note()
 
     over = threading.Event()

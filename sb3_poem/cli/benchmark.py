@@ -112,8 +112,8 @@ def _report(arguments: argparse.Namespace) -> int:
 
 
 def _verify(arguments: argparse.Namespace) -> int:
+    from sb3_poem.benchmark.cells import find_record, verify_cell
     from sb3_poem.benchmark.store import Store
-    from sb3_poem.benchmark.verification import find_record, verify_cell
 
     import_packages(arguments.gym_packages)
     store = Store(arguments.store, create=False)
