@@ -98,7 +98,7 @@ class Inference(ABC):
         roll out, or trajectories to show.
         """
 
-    def same_latents(self, *latents: np.ndarray) -> tuple[np.ndarray, ...]:
+    def same_latents(self, *latents: np.ndarray) -> tuple[Shown, ...]:
         """The latents of a question from a file; others where a latent means something to one model
         object alone.
         """

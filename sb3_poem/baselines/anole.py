@@ -1,9 +1,11 @@
-"""ANOLE and its two variants: candidates told apart by the reward decoder (Ren et al. 2022)."""
+"""ANOLE and its two variants: candidates told apart by the reward decoder (Ren et al. 2022), in as
+many ways as the answers still to come may lie (Berlekamp 1968).
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import floor
+from math import comb, floor
 from typing import Any
 
 import numpy as np
@@ -14,10 +16,12 @@ from sb3_poem.adaptation.preference import SIGNS, Preference
 from sb3_poem.adaptation.priors import SOURCES, make_prior
 from sb3_poem.adaptation.queries import random_pair
 from sb3_poem.adaptation.rule import Shown, Snapshot, check_choice, trajectories_of
-from sb3_poem.baselines.berlekamp import n_distinguishable, worst_case_volumes
-from sb3_poem.baselines.fragments import default_fragment_length, replay_fragments
+from sb3_poem.baselines.fragments import (
+    check_shared_dynamics,
+    default_fragment_length,
+    replay_fragments,
+)
 from sb3_poem.common.checks import check_whole
-from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.pearl_sac import PEARLSAC
 
@@ -87,7 +91,7 @@ class ANOLE(Rule):
     def check(self, model: MetaModel, setting: Setting) -> None:
         """See :class:`Rule`: it needs a decoder, experience, and tasks that share dynamics."""
         super().check(model, setting)
-        n_queries, env = setting.n_queries, setting.env
+        n_queries = setting.n_queries
         if self.strategy == "greedy" and n_queries > MAX_GREEDY_QUERIES:
             raise ValueError(
                 f'`n_queries` must be at most {MAX_GREEDY_QUERIES} with strategy="greedy", which '
@@ -108,13 +112,11 @@ class ANOLE(Rule):
                 "sb3_poem.baselines.training_rollouts(model, env, 200), of another copy of the "
                 "environment"
             )
-        family = None if env is None else FamilyView.of(env)
-        if family is not None and not family.shared_dynamics:
-            raise ValueError(
-                "`env` must be of a family whose tasks share their dynamics: ANOLE asks which "
-                "fragment of the training tasks is better on the new task, and here these show "
-                "another world; pass a `library` from the new task"
-            )
+        check_shared_dynamics(
+            setting,
+            "ANOLE asks which fragment of the training tasks is better on the new task, and here "
+            "these show another world; pass a `library` from the new task",
+        )
 
     def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> ANOLEInference:
         library = setting.library
@@ -201,3 +203,36 @@ def has_experience(model: MetaModel) -> bool:
     """Whether a model has steps in its replay buffer; a loaded one has none."""
     buffer = model.replay_buffer if isinstance(model, PEARLSAC) else None
     return buffer is not None and bool(buffer.counts.any())
+
+
+def berlekamp_volumes(contradictions: np.ndarray, n_left: int, budget: int) -> np.ndarray:
+    """In how many ways the ``n_left`` answers to come (K - k) may lie without exceeding the budget
+    (E), if a candidate is the truth that contradicts so many answers (m): sum over e = 0, ..., E -
+    m of C(n_left, e); 0 where m exceeds E.
+    """
+    by_lies_left = np.cumsum([float(comb(n_left, lies)) for lies in range(budget + 1)])
+    lies_left = budget - np.asarray(contradictions)
+    return np.where(lies_left >= 0, by_lies_left[np.maximum(lies_left, 0)], 0.0)
+
+
+def worst_case_volumes(
+    differences: np.ndarray, contradictions: np.ndarray, n_left: int, budget: int
+) -> np.ndarray:
+    """(n_pairs,) the volume that the worse of two answers leaves, over all candidates, with
+    ``n_left`` questions to come after it.
+
+    :param differences: (n_candidates, n_pairs) predicted return of the left fragment minus that of
+        the right one.
+    """
+    kept = berlekamp_volumes(contradictions, n_left, budget)
+    lost = kept - berlekamp_volumes(contradictions + 1, n_left, budget)
+    after_left = kept.sum() - lost @ (differences < 0)
+    after_right = kept.sum() - lost @ (differences > 0)
+    return np.maximum(after_left, after_right)
+
+
+def n_distinguishable(n_queries: int, budget: int) -> int:
+    """How many candidates so many answers with so many lies can tell apart at most (the
+    sphere-packing bound): 2^K over the number of ways to lie, rounded down.
+    """
+    return 2**n_queries // sum(comb(n_queries, lies) for lies in range(budget + 1))

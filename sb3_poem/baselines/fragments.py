@@ -1,5 +1,5 @@
 """Fragments of the training tasks' trajectories, which ANOLE shows instead of rolling out on the
-new task.
+new task; and trajectories as rows that networks take.
 """
 
 from __future__ import annotations
@@ -10,9 +10,12 @@ import numpy as np
 import torch as th
 
 from sb3_poem.adaptation.environments import Env, model_and_env
+from sb3_poem.adaptation.rule import Setting
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.pearl_sac import PEARLSAC
+from sb3_poem.pearl_sac.policies import LatentPolicy
 
 MAX_ROUNDS = 50
 FRAGMENT_LENGTH = 50
@@ -90,3 +93,29 @@ def rollout_fragments(
         features = None if features is None else features[part]
         fragments.append(Trajectory(seen, done, episode.latent, features))
     return fragments
+
+
+def check_shared_dynamics(setting: Setting, why: str) -> None:
+    """Refuse an environment of a family whose tasks differ in their dynamics."""
+    family = None if setting.env is None else FamilyView.of(setting.env)
+    if family is not None and not family.shared_dynamics:
+        raise ValueError(f"`env` must be of a family whose tasks share their dynamics: {why}")
+
+
+def standardised(policy: LatentPolicy, trajectory: Trajectory) -> th.Tensor:
+    with th.no_grad():
+        return policy.standardise(_tensor(policy, trajectory.observations))
+
+
+def transition_rows(
+    policy: LatentPolicy, trajectory: Trajectory, last: np.ndarray | float
+) -> th.Tensor:
+    """(T, ...) standardised (s, a, s') and a last column."""
+    obs = standardised(policy, trajectory)
+    actions = policy.scale_action_batch(_tensor(policy, trajectory.actions))
+    column = _tensor(policy, np.full(len(actions), last))[:, None]
+    return th.cat([obs[:-1], actions, obs[1:], column], dim=1)
+
+
+def _tensor(policy: LatentPolicy, array: np.ndarray) -> th.Tensor:
+    return th.as_tensor(array, dtype=th.float32, device=policy.device)

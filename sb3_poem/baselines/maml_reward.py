@@ -13,15 +13,15 @@ import numpy as np
 import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.utils import set_random_seed
 
 from sb3_poem.adaptation import Answer, Inference, Rule, Setting
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.preference import Preference
 from sb3_poem.adaptation.rule import Shown, Snapshot, trajectories_of
+from sb3_poem.baselines.fragments import check_shared_dynamics, standardised
 from sb3_poem.baselines.meta_reward import MetaReward
-from sb3_poem.baselines.transitions import standardised
 from sb3_poem.common.checks import check_whole
-from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -144,12 +144,10 @@ class MAMLReward(Rule):
                 "one by MAMLRewardModel(meta_train_reward(model), model)"
             )
         super().check(model, setting)
-        family = None if setting.env is None else FamilyView.of(setting.env)
-        if family is not None and not family.shared_dynamics:
-            raise ValueError(
-                "`env` must be of a family whose tasks share their dynamics: MAML-reward's network "
-                "was trained on what tasks say of each other's fragments"
-            )
+        check_shared_dynamics(
+            setting,
+            "MAML-reward's network was trained on what tasks say of each other's fragments",
+        )
 
     def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> MAMLRewardInference:
         return MAMLRewardInference(self, model, rng, setting.n_queries)
@@ -176,24 +174,16 @@ class MAMLRewardInference(Inference):
 
     def ask(self) -> tuple[Shown, Shown]:
         """See :class:`Inference`: the current policy twice, with opposite exploration noise."""
-        return self._both_signs()
-
-    def same_latents(self, *latents: np.ndarray) -> tuple[np.ndarray, ...]:
-        """See :class:`Inference`: the current policy, whose number in the file was another."""
-        return self._both_signs()
-
-    def _both_signs(self) -> tuple[np.ndarray, np.ndarray]:
         return self.latent.copy(), self.latent * np.array([1.0, -1.0])
 
+    def same_latents(self, *latents: np.ndarray) -> tuple[Shown, ...]:
+        """See :class:`Inference`: the current policy, whose number in the file was another."""
+        return self.ask()
+
     def tell(self, preference: Preference, *shown: Shown) -> None:
-        trajectories_of("MAML-reward", *shown)
-        self.answers.append(Answer(preference, shown))
-        parameters = self.model.reward.adapted(self.answers)
-        seen = [
-            trajectory
-            for answer in self.answers
-            for trajectory in trajectories_of("MAML-reward", *answer.shown)
-        ]
+        answers = [*self.answers, Answer(preference, shown)]
+        seen = [one for each in answers for one in trajectories_of("MAML-reward", *each.shown)]
+        self.answers, parameters = answers, self.model.reward.adapted(answers)
         rewards = [self.model.reward.rewards(parameters, trajectory) for trajectory in seen]
         # Preferences fix no unit; SAC's entropy needs one.
         scale = max(float(np.concatenate(rewards).std()), 1e-6)
@@ -250,9 +240,7 @@ def _seeded(seed: int) -> Iterator[None]:
     """SB3 draws from the global generators: seed them, and hand them back as they were."""
     python, numpy = random.getstate(), np.random.get_state()  # noqa: NPY002
     with th.random.fork_rng():
-        random.seed(seed)
-        np.random.seed(seed % 2**32)  # noqa: NPY002
-        th.manual_seed(seed)
+        set_random_seed(seed)
         try:
             yield
         finally:

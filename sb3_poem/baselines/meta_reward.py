@@ -1,10 +1,12 @@
-"""A meta-trained reward, which a few answers adapt to a task (Hejna & Sadigh 2023)."""
+"""A reward, meta-trained by MAML (Finn et al. 2017), which a few answers adapt to a task (Hejna &
+Sadigh 2023).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
@@ -12,28 +14,111 @@ from gymnasium import spaces
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as tensors_to_bytes
+from torch import nn
+from torch.func import functional_call, grad, vmap
+from torch.nn.functional import softplus
+from torch.nn.utils.rnn import pad_sequence
 
 from sb3_poem.adaptation.preference import SIGNS
 from sb3_poem.adaptation.rule import Answer, trajectories_of
 from sb3_poem.adaptation.state import read_json, write_json_atomically
-from sb3_poem.baselines.fragments import default_fragment_length, replay_fragments
-from sb3_poem.baselines.maml import (
-    Parameters,
-    PreferencePairs,
-    RewardNetwork,
-    adapt_parameters,
-    maml_loss,
+from sb3_poem.baselines.fragments import (
+    default_fragment_length,
+    replay_fragments,
+    transition_rows,
 )
-from sb3_poem.baselines.transitions import transition_rows
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.digest import digest_of
 from sb3_poem.common.files import write_atomically
+from sb3_poem.common.networks import MLP
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.pearl_sac import PEARLSAC
 from sb3_poem.pearl_sac.policies import LatentPolicy
 
 FORMAT = "sb3_poem meta reward 2"
 WEIGHTS, CONFIG = "reward.safetensors", "reward.json"
+SETTINGS = ("net_arch", "inner_learning_rate", "inner_steps", "fragment_length")
+
+Parameters = dict[str, th.Tensor]
+
+
+class PreferencePairs(NamedTuple):
+    """Pairs of fragments, (..., pairs, steps, in_dim + 1) transitions as :class:`RewardNetwork`
+    takes them, and ``label`` (..., pairs): 1 where the left one is better, 0 where the right one
+    is, 0.5 where neither is.
+    """
+
+    left: th.Tensor
+    right: th.Tensor
+    label: th.Tensor
+
+
+class RewardNetwork(nn.Module):
+    """Reward of a transition (s, a, s') of width ``in_dim``, unknown up to scale."""
+
+    def __init__(self, in_dim: int, net_arch: Sequence[int] = (64, 64)) -> None:
+        super().__init__()
+        # A smooth activation: MAML differentiates the gradient.
+        self.mlp = MLP(in_dim, 1, net_arch, nn.Tanh)
+
+    def forward(self, transitions: th.Tensor) -> th.Tensor:
+        """(..., in_dim + 1), the last entry 1, or 0 for what only fills up an episode that ended
+        early -> (...).
+        """
+        return self.mlp(transitions[..., :-1]).squeeze(-1) * transitions[..., -1]
+
+
+def preference_loss(
+    network: nn.Module, parameters: Parameters, pairs: PreferencePairs
+) -> th.Tensor:
+    """Bradley-Terry cross-entropy of the sums of predicted rewards; the mean over one
+    task's pairs.
+    """
+    both = functional_call(network, parameters, (th.stack([pairs.left, pairs.right]),)).sum(dim=-1)
+    logit = both[0] - both[1]
+    return (softplus(logit) - pairs.label * logit).mean()
+
+
+def adapt_parameters(
+    network: nn.Module,
+    parameters: Parameters,
+    pairs: PreferencePairs,
+    learning_rate: float,
+    steps: int,
+) -> Parameters:
+    """MAML's inner loop: gradient steps on one task's preferences. It can be differentiated, and
+    mapped over tasks.
+    """
+    slope = grad(preference_loss, argnums=1)
+    for _ in range(steps):
+        gradients = slope(network, parameters, pairs)
+        parameters = {
+            name: value - learning_rate * gradients[name] for name, value in parameters.items()
+        }
+    return parameters
+
+
+def maml_loss(
+    network: nn.Module,
+    parameters: Parameters,
+    support: PreferencePairs,
+    query: PreferencePairs,
+    learning_rate: float,
+    steps: int,
+) -> th.Tensor:
+    """MAML's outer objective: how well the adapted networks predict other preferences of their
+    tasks. Its gradient passes through the inner loop.
+
+    :param support: (tasks, pairs, ...) what each task adapts to.
+    :param query: (tasks, pairs, ...) what it is judged by.
+    :return: The mean over the tasks.
+    """
+
+    def task_loss(some: PreferencePairs, others: PreferencePairs) -> th.Tensor:
+        adapted = adapt_parameters(network, parameters, some, learning_rate, steps)
+        return preference_loss(network, adapted, others)
+
+    return vmap(task_loss)(support, query).mean()
 
 
 class MetaReward:
@@ -85,18 +170,12 @@ class MetaReward:
         """Write the parameters as safetensors and the settings as JSON; the folder is made if
         missing.
         """
-        own = {f"network.{name}": value.detach() for name, value in self.parameters.items()}
-        tensors = {**own, **_standardisation(self.policy)}
-        config = {
-            "format": FORMAT,
-            "net_arch": list(self.net_arch),
-            "inner_learning_rate": self.inner_learning_rate,
-            "inner_steps": self.inner_steps,
-            "fragment_length": self.fragment_length,
-        }
-        content = {name: value.cpu().contiguous() for name, value in tensors.items()}
+        tensors = {f"network.{name}": value for name, value in self.parameters.items()}
+        tensors |= _standardisation(self.policy)
+        content = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
         write_atomically(Path(folder) / WEIGHTS, tensors_to_bytes(content))
-        write_json_atomically(Path(folder) / CONFIG, config)
+        settings = {name: getattr(self, name) for name in SETTINGS}
+        write_json_atomically(Path(folder) / CONFIG, {"format": FORMAT, **settings})
 
     @classmethod
     def load(cls, folder: str | Path, policy: LatentPolicy) -> MetaReward:
@@ -119,8 +198,7 @@ class MetaReward:
                     "`policy` is not the one with which the reward in "
                     f"{folder} was meta-trained: its {name} differs; load the same model again"
                 )
-        names = ("net_arch", "inner_learning_rate", "inner_steps", "fragment_length")
-        meta = cls(policy, *(config[name] for name in names))
+        meta = cls(policy, **{name: config[name] for name in SETTINGS})
         shapes = {f"network.{name}": value.shape for name, value in meta.parameters.items()}
         if shapes != {name: t.shape for name, t in tensors.items() if name.startswith("network.")}:
             raise ValueError(f"{weights} does not hold the network that {CONFIG} describes")
@@ -140,17 +218,13 @@ class MetaReward:
         parameters = self.parameters
         if not answers:
             return parameters
-        shown = [trajectories_of("MAML-reward", *item.shown) for item in answers]
-        longest = max(len(trajectory) for pair in shown for trajectory in pair)
-        left, right = (
-            th.stack([_filled(self.transitions(trajectory), longest) for trajectory in side])
-            for side in zip(*shown, strict=True)
-        )
-        share = min(1.0, (self.fragment_length or longest) / longest)
-        left[..., -1] *= share
-        right[..., -1] *= share
+        shown = [one for item in answers for one in trajectories_of("MAML-reward", *item.shown)]
+        # (2 answers, longest, in_dim + 1)
+        rows = pad_sequence([self.transitions(trajectory) for trajectory in shown], True)
+        longest = rows.shape[1]
+        rows[..., -1] *= min(1.0, (self.fragment_length or longest) / longest)
         labels = [0.5 + 0.5 * SIGNS[answer.preference] for answer in answers]
-        pairs = PreferencePairs(left, right, th.tensor(labels, device=left.device))
+        pairs = PreferencePairs(rows[::2], rows[1::2], th.tensor(labels, device=rows.device))
         rate, steps = self.inner_learning_rate, self.inner_steps
         adapted = adapt_parameters(self.network, parameters, pairs, rate, steps)
         return {name: value.detach() for name, value in adapted.items()}
@@ -197,9 +271,9 @@ def meta_train_reward(
     if not model.replay_buffer.counts.any():
         empty = "has an empty replay buffer (a loaded model has none)"
         raise ValueError(f"`model` {empty}: call load_replay_buffer")
-    check_whole("n_iterations", n_iterations, 1)
-    check_whole("n_support", n_support, 1)
-    check_whole("n_query", n_query, 1)
+    sizes = {"n_iterations": n_iterations, "n_support": n_support, "n_query": n_query}
+    for name, size in sizes.items():
+        check_whole(name, size, 1)
     rng = np.random.default_rng([seed, 5])
     length = default_fragment_length(model.horizon) if fragment_length is None else fragment_length
     meta = MetaReward(model.policy, fragment_length=length, seed=seed, **arguments)
@@ -236,7 +310,3 @@ def _judged(
 def _standardisation(policy: LatentPolicy) -> dict[str, th.Tensor]:
     """How observations are standardised, without which the parameters mean nothing."""
     return {"obs_mean": policy.obs_norm.mean, "obs_std": policy.obs_norm.std}
-
-
-def _filled(rows: th.Tensor, length: int) -> th.Tensor:
-    return th.cat([rows, rows.new_zeros(length - len(rows), rows.shape[1])])

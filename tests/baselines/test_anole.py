@@ -19,7 +19,7 @@ from sb3_poem.adaptation import (
 )
 from sb3_poem.adaptation.rule import Setting, inference_rng
 from sb3_poem.baselines import replay_fragments, rollout_fragments, training_rollouts
-from sb3_poem.baselines.berlekamp import berlekamp_volumes, n_distinguishable, worst_case_volumes
+from sb3_poem.baselines.anole import berlekamp_volumes, n_distinguishable, worst_case_volumes
 from sb3_poem.common.rollouts import rollout_latents
 
 MODEL = SpeedModel()

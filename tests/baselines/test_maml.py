@@ -10,14 +10,15 @@ from sb3_poem import PEARLSAC
 from sb3_poem.adaptation import Preference
 from sb3_poem.adaptation.rule import Answer
 from sb3_poem.baselines import replay_fragments
-from sb3_poem.baselines.maml import (
+from sb3_poem.baselines.meta_reward import (
+    MetaReward,
     PreferencePairs,
     RewardNetwork,
     adapt_parameters,
     maml_loss,
+    meta_train_reward,
     preference_loss,
 )
-from sb3_poem.baselines.meta_reward import MetaReward, meta_train_reward
 from sb3_poem.common.trajectory import Trajectory
 
 
