@@ -7,9 +7,10 @@ import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
 
 from sb3_poem.adaptation.bayes import Bayes
@@ -34,9 +35,7 @@ from sb3_poem.common.checks import check_whole
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    from stable_baselines3.common.vec_env import VecEnv
+from sb3_poem.loading import as_model
 
 FORMAT, FORMAT_VERSION = "sb3_poem.PreferenceAdapter", 3
 
@@ -374,8 +373,6 @@ class PreferenceAdapter:
         if version != FORMAT_VERSION:
             reads = f"this program reads {FORMAT_VERSION}"
             raise ValueError(f"a saved adaptation of version {version!r}; {reads}")
-        from sb3_poem.loading import as_model
-
         own: MetaModel = as_model(model)
         with _complete():
             _check_same_model(data["model"], own)
@@ -384,17 +381,9 @@ class PreferenceAdapter:
                     "this adaptation asks about a library of trajectories; pass the same `library` "
                     "again"
                 )
-            adapter = cls(
-                own,
-                env,
-                rule=Rule.from_dict(data["rule"]),
-                n_queries=data["n_queries"],
-                oracle=oracle,
-                seed=data["seed"],
-                deterministic=data["deterministic"],
-                library=library,
-                render=render,
-            )
+            kept = {name: data[name] for name in ("n_queries", "seed", "deterministic")}
+            kept["rule"] = Rule.from_dict(data["rule"])
+            adapter = cls(own, env, oracle=oracle, library=library, render=render, **kept)
         adapter.restore(data)
         return adapter
 

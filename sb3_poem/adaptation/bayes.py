@@ -4,7 +4,7 @@ they thin out.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -216,11 +216,8 @@ class Bayes(Rule):
     def check(self, model: MetaModel, setting: Setting) -> None:
         """See :class:`Rule`: the likelihood and the questions need what not all models have."""
         super().check(model, setting)
-        name, noise, compares = (
-            type(model).__name__,
-            self.noise_model,
-            isinstance(model, HasSimilarity),
-        )
+        name, noise = type(model).__name__, self.noise_model
+        compares = isinstance(model, HasSimilarity)
         likelihood = self.likelihood_with(model)
         if likelihood == "decoder" and not _knows_its_decoder(model):
             error = getattr(model, "predicted_rewards_error", np.nan)
@@ -255,7 +252,7 @@ class Bayes(Rule):
         return self.likelihood or ("decoder" if _knows_its_decoder(model) else "similarity")
 
     def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> BayesInference:
-        return BayesInference(self, model, rng, setting.library, setting.visibility)
+        return BayesInference(self, model, rng, setting)
 
     def to_dict(self) -> dict[str, Any]:
         data, noise = super().to_dict(), self.noise_model
@@ -275,17 +272,9 @@ class BayesInference(Inference):
 
     state: tuple[str, ...] = ("particles", "log_weights", "scale", "calibration", "thinning")
 
-    def __init__(
-        self,
-        rule: Bayes,
-        model: Any,
-        rng: np.random.Generator,
-        library: Sequence[Trajectory] | None = None,
-        visibility: Callable[[Shown, Shown], float] | None = None,
-    ) -> None:
+    def __init__(self, rule: Bayes, model: Any, rng: np.random.Generator, setting: Setting) -> None:
         super().__init__(rng)
-        self.visibility = visibility
-        self.rule, self.model = rule, model
+        self.rule, self.model, self.visibility = rule, model, setting.visibility
         self.n_shown = len(PLACES[rule.question])
         self.has_similarity = isinstance(model, HasSimilarity)
         self.likelihood = rule.likelihood_with(model)
@@ -294,7 +283,7 @@ class BayesInference(Inference):
         self.noise_model: NoiseModel | None = None if noise == INFER else noise
         grid = noise == INFER or rule.question != "pair"
         self.people = People(rule.question, self.noise_model) if grid else None
-        self.library = None if library is None else list(library)
+        self.library = None if setting.library is None else list(setting.library)
         far = model.aggregate_to_prior_kl > PRIOR_COVERS
         self.prior = make_prior(model, rule.candidates or ("aggregate" if far else "prior"), rng)
         self.particles = self.prior.balanced_sample(rule.n_particles, rng)
@@ -331,7 +320,10 @@ class BayesInference(Inference):
     def ask(self) -> tuple[Shown, ...]:
         if self.library is not None:
             return tuple(self.library[i] for i in self._ask_about(self.library))
-        policies = self._query_policies()
+        # half of them draws of the posterior, half of the prior
+        half = QUERY_POLICIES[self.rule.question] // 2
+        posterior = self.particles[systematic_resample(self.weights, half, self.rng)]
+        policies = np.concatenate([posterior, self.prior.sample(half, self.rng)])
         chosen: tuple[int, ...]
         if self.rule.query_rule == "random":
             chosen = queries.random_set(len(policies), self.n_shown, self.rng)
@@ -384,8 +376,8 @@ class BayesInference(Inference):
         if self.rule.query_rule == "random":
             return queries.random_set(len(library), self.n_shown, self.rng)
         if self._library_returns is None:
-            returns = self.model.predicted_returns(self.particles, library, DECODED_STEPS)
-            self._library_returns = returns
+            decode = self.model.predicted_returns
+            self._library_returns = decode(self.particles, library, DECODED_STEPS)
         returns = self._library_returns
         error = self._decoder_error(2.0 * float(np.mean([len(item) for item in library])))
         magnitude = float(2.0 * np.abs(returns).mean())
@@ -587,12 +579,6 @@ class BayesInference(Inference):
         s = first_to_others(self.model.similarities(latents, shown_latents)).ravel()
         magnitude = 2.0 * np.abs(returns).mean(axis=1).mean()
         self.calibration += [s @ first_to_others(returns).ravel(), s @ s, magnitude, 1.0]
-
-    def _query_policies(self) -> np.ndarray:
-        """(n, d): half of them draws of the posterior, half of the prior."""
-        half = QUERY_POLICIES[self.rule.question] // 2
-        posterior = self.particles[systematic_resample(self.weights, half, self.rng)]
-        return np.concatenate([posterior, self.prior.sample(half, self.rng)])
 
     def _query_particles(self) -> tuple[np.ndarray, np.ndarray]:
         if len(self.particles) <= QUERY_PARTICLES:

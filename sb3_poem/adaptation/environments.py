@@ -5,18 +5,19 @@ from __future__ import annotations
 import sys
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias, Union
+from typing import TypeAlias
 
 import gymnasium as gym
+from stable_baselines3.common.vec_env import VecEnv
 
 from poem_envs.registration import plain_id
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.common.family_view import FamilyView, vectorised
+from sb3_poem.common.foreign import environment_of
+from sb3_poem.common.vec_env import as_task_vec_env, make_task_vec_env
+from sb3_poem.loading import as_model
 
-if TYPE_CHECKING:
-    from stable_baselines3.common.vec_env import VecEnv
-
-Env: TypeAlias = Union[gym.Env, gym.vector.VectorEnv, str, "VecEnv"]
+Env: TypeAlias = gym.Env | gym.vector.VectorEnv | str | VecEnv
 #: How many copies an id makes where many tasks are rolled out together.
 COPIES = 60
 
@@ -34,12 +35,6 @@ def model_and_env(
     :raises FileNotFoundError: If there is no such model.
     :raises ValueError: If the model's file asks for what :func:`environment_of` refuses.
     """
-    from stable_baselines3.common.vec_env import VecEnv
-
-    from sb3_poem.common.foreign import environment_of
-    from sb3_poem.common.vec_env import as_task_vec_env, make_task_vec_env
-    from sb3_poem.loading import as_model
-
     found: MetaModel = as_model(model)
     if isinstance(env, VecEnv):
         return found, env

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.adaptation.environments import Env, model_and_env
 from sb3_poem.adaptation.many_tasks import Library, OracleFactory, TaskAdaptations, adapt_tasks
@@ -17,9 +18,6 @@ from sb3_poem.adaptation.rule import Rule
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.rollouts import rollout_outcomes
-
-if TYPE_CHECKING:
-    from stable_baselines3.common.vec_env import VecEnv
 
 N_TEST_TASKS = 30
 

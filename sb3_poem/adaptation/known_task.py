@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.adaptation.environments import Env, model_and_env
 from sb3_poem.adaptation.evaluation import (
@@ -21,9 +21,6 @@ from sb3_poem.adaptation.noise import NoiseModel
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.rollouts import rollout_outcomes
-
-if TYPE_CHECKING:
-    from stable_baselines3.common.vec_env import VecEnv
 
 # Latents to try for each task, where every one must be rolled out in every task, and where one
 # rollout serves all of them.

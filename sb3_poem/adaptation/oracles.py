@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.adaptation.noise import BoltzmannNoise, ExactNoise, MistakeNoise, NoiseModel
 from sb3_poem.adaptation.preference import ANSWERS, BEST_OF_FOUR, Preference, check_number
 from sb3_poem.common.family_view import FamilyView, vectorised
 from sb3_poem.common.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    from stable_baselines3.common.vec_env import VecEnv
-
 
 ORACLE_STREAM = 8
 
@@ -120,12 +117,6 @@ class TaskOracle(ABC):
         name = type(self).__name__
         if self.env is None:
             raise RuntimeError(f"{name} has no environment: pass `env` or call bind(env)")
-        if trajectory.reward_features is None:
-            raise ValueError(
-                f"{name} computes returns from reward features, but the trajectory has none: its "
-                'environment gave no info["reward_features"]. Use an oracle that does not need '
-                "them, such as HumanOracle."
-            )
         value = float(np.sum(step_rewards(self.env, self.task, trajectory)))
         if not np.isfinite(value):
             why = "its reward features are not finite"
@@ -158,16 +149,8 @@ class BoltzmannOracle(TaskOracle):
     BoltzmannNoise(beta=0.5)
     """
 
-    def __init__(
-        self,
-        beta: float | None = None,
-        env: gym.Env | VecEnv | None = None,
-        task: np.ndarray | None = None,
-        seed: int | None = None,
-        thresholds: tuple[float, float] | None = None,
-        question: str | None = None,
-    ) -> None:
-        super().__init__(env, task, seed, thresholds, question)
+    def __init__(self, beta: float | None = None, *others: Any, **named: Any) -> None:
+        super().__init__(*others, **named)
         self.beta, self.noise_model = beta, BoltzmannNoise(beta)
 
     def _perceive(self, returns: np.ndarray) -> np.ndarray:
@@ -189,18 +172,10 @@ class MistakeOracle(TaskOracle):
     MistakeNoise(rate=0.1)
     """
 
-    def __init__(
-        self,
-        rate: float = 0.2,
-        env: gym.Env | VecEnv | None = None,
-        task: np.ndarray | None = None,
-        seed: int | None = None,
-        thresholds: tuple[float, float] | None = None,
-        question: str | None = None,
-    ) -> None:
+    def __init__(self, rate: float = 0.2, *others: Any, **named: Any) -> None:
         if not 0.0 <= rate <= 1.0:
             raise ValueError(f"`rate` must lie in [0, 1], but is {rate}")
-        super().__init__(env, task, seed, thresholds, question)
+        super().__init__(*others, **named)
         self.rate, self.noise_model = rate, MistakeNoise(min(rate, 0.5))
 
     def _perceive(self, returns: np.ndarray) -> np.ndarray:
@@ -216,7 +191,10 @@ def step_rewards(
 ) -> np.ndarray:
     """The true rewards (T,) of a trajectory; for the arguments see :class:`TaskOracle`."""
     if trajectory.reward_features is None:
-        gave = 'its environment gave no info["reward_features"]'
-        raise ValueError(f"the trajectory has no reward features: {gave}")
+        raise ValueError(
+            "returns are computed from reward features, but the trajectory has none: its "
+            'environment gave no info["reward_features"]. Use an oracle that does not need them, '
+            "such as HumanOracle."
+        )
     family = FamilyView(vectorised(env))
     return family.compute_rewards(family.task if task is None else task, trajectory.reward_features)

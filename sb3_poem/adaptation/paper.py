@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.special import log_expit
 
 from sb3_poem.adaptation import queries
 from sb3_poem.adaptation.meta_model import HasSimilarity, MetaModel
 from sb3_poem.adaptation.preference import SIGNS, Preference, preference_log_likelihood
 from sb3_poem.adaptation.priors import SOURCES, make_prior
-from sb3_poem.adaptation.queries import tolerance
 from sb3_poem.adaptation.rule import (
     Answer,
     Inference,
@@ -92,7 +92,7 @@ class PaperInference(Inference):
             self.candidates = self._draw_candidates()
             self.fresh = np.array([True])
         if self.rule.query_rule == "random":
-            first, second = queries.random_pair(len(self.candidates), self.rng)
+            first, second = queries.random_set(len(self.candidates), 2, self.rng)
         else:
             similarities = self.model.similarities(self.candidates, self.candidates)
             if self.rule.query_rule == "worst-case":
@@ -123,7 +123,7 @@ class PaperInference(Inference):
         return self._satisfied(self._differences(latents))
 
     def _most_informative(self, similarities: np.ndarray) -> tuple[int, int]:
-        probabilities = np.exp(log_sigmoid(queries.pair_differences(similarities)))  # eq. 7
+        probabilities = np.exp(log_expit(queries.pair_differences(similarities)))  # eq. 7
         n = len(self.candidates)
         gains = queries.information_gains(probabilities, np.full(n, 1.0 / n))
         return queries.pair_at(int(np.argmax(gains)), n)
@@ -135,13 +135,13 @@ class PaperInference(Inference):
         return similarities[:, 0::2] - similarities[:, 1::2]
 
     def _satisfied(self, differences: np.ndarray) -> np.ndarray:
-        slack = tolerance(self.rule.epsilon)
+        slack = queries.tolerance(self.rule.epsilon)
         signs = np.array([SIGNS[answer.preference] for answer in self.answers])
         return np.count_nonzero(differences * signs >= -slack, axis=1)
 
     def _log_likelihoods(self, differences: np.ndarray) -> np.ndarray:
         told = [answer.preference for answer in self.answers]
-        return preference_log_likelihood(log_sigmoid(differences), log_sigmoid(-differences), told)
+        return preference_log_likelihood(log_expit(differences), log_expit(-differences), told)
 
     def _draw_candidates(self) -> np.ndarray:
         """Lines 3 to 9, bounded. The last question's candidates take part in the fall-back alone:
@@ -174,8 +174,3 @@ class PaperInference(Inference):
         contenders = np.flatnonzero(satisfied >= np.partition(satisfied, worst)[worst])
         likelihoods = self._log_likelihoods(differences[contenders])
         return contenders[np.lexsort((-likelihoods, -satisfied[contenders]))[:n]]
-
-
-def log_sigmoid(x: np.ndarray) -> np.ndarray:
-    """log(1 / (1 + exp(-x))) without overflow."""
-    return np.minimum(x, 0.0) - np.log1p(np.exp(-np.abs(x)))

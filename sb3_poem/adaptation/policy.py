@@ -6,16 +6,19 @@ import json
 import os
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch as th
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.adaptation.environments import describe_model
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.common.files import write_atomically
-
-if TYPE_CHECKING:
-    from stable_baselines3.common.vec_env import VecEnv
+from sb3_poem.loading import BY_CLASS_NAME
+from sb3_poem.pearl_sac.saving import build_model, config_text, model_contents, parse_config
 
 FORMAT = "sb3_poem adapted policy 2"
 LATENT = "latent"
@@ -76,11 +79,6 @@ class AdaptedPolicy:
         """The policy as one safetensors file: the model, its configuration in the header, the
         latent and the number of answers. Nothing in it can run code.
         """
-        import torch as th
-        from safetensors.torch import save
-
-        from sb3_poem.pearl_sac.saving import config_text, model_contents
-
         config, tensors = model_contents(self.model)
         named = {MODEL_PREFIX + name: value for name, value in tensors.items()}
         facts = {"format": FORMAT, "config": config_text(config), "n_answers": str(self.n_answers)}
@@ -104,13 +102,6 @@ class AdaptedPolicy:
         """Read what :meth:`to_bytes` gave; a ``ValueError``, which names ``source``, if it is
         truncated or of another program.
         """
-        import torch as th
-        from safetensors import SafetensorError
-        from safetensors.torch import load
-
-        from sb3_poem.loading import BY_CLASS_NAME
-        from sb3_poem.pearl_sac.saving import build_model, parse_config
-
         try:
             tensors = load(content)
             header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from sb3_poem.common.trajectory import Trajectory
+from sb3_poem.common.video import in_rows, write_video
 
 
 class Preference(Enum):
@@ -85,8 +86,6 @@ class Query:
         return its path; missing folders are made. A ``ValueError`` if they have no frames, or the
         suffix is another.
         """
-        from sb3_poem.common.video import in_rows, write_video
-
         if not all(each.frames for each in self.shown):
             raise ValueError(
                 "the question has no frames to show: ask for them by PreferenceAdapter(..., "

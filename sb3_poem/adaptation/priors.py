@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
+from scipy.special import logsumexp
 
 from sb3_poem.adaptation.meta_model import MetaModel
 
@@ -12,46 +11,32 @@ SOURCES = ("prior", "aggregate")
 N_CENTRES = 256
 
 
-class Prior(Protocol):
-    """A distribution over latents that can be drawn from and evaluated; it may have holes of little
-    density.
-    """
-
-    has_holes: bool
-
-    def sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """(n, d) draws."""
-
-    def balanced_sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """(n, d) draws that stand for the distribution more evenly than independent ones do."""
-
-    def log_density(self, latents: np.ndarray) -> np.ndarray:
-        """(m,) log density at (m, d), up to a constant."""
-
-
-class GaussianPrior(Prior):
+class GaussianPrior:
     """N(0, I) of d dimensions, Algorithm 2's own prior."""
 
+    #: Whether it has places of little density between such of much
     has_holes = False
 
     def __init__(self, dim: int) -> None:
         self.dim = dim
 
     def sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """(n, d) draws."""
         return rng.standard_normal((n, self.dim))
 
     def balanced_sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Draws in pairs of z and -z, so that their mean is the prior's own (an odd one is left
-        over).
+        """(n, d) draws that stand for the distribution more evenly than independent ones do: in
+        pairs of z and -z, so that their mean is the prior's own (an odd one is left over).
         """
         half = rng.standard_normal(((n + 1) // 2, self.dim))
         return np.concatenate([half, -half])[:n]
 
     def log_density(self, latents: np.ndarray) -> np.ndarray:
+        """(m,) log density at (m, d), up to a constant."""
         return -0.5 * np.square(latents).sum(axis=1)
 
 
-class AggregatePrior(Prior):
+class AggregatePrior:
     """The mixture of the training tasks' posteriors. A model can draw from it but does not give its
     density, which moving particles needs; so this *is* a mixture of Gaussians around draws (M, d)
     of the model, whose common width is a share of the draws' distance to their neighbours.
@@ -84,12 +69,12 @@ class AggregatePrior(Prior):
             - 2.0 * latents @ self.centres.T
             + np.square(self.centres).sum(axis=1)[None, :]
         )
-        exponents = -0.5 * squared / self.width**2
-        peak = exponents.max(axis=1)
-        return peak + np.log(np.exp(exponents - peak[:, None]).mean(axis=1))
+        return logsumexp(-0.5 * squared / self.width**2, axis=1)
 
 
-def make_prior(model: MetaModel, source: str, rng: np.random.Generator) -> Prior:
+def make_prior(
+    model: MetaModel, source: str, rng: np.random.Generator
+) -> GaussianPrior | AggregatePrior:
     """The prior of a model from one of ``SOURCES``; the aggregate's centres are drawn."""
     if source == "prior":
         return GaussianPrior(model.latent_dim)

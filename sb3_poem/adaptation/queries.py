@@ -176,12 +176,6 @@ def best_pair(gains: np.ndarray, n: int, visibility: Visibility | None = None) -
     return best
 
 
-def random_pair(n: int, rng: np.random.Generator) -> tuple[int, int]:
-    """Two different ones of n policies, uniformly."""
-    first, second = random_set(n, 2, rng)
-    return first, second
-
-
 def random_set(n: int, size: int, rng: np.random.Generator) -> tuple[int, ...]:
     """Different ones of n policies, uniformly."""
     return tuple(map(int, rng.choice(n, size=size, replace=False)))

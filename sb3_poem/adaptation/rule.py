@@ -5,22 +5,18 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, TypeVar
+from typing import Any, ClassVar, Self, TypeAlias
 
 import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.adaptation.environments import check_model_fits
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.preference import Preference
-from sb3_poem.adaptation.state import generator_from_state
 from sb3_poem.common.trajectory import Trajectory, decode_array, encode_array
-
-if TYPE_CHECKING:
-    from stable_baselines3.common.vec_env import VecEnv
 
 # What a question compares: trajectories, or the latents of policies to roll out.
 Shown: TypeAlias = Trajectory | np.ndarray
-SelfRule = TypeVar("SelfRule", bound="Rule")
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,10 +124,14 @@ class Inference(ABC):
         missing = [name for name in self.state if name not in snapshot.arrays]
         if missing:
             raise ValueError(f"not a snapshot of {type(self).__name__}: {missing[0]} is missing")
+        rng = np.random.default_rng(0)
+        try:
+            rng.bit_generator.state = snapshot.random_state
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"not the state of a PCG64 generator: {error}") from error
         for name in self.state:
             setattr(self, name, snapshot.arrays[name].copy())
-        self.rng = generator_from_state(snapshot.random_state)
-        self.answers = list(answers)
+        self.rng, self.answers = rng, list(answers)
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +206,7 @@ class Rule(ABC):
     def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> Inference:
         """Begin with a task, with what :meth:`check` has accepted."""
 
-    def answered_by(self: SelfRule, oracle: Any) -> SelfRule:
+    def answered_by(self, oracle: Any) -> Self:
         """The rule for the answers of this oracle: itself, where it makes no difference. An oracle
         that says of itself that it answers questions of another kind is refused.
         """
@@ -239,7 +239,7 @@ class Rule(ABC):
         return cls._known[name]._of_options(data["options"])
 
     @classmethod
-    def _of_options(cls: type[SelfRule], options: dict[str, Any]) -> SelfRule:
+    def _of_options(cls, options: dict[str, Any]) -> Self:
         return cls(**options)
 
 

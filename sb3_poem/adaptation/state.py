@@ -1,4 +1,4 @@
-"""Adaptation state as JSON: generators, and files that are whole or absent."""
+"""Adaptation state as JSON: files that are whole or absent."""
 
 from __future__ import annotations
 
@@ -7,19 +7,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from sb3_poem.common.files import write_atomically
-
-
-def generator_from_state(state: dict[str, Any]) -> np.random.Generator:
-    """A generator that continues where the one with this ``bit_generator.state`` stood."""
-    rng = np.random.default_rng(0)
-    try:
-        rng.bit_generator.state = state
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"not the state of a PCG64 generator: {error}") from error
-    return rng
 
 
 def write_json_atomically(path: str | os.PathLike[str], data: dict[str, Any]) -> None:

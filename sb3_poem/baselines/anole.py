@@ -14,7 +14,7 @@ from sb3_poem.adaptation import Answer, Inference, Rule, Setting
 from sb3_poem.adaptation.meta_model import HasRewardDecoder, MetaModel
 from sb3_poem.adaptation.preference import SIGNS, Preference
 from sb3_poem.adaptation.priors import SOURCES, make_prior
-from sb3_poem.adaptation.queries import random_pair
+from sb3_poem.adaptation.queries import random_set
 from sb3_poem.adaptation.rule import Shown, Snapshot, check_choice, trajectories_of
 from sb3_poem.baselines.fragments import (
     check_shared_dynamics,
@@ -160,9 +160,9 @@ class ANOLEInference(Inference):
         """See :class:`Inference`: the best of random pairs, or one random pair."""
         n = len(self.library)
         if self.rule.strategy == "random":
-            first, second = random_pair(n, self.rng)
+            first, second = random_set(n, 2, self.rng)
             return self.library[first], self.library[second]
-        pairs = np.array([random_pair(n, self.rng) for _ in range(self.rule.n_pairs)])
+        pairs = np.array([random_set(n, 2, self.rng) for _ in range(self.rule.n_pairs)])
         if self._library_returns is None:
             self._library_returns = self.model.predicted_returns(self.candidates, self.library)
         returns = self._library_returns

@@ -7,7 +7,7 @@ import copy
 import random
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -23,9 +23,7 @@ from sb3_poem.baselines.fragments import check_shared_dynamics, standardised
 from sb3_poem.baselines.meta_reward import MetaReward
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    from sb3_poem.pearl_sac import PEARLSAC
+from sb3_poem.pearl_sac import PEARLSAC
 
 
 class MAMLRewardModel(MetaModel):

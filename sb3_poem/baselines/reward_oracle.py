@@ -5,10 +5,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.oracles import step_rewards
@@ -27,9 +28,6 @@ from sb3_poem.baselines.fragments import transition_rows
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.pearl_sac import PEARLSAC
-
-if TYPE_CHECKING:
-    from stable_baselines3.common.vec_env import VecEnv
 
 
 @dataclass(frozen=True, repr=False)

@@ -23,7 +23,7 @@ from sb3_poem.adaptation.queries import (
     most_telling_pair,
     most_telling_set,
     pair_differences,
-    random_pair,
+    random_set,
     tolerance,
     worst_case_pair,
     worst_case_sizes,
@@ -211,7 +211,7 @@ def test_what_is_added_to_a_pair_adds_the_most_mutual_information():
 
 def test_random_pairs_differ_and_cover():
     rng = np.random.default_rng(0)
-    pairs = {random_pair(3, rng) for _ in range(100)}
+    pairs = {random_set(3, 2, rng) for _ in range(100)}
     assert pairs == {(i, j) for i in range(3) for j in range(3) if i != j}
 
 
