@@ -1,13 +1,11 @@
 """Adaptation to one task, by ask and tell."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
@@ -358,7 +356,7 @@ class PreferenceAdapter:
         oracle: Oracle | None = None,
         library: Sequence[Trajectory] | None = None,
         render: bool = False,
-    ) -> PreferenceAdapter:
+    ) -> Self:
         """Continue where :meth:`to_dict` stood: the same answers lead to the same policy as without
         the interruption. Model, task and library must be the same; a stochastic oracle's own
         generator is its own affair. For the arguments see :class:`PreferenceAdapter`.
@@ -408,9 +406,7 @@ class PreferenceAdapter:
         return json.dumps(self.to_dict(), allow_nan=False)
 
     @classmethod
-    def from_json(
-        cls, text: str, model: MetaModel | str | Path, env: Env, **kwargs: Any
-    ) -> PreferenceAdapter:
+    def from_json(cls, text: str, model: MetaModel | str | Path, env: Env, **kwargs: Any) -> Self:
         """:meth:`from_dict`, with its arguments, of a JSON text."""
         return cls.from_dict(parse_json(text, "the text is"), model, env, **kwargs)
 
@@ -421,7 +417,7 @@ class PreferenceAdapter:
     @classmethod
     def load(
         cls, path: str | os.PathLike[str], model: MetaModel | str | Path, env: Env, **kwargs: Any
-    ) -> PreferenceAdapter:
+    ) -> Self:
         """:meth:`from_dict`, with its arguments, of a file of :meth:`save`."""
         return cls.from_dict(read_json(path), model, env, **kwargs)
 

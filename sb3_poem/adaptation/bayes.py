@@ -2,11 +2,9 @@
 they thin out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from scipy.special import log_softmax, logsumexp
@@ -107,7 +105,7 @@ class Thinning(NamedTuple):
     error: float = 0.0
 
     @classmethod
-    def fit(cls, thin: np.ndarray, full: np.ndarray) -> Thinning:
+    def fit(cls, thin: np.ndarray, full: np.ndarray) -> Self:
         """Fit differences (n,) decoded from some steps and from all, by ridge regression."""
         added = full - thin
         covariance = np.mean((thin - thin.mean()) * added)
@@ -207,7 +205,7 @@ class Bayes(Rule):
                 f"but is {self.noise_model!r}"
             )
 
-    def answered_by(self, oracle: Any) -> Bayes:
+    def answered_by(self, oracle: Any) -> Self:
         """See :class:`Rule`: with the oracle's own noise model, unless one was chosen."""
         super().answered_by(oracle)
         noise_model = self.noise_model or getattr(oracle, "noise_model", None) or ExactNoise()
@@ -251,7 +249,7 @@ class Bayes(Rule):
         """Which one is used with a model."""
         return self.likelihood or ("decoder" if _knows_its_decoder(model) else "similarity")
 
-    def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> BayesInference:
+    def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> Inference:
         return BayesInference(self, model, rng, setting)
 
     def to_dict(self) -> dict[str, Any]:
@@ -261,7 +259,7 @@ class Bayes(Rule):
         return data
 
     @classmethod
-    def _of_options(cls, options: dict[str, Any]) -> Bayes:
+    def _of_options(cls, options: dict[str, Any]) -> Self:
         noise = options["noise_model"]
         noise_model = noise_model_from_dict(noise) if isinstance(noise, dict) else noise
         return cls(**{**options, "noise_model": noise_model})

@@ -1,7 +1,5 @@
 """Evaluation on held-out tasks during training."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +13,7 @@ from sb3_poem.adaptation.evaluation import evaluate_adaptation, evaluate_episode
 from sb3_poem.adaptation.known_task import known_task_return, preference_order
 from sb3_poem.adaptation.meta_model import HasSimilarity
 from sb3_poem.adaptation.rule import as_rule
+from sb3_poem.common.checks import check_whole
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.pearl_sac.callbacks import EpochCallback
@@ -68,15 +67,15 @@ class AdaptationEvalCallback(EpochCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__(every, verbose)
-        if n_tasks < 1 or n_episodes < 1:
-            got = f"{n_tasks} and {n_episodes}"
-            raise ValueError(f"n_tasks and n_episodes must be at least 1, got {got}")
+        check_whole("n_tasks", n_tasks, 1)
+        check_whole("n_episodes", n_episodes, 1)
         if not record_at:
             raise ValueError(f"record_at must hold at least one number, got {record_at!r}")
         self.n_tasks, self.n_episodes, self.seed = n_tasks, n_episodes, seed
         self.record_at = tuple(record_at)
-        folder = best_model_save_path
-        self.best_model_save_path = None if folder is None else Path(folder)
+        self._best_model: Path | None = None
+        if best_model_save_path is not None:
+            self._best_model = Path(best_model_save_path) / "best_model.zip"
         self.adaptation_kwargs = dict(adaptation_kwargs or {})
         self.env_kwargs = dict(env_kwargs or {})
         for name in self.adaptation_kwargs:
@@ -91,16 +90,11 @@ class AdaptationEvalCallback(EpochCallback):
     def _init_callback(self) -> None:
         """Refuse before training what could not be evaluated or saved after some epochs of it."""
         super()._init_callback()
-        if self.best_model_save_path is not None:
-            self.best_model_save_path.mkdir(parents=True, exist_ok=True)
         self._make_env()
-        if self._best_model is not None and self._best_model.exists():  # a run that goes on
-            self.best_return = getattr(self.model, "best_adapted_return", self.best_return)
-
-    @property
-    def _best_model(self) -> Path | None:
-        folder = self.best_model_save_path
-        return None if folder is None else folder / "best_model.zip"
+        if self._best_model is not None:
+            self._best_model.parent.mkdir(parents=True, exist_ok=True)
+            if self._best_model.exists():  # a run that goes on
+                self.best_return = getattr(self.model, "best_adapted_return", self.best_return)
 
     def _make_env(self) -> tuple[VecEnv, np.ndarray]:
         if self._env is None:
@@ -111,9 +105,8 @@ class AdaptationEvalCallback(EpochCallback):
                     "registered with Gymnasium; register it, or call evaluate_adaptation with a "
                     "vector environment of your own"
                 )
-            arguments = {"max_episode_steps": spec.max_episode_steps, **spec.kwargs}
-            arguments |= self.env_kwargs
-            self._env = make_task_vec_env(spec.id, 2 * self.n_tasks, **arguments)
+            kwargs = {"max_episode_steps": spec.max_episode_steps, **spec.kwargs, **self.env_kwargs}
+            self._env = make_task_vec_env(spec.id, 2 * self.n_tasks, **kwargs)
             check_model_fits(self.model, self._env)
         family = FamilyView(self._env)
         family.check_same_family(self.model.task_space, self.model.reward_feature_dim)

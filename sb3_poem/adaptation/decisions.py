@@ -1,7 +1,5 @@
 """Which latent to act on, given a posterior."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sb3_poem.adaptation.meta_model import HasSimilarity

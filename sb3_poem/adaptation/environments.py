@@ -1,7 +1,5 @@
 """What adaptation accepts as an environment, and whether a model fits it."""
 
-from __future__ import annotations
-
 import sys
 import warnings
 from pathlib import Path

@@ -1,7 +1,5 @@
 """How well adaptation does: true returns after each answer."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -201,21 +199,10 @@ def evaluate_adaptation(
         if on_record is not None:
             on_record(_evaluation(adapted, outcomes))
 
-    adapted = adapt_tasks(
-        own,
-        vec_env,
-        tasks,
-        oracle_factory,
-        rule=rule,
-        n_queries=max(1, *record_at),
-        record_at=record_at,
-        seed=seed,
-        deterministic=deterministic,
-        library=library,
-        progress_bar=progress_bar,
-        on_record=measure,
-    )
-    return _evaluation(adapted, outcomes)
+    how: dict[str, Any] = {"rule": rule, "n_queries": max(1, *record_at), "record_at": record_at}
+    how |= {"seed": seed, "deterministic": deterministic, "library": library}
+    how |= {"progress_bar": progress_bar, "on_record": measure}
+    return _evaluation(adapt_tasks(own, vec_env, tasks, oracle_factory, **how), outcomes)
 
 
 def _evaluation(

@@ -1,7 +1,5 @@
 """A person at a terminal answers."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass

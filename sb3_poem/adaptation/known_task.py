@@ -1,7 +1,5 @@
 """What a known task would give, and Property 1 on held-out tasks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -155,9 +153,8 @@ def known_task_return(
         if ordered:
             chosen_on = chosen_on[np.argsort(along[:, 0])]
         measured = AnswerLimits.measure(chosen_on, returns, fresh, ordered=ordered)
-    outcomes = evaluate_episodes(
-        model, vec_env, best, tasks, n_episodes, evaluation_seed(seed), deterministic
-    )
+    how = n_episodes, evaluation_seed(seed), deterministic
+    outcomes = evaluate_episodes(model, vec_env, best, tasks, *how)
     own = {"tasks": tasks, "latents": best, "candidate_latents": candidates}
     return KnownTaskReturn(**vars(outcomes), **own, candidate_returns=returns, limits=measured)
 
@@ -199,9 +196,8 @@ def return_matrix(
     if not family.shared_dynamics:
         every, rows = np.tile(latents, (shape[0], 1)), np.repeat(tasks, shape[1], axis=0)
         how = n_episodes, seed, deterministic
-        return (
-            evaluate_episodes(model, vec_env, every, rows, *how).returns.mean(axis=1).reshape(shape)
-        )
+        found = evaluate_episodes(model, vec_env, every, rows, *how)
+        return found.returns.mean(axis=1).reshape(shape)
     # The task in effect does not matter, and it must be one that every copy accepts.
     some_task = np.repeat(tasks[:1], n_episodes * shape[1], axis=0)
     every = np.tile(latents, (n_episodes, 1))

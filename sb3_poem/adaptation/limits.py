@@ -1,11 +1,10 @@
 """The most that k answers, or so many bits about the task, can give."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from math import comb
+from typing import Self
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -53,7 +52,7 @@ class AnswerLimits:
     @classmethod
     def measure(
         cls, others: np.ndarray, chosen: np.ndarray, fresh: np.ndarray, *, ordered: bool = False
-    ) -> AnswerLimits:
+    ) -> Self:
         """Take three matrices of returns of the same policies.
 
         :param others: (n_others, n_policies), on which codebooks are chosen.
@@ -279,7 +278,7 @@ def rate_distortion_limit(returns: np.ndarray, bits: float) -> float:
 
     def bound(log_slope: float) -> float:
         slope = float(np.exp(log_slope))
-        return (nats + _log_partition(scaled, slope)) / slope
+        return (nats + _best_marginal(scaled, slope)[1]) / slope
 
     # The dual is convex in 1 / slope, hence unimodal in its logarithm.
     bounds, options = (np.log(1e-2), np.log(1e5)), {"xatol": 1e-2}
@@ -329,26 +328,18 @@ def _swap(returns: np.ndarray, chosen: np.ndarray) -> np.ndarray:
 
 def _check_returns(returns: np.ndarray) -> np.ndarray:
     returns = np.asarray(returns, dtype=np.float64)
-    if returns.ndim != 2 or 0 in returns.shape:
-        expected = "(n_tasks, n_policies), neither 0"
-        raise ValueError(f"`returns` must have shape {expected}, but has shape {returns.shape}")
-    if not np.isfinite(returns).all():
-        raise ValueError("`returns` must be finite")
+    if returns.ndim != 2 or 0 in returns.shape or not np.isfinite(returns).all():
+        expected = "finite, (n_tasks, n_policies), neither 0"
+        raise ValueError(f"`returns` must be {expected}, but has shape {returns.shape}")
     return returns
-
-
-def _log_partition(returns: np.ndarray, slope: float) -> float:
-    """An upper bound, tight within ``TOLERANCE``, on the maximum over p(j | i) of slope E[J] - I(i;
-    j).
-    """
-    return _best_marginal(returns, slope)[1]
 
 
 def _best_marginal(
     returns: np.ndarray, slope: float, marginal: np.ndarray | None = None
 ) -> tuple[np.ndarray, float]:
-    """(n_policies,) how often each policy is taken at the maximum of slope E[J] - I(i; j), and an
-    upper bound on it, by the algorithm of Blahut and Arimoto; it may start at a marginal.
+    """(n_policies,) how often each policy is taken at the maximum of slope E[J] - I(i; j) over
+    p(j | i), and an upper bound on it, tight within ``TOLERANCE``, by the algorithm of Blahut and
+    Arimoto; it may start at a marginal.
     """
     best = returns.max(axis=1, keepdims=True)
     kernel = np.exp(slope * (returns - best))

@@ -1,7 +1,5 @@
 """Adaptation to many tasks at once: their rollouts fill a vector environment."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -125,16 +123,10 @@ def adapt_tasks(
         n_shown = len(PLACES[rule.question])
         shown = [item for item in asked if isinstance(item, Trajectory)]
         if not shown:
-            shown = rollout_latents(
-                model,
-                vec_env,
-                np.stack([latent_of(item) for item in asked]),
-                np.repeat(tasks, n_shown, axis=0),
-                np.repeat(
-                    [rollout_seed(number, query) for number, _ in numbered], n_shown
-                ).tolist(),
-                deterministic and not rule.explores,
-            )
+            seeds = [rollout_seed(number, query) for number, _ in numbered for _ in range(n_shown)]
+            policies = np.stack([latent_of(item) for item in asked])
+            where, by_mode = np.repeat(tasks, n_shown, axis=0), deterministic and not rule.explores
+            shown = rollout_latents(model, vec_env, policies, where, seeds, by_mode)
         for i, (inference, oracle) in enumerate(zip(inferences, oracles, strict=True)):
             own = shown[n_shown * i : n_shown * (i + 1)]
             answer = as_preference(oracle(*own), rule.question)

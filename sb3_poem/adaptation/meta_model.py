@@ -1,7 +1,5 @@
 """What adaptation needs of a model."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 

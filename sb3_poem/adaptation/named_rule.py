@@ -1,7 +1,5 @@
 """Rules by their short form: words, as a command line and the sessions of the page have them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from sb3_poem.adaptation.bayes import Bayes

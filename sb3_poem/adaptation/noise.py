@@ -6,8 +6,6 @@ argument (MacKay 1992). Both are evaluated as logistic functions, whose tails ar
 that the prediction calls impossible should not veto a latent.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Protocol
 

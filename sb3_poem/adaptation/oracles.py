@@ -1,9 +1,7 @@
 """Who answers. Oracles alone may know the task; an adapter never does."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
-from typing import Any
+from typing import Any, Self
 
 import gymnasium as gym
 import numpy as np
@@ -89,7 +87,7 @@ class TaskOracle(ABC):
     def _perceive(self, returns: np.ndarray) -> np.ndarray:
         """The returns by which to answer, from true ones; both (n,)."""
 
-    def bind(self, env: gym.Env | VecEnv, task: np.ndarray | None = None) -> TaskOracle:
+    def bind(self, env: gym.Env | VecEnv, task: np.ndarray | None = None) -> Self:
         """Give the oracle its environment, and its task unless that is None; returns itself."""
         self.env = env
         if task is not None:

@@ -1,7 +1,5 @@
 """The paper's own rule, Algorithm 2 of Xu & Zhu (2025)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -70,7 +68,7 @@ class Paper(Rule):
             name = type(model).__name__
             raise ValueError(f"rule=Paper() needs a model with a similarity S; {name} has none")
 
-    def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> PaperInference:
+    def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> Inference:
         return PaperInference(self, model, rng)
 
 

@@ -2,8 +2,6 @@
 once, and kernels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

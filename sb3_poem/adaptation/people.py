@@ -2,8 +2,6 @@
 much better. Which of them it is is inferred with the task.
 """
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

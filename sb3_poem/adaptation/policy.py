@@ -1,12 +1,10 @@
 """The adapted policy."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch as th
@@ -89,16 +87,14 @@ class AdaptedPolicy:
         write_atomically(Path(path), self.to_bytes())
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], device: str = "auto") -> AdaptedPolicy:
+    def load(cls, path: str | os.PathLike[str], device: str = "auto") -> Self:
         """Read what :meth:`save` wrote, or what the page for answering gives for download; see
         :meth:`from_bytes`.
         """
         return cls.from_bytes(Path(path).read_bytes(), device, os.fspath(path))
 
     @classmethod
-    def from_bytes(
-        cls, content: bytes, device: str = "auto", source: str = "the content"
-    ) -> AdaptedPolicy:
+    def from_bytes(cls, content: bytes, device: str = "auto", source: str = "the content") -> Self:
         """Read what :meth:`to_bytes` gave; a ``ValueError``, which names ``source``, if it is
         truncated or of another program.
         """

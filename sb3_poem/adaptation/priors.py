@@ -1,6 +1,6 @@
 """Where candidate latents come from before the first answer."""
 
-from __future__ import annotations
+from typing import TypeAlias
 
 import numpy as np
 from scipy.special import logsumexp
@@ -72,9 +72,10 @@ class AggregatePrior:
         return logsumexp(-0.5 * squared / self.width**2, axis=1)
 
 
-def make_prior(
-    model: MetaModel, source: str, rng: np.random.Generator
-) -> GaussianPrior | AggregatePrior:
+Prior: TypeAlias = GaussianPrior | AggregatePrior
+
+
+def make_prior(model: MetaModel, source: str, rng: np.random.Generator) -> Prior:
     """The prior of a model from one of ``SOURCES``; the aggregate's centres are drawn."""
     if source == "prior":
         return GaussianPrior(model.latent_dim)

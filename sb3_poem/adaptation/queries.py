@@ -2,8 +2,6 @@
 nothing loops over pairs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """What a rule of inference is: options that start an inference, which asks and is told."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
@@ -34,16 +32,6 @@ class Answer:
     preference: Preference
     shown: tuple[Shown, ...]
 
-    @property
-    def left(self) -> Shown:
-        """What a pair showed left."""
-        return self.shown[0]
-
-    @property
-    def right(self) -> Shown:
-        """What a pair showed right."""
-        return self.shown[1]
-
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
@@ -57,7 +45,7 @@ class Snapshot:
         return {"random_state": self.random_state, "arrays": arrays}
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Snapshot:
+    def from_dict(cls, data: dict[str, Any]) -> Self:
         """Read what :meth:`to_dict` wrote; a ``ValueError`` if it is incomplete or broken."""
         try:
             arrays = {str(name): decode_array(array) for name, array in data["arrays"].items()}
@@ -176,7 +164,7 @@ class Rule(ABC):
     #: Why the rule takes no library; None if it takes one.
     refuses_library: ClassVar[str | None] = None
 
-    _known: ClassVar[dict[str, type[Rule]]] = {}
+    _known: ClassVar[dict[str, "type[Rule]"]] = {}
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -228,7 +216,7 @@ class Rule(ABC):
         return {"name": type(self).__name__, "module": type(self).__module__, "options": options}
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Rule:
+    def from_dict(cls, data: dict[str, Any]) -> "Rule":
         """Read what :meth:`to_dict` of any imported rule wrote."""
         name, module = data["name"], data["module"]
         if name not in cls._known:

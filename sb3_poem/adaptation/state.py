@@ -1,7 +1,5 @@
 """Adaptation state as JSON: files that are whole or absent."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

@@ -2,8 +2,6 @@
 many ways as the answers still to come may lie (Berlekamp 1968).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import comb, floor
 from typing import Any
@@ -118,7 +116,7 @@ class ANOLE(Rule):
             "these show another world; pass a `library` from the new task",
         )
 
-    def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> ANOLEInference:
+    def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> Inference:
         library = setting.library
         if library is None:
             length = self.fragment_length or default_fragment_length(model.horizon)

@@ -2,8 +2,6 @@
 new task; and trajectories as rows that networks take.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

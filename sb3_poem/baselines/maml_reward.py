@@ -1,7 +1,5 @@
 """MAML-reward: the answers adapt the reward, and SAC learns from what was shown."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import random
@@ -147,7 +145,7 @@ class MAMLReward(Rule):
             "MAML-reward's network was trained on what tasks say of each other's fragments",
         )
 
-    def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> MAMLRewardInference:
+    def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> Inference:
         return MAMLRewardInference(self, model, rng, setting.n_queries)
 
 

@@ -2,11 +2,9 @@
 Sadigh 2023).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch as th
@@ -178,7 +176,7 @@ class MetaReward:
         write_json_atomically(Path(folder) / CONFIG, {"format": FORMAT, **settings})
 
     @classmethod
-    def load(cls, folder: str | Path, policy: LatentPolicy) -> MetaReward:
+    def load(cls, folder: str | Path, policy: LatentPolicy) -> Self:
         """Read what :meth:`save` wrote; the policy must be that of the meta-training."""
         weights, settings = Path(folder) / WEIGHTS, Path(folder) / CONFIG
         if not settings.is_file():

@@ -2,8 +2,6 @@
 2019).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -80,7 +78,7 @@ class RewardOracle(Rule):
             raise ValueError(f"`model` {lacks}; train it for an epoch first")
         FamilyView(_env_of(setting))  # which refuses what is no family
 
-    def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> RewardInference:
+    def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> Inference:
         inference = RewardInference(model, rng, _env_of(setting), setting.task)
         if self.candidates == "aggregate":
             latents = model.sample_latents(N_CENTRES, rng, source="aggregate")

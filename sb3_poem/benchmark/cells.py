@@ -2,8 +2,6 @@
 to the same.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from functools import partial

@@ -1,7 +1,5 @@
 """How long trainings and cells take, told from how fast this machine is at a short training."""
 
-from __future__ import annotations
-
 import contextlib
 from dataclasses import dataclass
 from functools import cache

@@ -2,21 +2,18 @@
 and tolerance.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from sb3_poem.benchmark.methods import INFERENCE_LABELS, METHODS
 from sb3_poem.benchmark.results import Condition, Reference, Selection, Series
 from sb3_poem.benchmark.suites import Entry, OracleSpec
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 PANEL_WIDTH, PANEL_HEIGHT = 4.2, 3.0
 TOLERANCE = "tolerance"
@@ -167,9 +164,6 @@ def _grid(
     """A column for each family; a row for each oracle, or inference rule, or one."""
     # The object interface: a figure of pyplot would stay in its global list, and choose a window
     # system.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     rows = list(INFERENCE_LABELS.values()) if entry.by_inference else [""]
     if by_oracle:
         rows = [oracle.label for oracle in entry.oracles]

@@ -1,7 +1,5 @@
 """Trained models: found among those that were handed over or left by earlier runs, or trained."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import os
@@ -10,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 # A model that rl_zoo3 trained may hold its schedules. Importing it replaces Gymnasium's TimeLimit,
 # so it comes first.
@@ -82,7 +80,7 @@ class Workplace:
     device: str = "cpu"
     num_threads: int = 1
 
-    def absolute(self) -> Workplace:
+    def absolute(self) -> Self:
         """The same for a process with another working folder."""
         return replace(
             self,

@@ -1,7 +1,5 @@
 """Where a record comes from: commit, versions, machine."""
 
-from __future__ import annotations
-
 import os
 import platform
 import re

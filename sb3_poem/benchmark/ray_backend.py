@@ -6,8 +6,6 @@ which all machines must share: so a lost worker's trial is tried again where it 
 command resumes a whole experiment.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import shutil

@@ -1,10 +1,9 @@
 """What a store holds of a suite: finished cells, gathered over seeds and summarised."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from scipy.stats import sem, trim_mean
@@ -42,7 +41,7 @@ class Condition:
     revision: int
 
     @classmethod
-    def of(cls, record: Record) -> Condition:
+    def of(cls, record: Record) -> Self:
         identity, trained = record.identity, Training.from_dict(record.identity["training"])
         sizes = {name: identity[name] for name in ("tasks", "episodes", "task_seed")}
         return cls(identity["env_id"], Budget(**sizes), trained, identity["revision"])
@@ -118,7 +117,7 @@ class Series(_Measured):
         """(n_seeds, n_tasks) after so many answers."""
         return self.returns[:, :, self.queries.index(queries)]
 
-    def against(self, other: Series, queries: int) -> Comparison | None:
+    def against(self, other: Self, queries: int) -> "Comparison | None":
         """After so many answers, on the seeds that both have; None if there are none."""
         mine, theirs = ([record.seed for record in each.records] for each in (self, other))
         common, one, two = np.intersect1d(mine, theirs, return_indices=True)

@@ -1,7 +1,5 @@
 """What a run will do, and doing it in this process, one cell after another."""
 
-from __future__ import annotations
-
 import contextlib
 import traceback
 from collections import Counter

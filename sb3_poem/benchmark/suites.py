@@ -1,12 +1,10 @@
 """The suites, and the cells that they are made of. Nothing heavy is imported here."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Self
 
 from sb3_poem.benchmark.methods import EPSILONS, METHODS, QUERY_RULES, Method, find_method
 
@@ -117,7 +115,7 @@ class Training:
         return {"timesteps": self.timesteps, "hyperparameters": dict(self.hyperparameters)}
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Training:
+    def from_dict(cls, data: dict[str, Any]) -> Self:
         given = {name: hashable(value) for name, value in data["hyperparameters"].items()}
         return cls(data["timesteps"], tuple(sorted(given.items())))
 
@@ -195,7 +193,7 @@ class Cell:
         }
 
     @classmethod
-    def of_identity(cls, method: str, identity: dict[str, Any]) -> Cell:
+    def of_identity(cls, method: str, identity: dict[str, Any]) -> Self:
         """The cell of a record, from its method's name and what :meth:`identity` gave."""
         usual = METHODS[method].recorded({})["options"]
         options = ((name, hashable(value)) for name, value in identity["options"].items())

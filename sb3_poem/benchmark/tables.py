@@ -1,7 +1,5 @@
 """Tables of a suite, and its report: pure functions of what the store holds."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -5,8 +5,6 @@ The child ends with its parent, so that a benchmark that was killed leaves no tr
 notes how long it took.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import json

@@ -129,7 +129,7 @@ def test_it_never_reads_rewards(rule):
     seeing, blind = adapter(rule=rule), adapter(Blinded(make_env()), rule=rule)
     for a in (seeing, blind):
         answer(a, 10)
-    assert blind.answers[0].left.reward_features is None
+    assert blind.answers[0].shown[0].reward_features is None
     np.testing.assert_array_equal(seeing.policy().latent, blind.policy().latent)
 
 
@@ -761,8 +761,8 @@ def test_an_id_and_a_vector_environment_will_do():
         )
         one = adapter(make_env(), oracle=ReturnOracle(), n_queries=2)
         np.testing.assert_array_equal(many.adapt().latent, one.adapt().latent)
-        first = from_id.answers[0].left.observations
-        np.testing.assert_array_equal(first, one.answers[0].left.observations)
+        first = from_id.answers[0].shown[0].observations
+        np.testing.assert_array_equal(first, one.answers[0].shown[0].observations)
     finally:
         del gym.registry["test/Speed-v0"]
 

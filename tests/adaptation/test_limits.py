@@ -293,7 +293,7 @@ class OtherNoise:
     ("call", "message"),
     [
         (lambda: information_limit(np.zeros((2, 2)), -1), "`k` must not be negative"),
-        (lambda: information_limit(np.zeros(3), 1), "`returns` must have shape"),
+        (lambda: information_limit(np.zeros(3), 1), "neither 0, but has shape"),
         (lambda: information_limit(np.full((2, 2), np.nan), 1), "`returns` must be finite"),
         (
             lambda: information_limit(np.zeros((2, 2)), 1, noise_model=OtherNoise()),

@@ -133,7 +133,9 @@ def test_noise_follows_the_seed(kind):
 
 def test_what_an_oracle_needs():
     blind = Trajectory(np.zeros((3, 2)), np.zeros((2, 1)), np.zeros(5))
-    with pytest.raises(ValueError, match="computed from reward features, but the trajectory has none"):
+    with pytest.raises(
+        ValueError, match="computed from reward features, but the trajectory has none"
+    ):
         ReturnOracle(env_with_goal(1.0))(blind, blind)
     with pytest.raises(RuntimeError, match="has no environment"):
         ReturnOracle()(at_speed(1.0), at_speed(2.0))

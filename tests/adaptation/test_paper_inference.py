@@ -30,7 +30,7 @@ def differences(inference, latents):
     model = inference.model
     columns = []
     for answer in inference.answers:
-        left, right = model.similarities(latents, np.stack([answer.left, answer.right])).T
+        left, right = model.similarities(latents, np.stack(answer.shown)).T
         columns.append(left - right if answer.preference is LEFT else right - left)
     return np.stack(columns, axis=1)
 

@@ -56,7 +56,7 @@ def surviving_mass(model, inference, epsilon, draws):
     """P_k by Monte Carlo: eq. 9 written out, independent of the code under test."""
     alive = np.ones(len(draws), dtype=bool)
     for answer in inference.answers:
-        s = model.similarities(draws, np.stack([answer.left, answer.right]))
+        s = model.similarities(draws, np.stack(answer.shown))
         better, worse = (
             (s[:, 0], s[:, 1]) if answer.preference is Preference.LEFT else (s[:, 1], s[:, 0])
         )

@@ -106,8 +106,8 @@ def accuracy(meta, parameters, answers):
     right = 0
     for answer in answers:
         difference = (
-            meta.rewards(parameters, answer.left).sum()
-            - meta.rewards(parameters, answer.right).sum()
+            meta.rewards(parameters, answer.shown[0]).sum()
+            - meta.rewards(parameters, answer.shown[1]).sum()
         )
         right += (difference > 0) == (answer.preference == Preference.LEFT)
     return right / len(answers)
@@ -140,7 +140,7 @@ def test_answers_about_episodes_that_ended_early(trained):
         sums = [
             th.func.functional_call(meta.network, parts, (meta.transitions(shown),)).sum()
             for answer in answers
-            for shown in (answer.left, answer.right)
+            for shown in answer.shown
         ]
         loss = -th.nn.functional.logsigmoid(sums[0] - sums[1]) / 2 + np.log(2) / 2
         slopes = th.autograd.grad(loss, list(parts.values()))

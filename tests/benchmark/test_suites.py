@@ -209,10 +209,7 @@ def test_the_papers_table() -> None:
 
 def test_the_declarations_are_light() -> None:
     """The command line reads them for its help."""
-    code = (
-        "import sys, sb3_poem.benchmark.suites; "
-        "print({'torch', 'mujoco'} & set(sys.modules))"
-    )
+    code = "import sys, sb3_poem.benchmark.suites; print({'torch', 'mujoco'} & set(sys.modules))"
     assert (
         subprocess.run(
             [sys.executable, "-c", code], capture_output=True, text=True, check=True

@@ -282,7 +282,7 @@ def test_the_terminals_answers_are_in_the_same_store(
         ("terminal", "left", "left"),
         ("terminal", "equal", "left"),
     ]
-    assert kept[1]["left_latent"] == adapter.answers[1].left.latent.tolist()
+    assert kept[1]["left_latent"] == adapter.answers[1].shown[0].latent.tolist()
     assert Path(kept[0]["video"]).read_bytes().startswith(b"GIF8")
 
 

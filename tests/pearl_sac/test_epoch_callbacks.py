@@ -246,7 +246,7 @@ def test_what_cannot_be_evaluated_or_saved_is_refused_before_training(tmp_path: 
 
 @pytest.mark.parametrize("arguments", [{"n_tasks": 0}, {"n_episodes": 0}])
 def test_evaluation_refuses_nothing_to_do(arguments: dict[str, int]) -> None:
-    with pytest.raises(ValueError, match="n_tasks and n_episodes must be at least 1, got"):
+    with pytest.raises(ValueError, match="must be at least 1, but is 0"):
         AdaptationEvalCallback(**arguments)
 
 
