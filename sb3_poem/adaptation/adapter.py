@@ -427,7 +427,7 @@ def _complete() -> Iterator[None]:
     """Says of data that lacks something that it does."""
     try:
         yield
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"a saved adaptation that is incomplete or broken: {error!r}") from error
 
 

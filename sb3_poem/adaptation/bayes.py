@@ -22,6 +22,7 @@ from sb3_poem.adaptation.noise import (
 )
 from sb3_poem.adaptation.particles import (
     WIDENING,
+    Gaussian,
     elliptical_slice_moves,
     fit_gaussian,
     kernel_neighbours,
@@ -586,7 +587,7 @@ class BayesInference(Inference):
 
     def _rejuvenate(self) -> None:
         """Resample, and replace what is now double, at bounded cost."""
-        mean, factor = fit_gaussian(self.particles, self.weights)
+        fitted = fit_gaussian(self.particles, self.weights)
         chosen = systematic_resample(self.weights, len(self.particles), self.rng)
         copies = np.flatnonzero(np.concatenate([[False], chosen[1:] == chosen[:-1]]))
         self.particles = self.particles[chosen]
@@ -595,7 +596,7 @@ class BayesInference(Inference):
         self.log_weights = np.zeros(len(self.particles))
         self._library_returns = None
         if self.likelihood == "similarity":
-            self._move(np.arange(len(self.particles)), MOVE_SWEEPS, MOVE_TRIES, mean, factor)
+            self._move(np.arange(len(self.particles)), MOVE_SWEEPS, MOVE_TRIES, fitted)
             return
         # One evaluation more than tries: where a particle stands now has to be weighed, too; and
         # another for who answers.
@@ -604,30 +605,22 @@ class BayesInference(Inference):
         steps = sum(min(len(item), DECODED_STEPS) for item in shown)
         affordable = DECODER_MOVE_STEPS // (steps * evaluations)
         order = self.rng.permutation(len(copies))
-        self._move(copies[order[:affordable]], 1, DECODER_TRIES, mean, factor)
+        self._move(copies[order[:affordable]], 1, DECODER_TRIES, fitted)
         left_over = copies[order[affordable:]]
         log_prior = self.prior.log_density if self.prior.has_holes else None
-        self.particles[left_over] = kernel_neighbours(
-            self.particles[left_over], mean, factor, KERNEL_WIDTH, log_prior, self.rng
-        )
+        replaced = self.particles[left_over], fitted, KERNEL_WIDTH, log_prior, self.rng
+        self.particles[left_over] = kernel_neighbours(*replaced)
 
-    def _move(
-        self, moved: np.ndarray, sweeps: int, tries: int, mean: np.ndarray, factor: np.ndarray
-    ) -> None:
+    def _move(self, moved: np.ndarray, sweeps: int, tries: int, fitted: Gaussian) -> None:
         if not len(moved):
             return
         particles = self.particles[moved]
         log_likelihoods = self._answer_log_likelihoods(particles)
+        reference = Gaussian(fitted.mean, WIDENING * fitted.factor)
+        target = self._answer_log_likelihoods, self.prior.log_density, reference
         for _ in range(sweeps):
             particles, log_likelihoods = elliptical_slice_moves(
-                particles,
-                log_likelihoods,
-                self._answer_log_likelihoods,
-                self.prior.log_density,
-                mean,
-                WIDENING * factor,
-                tries,
-                self.rng,
+                particles, log_likelihoods, *target, tries, self.rng
             )
         self.particles[moved] = particles
         if self.people is not None:

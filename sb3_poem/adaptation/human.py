@@ -16,28 +16,25 @@ PROMPTS = {
     "5 right, much: ",
     BEST_OF_FOUR: "Which is best? 1, 2, 3 or 4, or 0 (can't tell): ",
 }
-EQUAL_WORDS = dict.fromkeys(("e", "equal", "=", "can't tell", "cant tell", "?"), Preference.EQUAL)
-WORDS = {
-    **dict.fromkeys(("l", "left"), Preference.LEFT),
-    **dict.fromkeys(("r", "right"), Preference.RIGHT),
-    **EQUAL_WORDS,
+SHORT = {
+    **{"l": Preference.LEFT, "ll": Preference.MUCH_LEFT},
+    **{"r": Preference.RIGHT, "rr": Preference.MUCH_RIGHT},
+    **dict.fromkeys(("e", "=", "can't tell", "cant tell", "?"), Preference.EQUAL),
 }
-READ = {
-    "pair": {**WORDS, "1": Preference.LEFT, "2": Preference.RIGHT},
-    "graded": {
-        **WORDS,
-        **dict.fromkeys(("1", "ll", "much left"), Preference.MUCH_LEFT),
-        "2": Preference.LEFT,
-        "3": Preference.EQUAL,
-        "4": Preference.RIGHT,
-        **dict.fromkeys(("5", "rr", "much right"), Preference.MUCH_RIGHT),
-    },
+NUMBERED = {
+    "pair": {"1": Preference.LEFT, "2": Preference.RIGHT},
+    "graded": {str(n): each for n, each in enumerate(ANSWERS["graded"][::-1], 1)},
     BEST_OF_FOUR: {
-        **EQUAL_WORDS,
         "0": Preference.EQUAL,
-        **{str(n): each for n, each in enumerate(ANSWERS[BEST_OF_FOUR][:0:-1], 1)},
-        **{each.value: each for each in ANSWERS[BEST_OF_FOUR][1:]},
+        **dict(zip("4321", ANSWERS[BEST_OF_FOUR][1:], strict=True)),
     },
+}
+#: What each word that may be typed means, by kind of question
+READ = {
+    kind: {word: each for word, each in SHORT.items() if each in answers}
+    | {each.value: each for each in answers}
+    | NUMBERED[kind]
+    for kind, answers in ANSWERS.items()
 }
 KEYS = {
     "pair": "l, r or e",

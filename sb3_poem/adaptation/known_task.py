@@ -16,6 +16,7 @@ from sb3_poem.adaptation.evaluation import (
 from sb3_poem.adaptation.limits import AnswerLimits
 from sb3_poem.adaptation.meta_model import HasSimilarity, MetaModel
 from sb3_poem.adaptation.noise import NoiseModel
+from sb3_poem.adaptation.rule import check_choice
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.rollouts import rollout_outcomes
@@ -254,12 +255,8 @@ def preference_order(model: HasSimilarity, known: KnownTaskReturn) -> tuple[floa
 
 
 def _draw_latents(model: MetaModel, n: int, source: str, rng: np.random.Generator) -> np.ndarray:
-    if source in ("prior", "aggregate"):
-        return model.sample_latents(n, rng, source=source)
-    if source != "both":
-        raise ValueError(f'`source` must be "prior", "aggregate" or "both", but is {source!r}')
-    half = n // 2
-    prior = model.sample_latents(n - half, rng, source="prior")
-    if not half:
-        return prior
-    return np.concatenate([prior, model.sample_latents(half, rng, source="aggregate")])
+    of_aggregate = {"prior": 0, "both": n // 2, "aggregate": n}
+    check_choice("source", source, tuple(of_aggregate))
+    numbers = {"prior": n - of_aggregate[source], "aggregate": of_aggregate[source]}
+    drawn = [model.sample_latents(k, rng, source=name) for name, k in numbers.items() if k]
+    return np.concatenate(drawn)

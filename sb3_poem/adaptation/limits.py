@@ -60,7 +60,7 @@ class AnswerLimits:
         :param fresh: (n_tasks, n_policies), of other episodes, which score it.
         :param ordered: See :func:`best_codebook`.
         """
-        others, chosen, fresh = (_check_returns(returns) for returns in (others, chosen, fresh))
+        others, chosen, fresh = (check_returns(returns) for returns in (others, chosen, fresh))
         n_policies, every = others.shape[1], np.arange(len(chosen))
         codebooks = []
         for k in range((n_policies - 1).bit_length() + 1):
@@ -131,7 +131,7 @@ def information_limit(
     """
     if k < 0:
         raise ValueError(f"`k` must not be negative, but is {k}")
-    returns = _check_returns(returns)
+    returns = check_returns(returns)
     capacity = answer_capacity(noise_model, float(np.ptp(returns, axis=1).max()), n_answers)
     n_tasks, n_policies = returns.shape
     if k >= 63 or n_answers**k >= min(n_tasks, n_policies):
@@ -160,7 +160,7 @@ def best_codebook(returns: np.ndarray, size: int, *, ordered: bool = False) -> n
         from there on, as with a goal speed; noise in the returns may break this, so the general
         search is tried too.
     """
-    returns = _check_returns(returns)
+    returns = check_returns(returns)
     if size < 1:
         raise ValueError(f"`size` must be at least 1, but is {size}")
     n_policies = returns.shape[1]
@@ -326,10 +326,11 @@ def _swap(returns: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     return chosen
 
 
-def _check_returns(returns: np.ndarray) -> np.ndarray:
+def check_returns(returns: np.ndarray, axes: str = "(n_tasks, n_policies)") -> np.ndarray:
+    """Returns of these two axes as float64; a ``ValueError`` if they are not finite, or none."""
     returns = np.asarray(returns, dtype=np.float64)
     if returns.ndim != 2 or 0 in returns.shape or not np.isfinite(returns).all():
-        expected = "finite, (n_tasks, n_policies), neither 0"
+        expected = f"finite, {axes}, neither 0"
         raise ValueError(f"`returns` must be {expected}, but has shape {returns.shape}")
     return returns
 

@@ -73,23 +73,10 @@ def _with_lapse(probability: np.ndarray) -> np.ndarray:  # in place
     return probability
 
 
-class _Serialisable:
+class _Noise:
+    """The larger return is perceived to be larger, unless a subclass says otherwise."""
+
     kind: str
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"kind": self.kind, **vars(self)}
-
-
-@dataclass(frozen=True)
-class ExactNoise(_Serialisable):
-    """The larger return always wins; what doubt there is comes from the prediction.
-
-    >>> p = ExactNoise().probability_left(difference=3.0, error=3.0, magnitude=20.0)
-    >>> round(float(p), 2)
-    0.84
-    """
-
-    kind = "exact"
     mistakes = 0.0
 
     def probability_above(self, difference: Values, error: Values, magnitude: Values) -> Any:
@@ -98,9 +85,24 @@ class ExactNoise(_Serialisable):
     def probability_left(self, difference: Values, error: Values, magnitude: Values) -> Any:
         return _with_lapse(self.probability_above(difference, error, magnitude))
 
+    def to_dict(self) -> dict[str, Any]:
+        return {"kind": self.kind, **vars(self)}
+
 
 @dataclass(frozen=True)
-class MistakeNoise(_Serialisable):
+class ExactNoise(_Noise):
+    """The larger return always wins; what doubt there is comes from the prediction.
+
+    >>> p = ExactNoise().probability_left(difference=3.0, error=3.0, magnitude=20.0)
+    >>> round(float(p), 2)
+    0.84
+    """
+
+    kind = "exact"
+
+
+@dataclass(frozen=True)
+class MistakeNoise(_Noise):
     """The right answer, flipped with a fixed probability, in [0, 0.5].
 
     >>> p = MistakeNoise(0.1).probability_left(difference=3.0, error=0.0, magnitude=20.0)
@@ -116,19 +118,16 @@ class MistakeNoise(_Serialisable):
             raise ValueError(f"`rate` must lie in [0, 0.5], but is {self.rate}")
 
     @property
-    def mistakes(self) -> float:
+    def mistakes(self) -> float:  # type: ignore[override]
         return self.rate
 
-    def probability_above(self, difference: Values, error: Values, magnitude: Values) -> Any:
-        return ExactNoise().probability_above(difference, error, magnitude)
-
     def probability_left(self, difference: Values, error: Values, magnitude: Values) -> Any:
-        right = ExactNoise().probability_left(difference, error, magnitude)
+        right = super().probability_left(difference, error, magnitude)
         return self.rate + (1.0 - 2.0 * self.rate) * right
 
 
 @dataclass(frozen=True)
-class BoltzmannNoise(_Serialisable):
+class BoltzmannNoise(_Noise):
     """LEFT with probability 1 / (1 + exp(-beta (R_left - R_right))) (C.6 of Xu & Zhu 2025); a beta
     of None is the paper's ``1 / (|R_left| + |R_right|)``.
 
@@ -139,7 +138,6 @@ class BoltzmannNoise(_Serialisable):
 
     beta: float | None = None
     kind = "boltzmann"
-    mistakes = 0.0
 
     def __post_init__(self) -> None:
         if self.beta is not None and not (np.isfinite(self.beta) and self.beta > 0):
@@ -149,9 +147,6 @@ class BoltzmannNoise(_Serialisable):
         beta = 1.0 / np.maximum(magnitude, 1e-12) if self.beta is None else self.beta
         shrink = np.sqrt(1.0 + np.pi / 8.0 * (beta * np.asarray(error)) ** 2)
         return _logistic(difference, beta / shrink)
-
-    def probability_left(self, difference: Values, error: Values, magnitude: Values) -> Any:
-        return _with_lapse(self.probability_above(difference, error, magnitude))
 
 
 _KINDS: dict[str, type] = {cls.kind: cls for cls in (ExactNoise, MistakeNoise, BoltzmannNoise)}

@@ -3,6 +3,7 @@ once, and kernels.
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,9 +22,15 @@ def systematic_resample(weights: np.ndarray, n: int, rng: np.random.Generator) -
     return np.minimum(found, len(weights) - 1)
 
 
-def fit_gaussian(particles: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A Gaussian over weighted particles (n, d): mean (d,), and a lower-triangular factor (d, d) of
-    the covariance.
+class Gaussian(NamedTuple):
+    """Mean (d,), and a lower-triangular factor (d, d) of the covariance."""
+
+    mean: np.ndarray
+    factor: np.ndarray
+
+
+def fit_gaussian(particles: np.ndarray, weights: np.ndarray) -> Gaussian:
+    """A Gaussian over weighted particles (n, d).
 
     With fewer effective particles than dimensions the sample covariance is singular, and moves
     would stay in its plane; it is shrunk towards its own diagonal by as much as particles are
@@ -39,21 +46,20 @@ def fit_gaussian(particles: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray
     diagonal = np.diag(covariance)
     floor = 1e-8 + 1e-4 * diagonal.max()
     covariance = (1.0 - shrinkage) * covariance + np.diag(shrinkage * diagonal + floor)
-    return mean, np.linalg.cholesky(covariance)
+    return Gaussian(mean, np.linalg.cholesky(covariance))
 
 
 def kernel_neighbours(
     particles: np.ndarray,
-    mean: np.ndarray,
-    factor: np.ndarray,
+    fitted: Gaussian,
     width: float,
     log_prior: Callable[[np.ndarray], np.ndarray] | None,
     rng: np.random.Generator,
 ) -> np.ndarray:
     """A neighbour of each particle (n, d), without a look at the likelihood.
 
-    The kernel shrinks towards the mean (d,) as much as it spreads by the covariance's lower
-    triangular factor (d, d), so that both stay (Liu & West 2001). Where the prior has holes
+    The kernel shrinks towards the mean as much as it spreads by the covariance, so that both stay
+    (Liu & West 2001). Where the prior has holes
     (between the modes of a mixture, off the surface on which its latents lie) there should be no
     particles however the likelihood looks: then a step is taken with the ratio of the prior's
     densities.
@@ -61,7 +67,7 @@ def kernel_neighbours(
     :param width: Of the kernel, as a share of the particles' spread, in (0, 1).
     :param log_prior: Maps (m, d) to (m,), up to a constant; None where the prior has no holes.
     """
-    noise = rng.standard_normal(particles.shape) @ factor.T
+    mean, noise = fitted.mean, rng.standard_normal(particles.shape) @ fitted.factor.T
     proposals = mean + np.sqrt(1.0 - width**2) * (particles - mean) + width * noise
     if log_prior is None:
         return proposals
@@ -75,8 +81,7 @@ def elliptical_slice_moves(
     log_likelihoods: np.ndarray,
     log_likelihood: Callable[[np.ndarray], np.ndarray],
     log_prior: Callable[[np.ndarray], np.ndarray],
-    mean: np.ndarray,
-    factor: np.ndarray,
+    reference: Gaussian,
     tries: int,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -91,16 +96,14 @@ def elliptical_slice_moves(
     probable as its reverse.
 
     :param log_likelihoods: (n,) at the particles.
-    :param mean: (d,) of the reference.
-    :param factor: (d, d) lower triangular factor of its covariance.
     :param tries: Bound on the evaluations per particle.
     """
-    n, dim = particles.shape
+    (n, dim), (mean, factor) = particles.shape, reference
     inverse = np.linalg.inv(factor)
 
     def log_ratio(latents: np.ndarray, likelihoods: np.ndarray) -> np.ndarray:
-        reference = -0.5 * np.square((latents - mean) @ inverse.T).sum(axis=1)
-        return likelihoods + log_prior(latents) - reference
+        of_reference = -0.5 * np.square((latents - mean) @ inverse.T).sum(axis=1)
+        return likelihoods + log_prior(latents) - of_reference
 
     particles, log_likelihoods = particles.copy(), log_likelihoods.copy()
     centred = particles - mean

@@ -52,12 +52,19 @@ class PreferencePairs(NamedTuple):
 
 
 class RewardNetwork(nn.Module):
-    """Reward of a transition (s, a, s') of width ``in_dim``, unknown up to scale."""
+    """Reward of a transition (s, a, s') of width ``in_dim``, unknown up to scale; and what MAML
+    does with its parameters, in functions of them.
 
-    def __init__(self, in_dim: int, net_arch: Sequence[int] = (64, 64)) -> None:
+    :param learning_rate: Step size of MAML's inner loop, which has so many ``steps``.
+    """
+
+    def __init__(
+        self, in_dim: int, net_arch: Sequence[int], learning_rate: float, steps: int
+    ) -> None:
         super().__init__()
         # A smooth activation: MAML differentiates the gradient.
         self.mlp = MLP(in_dim, 1, net_arch, nn.Tanh)
+        self.learning_rate, self.steps = learning_rate, steps
 
     def forward(self, transitions: th.Tensor) -> th.Tensor:
         """(..., in_dim + 1), the last entry 1, or 0 for what only fills up an episode that ended
@@ -65,58 +72,35 @@ class RewardNetwork(nn.Module):
         """
         return self.mlp(transitions[..., :-1]).squeeze(-1) * transitions[..., -1]
 
+    def preference_loss(self, parameters: Parameters, pairs: PreferencePairs) -> th.Tensor:
+        """Bradley-Terry cross-entropy of the sums of predicted rewards; the mean over one task's
+        pairs.
+        """
+        both = th.stack([pairs.left, pairs.right])
+        left, right = functional_call(self, parameters, (both,)).sum(dim=-1)
+        return (softplus(left - right) - pairs.label * (left - right)).mean()
 
-def preference_loss(
-    network: nn.Module, parameters: Parameters, pairs: PreferencePairs
-) -> th.Tensor:
-    """Bradley-Terry cross-entropy of the sums of predicted rewards; the mean over one
-    task's pairs.
-    """
-    both = functional_call(network, parameters, (th.stack([pairs.left, pairs.right]),)).sum(dim=-1)
-    logit = both[0] - both[1]
-    return (softplus(logit) - pairs.label * logit).mean()
+    def adapted(self, parameters: Parameters, pairs: PreferencePairs) -> Parameters:
+        """MAML's inner loop: gradient steps on one task's preferences. It can be differentiated,
+        and mapped over tasks.
+        """
+        for _ in range(self.steps):
+            slope = grad(self.preference_loss)(parameters, pairs)
+            parameters = {k: v - self.learning_rate * slope[k] for k, v in parameters.items()}
+        return parameters
 
+    def maml_loss(
+        self, parameters: Parameters, support: PreferencePairs, query: PreferencePairs
+    ) -> th.Tensor:
+        """MAML's outer objective: how well what ``support`` (tasks, pairs, ...) adapts predicts
+        ``query``, other preferences of the same tasks; the mean over them. Its gradient passes
+        through the inner loop.
+        """
 
-def adapt_parameters(
-    network: nn.Module,
-    parameters: Parameters,
-    pairs: PreferencePairs,
-    learning_rate: float,
-    steps: int,
-) -> Parameters:
-    """MAML's inner loop: gradient steps on one task's preferences. It can be differentiated, and
-    mapped over tasks.
-    """
-    slope = grad(preference_loss, argnums=1)
-    for _ in range(steps):
-        gradients = slope(network, parameters, pairs)
-        parameters = {
-            name: value - learning_rate * gradients[name] for name, value in parameters.items()
-        }
-    return parameters
+        def task_loss(some: PreferencePairs, others: PreferencePairs) -> th.Tensor:
+            return self.preference_loss(self.adapted(parameters, some), others)
 
-
-def maml_loss(
-    network: nn.Module,
-    parameters: Parameters,
-    support: PreferencePairs,
-    query: PreferencePairs,
-    learning_rate: float,
-    steps: int,
-) -> th.Tensor:
-    """MAML's outer objective: how well the adapted networks predict other preferences of their
-    tasks. Its gradient passes through the inner loop.
-
-    :param support: (tasks, pairs, ...) what each task adapts to.
-    :param query: (tasks, pairs, ...) what it is judged by.
-    :return: The mean over the tasks.
-    """
-
-    def task_loss(some: PreferencePairs, others: PreferencePairs) -> th.Tensor:
-        adapted = adapt_parameters(network, parameters, some, learning_rate, steps)
-        return preference_loss(network, adapted, others)
-
-    return vmap(task_loss)(support, query).mean()
+        return vmap(task_loss)(support, query).mean()
 
 
 class MetaReward:
@@ -155,7 +139,8 @@ class MetaReward:
         in_dim = 2 * spaces.flatdim(policy.observation_space) + spaces.flatdim(policy.action_space)
         with th.random.fork_rng():
             th.manual_seed(seed)
-            self.network = RewardNetwork(in_dim, net_arch).to(policy.device)
+            network = RewardNetwork(in_dim, net_arch, inner_learning_rate, inner_steps)
+        self.network = network.to(policy.device)
         self.parameters: Parameters = {
             name: value.detach().clone() for name, value in self.network.named_parameters()
         }
@@ -223,8 +208,7 @@ class MetaReward:
         rows[..., -1] *= min(1.0, (self.fragment_length or longest) / longest)
         labels = [0.5 + 0.5 * SIGNS[answer.preference] for answer in answers]
         pairs = PreferencePairs(rows[::2], rows[1::2], th.tensor(labels, device=rows.device))
-        rate, steps = self.inner_learning_rate, self.inner_steps
-        adapted = adapt_parameters(self.network, parameters, pairs, rate, steps)
+        adapted = self.network.adapted(parameters, pairs)
         return {name: value.detach() for name, value in adapted.items()}
 
     def rewards(self, parameters: Parameters, trajectory: Trajectory) -> np.ndarray:
@@ -287,8 +271,7 @@ def meta_train_reward(
         judges = rng.choice(len(returns), size=n_tasks, replace=False)
         support, query = (_judged(inputs, returns, judges, n, rng) for n in (n_support, n_query))
         optimizer.zero_grad()
-        rate, steps = meta.inner_learning_rate, meta.inner_steps
-        maml_loss(meta.network, parameters, support, query, rate, steps).backward()
+        meta.network.maml_loss(parameters, support, query).backward()
         optimizer.step()
     meta.parameters = {name: value.detach() for name, value in parameters.items()}
     return meta

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from scipy.stats import sem, trim_mean
 
-from sb3_poem.adaptation.limits import AnswerLimits
+from sb3_poem.adaptation.limits import AnswerLimits, check_returns
 from sb3_poem.benchmark.cells import make_oracle_factory
 from sb3_poem.benchmark.methods import METHODS
 from sb3_poem.benchmark.store import Record
@@ -236,12 +236,7 @@ class Summary:
 
 def summarise(returns: np.ndarray) -> Summary:
     """Summarise returns (n_seeds, n_tasks), column j the same test task for all seeds."""
-    returns = np.asarray(returns, dtype=np.float64)
-    if returns.ndim != 2 or 0 in returns.shape or not np.isfinite(returns).all():
-        raise ValueError(
-            "`returns` must be finite, (n_seeds, n_tasks), neither 0, but has shape "
-            f"{returns.shape}"
-        )
+    returns = check_returns(returns, "(n_seeds, n_tasks)")
     seeds, tasks = returns.mean(axis=1), returns.mean(axis=0)
     deviation = float(seeds.std(ddof=1)) if len(seeds) > 1 else None
     error = float(sem(tasks)) if len(tasks) > 1 else None

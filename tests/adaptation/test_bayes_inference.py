@@ -391,11 +391,11 @@ def test_slice_moves_leave_the_posterior_as_it_is():
     draws = rng.standard_normal((40_000, 2))
     draws = draws[rng.random(len(draws)) < np.exp(log_likelihood(draws))][:8000]
     prior = GaussianPrior(2)
-    mean, factor = fit_gaussian(draws, np.full(len(draws), 1 / len(draws)))
+    fitted = fit_gaussian(draws, np.full(len(draws), 1 / len(draws)))
     moved, values = draws, log_likelihood(draws)
     for _ in range(8):
         moved, values = elliptical_slice_moves(
-            moved, values, log_likelihood, prior.log_density, mean, factor, 2, rng
+            moved, values, log_likelihood, prior.log_density, fitted, 2, rng
         )
     np.testing.assert_allclose(values, log_likelihood(moved))
     assert np.mean(np.any(moved != draws, axis=1)) > 0.95
@@ -415,13 +415,13 @@ def test_kernel_neighbours_keep_mean_and_covariance_and_stay_where_the_prior_is(
         -1.0,
     ]
     weights = np.full(len(particles), 1 / len(particles))
-    mean, factor = fit_gaussian(particles, weights)
-    neighbours = kernel_neighbours(particles, mean, factor, 0.3, None, rng)
+    fitted = fit_gaussian(particles, weights)
+    neighbours = kernel_neighbours(particles, fitted, 0.3, None, rng)
     assert np.all(np.any(neighbours != particles, axis=1))
     np.testing.assert_allclose(neighbours.mean(axis=0), particles.mean(axis=0), atol=0.02)
     np.testing.assert_allclose(np.cov(neighbours.T), np.cov(particles.T), atol=0.03)
     upper = kernel_neighbours(
-        particles, mean, factor, 0.3, lambda z: np.where(z[:, 0] > 1, 0.0, -1e9), rng
+        particles, fitted, 0.3, lambda z: np.where(z[:, 0] > 1, 0.0, -1e9), rng
     )
     inside = particles[:, 0] > 1
     assert np.all(upper[inside, 0] > 1)

@@ -14,17 +14,14 @@ from sb3_poem.baselines.meta_reward import (
     MetaReward,
     PreferencePairs,
     RewardNetwork,
-    adapt_parameters,
-    maml_loss,
     meta_train_reward,
-    preference_loss,
 )
 from sb3_poem.common.trajectory import Trajectory
 
 
-def tiny():
+def tiny(steps=1):
     th.manual_seed(0)
-    network = RewardNetwork(3, (4,)).double()
+    network = RewardNetwork(3, (4,), 0.3, steps).double()
     parameters = {name: value.detach().clone() for name, value in network.named_parameters()}
     return network, parameters
 
@@ -44,15 +41,15 @@ def test_the_loss_is_bradley_terrys_cross_entropy():
     probability = np.exp(left) / (np.exp(left) + np.exp(right))
     label = some.label.numpy()
     expected = -(label * np.log(probability) + (1 - label) * np.log(1 - probability)).mean()
-    assert float(preference_loss(network, parameters, some)) == pytest.approx(expected, rel=1e-9)
+    assert float(network.preference_loss(parameters, some)) == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("steps", [1, 3])
 def test_the_outer_gradient_against_finite_differences(steps):
-    network, parameters = tiny()
+    network, parameters = tiny(steps)
     support, query = pairs(3, 6, 2), pairs(3, 6, 3)
-    rate, width = 0.3, 1e-5
-    slope = grad(maml_loss, argnums=1)(network, parameters, support, query, rate, steps)
+    width = 1e-5
+    slope = grad(network.maml_loss)(parameters, support, query)
     first_order = 0.0
     for name, value in parameters.items():
         for index in np.ndindex(*value.shape):
@@ -60,19 +57,17 @@ def test_the_outer_gradient_against_finite_differences(steps):
             for sign in (1, -1):
                 moved = {key: part.clone() for key, part in parameters.items()}
                 moved[name][index] += sign * width
-                ends.append(float(maml_loss(network, moved, support, query, rate, steps)))
+                ends.append(float(network.maml_loss(moved, support, query)))
             assert float(slope[name][index]) == pytest.approx(
                 (ends[0] - ends[1]) / (2 * width), abs=1e-8
             )
         adapted = [
-            adapt_parameters(
-                network, parameters, PreferencePairs(*(part[i] for part in support)), rate, steps
-            )
+            network.adapted(parameters, PreferencePairs(*(part[i] for part in support)))
             for i in range(3)
         ]
         plain = sum(
-            grad(preference_loss, argnums=1)(
-                network, adapted[i], PreferencePairs(*(part[i] for part in query))
+            grad(network.preference_loss)(
+                adapted[i], PreferencePairs(*(part[i] for part in query))
             )[name]
             for i in range(3)
         )
