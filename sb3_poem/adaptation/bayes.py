@@ -4,7 +4,7 @@ they thin out.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, TypeAlias
 
 import numpy as np
 from scipy.special import log_softmax, logsumexp
@@ -52,6 +52,9 @@ from sb3_poem.common.checks import check_whole
 from sb3_poem.common.trajectory import Trajectory
 
 LIKELIHOODS = ("decoder", "similarity")
+#: A predicted difference's error, the typical sum of both returns' absolute values, and the
+#: family's spread of returns
+Unit: TypeAlias = tuple[float, float, float]
 
 # Nats between the aggregate posterior and N(0, I) up to which draws of the latter are as good as
 # trained latents.
@@ -317,36 +320,41 @@ class BayesInference(Inference):
         return self.weights @ np.exp(self.people_log_shares.astype(np.float64))
 
     def ask(self) -> tuple[Shown, ...]:
-        if self.library is not None:
-            return tuple(self.library[i] for i in self._ask_about(self.library))
-        # half of them draws of the posterior, half of the prior
-        half = QUERY_POLICIES[self.rule.question] // 2
-        posterior = self.particles[systematic_resample(self.weights, half, self.rng)]
-        policies = np.concatenate([posterior, self.prior.sample(half, self.rng)])
-        chosen: tuple[int, ...]
+        shown = self._query_policies() if self.library is None else self.library
         if self.rule.query_rule == "random":
-            chosen = queries.random_set(len(policies), self.n_shown, self.rng)
-            return tuple(policies[list(chosen)])
+            chosen = queries.random_set(len(shown), self.n_shown, self.rng)
+        elif self.library is not None:
+            chosen = self._ask_about(self.library)
+        else:
+            chosen = self._compare(np.asarray(shown))
+        return tuple(shown[i] for i in chosen)
+
+    def _compare(self, policies: np.ndarray) -> tuple[int, ...]:
+        """Which of these (n, d) to roll out, by S."""
         particles, weights = self._query_particles()
         similarities = self.model.similarities(particles, policies)
         if self.rule.query_rule == "worst-case":
-            chosen = queries.worst_case_pair(similarities, self.rule.epsilon, weights)
-        else:
-            slope, magnitude, noise = self._return_unit()
-            unit = slope * (QUERY_RESOLUTION * self._spread), magnitude, slope * self._spread
-            values = slope * similarities
-            chosen = self._most_informative(policies, values, weights, noise, *unit)
-        return tuple(policies[list(chosen)])
+            return queries.worst_case_pair(similarities, self.rule.epsilon, weights)
+        slope, magnitude, noise = self._return_unit()
+        unit = slope * (QUERY_RESOLUTION * self._spread), magnitude, slope * self._spread
+        return self._most_informative(list(policies), slope * similarities, weights, noise, unit)
+
+    def _ask_about(self, library: list[Trajectory]) -> tuple[int, ...]:
+        if self._library_returns is None:
+            decode = self.model.predicted_returns
+            self._library_returns = decode(self.particles, library, DECODED_STEPS)
+        returns = self._library_returns
+        error = self._decoder_error(2.0 * float(np.mean([len(item) for item in library])))
+        unit = error, float(2.0 * np.abs(returns).mean()), self._return_spread(library)
+        return self._most_informative(library, returns, self.weights, self.noise_model, unit)
 
     def _most_informative(
         self,
-        shown: Sequence[Shown] | np.ndarray,
+        shown: Sequence[Shown],
         values: np.ndarray,
         weights: np.ndarray,
         noise: Any,
-        error: float,
-        magnitude: float,
-        spread: float,
+        unit: Unit,
     ) -> tuple[int, ...]:
         """See :func:`queries.most_informative_pair`; and :meth:`People.probabilities`."""
         see = self.visibility
@@ -354,34 +362,21 @@ class BayesInference(Inference):
             None if see is None else lambda first, second: see(shown[first], shown[second])
         )
         if self.people is None:
-            unit = error, magnitude
-            return queries.most_informative_pair(values, weights, noise, *unit, visibility)
+            return queries.most_informative_pair(values, weights, noise, *unit[:2], visibility)
         people = self.people
         if noise is not self.noise_model:
             people = People(self.rule.question, noise)
         shares, largest = self.people_shares, float(np.ptp(values, axis=1).max())
-        table = people.table(shares, largest, error, magnitude, spread)
+        table = people.table(shares, largest, *unit)
         pair = queries.most_telling_pair(values, weights, *table, visibility)
         if self.n_shown == 2:
             return pair
 
         def said(differences: np.ndarray) -> np.ndarray:
-            told = people.probabilities(differences, error, magnitude, spread)
+            told = people.probabilities(differences, *unit)
             return told @ shares.astype(told.dtype)
 
         return queries.most_telling_set(pair, self.n_shown, values, weights, said)
-
-    def _ask_about(self, library: list[Trajectory]) -> tuple[int, ...]:
-        if self.rule.query_rule == "random":
-            return queries.random_set(len(library), self.n_shown, self.rng)
-        if self._library_returns is None:
-            decode = self.model.predicted_returns
-            self._library_returns = decode(self.particles, library, DECODED_STEPS)
-        returns = self._library_returns
-        error = self._decoder_error(2.0 * float(np.mean([len(item) for item in library])))
-        magnitude = float(2.0 * np.abs(returns).mean())
-        unit = error, magnitude, self._return_spread(library)
-        return self._most_informative(library, returns, self.weights, self.noise_model, *unit)
 
     def tell(self, preference: Preference, *shown: Shown) -> None:
         if self.likelihood == "decoder":
@@ -399,15 +394,9 @@ class BayesInference(Inference):
             self._rejuvenate()
 
     def estimate(self) -> np.ndarray:
-        return decide(
-            self.rule.decision,
-            self.model if self.has_similarity else None,
-            self.particles,
-            self.weights,
-            self.model.task_latents,
-            self._reference,
-            self.prior.has_holes,
-        )
+        model = self.model if self.has_similarity else None
+        known = self.model.task_latents, self._reference, self.prior.has_holes
+        return decide(self.rule.decision, model, self.particles, self.weights, *known)
 
     def agreements(self) -> np.ndarray:
         """(k, 2) how well each answer agrees with the others: P(better on its side, or EQUAL),
@@ -578,6 +567,12 @@ class BayesInference(Inference):
         s = first_to_others(self.model.similarities(latents, shown_latents)).ravel()
         magnitude = 2.0 * np.abs(returns).mean(axis=1).mean()
         self.calibration += [s @ first_to_others(returns).ravel(), s @ s, magnitude, 1.0]
+
+    def _query_policies(self) -> np.ndarray:
+        """(n, d): half of them draws of the posterior, half of the prior."""
+        half = QUERY_POLICIES[self.rule.question] // 2
+        posterior = self.particles[systematic_resample(self.weights, half, self.rng)]
+        return np.concatenate([posterior, self.prior.sample(half, self.rng)])
 
     def _query_particles(self) -> tuple[np.ndarray, np.ndarray]:
         if len(self.particles) <= QUERY_PARTICLES:

@@ -24,10 +24,7 @@ SHORT = {
 NUMBERED = {
     "pair": {"1": Preference.LEFT, "2": Preference.RIGHT},
     "graded": {str(n): each for n, each in enumerate(ANSWERS["graded"][::-1], 1)},
-    BEST_OF_FOUR: {
-        "0": Preference.EQUAL,
-        **dict(zip("4321", ANSWERS[BEST_OF_FOUR][1:], strict=True)),
-    },
+    BEST_OF_FOUR: dict(zip("04321", ANSWERS[BEST_OF_FOUR], strict=True)),
 }
 #: What each word that may be typed means, by kind of question
 READ = {
