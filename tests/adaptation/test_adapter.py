@@ -881,7 +881,7 @@ def test_a_library_in_an_environment_that_was_not_reset(point_goal):
         model, "poem/PointGoal-v0", oracle=ReturnOracle(), seed=0, n_queries=2
     )
     source.adapt()
-    library = [trajectory for item in source.answers for trajectory in (item.left, item.right)]
+    library = [trajectory for item in source.answers for trajectory in item.shown]
     adapter = PreferenceAdapter(
         model, "poem/PointGoal-v0", oracle=ReturnOracle(), library=library, seed=0, n_queries=2
     )
@@ -905,7 +905,7 @@ def test_a_library_needs_no_rollouts():
         model, make_env(np.array([0.3])), seed=3, rule=Bayes(query_rule="random")
     )
     answer(source, 10)
-    library = [trajectory for item in source.answers for trajectory in (item.left, item.right)]
+    library = [trajectory for item in source.answers for trajectory in item.shown]
 
     class NoSteps(SpeedEnv):
         def step(self, action):
@@ -913,7 +913,7 @@ def test_a_library_needs_no_rollouts():
 
     a = PreferenceAdapter(model, NoSteps(), library=library, seed=0, n_queries=4)
     answer(a, 4)
-    assert all(item.left in library for item in a.answers)
+    assert all(item.shown[0] in library for item in a.answers)
     looking = PreferenceAdapter(model, NoSteps(), library=library, seed=0, oracle=Looks())
     assert looking.ask() is looking.ask()  # which has no frames, and is not rolled out for them
     with pytest.raises(ValueError, match="pass the same `library`"):
@@ -970,7 +970,7 @@ def test_lockstep_with_a_library():
     model, tasks = SpeedModel(), np.array([[0.4], [2.1]])
     source = PreferenceAdapter(model, make_env(), seed=3, rule=Bayes(query_rule="random"))
     answer(source, 10)
-    library = [trajectory for item in source.answers for trajectory in (item.left, item.right)]
+    library = [trajectory for item in source.answers for trajectory in item.shown]
     together = adapt_tasks(
         model, DummyVecEnv([SpeedEnv]), tasks, ReturnOracle, n_queries=4, library=library
     )

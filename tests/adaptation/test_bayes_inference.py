@@ -291,7 +291,7 @@ def test_what_the_other_answers_contradict_is_found_and_asked_again(question, se
     adapter.ask()
     again = adapter.ask_again(wrong)
     assert adapter.ask() is again
-    np.testing.assert_array_equal(again.left.observations, asked.left.observations)
+    np.testing.assert_array_equal(again.left.observations, asked.shown[0].observations)
     adapter.tell(oracle(again.left, again.right))
     assert adapter.contradicted is None
     kept = [adapter.answers[number].preference for number in (wrong, -1)]
@@ -563,7 +563,7 @@ def test_the_aggregate_prior_is_the_mixture_that_it_says():
     z = rng.normal(size=(4, 2))
     direct = [
         math.log(
-            np.mean([math.exp(-0.5 * np.sum((x - c) ** 2) / prior.width**2) for c in prior.centres])
+            np.sum([math.exp(-0.5 * np.sum((x - c) ** 2) / prior.width**2) for c in prior.centres])
         )
         for x in z
     ]
