@@ -85,6 +85,8 @@ class PreferenceAdapter:
     :raises TypeError: If an argument is of another kind.
     """
 
+    #: The question that waits for its answer, if any.
+    pending: Query | None
     #: Where the new task is: the environment that was given or made from its id, as an SB3 VecEnv.
     env: VecEnv
 
@@ -123,7 +125,7 @@ class PreferenceAdapter:
             self.env.reset()
         # What was rolled out to choose a question, by the question's number and latent
         self._seen: dict[tuple[int, bytes], Trajectory] = {}
-        self._pending: Query | None = None
+        self.pending = None
         self._previous: tuple[Snapshot, Query] | None = None
 
     @property
@@ -141,29 +143,24 @@ class PreferenceAdapter:
         """Whether all questions have been answered."""
         return self.n_answers >= self.n_queries
 
-    @property
-    def pending(self) -> Query | None:
-        """The question that waits for its answer, if any."""
-        return self._pending
-
     def ask(self) -> Query:
         """The next question, trajectories on the new task; the same again while it waits for its
         answer. A ``RuntimeError`` if all questions have been answered.
         """
-        if self._pending is None:
+        if self.pending is None:
             if self.done:
                 answered = f"all {self.n_queries} questions have been answered"
                 raise RuntimeError(f"{answered}; take policy()")
-            self._pending = self._make_query(self.inference.ask())
+            self.pending = self._make_query(self.inference.ask())
         elif (
             self._needs_frames
-            and self._pending.shown[0].frames is None
+            and self.pending.shown[0].frames is None
             and self.inference.library is None
         ):
             # It comes from a file, which holds no frames; the same seed gives the same rollouts.
-            latents = self.inference.same_latents(*(item.latent for item in self._pending.shown))
-            self._pending = self._make_query(latents, self._number_of(self._pending))
-        return self._pending
+            latents = self.inference.same_latents(*(item.latent for item in self.pending.shown))
+            self.pending = self._make_query(latents, self._number_of(self.pending))
+        return self.pending
 
     @property
     def contradicted(self) -> int | None:
@@ -187,7 +184,7 @@ class PreferenceAdapter:
                 f"{number!r}"
             )
         shown = trajectories_of("ask_again()", *self.inference.answers[number].shown)
-        self._pending = Query(shown, self.rule.question)
+        self.pending = Query(shown, self.rule.question)
         return self.ask()
 
     def tell(self, preference: Preference | str) -> None:
@@ -199,29 +196,29 @@ class PreferenceAdapter:
         :raises RuntimeError: If no question waits for an answer.
         :raises TypeError, ValueError: If it is no answer to such a question, which goes on waiting.
         """
-        if self._pending is None:
+        if self.pending is None:
             answered = "the last question has its answer already"
             state = answered if self.n_answers else "no question has been asked"
             raise RuntimeError(f"tell() without a pending question: {state}; call ask() first")
-        query = self._pending
+        query = self.pending
         answer = as_preference(preference, query.kind)
         before = self.inference.snapshot()
         self.inference.tell(answer, *query.shown)
-        self._pending, self._previous = None, (before, query)
+        self.pending, self._previous = None, (before, query)
         self._seen.clear()
 
     def undo(self) -> Query:
         """Take the last answer back; its question waits again. One step back, and only until the
         next question is asked for: else a ``RuntimeError``.
         """
-        if self._previous is None or self._pending is not None:
+        if self._previous is None or self.pending is not None:
             raise RuntimeError(
                 "nothing to undo: undo() takes back the last answer, before the next question is "
                 "asked for"
             )
         snapshot, query = self._previous
         self.inference.restore(snapshot, self.inference.answers[:-1])
-        self._pending, self._previous = query, None
+        self.pending, self._previous = query, None
         return query
 
     def policy(self) -> AdaptedPolicy:
@@ -324,7 +321,7 @@ class PreferenceAdapter:
         trajectories, posterior, random state, and the pending question. Frames stay out; model,
         environment, oracle and library too.
         """
-        model, pending, kind = self.model, self._pending, self.rule.question
+        model, pending, kind = self.model, self.pending, self.rule.question
         return {
             "format": FORMAT,
             "version": FORMAT_VERSION,
@@ -398,7 +395,7 @@ class PreferenceAdapter:
             waits = data["pending"]
             pending = None if waits is None else Query(shown_from_dict(kind, waits), kind)
             self.inference.restore(Snapshot.from_dict(data["inference"]), answers)
-        self._pending, self._previous = pending, None
+        self.pending, self._previous = pending, None
         self._seen.clear()
 
     def to_json(self) -> str:

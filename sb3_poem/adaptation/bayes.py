@@ -65,6 +65,8 @@ PRIOR_COVERS = 0.3
 # 1.3), where the two can also be told apart. Four of which each is best for some of a narrow
 # posterior are rarer.
 QUERY_POLICIES = {"pair": 64, "graded": 64, BEST_OF_FOUR: 128}
+# Differences at which the answers' probabilities are tabulated for choosing a question.
+TABLE_POINTS = 1025
 # Particles that a question's gain is averaged over.
 QUERY_PARTICLES = 128
 # The prior's policies that tell, at a decision, how widely S spreads.
@@ -367,15 +369,16 @@ class BayesInference(Inference):
         if noise is not self.noise_model:
             people = People(self.rule.question, noise)
         shares, largest = self.people_shares, float(np.ptp(values, axis=1).max())
-        table = people.table(shares, largest, *unit)
-        pair = queries.most_telling_pair(values, weights, *table, visibility)
-        if self.n_shown == 2:
-            return pair
 
         def said(differences: np.ndarray) -> np.ndarray:
             told = people.probabilities(differences, *unit)
             return told @ shares.astype(told.dtype)
 
+        differences = np.linspace(-largest, largest, TABLE_POINTS)
+        table = differences, said(differences)
+        pair = queries.most_telling_pair(values, weights, *table, visibility)
+        if self.n_shown == 2:
+            return pair
         return queries.most_telling_set(pair, self.n_shown, values, weights, said)
 
     def tell(self, preference: Preference, *shown: Shown) -> None:
@@ -544,7 +547,8 @@ class BayesInference(Inference):
             return preference_log_likelihood(np.log(probability), np.log1p(-probability), told)
         sums = np.zeros((len(latents), len(self.people)))
         for i, d, e, m, spread in self._each_difference(latents, answers, new):
-            sums += self.people.log_likelihoods(answers[i].preference, d, e, m, spread)
+            place = self.people.answers.index(answers[i].preference)
+            sums += np.log(self.people.probabilities(d, e, m, spread)[place])
         return sums
 
     def _answer_log_likelihoods(self, latents: np.ndarray) -> np.ndarray:

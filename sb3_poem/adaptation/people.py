@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 
 from sb3_poem.adaptation.noise import LAPSE, ExactNoise, GradedNoiseModel, Values
-from sb3_poem.adaptation.preference import ANSWERS, BEST_OF_FOUR, Preference
+from sb3_poem.adaptation.preference import ANSWERS, BEST_OF_FOUR
 
 INFER = "infer"
 
@@ -17,8 +17,6 @@ MISTAKES = {0.0: 0.8, 0.25: 0.2}
 DOUBTS = {0.0: 0.8, 2.0: 0.2}
 INDIFFERENCES = {0.0: 0.4, 0.12: 0.4, 0.4: 0.2}
 MUCH = {0.45: 0.3, 1.0: 0.5, 2.0: 0.2}
-# Differences at which the answers' probabilities are tabulated for choosing a question.
-TABLE_POINTS = 1025
 
 
 class People:
@@ -98,24 +96,3 @@ class People:
             perceived = -np.diff(np.concatenate([ends[0], above, ends[1]]), axis=0)
             said = perceived + self.mistakes * (perceived[::-1] - perceived)
         return (1.0 - LAPSE) * said + LAPSE / len(said)
-
-    def log_likelihoods(
-        self,
-        answer: Preference,
-        difference: np.ndarray,
-        error: Values,
-        magnitude: Values,
-        spread: float,
-    ) -> np.ndarray:
-        """(m, G) log P(answer); see :meth:`probabilities`."""
-        said = self.probabilities(difference, error, magnitude, spread)
-        return np.log(said[self.answers.index(answer)])
-
-    def table(
-        self, shares: np.ndarray, largest: float, error: float, magnitude: float, spread: float
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Differences (t,) from -largest to largest, evenly, and P(answer), (answers, t), at each
-        of them when people are mixed by these shares (G,).
-        """
-        differences = np.linspace(-largest, largest, TABLE_POINTS)
-        return differences, self.probabilities(differences, error, magnitude, spread) @ shares
