@@ -7,18 +7,17 @@ Trains with the hyperparameters of `zoo_configs/poem_sac.yml` (or `--conf`). Aft
 each; training ends when their mean return reaches the target.
 """
 
+import argparse
 import time
 from pathlib import Path
 from typing import Any
 
 import torch as th
 from common import DEVICE, ZOO, arguments, table, write
-from rl_zoo3.utils import linear_schedule
 
 from sb3_poem import POEMSAC
 from sb3_poem.adaptation import evaluate_adaptation, named_rule
 from sb3_poem.benchmark.suites import family_name
-from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.pearl_sac.callbacks import EpochCallback
 from sb3_poem.resources import zoo_entry
@@ -29,69 +28,38 @@ N_TASKS, N_EPISODES, N_QUERIES = 30, 10, 10
 class Clock(EpochCallback):
     """Times training, evaluates between epochs, and ends it at the target.
 
-    :param target: Mean return that ends training, by whichever of the rules
+    :param given: What the command line says
     :param test_seed: Seed of the test tasks
-    :param from_step: Environment steps before the first evaluation
-    :param every: Epochs between two evaluations
     """
 
-    def __init__(
-        self,
-        env_id: str,
-        target: float,
-        rules: list[str],
-        test_seed: int,
-        from_step: int,
-        every: int,
-    ) -> None:
-        super().__init__(every)
-        self.target, self.rules = target, rules
-        self.test_seed, self.from_step = test_seed, from_step
-        self.env = make_task_vec_env(env_id, 2 * N_TASKS)
-        self.tasks = FamilyView(self.env).test_tasks(N_TASKS, test_seed)
+    def __init__(self, given: argparse.Namespace, test_seed: int) -> None:
+        super().__init__(given.every)
+        self.given, self.test_seed = given, test_seed
+        self.env = make_task_vec_env(given.env, 2 * N_TASKS)
         self.seconds, self.started = 0.0, time.perf_counter()
         self.evaluations: list[dict[str, Any]] = []
         self.reached = False
 
     def _on_epoch(self) -> None:
-        if self.reached or self.num_timesteps < self.from_step:
+        if self.reached or self.num_timesteps < self.given.from_step:
             return
         self.seconds += time.perf_counter() - self.started
-        found = {
-            "seconds": self.seconds,
-            "env_steps": self.model.num_timesteps,
-            "updates": self.model._n_updates,
-        }
-        for rule in self.rules:
+        found = {"seconds": self.seconds, "env_steps": self.model.num_timesteps}
+        found["updates"] = self.model._n_updates
+        how: dict[str, Any] = {"record_at": (N_QUERIES,), "n_episodes": N_EPISODES}
+        how["seed"] = self.test_seed
+        for rule in self.given.rules:
             result = evaluate_adaptation(
-                self.model,
-                self.env,
-                self.tasks,
-                record_at=(N_QUERIES,),
-                n_episodes=N_EPISODES,
-                seed=self.test_seed,
-                rule=named_rule(rule),
+                self.model, self.env, N_TASKS, rule=named_rule(rule), **how
             )
             found[rule] = result.after(N_QUERIES)
         self.evaluations.append(found)
-        self.reached = max(found[rule] for rule in self.rules) >= self.target
+        self.reached = max(found[rule] for rule in self.given.rules) >= self.given.target
         print({key: round(value, 1) for key, value in found.items()}, flush=True)
         self.started = time.perf_counter()
 
     def _on_step(self) -> bool:
         return not self.reached
-
-
-def train(env_id: str, entry: dict[str, Any], seed: int, clock: Clock, device: str) -> POEMSAC:
-    """Train with an entry of hyperparameters until the clock ends it; returns the model."""
-    entry = dict(entry)
-    n_timesteps, policy, n_envs = (entry.pop(key) for key in ("n_timesteps", "policy", "n_envs"))
-    rate = entry.get("learning_rate")
-    if isinstance(rate, str):
-        entry["learning_rate"] = linear_schedule(rate.removeprefix("lin_"))
-    model = POEMSAC(policy, make_task_vec_env(env_id, n_envs), seed=seed, device=device, **entry)
-    clock.started = time.perf_counter()
-    return model.learn(int(n_timesteps), callback=clock)
 
 
 def main() -> None:
@@ -121,9 +89,10 @@ def main() -> None:
     kept = {key: str(v) for key, v in vars(given).items() if key not in ("out", "conf", "save")}
     title = f"Time to {given.target:g} on {given.env}"
     for seed in given.seeds:
-        where = (given.target, given.rules, 300 + seed, given.from_step, given.every)
-        clock = Clock(given.env, *where)
-        model = train(given.env, entry, seed, clock, given.device)
+        clock = Clock(given, 300 + seed)
+        model = POEMSAC.from_zoo(given.env, **{**entry, "seed": seed, "device": given.device})
+        clock.started = time.perf_counter()
+        model.learn(callback=clock)
         if given.save:
             model.save(given.save / f"seed{seed}.zip")
         last, reached = clock.evaluations[-1], clock.reached
