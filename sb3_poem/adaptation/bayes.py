@@ -358,13 +358,18 @@ class BayesInference(Inference):
         noise: Any,
         unit: Unit,
     ) -> tuple[int, ...]:
-        """See :func:`queries.most_informative_pair`; and :meth:`People.probabilities`."""
+        """Of what is shown, by its predicted fitness ``values`` (m, n) under m latents of these
+        weights, which sum to one.
+        """
         see = self.visibility
         visibility: queries.Visibility | None = (
             None if see is None else lambda first, second: see(shown[first], shown[second])
         )
         if self.people is None:
-            return queries.most_informative_pair(values, weights, noise, *unit[:2], visibility)
+            differences = queries.pair_differences(values)
+            probabilities = noise.probability_left(differences, *unit[:2])
+            gains = queries.information_gains(probabilities, weights)
+            return queries.best_pair(gains, values.shape[1], visibility)
         people = self.people
         if noise is not self.noise_model:
             people = People(self.rule.question, noise)

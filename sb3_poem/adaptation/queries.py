@@ -7,8 +7,6 @@ from functools import lru_cache
 
 import numpy as np
 
-from sb3_poem.adaptation.noise import NoiseModel
-
 QUERY_RULES = ("worst-case", "information-gain", "random")
 
 # Differences that are compared at a time: with a thousand candidates all pairs' would take
@@ -79,25 +77,6 @@ def information_gains(probabilities: np.ndarray, weights: np.ndarray) -> np.ndar
     """
     weights = weights.astype(probabilities.dtype, copy=False)
     return _entropy(probabilities @ weights) - _entropy(probabilities) @ weights
-
-
-def most_informative_pair(
-    values: np.ndarray,
-    weights: np.ndarray,
-    noise: NoiseModel,
-    error: float,
-    magnitude: float,
-    visibility: Visibility | None = None,
-) -> tuple[int, int]:
-    """The pair of n policies whose comparison is expected to tell most (see :func:`best_pair`).
-
-    :param values: (m, n) predicted fitness under m latents, in the unit of ``error``, a predicted
-        difference's standard deviation, and of ``magnitude``, the typical sum of both returns'
-        absolute values.
-    :param weights: (m,) summing to one.
-    """
-    probabilities = noise.probability_left(pair_differences(values), error, magnitude)
-    return best_pair(information_gains(probabilities, weights), values.shape[1], visibility)
 
 
 def most_telling_pair(

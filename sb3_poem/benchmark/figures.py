@@ -17,16 +17,7 @@ from sb3_poem.benchmark.suites import Entry, OracleSpec
 
 PANEL_WIDTH, PANEL_HEIGHT = 4.2, 3.0
 TOLERANCE = "tolerance"
-COLOURS = {
-    "poem-bayes": "#d62728",
-    "poem-paper": "#ff7f0e",
-    "anole": "#1f77b4",
-    "anole-greedy": "#17becf",
-    "anole-random": "#9467bd",
-    "maml-reward": "#8c564b",
-    "reward-oracle": "#2ca02c",
-}
-OTHER_COLOURS = ("#1f77b4", "#2ca02c", "#9467bd", "#8c564b", "#e377c2", "#17becf", "#bcbd22")
+COLOURS = 10  # of Matplotlib
 MARKERS = "osD^vPX*"
 
 
@@ -148,26 +139,19 @@ def _style(entry: Entry, series: Series) -> dict[str, Any]:
         words = method.split("-")
         return "-".join(w for w in words if not entry.by_inference or w not in INFERENCE_LABELS)
 
-    def position(methods: Sequence[str]) -> int:
-        return list(dict.fromkeys(map(change, methods))).index(change(series.method))
-
-    colour = COLOURS.get(series.method)
-    if colour is None:
-        others = [name for name in entry.methods if name not in COLOURS]
-        colour = OTHER_COLOURS[position(others) % len(OTHER_COLOURS)]
-    return {"color": colour, "marker": MARKERS[position(entry.methods) % len(MARKERS)]}
+    place = list(dict.fromkeys(map(change, entry.methods))).index(change(series.method))
+    return {"color": f"C{place % COLOURS}", "marker": MARKERS[place % len(MARKERS)]}
 
 
 def _grid(
     entry: Entry, found: dict[Condition, list[Series]], by_oracle: bool = False
 ) -> tuple[Figure, list[tuple[Axes, Condition, list[Series]]]]:
     """A column for each family; a row for each oracle, or inference rule, or one."""
-    # The object interface: a figure of pyplot would stay in its global list, and choose a window
-    # system.
     rows = list(INFERENCE_LABELS.values()) if entry.by_inference else [""]
     if by_oracle:
         rows = [oracle.label for oracle in entry.oracles]
     size = (max(6.0, PANEL_WIDTH * len(found)), PANEL_HEIGHT * len(rows) + 1.2)
+    # A figure of pyplot would stay in its global list, and choose a window system.
     figure = Figure(figsize=size, layout="constrained")
     FigureCanvasAgg(figure)
     grid: Any = figure.subplots(len(rows), len(found), squeeze=False)

@@ -203,11 +203,11 @@ class Selection:
     def _cells(self, entry: Entry, condition: Condition) -> Iterator[tuple[Cell, Record]]:
         shares = sorted(self._shares[condition])
         for seed in self.seeds:
-            where = condition.env_id, seed, condition.budget, condition.training, shares
-            for cell in self.suite.entry_cells(entry, *where):
-                key = replace(cell, revision=condition.revision).key
-                if key in self.records:
-                    yield cell, self.records[key]
+            base = Cell(condition.env_id, "", seed, revision=condition.revision)
+            base = replace(base, budget=condition.budget, training=condition.training)
+            for cell in self.suite.entry_cells(entry, base, shares):
+                if cell.key in self.records:
+                    yield cell, self.records[cell.key]
 
 
 def _kind(record: Record) -> tuple[Condition, str]:

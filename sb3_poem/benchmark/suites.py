@@ -300,40 +300,32 @@ class Suite:
                 )
         parts = snapshots or self.snapshots
         shares = [round(part / parts, 4) for part in range(1, parts)]
-        spent = (budget or self.budget, training or Training(), shares)
+        spent, given = budget or self.budget, training or Training()
         cells: dict[str, Cell] = {}
         for env_id in env_ids:
             for seed in seeds:
+                base = Cell(env_id, "", seed, budget=spent, training=given)
                 for entry in (*self.entries, Entry("references", "", self.references)):
-                    for cell in self.entry_cells(entry, env_id, seed, *spent):
+                    for cell in self.entry_cells(entry, base, shares):
                         if not methods or cell.method in methods:
                             cells.setdefault(cell.key, cell)
         return list(cells.values())
 
-    def entry_cells(
-        self,
-        entry: Entry,
-        env_id: str,
-        seed: int,
-        budget: Budget,
-        training: Training,
-        shares: Sequence[float],
-    ) -> list[Cell]:
-        """The cells of one entry, for one family and seed; its curves are measured after these
+    def entry_cells(self, entry: Entry, base: Cell, shares: Sequence[float]) -> list[Cell]:
+        """The cells of one entry, in all else like ``base``; its curves are measured after these
         shares of the training too.
         """
         cells = []
         for name in entry.methods:
             overrides = self.overrides.get(METHODS[name].rule or "", ())
             for oracle in entry.oracles:
+                own = replace(base, method=name, oracle=oracle, overrides=overrides)
                 moments: list[tuple[float | None, tuple[int, ...]]] = [(None, entry.record_at)]
                 if oracle in entry.curves and name not in WITHOUT_CURVE:
                     moments += [(share, entry.record_at[-1:]) for share in shares]
                 for share, record_at in moments:
-                    spent = replace(budget, record_at=record_at)
-                    cells.append(
-                        Cell(env_id, name, seed, oracle, spent, training, share, overrides)
-                    )
+                    budget = replace(base.budget, record_at=record_at)
+                    cells.append(replace(own, budget=budget, snapshot=share))
         return cells
 
 

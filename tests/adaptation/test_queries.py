@@ -18,8 +18,8 @@ from sb3_poem.adaptation.noise import (
 )
 from sb3_poem.adaptation.people import People
 from sb3_poem.adaptation.queries import (
+    best_pair,
     information_gains,
-    most_informative_pair,
     most_telling_pair,
     most_telling_set,
     pair_differences,
@@ -88,7 +88,8 @@ def test_the_most_informative_pair_splits_and_can_be_told_apart():
     goals, speeds = np.linspace(0, 1, 101), np.array([0.0, 0.5, 0.52, 1.0])
     values = -np.abs(goals[:, None] - speeds[None, :])
     weights = np.full(101, 1 / 101)
-    assert most_informative_pair(values, weights, ExactNoise(), error=0.1, magnitude=1.0) == (0, 3)
+    chances = ExactNoise().probability_left(pair_differences(values), 0.1, 1.0)
+    assert best_pair(information_gains(chances, weights), 4) == (0, 3)
     gains = information_gains(np.full((1, 101), 0.5), weights)
     assert gains[0] == pytest.approx(0.0, abs=1e-12)  # two policies that do the same
 
@@ -108,8 +109,7 @@ def test_what_people_can_hardly_see_costs_information(visible):
     gains = information_gains(chances, weights)
     pairs = list(itertools.combinations(range(4), 2))
     worth = [gain * visible.get(pair, 1.0) for gain, pair in zip(gains, pairs, strict=True)]
-    found = most_informative_pair(values, weights, noise, 0.1, 1.0, visibility)
-    assert found == pairs[int(np.argmax(worth))]
+    assert best_pair(gains, 4, visibility) == pairs[int(np.argmax(worth))]
     assert looked[0] == (0, 3)
     assert (len(looked) == 1) == (not visible)  # a pair that is seen well needs no other
     assert len(looked) < 6  # none that could not be better
