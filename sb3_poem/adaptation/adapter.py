@@ -148,9 +148,7 @@ class PreferenceAdapter:
         answer. A ``RuntimeError`` if all questions have been answered.
         """
         if self.pending is None:
-            if self.done:
-                answered = f"all {self.n_queries} questions have been answered"
-                raise RuntimeError(f"{answered}; take policy()")
+            self._check_unfinished()
             self.pending = self._make_query(self.inference.ask())
         elif (
             self._needs_frames
@@ -176,8 +174,7 @@ class PreferenceAdapter:
         :raises RuntimeError: If all questions have been answered.
         :raises ValueError: If question ``number`` has no answer.
         """
-        if self.done:
-            raise RuntimeError(f"all {self.n_queries} questions have been answered; take policy()")
+        self._check_unfinished()
         if number not in range(self.n_answers):
             raise ValueError(
                 f"`number` must be that of an answer, from 0 to {self.n_answers - 1}, but is "
@@ -256,6 +253,10 @@ class PreferenceAdapter:
     def _needs_frames(self) -> bool | int:
         return getattr(self.oracle, "needs_frames", False) or self.render
 
+    def _check_unfinished(self) -> None:
+        if self.done:
+            raise RuntimeError(f"all {self.n_queries} questions have been answered; take policy()")
+
     def _take_oracle(self, oracle: Oracle | None) -> None:
         self.oracle = oracle
         #: Whether somebody looks at the questions, also while answers given before are told again
@@ -276,8 +277,7 @@ class PreferenceAdapter:
         """The rollouts start alike, one after the other in the first copy: other copies may hold
         other tasks.
         """
-        number = self.n_answers if number is None else number
-        frames = self._needs_frames
+        number, frames = self.n_answers if number is None else number, self._needs_frames
         rolled = tuple(self._rolled_out(item, number, frames) for item in shown)
         return Query(rolled, self.rule.question)
 

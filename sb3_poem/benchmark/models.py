@@ -212,7 +212,7 @@ class ModelLibrary:
         if path is not None:
             if snapshot is not None:
                 raise ValueError(f"{key} was handed over, and so has no models along its training")
-            file = _content(path) if path.is_dir() else path
+            file = _content(path)
         elif snapshot is not None:
             file = self.snapshot_file(key, snapshot)
         else:
