@@ -16,7 +16,7 @@ from sb3_poem.adaptation.known_task import (
 from sb3_poem.baselines import ANOLE, MAMLReward
 from sb3_poem.baselines.fragments import default_fragment_length
 from sb3_poem.benchmark.cells import SELECTION_EPISODES
-from sb3_poem.benchmark.methods import META_ITERATIONS, META_ITERATIONS_OF, VARIANTS
+from sb3_poem.benchmark.methods import META_ITERATIONS, META_ITERATIONS_OF
 from sb3_poem.benchmark.suites import Cell, ModelKey
 from sb3_poem.benchmark.training import family_facts, training_plan
 from sb3_poem.common.vec_env import make_task_vec_env
@@ -64,7 +64,7 @@ def measure_pace(env_id: str, device: str = "cpu", num_threads: int = 1) -> Pace
 
 def training_seconds(key: ModelKey, pace: Pace) -> float:
     """Of a model's training from scratch; of one that is made from another's, what comes on top."""
-    if VARIANTS[key.variant].base is not None:
+    if key.base is not None:
         iterations = META_ITERATIONS_OF.get(key.family, META_ITERATIONS)
         return iterations * UPDATES_PER_META_ITERATION * pace.update
     plan = training_plan(key)

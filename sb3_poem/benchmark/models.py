@@ -126,7 +126,7 @@ class ModelLibrary:
                 config, wanted = read_config(pretrained), VARIANTS[key.variant]
                 own = config["algorithm"] == ALGORITHMS[wanted.algorithm].__name__
                 facts = {"seed": None, **config["arguments"], "env_id": config["env_id"]}
-                if own and wanted.base is None and not _departures(facts, key):
+                if own and key.base is None and not _departures(facts, key):
                     return pretrained
         return None
 
@@ -147,9 +147,8 @@ class ModelLibrary:
         path = self.given(key)
         if path is not None:
             return FILE + _describe_given(path)["sha256"][:24]
-        base = VARIANTS[key.variant].base
-        if base is not None:
-            return self.origin(replace(key, variant=base))
+        if key.base is not None:
+            return self.origin(key.base)
         hyperparameters, begun = training_plan(key).hyperparameters, self.folder(key) / BEGUN
         found = {"hyperparameters": hyperparameters, "revision": REVISION}
         if self.state(key) != "missing":
@@ -170,8 +169,7 @@ class ModelLibrary:
         """
         if self.state(key) in ("handed over", "trained"):
             return False
-        base = VARIANTS[key.variant].base
-        if base is not None and self.is_taken(replace(key, variant=base)):
+        if key.base is not None and self.is_taken(key.base):
             return True
         with try_lock(self.lock_file(key)) as free:
             return not free
@@ -185,13 +183,12 @@ class ModelLibrary:
             return _describe_given(path)
         finished = self.folder(key) / FINISHED
         if not finished.exists():
-            base = VARIANTS[key.variant].base
-            if base is not None:
-                self.ensure(replace(key, variant=base), say)
+            if key.base is not None:
+                self.ensure(key.base, say)
             wait = f"waiting for another process that trains {key}"
             with locked(self.lock_file(key), lambda: say(wait)) as lock:
                 if not finished.exists():
-                    made = self._train(key, lock, say) if base is None else self._derive(key, base)
+                    made = self._train(key, lock, say) if key.base is None else self._derive(key)
                     write_json_atomically(finished, {**made, **provenance()})
         return read_json(finished)
 
@@ -203,10 +200,9 @@ class ModelLibrary:
         :param snapshot: The share of the training after which to take it; None: all.
         :raises ValueError: If one that was handed over is another, or not saved along its training.
         """
-        base = VARIANTS[key.variant].base
         path = self.given(key)
-        if base is not None and path is None:
-            model = self.load(replace(key, variant=base), env)
+        if key.base is not None and path is None:
+            model = self.load(key.base, env)
             return MAMLRewardModel(MetaReward.load(self.folder(key) / REWARD, model.policy), model)
         algorithm = ALGORITHMS[VARIANTS[key.variant].algorithm]
         if path is not None:
@@ -287,15 +283,15 @@ class ModelLibrary:
             "sessions": len(sessions),
         }
 
-    def _derive(self, key: ModelKey, base: str) -> dict[str, Any]:
+    def _derive(self, key: ModelKey) -> dict[str, Any]:
         """MAML's reward, from PEARL's experience."""
-        base_key = replace(key, variant=base)
+        assert key.base is not None
         iterations = META_ITERATIONS_OF.get(key.family, META_ITERATIONS)
         with contextlib.closing(make_task_vec_env(key.env_id, 1)) as env:
-            model = self.load(base_key, env)
+            model = self.load(key.base, env)
             if not model.replay_buffer.counts.any():
                 raise ValueError(
-                    f"{key} learns from the replay buffer of {base_key}, which the model that was "
+                    f"{key} learns from the replay buffer of {key.base}, which the model that was "
                     f"handed over does not have; hand over its {CHECKPOINT} instead"
                 )
             started = time.time()
@@ -304,7 +300,7 @@ class ModelLibrary:
         reward.save(self.folder(key) / REWARD)
         return {
             "source": "derived",
-            "base": self.ensure(base_key),
+            "base": self.ensure(key.base),
             "hyperparameters": {"n_iterations": iterations, "fragment_length": length},
             "env_steps": int(model.num_timesteps),
             "updates": int(model._n_updates),

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 from sb3_poem.benchmark.cells import run_cell
-from sb3_poem.benchmark.methods import VARIANTS
 from sb3_poem.benchmark.models import ModelLibrary, Say, Workplace
 from sb3_poem.benchmark.running import Plan
 from sb3_poem.benchmark.store import Record, Store
@@ -53,8 +52,8 @@ def run_with_ray(
         quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
         ray.init(address=options.address, include_dashboard=False, **quiet)
     models = [key for key in plan.models if library.state(key) in ("missing", "interrupted")]
-    derived = [key for key in models if VARIANTS[key.variant].base is not None]
-    trained = [key for key in models if key not in derived]
+    derived = [key for key in models if key.base is not None]
+    trained = [key for key in models if key.base is None]
     workplace = library.workplace.absolute()
     failures: list[str] = []
     try:

@@ -13,7 +13,6 @@ import numpy as np
 from sb3_poem.adaptation.limits import AnswerLimits
 from sb3_poem.benchmark.cells import run_cell
 from sb3_poem.benchmark.estimate import cell_seconds, measure_pace, training_seconds
-from sb3_poem.benchmark.methods import VARIANTS
 from sb3_poem.benchmark.models import ModelLibrary, Say, locked, try_lock
 from sb3_poem.benchmark.results import Reference
 from sb3_poem.benchmark.store import Store
@@ -49,10 +48,7 @@ class Plan:
         """What the cells to be run need, each once, a variant after its base."""
         keys: dict[ModelKey, None] = {}
         for key in (cell.model_key for cell in self.todo):
-            base = VARIANTS[key.variant].base
-            if base is not None:
-                keys[replace(key, variant=base)] = None
-            keys[key] = None
+            keys |= dict.fromkeys(one for one in (key.base, key) if one is not None)
         return list(keys)
 
 
@@ -130,11 +126,11 @@ def describe(plan: Plan, library: ModelLibrary) -> list[str]:
         elif state != "trained":
             estimate = training_seconds(key, measure_pace(key.env_id, device, threads))
             seconds += estimate
-            base, training = VARIANTS[key.variant].base, training_plan(key)
-            if base is None:
+            if key.base is None:
+                training = training_plan(key)
                 text += f", {training.timesteps:,} steps, {training.updates:,} updates"
             else:
-                text += f", from the experience of {base}"
+                text += f", from the experience of {key.base.variant}"
             text += f", about {_minutes(estimate)}"
             text += " if from scratch" if state == "interrupted" else ""
         lines.append(text)

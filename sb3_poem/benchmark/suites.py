@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
-from sb3_poem.benchmark.methods import EPSILONS, METHODS, QUERY_RULES, Method, find_method
+from sb3_poem.benchmark.methods import EPSILONS, METHODS, QUERY_RULES, VARIANTS, Method, find_method
 
 PAPER_FAMILIES = (
     "HalfCheetahVel",
@@ -132,6 +132,12 @@ class ModelKey:
     @property
     def family(self) -> str:
         return family_name(self.env_id)
+
+    @property
+    def base(self) -> Self | None:
+        """The model that this one is derived from without a training of its own, if any."""
+        base = VARIANTS[self.variant].base
+        return None if base is None else replace(self, variant=base)
 
     def __str__(self) -> str:
         return f"{family_label(self.env_id)} {self.variant} seed {self.seed}"
