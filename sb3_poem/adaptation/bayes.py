@@ -204,6 +204,8 @@ class Bayes(Rule):
                 'query_rule="worst-case" (eq. 10) chooses pairs: with question="best-of-four" use '
                 '"information-gain" or "random"'
             )
+        if isinstance(self.noise_model, dict):  # of a file
+            object.__setattr__(self, "noise_model", noise_model_from_dict(self.noise_model))
         needed = "probability_left" if self.question == "pair" else "probability_above"
         if self.noise_model not in (None, INFER) and not hasattr(self.noise_model, needed):
             raise ValueError(
@@ -257,18 +259,6 @@ class Bayes(Rule):
 
     def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> Inference:
         return BayesInference(self, model, rng, setting)
-
-    def to_dict(self) -> dict[str, Any]:
-        data, noise = super().to_dict(), self.noise_model
-        if noise is not None and not isinstance(noise, str):
-            data["options"]["noise_model"] = noise.to_dict()
-        return data
-
-    @classmethod
-    def _of_options(cls, options: dict[str, Any]) -> Self:
-        noise = options["noise_model"]
-        noise_model = noise_model_from_dict(noise) if isinstance(noise, dict) else noise
-        return cls(**{**options, "noise_model": noise_model})
 
 
 class BayesInference(Inference):

@@ -208,8 +208,11 @@ class Rule(ABC):
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready."""
         options = {f.name: getattr(self, f.name) for f in fields(self)}
-        for name, value in options.items():  # JSON does not know NumPy's numbers
-            options[name] = value.item() if isinstance(value, np.generic) else value
+        for name, value in options.items():
+            if isinstance(value, np.generic):  # JSON does not know NumPy's numbers
+                options[name] = value.item()
+            elif hasattr(value, "to_dict"):
+                options[name] = value.to_dict()
         return {"name": type(self).__name__, "module": type(self).__module__, "options": options}
 
     @classmethod
@@ -221,11 +224,7 @@ class Rule(ABC):
                 f"the rule is {name!r}, which this program does not know: import it first, by "
                 f"`from {module} import {name}`"
             )
-        return cls._known[name]._of_options(data["options"])
-
-    @classmethod
-    def _of_options(cls, options: dict[str, Any]) -> Self:
-        return cls(**options)
+        return cls._known[name](**data["options"])
 
 
 def as_rule(rule: Any) -> Rule:

@@ -1,19 +1,8 @@
 """What POEM is compared with: rules like any other."""
+# ruff: noqa: F401
 
 from sb3_poem.baselines.anole import ANOLE
 from sb3_poem.baselines.fragments import replay_fragments, rollout_fragments, training_rollouts
 from sb3_poem.baselines.maml_reward import MAMLReward, MAMLRewardModel
 from sb3_poem.baselines.meta_reward import MetaReward, meta_train_reward
 from sb3_poem.baselines.reward_oracle import RewardOracle
-
-__all__ = [
-    "ANOLE",
-    "MAMLReward",
-    "MAMLRewardModel",
-    "MetaReward",
-    "RewardOracle",
-    "meta_train_reward",
-    "replay_fragments",
-    "rollout_fragments",
-    "training_rollouts",
-]
