@@ -1,7 +1,7 @@
 """Who answers. Oracles alone may know the task; an adapter never does."""
 
 from abc import ABC, abstractmethod
-from typing import Any, Self
+from typing import Self
 
 import gymnasium as gym
 import numpy as np
@@ -147,8 +147,16 @@ class BoltzmannOracle(TaskOracle):
     BoltzmannNoise(beta=0.5)
     """
 
-    def __init__(self, beta: float | None = None, *others: Any, **named: Any) -> None:
-        super().__init__(*others, **named)
+    def __init__(
+        self,
+        beta: float | None = None,
+        env: gym.Env | VecEnv | None = None,
+        task: np.ndarray | None = None,
+        seed: int | None = None,
+        thresholds: tuple[float, float] | None = None,
+        question: str | None = None,
+    ) -> None:
+        super().__init__(env, task, seed, thresholds, question)
         self.beta, self.noise_model = beta, BoltzmannNoise(beta)
 
     def _perceive(self, returns: np.ndarray) -> np.ndarray:
@@ -170,10 +178,18 @@ class MistakeOracle(TaskOracle):
     MistakeNoise(rate=0.1)
     """
 
-    def __init__(self, rate: float = 0.2, *others: Any, **named: Any) -> None:
+    def __init__(
+        self,
+        rate: float = 0.2,
+        env: gym.Env | VecEnv | None = None,
+        task: np.ndarray | None = None,
+        seed: int | None = None,
+        thresholds: tuple[float, float] | None = None,
+        question: str | None = None,
+    ) -> None:
         if not 0.0 <= rate <= 1.0:
             raise ValueError(f"`rate` must lie in [0, 1], but is {rate}")
-        super().__init__(*others, **named)
+        super().__init__(env, task, seed, thresholds, question)
         self.rate, self.noise_model = rate, MistakeNoise(min(rate, 0.5))
 
     def _perceive(self, returns: np.ndarray) -> np.ndarray:
