@@ -13,7 +13,7 @@ from typing import Protocol, runtime_checkable
 import mujoco
 import numpy as np
 
-from poem_envs.mujoco_rendering import FastRenderer
+from poem_envs.mujoco_rendering import StateRenderer, prepared_viewer
 
 #: Of the first path, the second and so on, red, green and blue in [0, 1].
 PATH_COLOURS = ((0.10, 0.33, 0.85), (0.90, 0.40, 0.02), (0.00, 0.52, 0.36), (0.62, 0.20, 0.65))
@@ -154,28 +154,23 @@ class MujocoFilms:
             self._film_renderer = None
 
 
-class FilmRenderer(FastRenderer):
+class FilmRenderer(StateRenderer):
     """Draws the states of several episodes of a MuJoCo model in one scene."""
 
     def __init__(self, model: mujoco.MjModel, look: Look, width: int, height: int) -> None:
         self.look, self._source = look, model
         own = copy.deepcopy(model)  # whose colours are changed
-        self._dress(own)
-        camera = {
-            name: getattr(look, name) for name in ("azimuth", "elevation", "distance", "lookat")
-        }
-        super().__init__(
-            own,
-            width=width,
-            height=height,
-            max_geom=MAX_SHAPES,
-            slices=SLICES,
-            default_cam_config={**camera, "lookat": np.array(look.lookat)},
-        )
-        self._options.sitegroup[:] = 0
+        super().__init__(own, width, height, fast=True, max_geom=MAX_SHAPES)
+        own.vis.quality.numslices = SLICES
+        self._others = mujoco.MjData(own)
+        self._dress()
+        self._viewer = viewer = prepared_viewer(self._renderer, "rgb_array", fast=True)
+        self._camera, self._scene, self._viewport = viewer.cam, viewer.scn, viewer.viewport
+        self._camera.azimuth, self._camera.elevation = look.azimuth, look.elevation
+        viewer.vopt.sitegroup[:] = 0
         looks_down = look.elevation <= -FIELD_OF_VIEW / 2
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = not looks_down
-        self._others = mujoco.MjData(own)
+        mujoco.mjr_changeFont(mujoco.mjtFontScale.mjFONTSCALE_100, viewer.con)
 
     def fits(self, model: mujoco.MjModel, size: tuple[int, int]) -> bool:
         """Whether it draws this model in this size, width and height."""
@@ -184,18 +179,15 @@ class FilmRenderer(FastRenderer):
     def film(self, paths: Sequence[np.ndarray], shown: Sequence[int]) -> list[np.ndarray]:
         """See :meth:`Filmed.film`."""
         # A placement moves bodies of the model.
-        self._model.body_pos[:], self._model.body_quat[:] = (
-            self._source.body_pos,
-            self._source.body_quat,
-        )
+        self._model.body_pos[:] = self._source.body_pos
+        self._model.body_quat[:] = self._source.body_quat
         places = [self._places(path) for path in paths]
         moments, self._camera.distance = moments_of([paths[i] for i in shown]), self.look.distance
         self._camera.lookat[:] = self.look.lookat
         moves = self.look.follows and len(shown) == 1
         if not moves:
             self._frame(np.concatenate(places))
-        self._context.make_current()  # another environment may have rendered since
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._resources)
+        self._viewer.make_context_current()  # another environment may have rendered since
         images = []
         for now in moments:
             if moves:
@@ -204,9 +196,9 @@ class FilmRenderer(FastRenderer):
             images.append(self._image(paths, places, dict(zip(shown, now, strict=True))))
         return images
 
-    def _dress(self, model: mujoco.MjModel) -> None:
+    def _dress(self) -> None:
         """Give the floor a plain colour and no end, and let light come from the camera alone."""
-        look, visual = self.look, model.vis
+        model, visual = self._model, self._model.vis
         model.light_active[:] = 0
         visual.headlight.ambient[:], visual.headlight.diffuse[:] = 0.65, 0.33
         visual.headlight.specular[:] = 0.1
@@ -219,7 +211,7 @@ class FilmRenderer(FastRenderer):
         floors = model.geom_type == PLANE
         model.geom_matid[floors], model.geom_size[floors, :2] = -1, FLOOR_SIZE
         model.geom_rgba[floors] = (*FLOOR_COLOUR, 1.0)
-        bodies = [model.body(name).id for name in look.hidden]
+        bodies = [model.body(name).id for name in self.look.hidden]
         # And those by which a hand is led.
         hidden = np.isin(model.geom_bodyid, bodies) | (model.body_mocapid[model.geom_bodyid] >= 0)
         model.geom_rgba[hidden, 3] = 0.0
@@ -254,7 +246,7 @@ class FilmRenderer(FastRenderer):
     def _image(
         self, paths: Sequence[np.ndarray], places: list[np.ndarray], shown: dict[int, int]
     ) -> np.ndarray:
-        model, scene, viewport = self._model, self._scene, self._viewport
+        model, scene, viewport, viewer = self._model, self._scene, self._viewport, self._viewer
         growth = 1.0
         if len(shown) > 1 and self.look.follows:
             growth = max(1.0, LEAST_SIZE * self._camera.distance / self.look.distance)
@@ -262,13 +254,11 @@ class FilmRenderer(FastRenderer):
             data, first = (self._others, scene.ngeom) if order else (self._data, 0)
             self._pose(data, paths[i][now])
             if order == 0:
-                everything = mujoco.mjtCatBit.mjCAT_ALL
-                mujoco.mjv_updateScene(
-                    model, data, self._options, None, self._camera, everything, scene
-                )
+                drawn = viewer.vopt, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL
+                mujoco.mjv_updateScene(model, data, *drawn, scene)
             else:
-                moving, perturbation = mujoco.mjtCatBit.mjCAT_DYNAMIC, mujoco.MjvPerturb()
-                mujoco.mjv_addGeoms(model, data, self._options, perturbation, moving, scene)
+                moving = mujoco.mjtCatBit.mjCAT_DYNAMIC
+                mujoco.mjv_addGeoms(model, data, viewer.vopt, viewer.pert, moving, scene)
             # Those who run along a line have lanes.
             lane = np.array([0.0, 1.2 * growth * order, 0.0]) * (self.look.marks == "metres")
             if len(shown) > 1:
@@ -276,11 +266,11 @@ class FilmRenderer(FastRenderer):
             self._add_way(places[i][: now + 1] + lane, PATH_COLOURS[i])
         start = places[next(iter(shown))][0]
         labels = self._add_marks(start)
-        mujoco.mjr_render(viewport, scene, self._resources)
+        mujoco.mjr_render(viewport, scene, viewer.con)
         for text, x, y in labels:
             self._write(text, x, y)
         pixels = np.empty((viewport.height, viewport.width, 3), dtype=np.uint8)
-        mujoco.mjr_readPixels(pixels, None, viewport, self._resources)
+        mujoco.mjr_readPixels(pixels, None, viewport, viewer.con)
         return pixels[::-1]
 
     def _recolour(
@@ -385,7 +375,7 @@ class FilmRenderer(FastRenderer):
 
     def _write(self, text: str, x: float, y: float) -> None:
         """Write a word around a point of the picture."""
-        font, resources = mujoco.mjtFont.mjFONT_NORMAL, self._resources
+        font, resources = mujoco.mjtFont.mjFONT_NORMAL, self._viewer.con
         width = sum(resources.charWidth[ord(letter)] for letter in text)
         x -= width / 2 / self._viewport.width
         y -= resources.charHeight / 4 / self._viewport.height
@@ -402,4 +392,5 @@ class FilmRenderer(FastRenderer):
     def _add_shape(
         self, kind: int, place: np.ndarray, size: np.ndarray, colour: Sequence[float]
     ) -> None:
-        self._add({"type": kind, "pos": place, "size": size, "rgba": (*colour, 1.0)})
+        rgba = np.array([*colour, 1.0])
+        self._viewer._add_marker_to_scene({"type": kind, "pos": place, "size": size, "rgba": rgba})

@@ -15,7 +15,7 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
 from poem_envs.family import BOUNDS_TOLERANCE, TaskFamily, is_flat
-from poem_envs.mujoco_rendering import prepare_to_render
+from poem_envs.mujoco_rendering import prepared_viewer
 
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 GOAL_SITE = "target"
@@ -262,7 +262,9 @@ class GoalFamily(TaskFamily):
         """Render the current state as the environment does."""
         if self._task is None:
             raise RuntimeError("render() was called before the first reset()")
-        prepare_to_render(self.env, self.render_mode)
+        renderer = renderer_inside(self.env)
+        if renderer is not None and self.render_mode is not None:
+            prepared_viewer(renderer, self.render_mode)
         with unchanged_physics(self.env):
             if self.render_task:
                 return self.env.render()
@@ -279,6 +281,12 @@ class GoalFamily(TaskFamily):
         if self._goal_env is not None:
             self._goal_env.close()
             self._goal_env = None
+
+
+def renderer_inside(env: Any) -> Any:
+    """The ``MujocoRenderer`` of a bare environment, which mazes keep one deeper, if it has one."""
+    holders = (env, getattr(env, "ant_env", None), getattr(env, "point_env", None))
+    return next((one.mujoco_renderer for one in holders if hasattr(one, "mujoco_renderer")), None)
 
 
 @contextlib.contextmanager

@@ -14,7 +14,7 @@ from gymnasium import spaces
 from mujoco.rollout import Rollout
 
 from poem_envs.films import MujocoFilms
-from poem_envs.mujoco_rendering import FastRenderer, StateRenderer, renders_fast
+from poem_envs.mujoco_rendering import StateRenderer, renders_fast
 from poem_envs.vector import BatchFamily, DivergenceError
 
 RENDER_MODES = ["human", "rgb_array", "depth_array", "rgbd_tuple"]
@@ -76,7 +76,7 @@ class MujocoFamily(MujocoFilms, BatchFamily):
         if self.model.na:
             raise ValueError(f"xml_file={self.xml_file!r} must not have actuators with activations")
         self._rollout: Rollout | None = None
-        self._renderer: StateRenderer | FastRenderer | None = None
+        self._renderer: StateRenderer | None = None
         initial = mujoco.MjData(self.model)
         self.init_qpos, self.init_qvel = initial.qpos.copy(), initial.qvel.copy()
         self._renders_fast = renders_fast(self.render_quality, self.render_mode)
@@ -178,11 +178,16 @@ class MujocoFamily(MujocoFilms, BatchFamily):
     def _render_copy(self, copy: int, render_mode: str, task: np.ndarray | None) -> Any:
         markers = [] if task is None else self._task_markers(task, self._qpos[copy, :3])
         if self._renderer is None:
-            renderer = FastRenderer if self._renders_fast else StateRenderer
             camera = {**self.camera_config, **(self.default_camera_config or {})}
-            names = ("width", "height", "camera_name", "max_geom")
-            arguments: dict[str, Any] = {name: getattr(self, name) for name in names}
-            self._renderer = renderer(self.model, default_cam_config=camera, **arguments)
+            self._renderer = StateRenderer(
+                self.model,
+                self.width,
+                self.height,
+                fast=self._renders_fast,
+                max_geom=self.max_geom,
+                camera_name=self.camera_name,
+                default_cam_config=camera,
+            )
         return self._renderer.render(self.states[copy], render_mode, markers)
 
     def film_state(self) -> np.ndarray:

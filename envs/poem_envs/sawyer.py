@@ -11,7 +11,12 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from poem_envs.mujoco_rendering import FastRenderer, close_viewers, fit_buffer, prepare_to_render
+from poem_envs.mujoco_rendering import (
+    close_viewers,
+    fit_buffer,
+    leave_out_details,
+    prepared_viewer,
+)
 
 INSTALL = "pip install 'sb3_poem[metaworld]'"
 
@@ -70,7 +75,7 @@ class Sawyer:
     was used before.
 
     :param manipulation: its name, without ``-v3``
-    :param renders_fast: by :class:`~poem_envs.mujoco_rendering.FastRenderer`
+    :param renders_fast: see :class:`~poem_envs.mujoco_rendering.StateRenderer`
     :param render_arguments: ``render_mode``, ``camera_name``, ``width`` and ``height``, as
         Meta-World has them
     """
@@ -81,7 +86,8 @@ class Sawyer:
         self.manipulation = manipulation
         self.arguments = {"renders_fast": renders_fast, **render_arguments}
         self.env = env = _environment_class(manipulation)(**render_arguments)
-        self._fast_renderer: FastRenderer | None = None
+        if renders_fast:
+            leave_out_details(env.model)
         env._set_task_called = True  # placements are set here, without Meta-World's pickled tasks
         env.max_path_length = np.inf  # time limits are a wrapper's
         env._get_state_rand_vec = self._take_placement
@@ -126,20 +132,13 @@ class Sawyer:
     def render(self) -> Any:
         """An image ``(height, width, 3)`` uint8, or what else ``render_mode`` says."""
         env = self.env
-        if not self.arguments["renders_fast"]:
-            prepare_to_render(env, env.render_mode)
-            return env.render()
-        if self._fast_renderer is None:
-            size = {"width": env.width, "height": env.height}
-            self._fast_renderer = FastRenderer(env.model, camera_name=env.camera_name, **size)
-        return self._fast_renderer.render_data(env.data, [])
+        if env.render_mode is not None:
+            prepared_viewer(env.mujoco_renderer, env.render_mode, self.arguments["renders_fast"])
+        return env.render()
 
     def close(self) -> None:
         """Close windows and graphics contexts, which a later rendering would open again."""
-        close_viewers(self.env)
-        if self._fast_renderer is not None:
-            self._fast_renderer.close()
-            self._fast_renderer = None
+        close_viewers(self.env.mujoco_renderer)
 
     def _take_placement(self) -> np.ndarray:
         if self._placement is None:
