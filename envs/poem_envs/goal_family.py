@@ -286,7 +286,8 @@ class GoalFamily(TaskFamily):
 def renderer_inside(env: Any) -> Any:
     """The ``MujocoRenderer`` of a bare environment, which mazes keep one deeper, if it has one."""
     holders = (env, getattr(env, "ant_env", None), getattr(env, "point_env", None))
-    return next((one.mujoco_renderer for one in holders if hasattr(one, "mujoco_renderer")), None)
+    renderers = (getattr(holder, "mujoco_renderer", None) for holder in holders)
+    return next((renderer for renderer in renderers if renderer is not None), None)
 
 
 @contextlib.contextmanager

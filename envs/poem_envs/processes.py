@@ -8,6 +8,7 @@ steps a group of its own meanwhile.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pickle
 import signal
@@ -16,6 +17,7 @@ import sys
 import traceback
 import weakref
 from collections.abc import Callable, Sequence
+from functools import partial
 from multiprocessing.connection import Connection, Pipe
 from typing import Any, NamedTuple
 
@@ -42,27 +44,24 @@ class EpisodeStart(NamedTuple):
 class CopyGroup:
     """Copies of a task family that one process steps in turn, numbered from ``first``."""
 
-    def __init__(
+    def __init__(self) -> None:
+        self.envs: list[TaskFamily] = []
+
+    def make(
         self, make: Callable[[], TaskFamily], n: int, first: int, attributes: dict[str, Any]
     ) -> None:
+        """Make the copies."""
         self.envs, self.first = [make() for _ in range(n)], first
         for name, value in attributes.items():
             self.set_attribute(name, value)
-        self._answer: tuple[Any, Exception | None] = None, None
 
     def send(self, method: str, *arguments: Any) -> None:
-        """As :meth:`RemoteGroup.send`, but what is called is done when this returns."""
-        try:
-            self._answer = getattr(self, method)(*arguments), None
-        except Exception as error:
-            self._answer = None, error
+        """As :meth:`RemoteGroup.send`; the call is made when its result is asked for."""
+        self._call = partial(getattr(self, method), *arguments)
 
     def receive(self) -> Any:
-        """The result of the last call, or its error."""
-        result, error = self._answer
-        if error is not None:
-            raise error
-        return result
+        """The result of the last call."""
+        return self._call()
 
     def begin(
         self, starts: Sequence[EpisodeStart]
@@ -110,40 +109,27 @@ class CopyGroup:
 
 
 def serve(file_descriptor: int) -> None:
-    """Answer a :class:`RemoteGroup`'s calls of a group's methods, the first of which makes it."""
+    """Answer a :class:`RemoteGroup`'s calls of a group's methods."""
     # Ctrl-C reaches all processes; the parent's end ends this one.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    connection, group = Connection(file_descriptor), None
-    while True:
-        try:
+    connection, group = Connection(file_descriptor), CopyGroup()
+    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
+        while True:
             call = connection.recv_bytes()
             answer: tuple[bool, Any]
             try:
                 method, arguments = pickle.loads(call)
-                if method == "__init__":
-                    group, answer = CopyGroup(*arguments), (True, None)
-                else:
-                    answer = True, getattr(group, method)(*arguments)
+                answer = True, getattr(group, method)(*arguments)
             except Exception as error:
                 answer = False, (str(error), traceback.format_exc())
             connection.send_bytes(cloudpickle.dumps(answer))
-        except (EOFError, BrokenPipeError, ConnectionResetError):
-            break
-    if group is not None:
-        group.close()
-
-
-class WorkerError(Exception):
-    """An error's traceback in a worker process, as text; the cause of the error raised for it."""
-
-    def __str__(self) -> str:
-        return "\n" + str(self.args[0])
+    group.close()
 
 
 class RemoteGroup:
-    """A :class:`CopyGroup` in a process: calls are sent, results received, first of making it."""
+    """A :class:`CopyGroup` in a process of its own: calls are sent, results received."""
 
-    def __init__(self, *arguments: Any) -> None:
+    def __init__(self) -> None:
         self._connection, theirs = Pipe()
         # The worker imports what the parent can import, and "" is the parent's working directory.
         paths = os.pathsep.join(path or os.getcwd() for path in sys.path)
@@ -155,7 +141,6 @@ class RemoteGroup:
         )
         theirs.close()
         self.close = weakref.finalize(self, _end_worker, self._connection, self._process)
-        self.send("__init__", *arguments)
 
     def send(self, method: str, *arguments: Any) -> None:
         """Begin a call of a group's method."""
@@ -172,7 +157,9 @@ class RemoteGroup:
             raise self._gone() from None
         if not succeeded:
             message, trace = result
-            raise RuntimeError(message) from WorkerError(trace)
+            error = RuntimeError(message)
+            error.add_note(f"In the worker process:\n{trace}")
+            raise error
         return result
 
     def _gone(self) -> RuntimeError:
@@ -221,10 +208,11 @@ class ProcessCopies:
         ends = [*self._firsts[1:], self._n]
         try:
             for first, end in zip(self._firsts, ends, strict=True):
-                group = CopyGroup if end == self._n else RemoteGroup
-                self._groups.append(group(self._make, end - first, first, self._attributes))
-            for remote in self._groups[:-1]:
-                remote.receive()
+                group = CopyGroup() if end == self._n else RemoteGroup()
+                self._groups.append(group)
+                group.send("make", self._make, end - first, first, self._attributes)
+            for group in reversed(self._groups):
+                group.receive()
         except BaseException:  # the next call tries again, rather than to use what is half made
             self._release()
             raise
@@ -237,24 +225,25 @@ class ProcessCopies:
                 "it; reset it"
             )
         results: dict[int, Any] = {}
-        failure: Exception | None = None
+        failures: list[Exception] = []
         try:
             if not self._groups:
                 self._start()
-            for index in sorted(arguments):  # this process's own last: the others work meanwhile
+            for index in arguments:
                 self._groups[index].send(method, *arguments[index])
-            for index in arguments:  # all of them even if one failed: none may be left over
+            # This process's own first: the others work meanwhile. All of them even if one failed:
+            # none may be left over.
+            for index in sorted(arguments, reverse=True):
                 try:
                     results[index] = self._groups[index].receive()
                 except Exception as problem:
-                    failure = failure or problem
-        except BaseException as error:
-            if not isinstance(error, Exception):  # answers under way would be taken for later ones
-                self._release()
-                self._interrupted = True
+                    failures.append(problem)
+        except (KeyboardInterrupt, SystemExit):  # answers under way would be taken for later ones
+            self._release()
+            self._interrupted = True
             raise
-        if failure is not None:
-            raise failure
+        if failures:
+            raise failures[0]
         self._interrupted = False
         return results
 
@@ -278,7 +267,8 @@ class ProcessCopies:
         """Step all copies; returns reward features and early ends."""
         chunks = np.split(actions, self._firsts[1:])
         results = self._call("step", {index: (chunk,) for index, chunk in enumerate(chunks)})
-        observations, features, terminated, infos = zip(*results.values(), strict=True)
+        in_order = [results[index] for index in sorted(results)]
+        observations, features, terminated, infos = zip(*in_order, strict=True)
         self._last_observations = np.concatenate(observations)
         self._last_infos = {key: np.concatenate([info[key] for info in infos]) for key in infos[0]}
         return np.concatenate(features), np.concatenate(terminated)

@@ -155,13 +155,6 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
-def checked_nthread(nthread: int | None) -> int:
-    """How many threads (or processes) to use; None takes as many as there are cores."""
-    if nthread is not None and nthread < 1:
-        raise ValueError(f"nthread={nthread!r} must be at least 1, or None for all cores")
-    return available_cores() if nthread is None else nthread
-
-
 class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """A vectorised task family, each copy with a task of its own.
 
@@ -208,11 +201,14 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
     ) -> None:
         super().__init__()
         self.closed = True  # until there is something to close
-        if num_envs < 1:
-            raise ValueError(f"num_envs={num_envs!r} must be at least 1")
-        if max_episode_steps is not None and max_episode_steps < 1:
-            raise ValueError(f"{max_episode_steps=} must be at least 1, or None for no limit")
-        nthread = checked_nthread(nthread)
+        for name, number, none in (
+            ("num_envs", num_envs, ""),
+            ("nthread", nthread, ", or None for all cores"),
+            ("max_episode_steps", max_episode_steps, ", or None for no limit"),
+        ):
+            if number is not None and number < 1:
+                raise ValueError(f"{name}={number!r} must be at least 1{none}")
+        nthread = nthread or available_cores()
         if render_mode is not None:
             family_kwargs["render_mode"] = render_mode
         make = functools.partial(family, **family_kwargs)
@@ -244,8 +240,8 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         self._next_tasks = np.full((num_envs, *one.task_space.shape), np.nan)
         self._task_chosen = np.zeros(num_envs, dtype=bool)
         self._tasks_kept = np.zeros(num_envs, dtype=bool)
-        self._rngs: list[np.random.Generator] = []
-        self._seeds: list[int] = []
+        self._rngs: dict[int, np.random.Generator] = {}  # of each copy, as are the seeds
+        self._seeds: dict[int, int] = {}
         self._elapsed_steps = np.zeros(num_envs, dtype=np.int64)
         self._episodes = np.zeros(num_envs, dtype=np.int64)
         self._succeeded = np.zeros(num_envs, dtype=bool)
@@ -305,23 +301,28 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         :param options: ``{"tasks": tasks}`` is short for :meth:`set_tasks` just before
         """
         options = check_options(options, self._reset_options)
-        seeds = self._seed_of_each_copy(seed)
-        seeded = np.array([s is not None for s in seeds])
+        if isinstance(seed, (int, np.integer)):
+            seed = [int(seed) + copy for copy in range(self.num_envs)]
+        given = [None] * self.num_envs if seed is None else seed
+        seeds = [None if own is None else int(own) for own in given]
+        if len(seeds) != self.num_envs:
+            raise ValueError(
+                f"seed={seed!r} holds {len(seeds)} seeds, expected one for each of "
+                f"num_envs={self.num_envs}"
+            )
+        seeded = np.array([own is not None for own in seeds])
         if "tasks" in options:
             self.set_tasks(options["tasks"])
-        if not self._rngs:
-            generators = [seeding.np_random(s) for s in seeds]
-            self._rngs, self._seeds = map(list, zip(*generators, strict=True))
-        else:
-            for copy in np.flatnonzero(seeded):
-                self._rngs[copy], self._seeds[copy] = seeding.np_random(seeds[copy])
+        for copy, own in enumerate(seeds):
+            if own is not None or copy not in self._rngs:
+                self._rngs[copy], self._seeds[copy] = seeding.np_random(own)
         self._episodes[seeded] = 0
         undecided = ~self._task_chosen
         if self._tasks is None:
             self._tasks = self._next_tasks.copy()
         else:
             undecided &= seeded & ~self._tasks_kept
-        for copy in np.flatnonzero(undecided):
+        for copy in np.flatnonzero(undecided).tolist():
             self._tasks[copy] = self.family.sample_tasks(1, task_stream(self._rngs[copy]))[0]
         self._begin(np.arange(self.num_envs))
         if self.render_mode == "human":
@@ -377,24 +378,12 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
     @property  # type: ignore[misc]
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
         """Of each copy; empty before the first reset."""
-        return tuple(self._rngs)
+        return tuple(self._rngs.values())
 
     @property
     def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
         """Of each copy; empty before the first reset."""
-        return tuple(self._seeds)
-
-    def _seed_of_each_copy(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
-        if seed is None:
-            return [None] * self.num_envs
-        if isinstance(seed, (int, np.integer)):
-            return [int(seed) + copy for copy in range(self.num_envs)]
-        if len(seed) != self.num_envs:
-            raise ValueError(
-                f"seed={seed!r} holds {len(seed)} seeds, expected one for each of "
-                f"num_envs={self.num_envs}"
-            )
-        return [None if s is None else int(s) for s in seed]
+        return tuple(self._seeds.values())
 
     def _begin(self, copies: np.ndarray) -> None:
         assert self._tasks is not None
@@ -413,8 +402,7 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
             EpisodeStart(copy, rng, tasks[copy], self._seeds[copy], episodes[copy])
             for copy, rng in zip(copies.tolist(), rngs, strict=True)
         ]
-        for copy, rng in self._copies.begin(starts).items():
-            self._rngs[copy] = rng  # which has drawn, in another process
+        self._rngs |= self._copies.begin(starts)  # which have drawn, in other processes
 
     def _describe_episode(self, copy: int) -> str:
         return (
