@@ -16,9 +16,9 @@ import torch as th
 
 from poem_envs.vector import available_cores
 from sb3_poem import POEMSAC, TaskVecEnv
-from sb3_poem.common.collection import relabelled_returns
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.vec_env import make_task_vec_env
+from sb3_poem.pearl_sac.collector import relabelled_returns
 
 COPIES = (1, 4, 16, 64, 256, 1024)
 BATCH_TASKS, TASKS = (2, 4, 8, 16, 32, 64), (120, 300, 1000)

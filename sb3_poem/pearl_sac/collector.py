@@ -2,13 +2,13 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import torch as th
 from colorednoise import powerlaw_psd_gaussian
 
 from sb3_poem.common.buffers import Segment, TaskReplayBuffer
-from sb3_poem.common.collection import OnStep, collect_segment
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.random import Generators
 from sb3_poem.pearl_sac.policies import LatentPolicy
@@ -19,7 +19,8 @@ from sb3_poem.pearl_sac.train_tasks import TrainTasks
 class EpochCollector:
     """Rolls training tasks out and fills their replay buffers. ``explores`` tells whether actions
     are uniformly random at present, ``episode_count`` the episodes begun so far, for messages;
-    other fields are PEARLSAC's.
+    ``on_step`` is given the local variables of a step, and ends the collection by False; other
+    fields are PEARLSAC's.
     """
 
     family: FamilyView
@@ -31,7 +32,7 @@ class EpochCollector:
     noise_color: float
     explores: Callable[[], bool]
     episode_count: Callable[[], int]
-    on_step: OnStep
+    on_step: Callable[[dict[str, Any]], bool]
 
     def collect(self) -> list[Segment] | None:
         """An epoch: a segment for each wave of copies; None if ``on_step`` ended it."""
@@ -46,9 +47,66 @@ class EpochCollector:
         return waves
 
     def roll_out(self, task_ids: np.ndarray, latents: np.ndarray) -> Segment | None:
-        """A horizon of each copy, which goes to the buffer too; None if ``on_step`` ended it."""
-        space = self.policy.action_space
-        shape = (len(latents), int(space.shape[0]))
+        """A horizon of each copy on its task, (copies,), under its latent, (copies, latent_dim),
+        which goes to the buffer too; None if ``on_step`` ended it. An episode that ends early is
+        followed by another of the same task.
+
+        :raises ValueError: for NaN and infinity, and as :meth:`FamilyView.check_experience`
+        """
+        family, tasks = self.family, self.train_tasks.tasks[task_ids]
+        n, seed, steps = family.num_envs, self.generators.integer_seed(), []
+        episodes, in_first_episode = np.full(n, self.episode_count()), np.ones(n, dtype=bool)
+
+        def check(name: str, values: np.ndarray, step: int) -> None:
+            # then all are; the sum of large finite values may overflow, which is sorted out here
+            if np.isfinite(values.sum()):
+                return
+            finite = np.isfinite(values).reshape(n, -1).all(axis=1)
+            if not finite.all():
+                copy = int(np.argmin(finite))
+                raise ValueError(
+                    f"the environment returned {name} that are NaN or infinite: copy {copy}, "
+                    f"training task {int(task_ids[copy])}, episode {int(episodes[copy])}, step "
+                    f"{step}: {values[copy]}. Training stops here, before the networks see them."
+                )
+
+        act, obs = self._acting_on(latents), family.reset(tasks, seed)
+        check("observations", obs, 0)
+        for step in range(family.horizon):
+            actions, scaled_actions = act(obs)
+            check("actions (of the policy)", actions, step)
+            new_obs, rewards, dones, infos = family.env.step(actions)
+            assert isinstance(new_obs, np.ndarray)
+            if not self.on_step(locals()):
+                return None
+            next_obs, terminated = new_obs, np.zeros(n, dtype=np.float32)
+            if dones.any():
+                next_obs = new_obs.copy()
+                for copy in np.flatnonzero(dones):
+                    next_obs[copy] = infos[copy]["terminal_observation"]
+                    terminated[copy] = not infos[copy].get("TimeLimit.truncated", False)
+            features = family.features_of(infos)
+            check("observations", next_obs, step)
+            check("rewards", rewards, step)
+            check("reward features", features, step)
+            seen, then = obs.astype(np.float32), next_obs.astype(np.float32)
+            # rewards as most VecEnvs give them; SubprocVecEnv does not round
+            paid = rewards.astype(np.float32).astype(np.float64)
+            steps.append((seen, scaled_actions, then, paid, terminated, features, in_first_episode))
+            in_first_episode = in_first_episode & ~dones
+            episodes += dones
+            obs = new_obs
+        stacked = (np.stack(rows, axis=1) for rows in zip(*steps, strict=True))
+        segment = Segment(task_ids, latents, *stacked)
+        family.check_experience(tasks, seed, segment)
+        self.replay_buffer.extend(segment)
+        return segment
+
+    def _acting_on(
+        self, latents: np.ndarray
+    ) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
+        """How to act: from observations to actions in the environment's units, and in [-1, 1]."""
+        space, shape = self.policy.action_space, (len(latents), self.family.action_dim)
         policy_action, noises = self.policy.acting_on(latents), self.action_noises(shape)
 
         def act(obs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -58,14 +116,7 @@ class EpochCollector:
                 scaled = policy_action(obs, next(noises))
             return np.clip(self.policy.unscale_action(scaled), space.low, space.high), scaled
 
-        episodes = np.full(self.family.num_envs, self.episode_count())
-        seed, tasks = self.generators.integer_seed(), self.train_tasks.tasks[task_ids]
-        segment = collect_segment(
-            self.family, act, task_ids, tasks, latents, seed, episodes, self.on_step
-        )
-        if segment is not None:
-            self.replay_buffer.extend(segment)
-        return segment
+        return act
 
     def action_noises(self, shape: tuple[int, int]) -> Iterator[th.Tensor]:
         """Standard normal noise of each step of a horizon, (copies, action_dim)."""
@@ -89,3 +140,16 @@ def concatenate(segments: list[Segment], n: int) -> Segment:
     names = [field.name for field in fields(Segment)]
     parts = {name: [getattr(segment, name) for segment in segments] for name in names}
     return Segment(**{name: np.concatenate(values)[:n] for name, values in parts.items()})
+
+
+def relabelled_returns(
+    compute_rewards: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    tasks: np.ndarray,
+    features: np.ndarray,
+    mask: np.ndarray,
+) -> np.ndarray:
+    """Returns under tasks (tasks, task_dim) of trajectories' features (trajectories, steps,
+    feat_dim), over the steps of a mask (trajectories, steps): (tasks, trajectories).
+    """
+    # one row at a time bounds the memory at trajectories x steps
+    return np.array([(compute_rewards(task, features) * mask).sum(axis=1) for task in tasks])

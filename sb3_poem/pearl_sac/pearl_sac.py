@@ -522,7 +522,7 @@ class PEARLSAC(SAC):
 
         def on_step(step_locals: dict[str, Any]) -> bool:
             self.num_timesteps += num_envs
-            callback.update_locals(step_locals)
+            callback.update_locals({**step_locals, "self": self})
             if not callback.on_step():
                 return False
             dones = step_locals["dones"]

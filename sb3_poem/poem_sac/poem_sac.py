@@ -8,10 +8,9 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_poem.common.buffers import Segment
 from sb3_poem.common.checks import check_number, check_whole
-from sb3_poem.common.collection import relabelled_returns
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.pearl_sac.arguments import refuse_unknown, with_arguments_of
-from sb3_poem.pearl_sac.collector import EpochCollector, in_waves
+from sb3_poem.pearl_sac.collector import EpochCollector, in_waves, relabelled_returns
 from sb3_poem.pearl_sac.environments import GivenEnv
 from sb3_poem.pearl_sac.objective import Objective
 from sb3_poem.pearl_sac.pearl_sac import PEARLSAC

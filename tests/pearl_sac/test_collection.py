@@ -4,6 +4,8 @@ the other tasks.
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -12,19 +14,28 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_poem.common.buffers import Segment
-from sb3_poem.common.collection import collect_segment, relabelled_returns
 from sb3_poem.common.family_view import FamilyView
+from sb3_poem.common.random import Generators
 from sb3_poem.common.vec_env import make_task_vec_env
+from sb3_poem.pearl_sac.collector import EpochCollector, relabelled_returns
+from sb3_poem.pearl_sac.train_tasks import TrainTasks
 
 
-def random_policy(env: VecEnv, seed: int = 0):  # type: ignore[no-untyped-def]
-    rng, space = np.random.default_rng(seed), env.action_space
+class RandomPolicy:
+    """Acts at random; what a collector asks of a policy."""
 
-    def act(obs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        scaled = rng.uniform(-1.0, 1.0, (len(obs), *space.shape)).astype(np.float32)
-        return space.low + 0.5 * (scaled + 1.0) * (space.high - space.low), scaled
+    device = "cpu"
 
-    return act
+    def __init__(self, env: VecEnv) -> None:
+        self.action_space, self.rng = env.action_space, np.random.default_rng(0)
+
+    def acting_on(self, latents: np.ndarray):  # type: ignore[no-untyped-def]
+        shape = (len(latents), *self.action_space.shape)
+        return lambda obs, noise: self.rng.uniform(-1.0, 1.0, shape).astype(np.float32)
+
+    def unscale_action(self, scaled: np.ndarray) -> np.ndarray:
+        low, high = self.action_space.low, self.action_space.high
+        return low + 0.5 * (scaled + 1.0) * (high - low)
 
 
 def collect(
@@ -33,13 +44,26 @@ def collect(
     horizon: int | None = None,
     seed: int = 3,
     on_step=lambda _: True,
-):  # type: ignore[no-untyped-def]
-    family, n = FamilyView.for_training(env, horizon), env.num_envs
-    counts = np.zeros(n, dtype=int)
-    latents = np.arange(2.0 * n).reshape(n, 2)
-    return collect_segment(
-        family, random_policy(env), np.arange(n), tasks, latents, seed, counts, on_step
-    ), counts
+    policy: RandomPolicy | None = None,
+) -> Segment | None:
+    """A rollout of each task, the copies' seeds from ``seed`` on; it must be what is stored."""
+    n, stored, generators = env.num_envs, [], Generators(0)
+    generators.integer_seed = lambda: seed
+    collector = EpochCollector(
+        family=FamilyView.for_training(env, horizon),
+        policy=policy or RandomPolicy(env),
+        train_tasks=TrainTasks.of_prior(tasks, latent_dim=2),
+        replay_buffer=SimpleNamespace(extend=stored.append),
+        generators=generators,
+        trajectories_per_task=1,
+        noise_color=0.0,
+        explores=lambda: False,
+        episode_count=lambda: 0,
+        on_step=on_step,
+    )
+    segment = collector.roll_out(np.arange(n), np.arange(2.0 * n).reshape(n, 2))
+    assert stored == ([] if segment is None else [segment])
+    return segment
 
 
 def unscaled(segment: Segment, env: VecEnv) -> np.ndarray:
@@ -50,14 +74,14 @@ def unscaled(segment: Segment, env: VecEnv) -> np.ndarray:
 @pytest.mark.parametrize("edge", [np.inf, 0.35])
 def test_a_segment_is_what_single_environments_give(edge: float) -> None:
     env, tasks = walks(3, steps=10, edge=edge), np.array([[-0.5], [0.0], [1.0]])
-    segment, counts = collect(env, tasks, horizon=25)
+    segment = collect(env, tasks, horizon=25)
     assert segment.actions.min() < -0.9
     assert np.abs(segment.actions).max() <= 1.0
     ended_early = 0
     for copy, task in enumerate(tasks):
         single, actions = gym.wrappers.TimeLimit(Walk(edge=edge), 10), unscaled(segment, env)[copy]
         obs, _ = single.reset(seed=3 + copy, options={"task": task})
-        first, episodes = True, 0
+        first = True
         for step, action in enumerate(actions):
             np.testing.assert_allclose(segment.observations[copy, step], obs, atol=1e-6)
             obs, reward, terminated, truncated, info = single.step(action)
@@ -71,9 +95,7 @@ def test_a_segment_is_what_single_environments_give(edge: float) -> None:
             ended_early += terminated
             if terminated or truncated:
                 first = False
-                episodes += 1
                 obs, _ = single.reset()
-        assert counts[copy] == episodes
     assert (ended_early > 0) == np.isfinite(edge)
     assert np.array_equal(segment.latents, np.arange(6.0).reshape(3, 2))
     assert segment.task_ids.tolist() == [0, 1, 2]
@@ -81,8 +103,8 @@ def test_a_segment_is_what_single_environments_give(edge: float) -> None:
 
 def test_the_vectorised_and_the_single_environment_give_the_same_segment() -> None:
     tasks = np.array([[0.1], [2.0], [3.0]])
-    ours, _ = collect(make_task_vec_env(POINT_GOAL, 3), tasks)
-    theirs, _ = collect(make_vec_env(POINT_GOAL, 3), tasks)
+    ours = collect(make_task_vec_env(POINT_GOAL, 3), tasks)
+    theirs = collect(make_vec_env(POINT_GOAL, 3), tasks)
     for name in Segment.__dataclass_fields__:
         assert np.array_equal(getattr(ours, name), getattr(theirs, name)), name
 
@@ -94,8 +116,7 @@ def test_a_false_step_ends_the_collection() -> None:
         seen.append(sorted(step_locals["infos"][0])[0])
         return len(seen) < 4
 
-    segment, _ = collect(env, np.zeros((2, 1)), horizon=10, on_step=on_step)
-    assert segment is None
+    assert collect(env, np.zeros((2, 1)), horizon=10, on_step=on_step) is None
     assert len(seen) == 4
 
 
@@ -117,27 +138,16 @@ def test_poison_is_named(what: str) -> None:
 
 
 def test_actions_that_are_not_finite_do_not_reach_the_environment() -> None:
+    class Broken(RandomPolicy):
+        def acting_on(self, latents: np.ndarray):  # type: ignore[no-untyped-def]
+            return lambda obs, noise: np.array([[0.0], [np.nan]], dtype=np.float32)
+
     env = walks(2)
-    family = FamilyView.for_training(env, 10)
-
-    def act(obs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        bad = np.array([[0.0], [np.nan]], dtype=np.float32)
-        return bad, bad
-
     with pytest.raises(
         ValueError,
-        match=r"actions \(of the policy\) that are NaN or infinite: copy 1, training task 7",
+        match=r"actions \(of the policy\) that are NaN or infinite: copy 1, training task 1",
     ):
-        collect_segment(
-            family,
-            act,
-            np.array([5, 7]),
-            np.zeros((2, 1)),
-            np.zeros((2, 1)),
-            0,
-            np.zeros(2, dtype=int),
-            lambda _: True,
-        )
+        collect(env, np.zeros((2, 1)), horizon=10, policy=Broken(env))
 
 
 # ---------------------------------------------------------------- relabelling
@@ -170,7 +180,7 @@ def test_relabelled_returns_are_what_the_other_tasks_environments_return(
     kwargs = {"max_episode_steps": steps}
     env = make_task_vec_env(env_id, 3, **kwargs)
     tasks = FamilyView(env).sample_tasks(3, np.random.default_rng(0))
-    segment, _ = collect(env, tasks, seed=11)
+    segment = collect(env, tasks, seed=11)
     relabelled = relabelled_returns(
         FamilyView(env).compute_rewards, tasks, segment.features, segment.first_episode
     )
@@ -186,7 +196,7 @@ def test_relabelled_returns_are_what_the_other_tasks_environments_return(
 
 def test_relabelling_counts_the_marked_steps_only() -> None:
     env, tasks = walks(3, steps=8, edge=0.35), np.array([[-1.0], [0.0], [1.0]])
-    segment, _ = collect(env, tasks, horizon=8)
+    segment = collect(env, tasks, horizon=8)
     assert (~segment.first_episode).any()
     rewards_of = FamilyView(env).compute_rewards
     relabelled = relabelled_returns(rewards_of, tasks, segment.features, segment.first_episode)
