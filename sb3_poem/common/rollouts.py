@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from sb3_poem.common.checks import check_whole
 from sb3_poem.common.family_view import NO_FEATURES, FamilyView, reward_features, seed_copies
 from sb3_poem.common.trajectory import Trajectory
 
@@ -47,12 +47,10 @@ def rollout_latents(
     :raises ValueError: On wrong shapes, and if an observation or an action is not finite.
     """
     how = (seed, deterministic, frames, max_steps)
-    episodes = _episodes(model, vec_env, latents, tasks, *how, keep=True)
-    return [Trajectory(*episode[:5]) for episode in episodes]
+    return [seen for seen, _ in _episodes(model, vec_env, latents, tasks, *how)]
 
 
-@dataclass(frozen=True, eq=False)
-class Outcome:
+class Outcome(NamedTuple):
     """What evaluation needs to know of an episode."""
 
     #: (T, feat_dim)
@@ -68,35 +66,14 @@ def rollout_outcomes(
     tasks: np.ndarray | None = None,
     seed: int | Sequence[int] = 0,
     deterministic: bool = True,
-    *,
-    max_steps: int | None = None,
 ) -> list[Outcome]:
     """As :func:`rollout_latents`, but outcomes only: observations may take up all memory."""
-    outcomes, how = [], (seed, deterministic, False, max_steps)
-    for episode in _episodes(model, vec_env, latents, tasks, *how, keep=False):
-        if episode.reward_features is None:
+    outcomes = []
+    for seen, success in _episodes(model, vec_env, latents, tasks, seed, deterministic):
+        if seen.reward_features is None:
             raise ValueError(NO_FEATURES)
-        outcomes.append(Outcome(episode.reward_features, episode.success))
+        outcomes.append(Outcome(seen.reward_features, success))
     return outcomes
-
-
-def policy_actions(
-    model: Any, observations: np.ndarray, latents: np.ndarray, deterministic: bool
-) -> np.ndarray:
-    """Actions (n, act_dim) of pi(. | f_pi(z)) for observations (n, obs_dim), a latent each."""
-    actions, _ = model.predict(observations, state=latents, deterministic=deterministic)
-    return actions
-
-
-class _Episode(NamedTuple):
-    """A trajectory's fields in their order, and an outcome's."""
-
-    observations: np.ndarray
-    actions: np.ndarray
-    latent: np.ndarray
-    reward_features: np.ndarray | None
-    frames: list[np.ndarray] | None
-    success: bool | None
 
 
 def _episodes(
@@ -106,11 +83,10 @@ def _episodes(
     tasks: np.ndarray | None,
     seed: int | Sequence[int],
     deterministic: bool,
-    frames: int,
-    max_steps: int | None,
-    keep: bool,
-) -> Iterator[_Episode]:
-    """Of every latent; observations and actions are empty unless they are to be kept."""
+    frames: int = 0,
+    max_steps: int | None = None,
+) -> Iterator[tuple[Trajectory, bool | None]]:
+    """Of every latent, and whether it was a success."""
     latents = np.asarray(latents, dtype=np.float64)
     n, copies = len(latents), vec_env.num_envs
     if latents.ndim != 2:
@@ -128,10 +104,8 @@ def _episodes(
     if len(seeds) != n:
         raise ValueError(f"`seed` must be one integer or hold one a latent ({n}), not {len(seeds)}")
     steps = model.horizon if max_steps is None else max_steps
-    if steps < 1:
-        raise ValueError(f"`max_steps` must be at least 1, but is {steps}")
-    if frames < 0:
-        raise ValueError(f"`frames` must be True, False, or at least 1, but is {frames}")
+    check_whole("max_steps", steps, 1)
+    check_whole("frames", int(frames), 0)
     if frames and vec_env.render_mode != "rgb_array":
         raise ValueError(
             'rendering needs an environment made with render_mode="rgb_array", but this one has '
@@ -149,9 +123,8 @@ def _episodes(
                 if family is not None and tasks is not None:
                     family.set_tasks(tasks[wave])
                 seed_copies(vec_env, wave_seeds)
-            running = first + np.arange(copies) < n
-            how = (deterministic, frames, int(steps), keep, first)
-            yield from _wave(model, vec_env, latents[wave], running, *how)
+            how = (deterministic, frames, int(steps), first, min(copies, n - first))
+            yield from _wave(model, vec_env, latents[wave], *how)
 
 
 @contextlib.contextmanager
@@ -171,60 +144,68 @@ def _wave(
     model: Any,
     vec_env: VecEnv,
     latents: np.ndarray,
-    running: np.ndarray,
     deterministic: bool,
     frames: int,
     max_steps: int,
-    keep: bool,
     first: int,
-) -> Iterator[_Episode]:
-    """An episode of each copy that is running, of which the first has this number."""
-    n, copies = int(running.sum()), len(running)
-    observations = _flat(vec_env.reset())
-    _finite(observations, running, first, 0, "an observation")
-    lengths = np.zeros(copies, dtype=np.int64)
-    seen, taken = [observations.copy()], []
-    features: list[np.ndarray | None] = []
+    n: int,
+) -> Iterator[tuple[Trajectory, bool | None]]:
+    """An episode of each of ``n`` copies, of which the first has this number."""
+    copies = len(latents)
+    running, lengths = np.arange(copies) < n, np.zeros(copies, dtype=np.int64)
     successes: list[bool | None] = [None] * copies
     images: list[list[np.ndarray]] = [[] for _ in range(copies)]
+
+    def finite(values: np.ndarray, step: int, what: str) -> np.ndarray:
+        bad = running & ~np.isfinite(values).all(axis=1)
+        if bad.any():
+            episode = first + int(np.argmax(bad))
+            raise ValueError(f"{what} of episode {episode} at step {step} is not finite")
+        return values
+
+    def render() -> None:
+        for copy, image in enumerate(vec_env.get_images()):
+            if running[copy] and image is not None:
+                images[copy].append(np.asarray(image))
+
+    observations = finite(_flat(vec_env.reset()), 0, "an observation")
+    seen, taken = [observations.copy()], []
+    features: list[np.ndarray | None] = []
     if frames:
-        _add_images(images, vec_env, running)
+        render()
     for step in range(1, max_steps + 1):
-        actions = policy_actions(model, observations, latents, deterministic)
-        _finite(actions, running, first, step, "an action")
+        actions, _ = model.predict(observations, state=latents, deterministic=deterministic)
+        taken.append(np.array(finite(actions, step, "an action")))
         stepped, _, dones, infos = vec_env.step(actions)
         observations = _flat(stepped)
         given = reward_features(vec_env, infos)
         features.append(None if given is None else np.array(given, dtype=np.float64))
+        after = observations.copy()
         for copy in np.flatnonzero(running):
             if "is_success" in infos[copy]:
                 successes[copy] = bool(infos[copy]["is_success"])
-        after = observations.copy()
-        for copy in np.flatnonzero(dones & running):
-            after[copy] = infos[copy]["terminal_observation"]
-        _finite(after, running, first, step, "an observation")
+            if dones[copy]:
+                after[copy] = infos[copy]["terminal_observation"]
+        seen.append(finite(after, step, "an observation"))
         lengths[running] = step
-        if keep:
-            taken.append(np.array(actions))
-            seen.append(after)
         running = running & ~dones
         if frames and step % frames == 0:
-            _add_images(images, vec_env, running)
+            render()
         if not running.any():
             break
 
     present = [rows for rows in features if rows is not None]
     of_rewards = np.stack(present, axis=1) if len(present) == len(features) else None
-    stacked = [np.stack(rows, axis=1) for rows in (seen, taken)] if keep else []
+    observed, acted = np.stack(seen, axis=1), np.stack(taken, axis=1)
     for row, used in enumerate(lengths[:n].tolist()):
-        yield _Episode(
-            observations=stacked[0][row, : used + 1].copy() if keep else np.empty((0, 0)),
-            actions=stacked[1][row, :used].copy() if keep else np.empty((0, 0)),
+        trajectory = Trajectory(
+            observations=observed[row, : used + 1].copy(),
+            actions=acted[row, :used].copy(),
             latent=latents[row].copy(),
             reward_features=None if of_rewards is None else of_rewards[row, :used].copy(),
             frames=images[row] if frames else None,
-            success=successes[row],
         )
+        yield trajectory, successes[row]
 
 
 def _flat(observations: Any) -> np.ndarray:
@@ -232,16 +213,3 @@ def _flat(observations: Any) -> np.ndarray:
         kind = type(observations).__name__
         raise ValueError(f"observations must be arrays (a Box space), but are of type {kind}")
     return observations.reshape(len(observations), -1)
-
-
-def _finite(values: np.ndarray, running: np.ndarray, first: int, step: int, what: str) -> None:
-    bad = running & ~np.isfinite(values).all(axis=1)
-    if bad.any():
-        episode = first + int(np.argmax(bad))
-        raise ValueError(f"{what} of episode {episode} at step {step} is not finite")
-
-
-def _add_images(images: list[list[np.ndarray]], vec_env: VecEnv, running: np.ndarray) -> None:
-    for copy, image in enumerate(vec_env.get_images()):
-        if running[copy] and image is not None:
-            images[copy].append(np.asarray(image))

@@ -9,7 +9,6 @@ import numpy as np
 from sb3_poem.adaptation.adapter import shown_from_dict
 from sb3_poem.adaptation.preference import BEST_OF_FOUR, PLACES, Preference
 from sb3_poem.adaptation.rule import Setting, inference_rng
-from sb3_poem.common.rollouts import policy_actions
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.label.beliefs import belief
 from sb3_poem.label.rendering import session_rule
@@ -91,7 +90,7 @@ def _most_alike(model: Any, latents: np.ndarray, recorded: Trajectory) -> tuple[
     seen = recorded.observations[:-1]
     errors = []
     for latent in latents:
-        actions = policy_actions(model, seen, np.tile(latent, (len(seen), 1)), deterministic=True)
+        actions, _ = model.predict(seen, np.tile(latent, (len(seen), 1)), deterministic=True)
         errors.append(float(np.sqrt(np.mean(np.square(actions - recorded.actions)))))
     best = int(np.argmin(errors))
     return replace(recorded, latent=latents[best].copy()), errors[best]
