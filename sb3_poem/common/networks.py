@@ -16,8 +16,6 @@ from torch import nn
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import linear, softplus
 
-from sb3_poem.common.low_precision import LowPrecisionMLP
-
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
 MIN_FACTOR_VARIANCE = 1e-7
 #: Of a standard normal and of tanh's slope, for each dimension of an action
@@ -100,7 +98,7 @@ class MLP(nn.Module):
         self.hidden = nn.ModuleList(nn.Linear(*pair) for pair in itertools.pairwise(widths))
         self.output = nn.Linear(widths[-1], out_dim)
         #: The hidden layers in another arithmetic, while :class:`MixedPrecision` holds
-        self.low_precision: LowPrecisionMLP | None = None
+        self.low_precision: Any = None
 
     def forward(self, *parts: th.Tensor, frozen: bool = False) -> th.Tensor:
         """Map parts of (..., in_dim) to (..., out_dim), float32; ``frozen`` trains no parameter."""

@@ -179,7 +179,8 @@ class PEARLSAC(SAC):
         **unsupported: Any,
     ) -> None:
         refuse_unknown(unsupported, type(self))
-        check_arguments(locals(), type(self))
+        arguments = locals()
+        check_arguments(arguments, type(self))
         self.n_train_tasks = n_train_tasks
         self.meta_batch_size = meta_batch_size
         self.context_size = context_size
@@ -224,29 +225,13 @@ class PEARLSAC(SAC):
                 )
             given = self._wrap_env(given, verbose)
             self._family = self._family_of(given)  # before SB3 speaks of other policies
-        super().__init__(
-            policy,
-            given,  # type: ignore[arg-type]
-            learning_rate,
-            buffer_size,
-            learning_starts,
-            batch_size,
-            tau,
-            gamma,
-            gradient_steps=gradient_steps,
-            replay_buffer_class=TaskReplayBuffer,
-            n_steps=n_steps,
-            ent_coef=ent_coef,
-            target_update_interval=target_update_interval,
-            target_entropy=target_entropy,
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            policy_kwargs=dict(policy_kwargs or {}),  # ours to complete, not the caller's
-            verbose=verbose,
-            seed=seed,
-            device=device,
-            _init_setup_model=_init_setup_model,
-        )
+        of_sac = arguments.keys() & inspect.signature(SAC).parameters.keys()
+        inherited = {name: arguments[name] for name in of_sac} | {
+            "env": given,
+            "replay_buffer_class": TaskReplayBuffer,
+            "policy_kwargs": dict(policy_kwargs or {}),  # ours to complete, not the caller's
+        }
+        super().__init__(**inherited)
 
     def __repr__(self) -> str:
         env_id, steps = getattr(self, "env_id", None), self.num_timesteps
@@ -407,11 +392,7 @@ class PEARLSAC(SAC):
 
     @th.no_grad()
     def _replace_context(self, epoch: Segment, returns: np.ndarray) -> None:
-        policy, n_tasks = self.policy, len(returns)
-
-        def tensor(values: np.ndarray) -> th.Tensor:
-            return th.as_tensor(values, dtype=th.float32, device=self.device)
-
+        policy, n_tasks, tensor = self.policy, len(returns), self.policy.tensor
         seen = map(tensor, (epoch.observations, epoch.next_observations))
         obs, next_obs = map(policy.standardise, seen)
         beyond = (obs.abs() == OBSERVATION_CLIP).any(dim=-1).float().mean()
@@ -480,11 +461,14 @@ class PEARLSAC(SAC):
         sources = th.randint(len(tasks), shape, generator=generator, device=device)
         data = self.replay_buffer.sample_rows(sources, generator)
         rewards = self.family.compute_rewards(tasks[:, None, :], data.features.cpu().numpy())
-        latents = th.as_tensor(self.task_latents, dtype=th.float32, device=device)
-        embedding = rows(policy.reward_embedding(latents), MEASURED_PER_TASK)
+        embedding = policy.reward_embedding(policy.tensor(self.task_latents))
         obs, next_obs = map(policy.standardise, (data.observations, data.next_observations))
-        predicted = policy.decode_rewards(obs, data.actions, next_obs, embedding).cpu().numpy()
-        self.predicted_rewards_error = float(np.sqrt(np.mean((predicted - rewards) ** 2)))
+        predicted = policy.decode_rewards(
+            obs, data.actions, next_obs, rows(embedding, MEASURED_PER_TASK)
+        )
+        self.predicted_rewards_error = float(
+            np.sqrt(np.mean((predicted.cpu().numpy() - rewards) ** 2))
+        )
         self.logger.record("train/decoder_error", self.predicted_rewards_error)
 
     def resume(

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
@@ -135,6 +136,10 @@ class LatentPolicy(SACPolicy):
         """z_r of latents (..., latent_dim)."""
         return latents
 
+    def tensor(self, values: npt.ArrayLike) -> th.Tensor:
+        """Numbers as float32 on the policy's device."""
+        return th.as_tensor(values, dtype=th.float32, device=self.device)
+
     def standardise(self, obs: th.Tensor) -> th.Tensor:
         """Standardised observations, bounded so that a fall does not saturate the networks."""
         return self.obs_norm(obs)
@@ -153,12 +158,9 @@ class LatentPolicy(SACPolicy):
         """Q(s, a) of the more doubtful critic, (copies, steps), of standardised observations and
         actions (copies, steps, ...), under latents (copies, latent_dim).
         """
-        z = th.as_tensor(latents, dtype=th.float32, device=self.device)
-        values = [
-            self.critic(o, a, own.expand(o.shape[0], -1)).min(dim=0).values
-            for o, a, own in zip(obs, actions, z, strict=True)
-        ]
-        return th.stack(values)
+        copies = zip(obs, actions, self.tensor(latents), strict=True)
+        values = [self.critic(o, a, own.expand(o.shape[0], -1)) for o, a, own in copies]
+        return th.stack([each.min(dim=0).values for each in values])
 
     @th.no_grad()
     def predicted_returns(
@@ -169,23 +171,16 @@ class LatentPolicy(SACPolicy):
         dtype: th.dtype,
     ) -> np.ndarray:
         """See :meth:`PEARLSAC.predicted_returns`; ``dtype`` is the hidden layers' arithmetic."""
-
-        def tensor(values: np.ndarray) -> th.Tensor:
-            return th.as_tensor(values, dtype=th.float32, device=self.device)
-
-        rows: list[th.Tensor] = []
-        lengths: list[int] = []
-        shares: list[float] = []  # of a trajectory's steps, one over
+        rows, lengths, shares = [], [], []  # shares: one over those of a trajectory's steps
         for trajectory in trajectories:
-            total = len(trajectory.actions)
-            steps = _evenly_spaced(total, max_steps)
+            steps = _evenly_spaced(len(trajectory), max_steps)
             seen = (trajectory.observations[at] for at in (steps, steps + 1))
-            obs, next_obs = (self.standardise(tensor(values)) for values in seen)
-            actions = self.scale_action_batch(tensor(trajectory.actions[steps]))
+            obs, next_obs = (self.standardise(self.tensor(values)) for values in seen)
+            actions = self.scale_action_batch(self.tensor(trajectory.actions[steps]))
             rows.append(th.cat([obs, actions, next_obs], dim=1))
             lengths.append(len(steps))
-            shares.append(total / max(len(steps), 1))
-        embeddings = self.reward_embedding(tensor(np.atleast_2d(latents)))
+            shares.append(len(trajectory) / len(steps))
+        embeddings = self.reward_embedding(self.tensor(np.atleast_2d(latents)))
         sums = decoded_sums(self.decoder.mlp, th.cat(rows), lengths, embeddings, dtype).double()
         norm = self.reward_norm
         sums = sums * norm.std + norm.mean * sums.new_tensor(lengths)
@@ -193,8 +188,7 @@ class LatentPolicy(SACPolicy):
 
     def scale_action_batch(self, actions: th.Tensor) -> th.Tensor:
         """Actions in the environment's units -> [-1, 1]."""
-        low = th.as_tensor(self.action_space.low, device=actions.device)
-        high = th.as_tensor(self.action_space.high, device=actions.device)
+        low, high = self.tensor(self.action_space.low), self.tensor(self.action_space.high)
         return 2.0 * (actions - low) / (high - low) - 1.0
 
     def decode_rewards(
@@ -209,17 +203,14 @@ class LatentPolicy(SACPolicy):
         """How to act under latents (n, latent_dim): a function of observations (n, obs_dim) and
         standard normal noise (n, action_dim), None for the mean, to actions in [-1, 1].
         """
-        device = self.device
         with th.no_grad():
-            z = th.as_tensor(latents, dtype=th.float32, device=device)
-            embedding = self.policy_embedding(z)
+            embedding = self.policy_embedding(self.tensor(latents))
 
+        @th.no_grad()
         def act(obs: np.ndarray, noise: th.Tensor | None) -> np.ndarray:
-            with th.no_grad():
-                standardised = self.standardise(th.as_tensor(obs, dtype=th.float32, device=device))
-                mean, log_std = self.actor.distribution(standardised, embedding)
-                actions = mean if noise is None else th.addcmul(mean, log_std.exp(), noise)
-                return actions.tanh_().cpu().numpy()
+            mean, log_std = self.actor.distribution(self.standardise(self.tensor(obs)), embedding)
+            actions = mean if noise is None else th.addcmul(mean, log_std.exp(), noise)
+            return actions.tanh_().cpu().numpy()
 
         return act
 
@@ -248,9 +239,8 @@ class LatentPolicy(SACPolicy):
         n, d, expected = len(obs), self.latent_dim, self.observation_space.shape
         if (shape := obs.shape[1:]) != expected:
             raise ValueError(f"observation has shape {shape}, but the policy takes {expected}")
-        if not np.all(np.isfinite(obs)):
-            where = int(np.argwhere(~np.isfinite(obs))[0, 0])
-            raise ValueError(f"observation {where} holds NaN or infinity")
+        if not (finite := np.isfinite(obs).all(axis=1)).all():
+            raise ValueError(f"observation {int(np.argmin(finite))} holds NaN or infinity")
         if state is None and not self._warned_of_no_latent:
             self._warned_of_no_latent = True
             warnings.warn(
@@ -279,10 +269,9 @@ class LatentPolicy(SACPolicy):
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         assert isinstance(observation, th.Tensor)
-        obs, n = observation.cpu().numpy(), len(observation)
-        act = self.acting_on(np.zeros((n, self.latent_dim)))
-        actions = act(obs, self._noise(n, deterministic))
-        return th.as_tensor(actions, device=self.device)
+        act = self.acting_on(np.zeros((len(observation), self.latent_dim)))
+        noise = self._noise(len(observation), deterministic)
+        return self.tensor(act(observation.cpu().numpy(), noise))
 
     def set_training_mode(self, mode: bool) -> None:
         """Put all networks in training or evaluation mode."""

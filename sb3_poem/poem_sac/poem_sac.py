@@ -1,5 +1,6 @@
 """POEM: meta-RL whose task embedding preserves the order of preferences."""
 
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,7 +18,22 @@ from sb3_poem.pearl_sac.pearl_sac import PEARLSAC
 from sb3_poem.pearl_sac.sampler import MetaBatchSampler
 from sb3_poem.poem_sac.objective import POEMObjective
 from sb3_poem.poem_sac.policies import MlpPolicy, POEMPolicy
-from sb3_poem.poem_sac.sampler import GroupSampler
+
+
+@dataclass
+class GroupSampler(MetaBatchSampler):
+    """Draws meta-batches of whole groups of tasks, where policies are compared within these."""
+
+    groups: list[np.ndarray]
+    preference_group_size: int
+
+    def choose_tasks(self) -> np.ndarray:
+        if not len(self.groups):
+            return super().choose_tasks()
+        wanted = self.meta_batch_size // self.preference_group_size
+        count = max(1, min(wanted, len(self.groups)))
+        chosen = self.generators.numpy.choice(len(self.groups), size=count, replace=False)
+        return np.concatenate([self.groups[index] for index in chosen])
 
 
 @with_arguments_of(PEARLSAC, without="context_relabel_fraction")
@@ -125,10 +141,8 @@ class POEMSAC(PEARLSAC):
         (m, n).
         """
         with th.no_grad():
-            tasks, policies = (
-                th.as_tensor(np.atleast_2d(latents), dtype=th.float32, device=self.device)
-                for latents in (task_latents, policy_latents)
-            )
+            given = map(np.atleast_2d, (task_latents, policy_latents))
+            tasks, policies = map(self.policy.tensor, given)
             return self.policy.similarity(tasks, policies).double().cpu().numpy()
 
     @property
