@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from poem_envs.films import Look
-from poem_envs.legged import DirectionFamily, LeggedFamily
+from poem_envs.mujoco_family import DirectionFamily, LeggedFamily
 from poem_envs.mujoco_rendering import arrow, pole
 
 

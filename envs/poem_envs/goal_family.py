@@ -18,7 +18,6 @@ from poem_envs.family import BOUNDS_TOLERANCE, TaskFamily, is_flat
 from poem_envs.mujoco_rendering import prepared_viewer
 
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
-GOAL_SITE = "target"
 #: Wrappers whose work is done anyway; by name, since rl_zoo3 replaces Gymnasium's TimeLimit
 TAKEN_OFF = frozenset({"TimeLimit", "OrderEnforcing", "PassiveEnvChecker"})
 REWARD = "compute_reward(achieved_goal, desired_goal, info)"
@@ -96,7 +95,7 @@ class GoalFamily(TaskFamily):
         self._set_goal_function = set_goal
         self._observed = GOAL_KEYS[: 1 + observe_achieved_goal]
         self._goal_env: gym.Env | None = None
-        self._success: bool | None = None
+        self._success: Any = None
         self._achieved_goal = np.zeros(0)
         self.env = self._make()
         self.metadata = {**self.env.metadata}
@@ -111,8 +110,7 @@ class GoalFamily(TaskFamily):
         boxes = [(own[key].low, own[key].high) for key in self._observed]
         low, high = (np.concatenate(b).astype(np.float64) for b in zip(*boxes, strict=True))
         self.observation_space = spaces.Box(low, high, dtype=np.float64)
-        assert isinstance(self.env.action_space, spaces.Box)
-        self.action_space = self.env.action_space
+        self.action_space = self.env.action_space  # a Box, as check_goal_env saw to
         self._rewards_broadcast = self._check_reward()
 
     def _make(self) -> gym.Env:
@@ -181,10 +179,10 @@ class GoalFamily(TaskFamily):
         desired = np.ascontiguousarray(tasks).reshape(-1, tasks.shape[-1])
         achieved = np.ascontiguousarray(features).reshape(desired.shape)
         if self._rewards_broadcast:
-            return self._own_reward(achieved, desired).reshape(tasks.shape[:-1])
-        rewards = np.empty(len(desired))
-        for i in range(len(desired)):
-            rewards[i : i + 1] = self._own_reward(achieved[i : i + 1], desired[i : i + 1])
+            rewards = self._own_reward(achieved, desired)
+        else:
+            pairs = zip(achieved[:, None], desired[:, None], strict=True)
+            rewards = np.array([self._own_reward(*pair)[0] for pair in pairs])
         return rewards.reshape(tasks.shape[:-1])
 
     def _draw_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
@@ -233,8 +231,7 @@ class GoalFamily(TaskFamily):
         observation, reward, terminated, _, info = self.env.step(action)
         features = observation["achieved_goal"].astype(np.float64)
         self._check_step(observation["desired_goal"], features, float(reward))
-        success = info.get("success", info.get("is_success"))
-        self._success = None if success is None else bool(success)
+        self._success = info.get("success", info.get("is_success"))
         self._achieved_goal = observation["achieved_goal"].copy()
         return self._observation(observation), features, bool(terminated)
 
@@ -256,7 +253,7 @@ class GoalFamily(TaskFamily):
             )
 
     def _step_info(self) -> dict[str, Any]:
-        return {} if self._success is None else {"success": self._success}
+        return {} if self._success is None else {"success": bool(self._success)}
 
     def render(self) -> Any:
         """Render the current state as the environment does."""
@@ -277,10 +274,10 @@ class GoalFamily(TaskFamily):
 
     def close(self) -> None:
         """Close the environment."""
-        self.env.close()
-        if self._goal_env is not None:
-            self._goal_env.close()
-            self._goal_env = None
+        for env in (self.env, self._goal_env):
+            if env is not None:
+                env.close()
+        self._goal_env = None
 
 
 def renderer_inside(env: Any) -> Any:
@@ -310,7 +307,7 @@ def hide_goal_sites(env: gym.Env) -> None:
     """Make the sites invisible by which MuJoCo environments of gymnasium-robotics mark the goal."""
     model: Any = getattr(env, "model", None)
     for site in range(0 if model is None else model.nsite):
-        if model.site(site).name.startswith(GOAL_SITE):
+        if model.site(site).name.startswith("target"):
             model.site(site).rgba[3] = 0.0
 
 

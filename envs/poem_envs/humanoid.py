@@ -10,9 +10,10 @@ import numpy as np
 from gymnasium import spaces
 
 from poem_envs.films import Look
-from poem_envs.legged import DirectionFamily
+from poem_envs.mujoco_family import DirectionFamily
 
 TORSO = 1  # its subtree is the whole robot
+DERIVED = ("cinert", "cvel", "qfrc_actuator", "cfrc_ext")
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
@@ -139,10 +140,8 @@ class HumanoidDir2DEnv(DirectionFamily):
     def _derive(self, copies: np.ndarray, controls: np.ndarray) -> None:
         """Compute what observation and reward take from the simulator, for some copies."""
         model, data = self.model, self._forward_data
-        cinert, cvel, cfrc_ext = (
-            field.reshape(-1) for field in (data.cinert, data.cvel, data.cfrc_ext)
-        )
-        derived = [cinert, cvel, data.qfrc_actuator, cfrc_ext]  # views, as are those below
+        # views, as are those below
+        derived = [np.ravel(getattr(data, name)) for name in DERIVED]
         ctrl, warm_start = data.ctrl, data.qacc_warmstart
         centre_of_mass = data.subtree_com[TORSO, :2]
         for copy, control in zip(copies.tolist(), controls, strict=True):

@@ -62,13 +62,9 @@ class StateRenderer:
 def renders_fast(render_quality: str, render_mode: str | None) -> bool:
     """Whether images come from a :class:`FastRenderer`; refuses what is unknown or does not fit."""
     if render_quality not in RENDER_QUALITIES:
-        raise ValueError(
-            f"render_quality must be one of {RENDER_QUALITIES}, got {render_quality!r}"
-        )
+        raise ValueError(f"{render_quality=} must be one of {RENDER_QUALITIES}")
     if render_quality == "fast" and render_mode not in (None, "rgb_array"):
-        raise ValueError(
-            f'render_quality="fast" goes with render_mode="rgb_array" alone, got {render_mode!r}'
-        )
+        raise ValueError(f"{render_quality=} needs render_mode='rgb_array', got {render_mode!r}")
     return render_quality == "fast"
 
 

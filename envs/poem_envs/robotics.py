@@ -9,6 +9,9 @@ import mujoco
 from poem_envs.films import Look, MujocoFilms
 from poem_envs.goal_family import GoalFamily
 
+#: Filmed by a camera that stays, with the way where the body was.
+IN_SPACE: dict[str, Any] = {"follows": False, "on_floor": False}
+
 
 class _RoboticsFamily(MujocoFilms, GoalFamily):
     """A goal-conditioned environment whose reward is dense or sparse."""
@@ -59,15 +62,7 @@ class FetchReachEnv(_RoboticsFamily):
     `FetchReach-v4`, such as `width`.
     """
 
-    look = Look(
-        132.0,
-        -14.0,
-        0.8,
-        (1.342, 0.749, 0.56),
-        site="robot0:grip",
-        follows=False,
-        on_floor=False,
-    )
+    look = Look(132.0, -14.0, 0.8, (1.342, 0.749, 0.56), site="robot0:grip", **IN_SPACE)
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(
@@ -103,9 +98,7 @@ class FetchPushEnv(_RoboticsFamily):
     is within 0.05.
     """
 
-    look = Look(
-        132.0, -35.0, 1.0, (1.342, 0.749, 0.45), body="object0", follows=False, on_floor=False
-    )
+    look = Look(132.0, -35.0, 1.0, (1.342, 0.749, 0.45), body="object0", **IN_SPACE)
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(

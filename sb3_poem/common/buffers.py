@@ -104,7 +104,9 @@ class TaskReplayBuffer(ReplayBuffer):
             start, count = int(self.positions[task]), int(self.counts[task])
             self._reserve(min(count + steps, self.buffer_size))
             slots = th.from_numpy((start + np.arange(steps)) % self.buffer_size).to(self.device)
-            self._release_ends(self.rows[task, slots[self.buffer_size - count :]])
+            overwritten = self.rows[task, slots[self.buffer_size - count :], self._mark]
+            released = overwritten[overwritten != 0].abs().cpu().numpy()
+            self._free_ends = np.concatenate([self._free_ends, released])
             own_ends = np.flatnonzero(is_end[copy])
             numbers = self._store_ends(next_observations[copy, own_ends])
             marks = np.zeros(steps, dtype=np.int32)
@@ -224,10 +226,6 @@ class TaskReplayBuffer(ReplayBuffer):
         grown = self.rows.new_empty(shape)
         grown[:, :capacity] = self.rows[:, :capacity]
         self.rows = grown
-
-    def _release_ends(self, overwritten: th.Tensor) -> None:
-        marks = overwritten[:, self._mark].cpu().numpy()
-        self._free_ends = np.concatenate([self._free_ends, np.abs(marks[marks != 0])])
 
     def _store_ends(self, observations: np.ndarray) -> np.ndarray:
         """Keep (n, obs_dim) in free places, and return their numbers."""

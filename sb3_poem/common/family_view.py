@@ -16,6 +16,7 @@ from stable_baselines3.common import vec_env as sb3_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
 from poem_envs.family import definition_problem
+from sb3_poem.common.checks import check_whole
 
 if TYPE_CHECKING:
     from sb3_poem.common.buffers import Segment
@@ -26,10 +27,6 @@ DRAWING_ARGUMENTS = {"render_mode", "render_task"}
 TEST_TASK_STREAM = 0x7E57
 #: Steps by which it is seen whether a wrapper changes a family
 COMPARED_STEPS = 10
-NO_FEATURES = (
-    'the environment gives no info["reward_features"], from which returns are computed; '
-    "it must be a task family (poem_envs.TaskFamily)"
-)
 
 #: These leave alone what is seen, done and paid; the patched one is rl_zoo3's.
 HARMLESS = frozenset(
@@ -127,8 +124,7 @@ class FamilyView:
                 f"horizon is {horizon}, but the environment ends episodes after {limit} steps; "
                 "they must agree"
             )
-        if steps < 1:
-            raise ValueError(f"horizon must be at least 1 step, got {steps}")
+        check_whole("horizon", steps, 1)
         return int(steps)
 
     @cached_property
@@ -312,10 +308,7 @@ class FamilyView:
 
     def features_of(self, infos: list[dict[str, Any]]) -> np.ndarray:
         """Reward features (num_envs, feat_dim) of the last step."""
-        features = reward_features(self.env, infos)
-        if features is None:
-            raise ValueError(NO_FEATURES)
-        return features
+        return demanded(reward_features(self.env, infos))
 
     def check_same_family(self, task_space: spaces.Box, reward_feature_dim: int) -> None:
         """Refuse a model that was made for another family."""
@@ -325,6 +318,16 @@ class FamilyView:
                 f"features, but env ({self.env_id}) has tasks in {self.task_space} with "
                 f"{self.reward_feature_dim}. Pass an environment of the model's own family."
             )
+
+
+def demanded(features: np.ndarray | None) -> np.ndarray:
+    """Reward features, which must be there."""
+    if features is None:
+        raise ValueError(
+            'the environment gives no info["reward_features"], from which returns are computed; '
+            "it must be a task family (poem_envs.TaskFamily)"
+        )
+    return features
 
 
 def reward_features(env: VecEnv, infos: Sequence[dict[str, Any]]) -> np.ndarray | None:

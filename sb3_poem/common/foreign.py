@@ -109,22 +109,18 @@ def _objection(name: str, value: Any, defaults: dict[str, Any]) -> str | None:
 
 def _fits(value: Any, default: Any) -> bool:
     """Whether a value is of its default's kind (None: of any), and in proportion to it."""
-    takes_list = default is None and isinstance(value, list)
-    if takes_list or isinstance(default, list | tuple | np.ndarray):
+    if isinstance(value, list):
+        if not isinstance(default, list | tuple | np.ndarray | None):
+            return False
         kinds = [None] if default is None else np.ravel(default).tolist()
-        return (
-            isinstance(value, list)
-            and len(value) <= LONGEST
-            and not any(isinstance(item, list) for item in value)
-            and all(any(_fits(item, kind) for kind in kinds) for item in value)
-        )
-    for kind in (bool, str):
-        if isinstance(value, kind) or isinstance(default, kind):
-            alike = isinstance(value, kind) and isinstance(default, kind | None)
-            return alike and WORD.fullmatch(str(value)) is not None
-    if not isinstance(value, int | float) or not isinstance(default, int | float | None):
-        return False
-    if type(default) is int and not isinstance(value, int):
+        short = len(value) <= LONGEST and not any(isinstance(item, list) for item in value)
+        return short and all(any(_fits(item, kind) for kind in kinds) for item in value)
+    if isinstance(value, str):
+        return isinstance(default, str | None) and WORD.fullmatch(value) is not None
+    if isinstance(value, bool) or isinstance(default, bool):
+        return isinstance(value, bool) and isinstance(default, bool | None)
+    kind = int if type(default) is int else int | float
+    if not isinstance(value, kind) or not isinstance(default, int | float | None):
         return False
     return abs(value) <= TIMES_DEFAULT * max(1, abs(default or 1))
 

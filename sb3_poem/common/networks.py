@@ -198,11 +198,9 @@ class _SquashedGaussian(th.autograd.Function):
 class LatentActor(nn.Module):
     """Squashed Gaussian policy pi_theta(a | s, z_pi)."""
 
-    def __init__(
-        self, obs_dim: int, latent_dim: int, action_dim: int, *architecture: Any, **more: Any
-    ) -> None:
+    def __init__(self, in_dim: int, action_dim: int, *architecture: Any, **more: Any) -> None:
         super().__init__()
-        self.mlp = MLP(obs_dim + latent_dim, 2 * action_dim, *architecture, **more)
+        self.mlp = MLP(in_dim, 2 * action_dim, *architecture, **more)
 
     def distribution(self, obs: th.Tensor, embedding: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Mean and log standard deviation before squashing, each (..., action_dim)."""
@@ -210,37 +208,21 @@ class LatentActor(nn.Module):
         return mean, log_std.clamp(LOG_STD_MIN, LOG_STD_MAX)
 
     def forward(
-        self, obs: th.Tensor, embedding: th.Tensor, noise: th.Tensor | None = None
-    ) -> tuple[th.Tensor, th.Tensor | None]:
-        """Sample actions in [-1, 1].
-
-        :param obs: (..., obs_dim), standardised
-        :param embedding: (..., latent_dim), the policy embedding z_pi
-        :param noise: (..., action_dim) standard normal draws; None takes the mean action
-        :return: actions (..., action_dim), and their log-probability (...), None without noise
+        self, obs: th.Tensor, embedding: th.Tensor, noise: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """Actions (..., action_dim) in [-1, 1] and their log-probability (...), of standardised
+        observations, policy embeddings z_pi and standard normal draws, each (..., dim).
         """
-        raw = self.mlp(obs, embedding)
-        if noise is None:
-            return th.tanh(raw.chunk(2, dim=-1)[0]), None
-        return _SquashedGaussian.apply(raw, noise)
+        return _SquashedGaussian.apply(self.mlp(obs, embedding), noise)
 
 
 class LatentCritic(nn.Module):
     """Action values Q(s, a, z) of several critics at once."""
 
-    def __init__(
-        self,
-        obs_dim: int,
-        action_dim: int,
-        latent_dim: int,
-        net_arch: Sequence[int],
-        activation_fn: type[nn.Module] = nn.ReLU,
-        layer_norm: bool = False,
-        n_critics: int = 2,
-    ) -> None:
+    def __init__(self, in_dim: int, n_critics: int, *architecture: Any, **more: Any) -> None:
         super().__init__()
-        shape = (obs_dim + action_dim + latent_dim, 1, net_arch, activation_fn, layer_norm)
-        self.members = nn.ModuleList(MLP(*shape) for _ in range(n_critics))
+        members = (MLP(in_dim, 1, *architecture, **more) for _ in range(n_critics))
+        self.members = nn.ModuleList(members)
 
     def forward(
         self, obs: th.Tensor, actions: th.Tensor, latents: th.Tensor, frozen: bool = False
@@ -254,11 +236,9 @@ class LatentCritic(nn.Module):
 class RewardDecoder(nn.Module):
     """Reward model r_theta_r(s, a, s', z_r), in standardised units of reward."""
 
-    def __init__(
-        self, obs_dim: int, action_dim: int, latent_dim: int, *architecture: Any, **more: Any
-    ) -> None:
+    def __init__(self, in_dim: int, *architecture: Any, **more: Any) -> None:
         super().__init__()
-        self.mlp = MLP(2 * obs_dim + action_dim + latent_dim, 1, *architecture, **more)
+        self.mlp = MLP(in_dim, 1, *architecture, **more)
 
     def forward(
         self, obs: th.Tensor, actions: th.Tensor, next_obs: th.Tensor, embedding: th.Tensor

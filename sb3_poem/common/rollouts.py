@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sb3_poem.common.checks import check_whole
-from sb3_poem.common.family_view import NO_FEATURES, FamilyView, reward_features, seed_copies
+from sb3_poem.common.family_view import FamilyView, demanded, reward_features, seed_copies
 from sb3_poem.common.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -68,12 +68,8 @@ def rollout_outcomes(
     deterministic: bool = True,
 ) -> list[Outcome]:
     """As :func:`rollout_latents`, but outcomes only: observations may take up all memory."""
-    outcomes = []
-    for seen, success in _episodes(model, vec_env, latents, tasks, seed, deterministic):
-        if seen.reward_features is None:
-            raise ValueError(NO_FEATURES)
-        outcomes.append(Outcome(seen.reward_features, success))
-    return outcomes
+    episodes = _episodes(model, vec_env, latents, tasks, seed, deterministic)
+    return [Outcome(demanded(seen.reward_features), success) for seen, success in episodes]
 
 
 def _episodes(

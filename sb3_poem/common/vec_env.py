@@ -67,11 +67,18 @@ class TaskVecEnv(VecEnv):
             raise TypeError(f"env_fns must hold functions that make one, but holds {env_fns[0]!r}")
         else:
             env = env_fns[0]()
-            wrappers = _wrappers(env)
+            while isinstance(env, gym.Wrapper):  # outermost first
+                wrappers.append(env)
+                env = env.env
             vector_env = _vectorised(env, wrappers, len(env_fns), nthread)
-            env.unwrapped.close()  # not env.close(): the monitor's file stays in use
+            env.close()  # not the wrapper's: the monitor's file stays in use
+        if (spec := vector_env.spec) is not None:
+            # a single environment's: make_vec's own adds what gym.make does not take
+            kwargs = {key: spec.kwargs[key] for key in spec.kwargs.keys() - MAKE_VEC_ARGUMENTS}
+            limit = vector_env.max_episode_steps
+            vector_env.spec = dataclasses.replace(spec, kwargs=kwargs, max_episode_steps=limit)
         self.vector_env = vector_env
-        self._wrapper_types = tuple(type(wrapper) for wrapper in wrappers)
+        self._wrapper_types = (Monitor, *map(type, wrappers))
         self._monitor = next((each for each in wrappers if isinstance(each, Monitor)), None)
         self._views = [_Copy(vector_env, index) for index in range(vector_env.num_envs)]
         observation_space = vector_env.single_observation_space
@@ -180,8 +187,7 @@ class TaskVecEnv(VecEnv):
         self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None
     ) -> list[bool]:
         """Whether the copies do what a wrapper does: the first environment's, and ``Monitor``."""
-        kinds: tuple[type, ...] = (Monitor, *self._wrapper_types)
-        wrapped = any(issubclass(kind, wrapper_class) for kind in kinds)
+        wrapped = any(issubclass(kind, wrapper_class) for kind in self._wrapper_types)
         return [wrapped for _ in self._get_indices(indices)]
 
     def _episode_info(self, index: int, info: dict[str, Any]) -> dict[str, Any]:
@@ -200,11 +206,6 @@ class TaskVecEnv(VecEnv):
 def as_task_vec_env(vector_env: gym.vector.VectorEnv) -> VecEnv:
     """Gymnasium's vectorised environment of a task family, from ``gym.make_vec``, as one of SB3."""
     if isinstance(vector_env, TaskFamilyVector):
-        if (spec := vector_env.spec) is not None:
-            # a single environment's: make_vec's own adds what gym.make does not take
-            kwargs = {key: spec.kwargs[key] for key in spec.kwargs.keys() - MAKE_VEC_ARGUMENTS}
-            limit = vector_env.max_episode_steps
-            vector_env.spec = dataclasses.replace(spec, kwargs=kwargs, max_episode_steps=limit)
         return TaskVecEnv(vector_env)
     if isinstance(vector_env, gym.vector.SyncVectorEnv):
         return DummyVecEnv([functools.partial(Monitor, env) for env in vector_env.envs])
@@ -281,15 +282,6 @@ class _Copy:
         return getattr(self._vector_env.family, name)
 
 
-def _wrappers(env: gym.Env) -> list[gym.Wrapper]:
-    """The wrappers around an environment, outermost first."""
-    wrappers = []
-    while isinstance(env, gym.Wrapper):
-        wrappers.append(env)
-        env = env.env
-    return wrappers
-
-
 def _is_absorbed(wrapper: gym.Wrapper) -> bool:
     # An import of rl_zoo3 replaces Gymnasium's TimeLimit by a subclass.
     patched = isinstance(wrapper, TimeLimit) and type(wrapper).__module__ == "rl_zoo3.gym_patches"
@@ -297,10 +289,10 @@ def _is_absorbed(wrapper: gym.Wrapper) -> bool:
 
 
 def _vectorised(
-    env: gym.Env, wrappers: list[gym.Wrapper], num_envs: int, nthread: int | None
+    bare: gym.Env, wrappers: list[gym.Wrapper], num_envs: int, nthread: int | None
 ) -> TaskFamilyVector:
     """The vectorised version of a single environment, from its registration and arguments."""
-    bare, instead = env.unwrapped, "use DummyVecEnv instead of TaskVecEnv"
+    instead = "use DummyVecEnv instead of TaskVecEnv"
     if not isinstance(bare, TaskFamily):
         raise ValueError(no_family(str(bare)))
     foreign = [type(wrapper).__name__ for wrapper in wrappers if not _is_absorbed(wrapper)]
@@ -319,10 +311,7 @@ def _vectorised(
     if bare.spec.vector_entry_point is None:
         raise ValueError(f"{bare.spec.id} is registered without a vector_entry_point; {instead}")
     if bare._next_task is not None:
-        raise ValueError(
-            "the environment was given a task, which its copies would not get; call set_tasks on "
-            "the TaskVecEnv"
-        )
+        raise ValueError(f"{bare} was given a task, which copies would not get; use set_tasks")
     limits = [wrapper._max_episode_steps for wrapper in wrappers if isinstance(wrapper, TimeLimit)]
     spec = copy.deepcopy(bare.spec)
     spec.max_episode_steps = min(limits, default=None)
@@ -330,6 +319,4 @@ def _vectorised(
     vector_env = gym.make_vec(spec, num_envs, "vector_entry_point", **kwargs)
     if not isinstance(vector_env, TaskFamilyVector):
         raise ValueError(f"{spec.id}'s vector_entry_point is no TaskFamilyVector; {instead}")
-    # a single environment's: make_vec's own adds what gym.make does not take
-    vector_env.spec = spec
     return vector_env

@@ -27,9 +27,9 @@ class EpochCallback(BaseCallback):
 
     def _init_callback(self) -> None:
         if not isinstance(self.model, PEARLSAC):
-            ours, other = type(self).__name__, type(self.model).__name__
+            who, other = type(self).__name__, type(self.model).__name__
             raise TypeError(
-                f"{ours} is for POEMSAC and PEARLSAC, which train in epochs, not for {other}"
+                f"{who} is for POEMSAC and PEARLSAC, which train in epochs, not {other}"
             )
 
     def _on_training_start(self) -> None:

@@ -15,6 +15,10 @@ from sb3_poem.pearl_sac.policies import LatentPolicy
 from sb3_poem.pearl_sac.train_tasks import TrainTasks
 
 
+class CollectionStoppedError(Exception):
+    """A callback ended training."""
+
+
 @dataclass
 class EpochCollector:
     """Rolls training tasks out and fills their replay buffers. ``explores`` tells whether actions
@@ -34,24 +38,21 @@ class EpochCollector:
     episode_count: Callable[[], int]
     on_step: Callable[[dict[str, Any]], bool]
 
-    def collect(self) -> list[Segment] | None:
-        """An epoch: a segment for each wave of copies; None if ``on_step`` ended it."""
-        waves = []
+    def collect(self) -> list[Segment]:
+        """An epoch: a segment for each wave of copies."""
         wanted = np.repeat(np.arange(len(self.train_tasks)), self.trajectories_per_task)
-        for wave in in_waves(wanted, self.family.num_envs):
-            latents = self.train_tasks.draw_latents(wave, self.generators.numpy)
-            segment = self.roll_out(wave, latents)
-            if segment is None:
-                return None
-            waves.append(segment)
-        return waves
+        return [
+            self.roll_out(wave, self.train_tasks.draw_latents(wave, self.generators.numpy))
+            for wave in in_waves(wanted, self.family.num_envs)
+        ]
 
-    def roll_out(self, task_ids: np.ndarray, latents: np.ndarray) -> Segment | None:
+    def roll_out(self, task_ids: np.ndarray, latents: np.ndarray) -> Segment:
         """A horizon of each copy on its task, (copies,), under its latent, (copies, latent_dim),
-        which goes to the buffer too; None if ``on_step`` ended it. An episode that ends early is
-        followed by another of the same task.
+        which goes to the buffer too. An episode that ends early is followed by another of the same
+        task.
 
         :raises ValueError: for NaN and infinity, and as :meth:`FamilyView.check_experience`
+        :raises CollectionStoppedError: if ``on_step`` ended it
         """
         family, tasks = self.family, self.train_tasks.tasks[task_ids]
         n, seed, steps = family.num_envs, self.generators.integer_seed(), []
@@ -78,7 +79,7 @@ class EpochCollector:
             new_obs, rewards, dones, infos = family.env.step(actions)
             assert isinstance(new_obs, np.ndarray)
             if not self.on_step(locals()):
-                return None
+                raise CollectionStoppedError
             next_obs, terminated = new_obs, np.zeros(n, dtype=np.float32)
             if dones.any():
                 next_obs = new_obs.copy()

@@ -32,7 +32,7 @@ from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.hub import upload
 from sb3_poem.pearl_sac import saving
 from sb3_poem.pearl_sac.arguments import check_arguments, refuse_unknown
-from sb3_poem.pearl_sac.collector import EpochCollector, concatenate
+from sb3_poem.pearl_sac.collector import CollectionStoppedError, EpochCollector, concatenate
 from sb3_poem.pearl_sac.environments import GivenEnv, vectorise
 from sb3_poem.pearl_sac.objective import Objective, rows
 from sb3_poem.pearl_sac.policies import OBSERVATION_CLIP, LatentPolicy, MlpPolicy
@@ -326,8 +326,9 @@ class PEARLSAC(SAC):
             callback.on_rollout_start()
             self._dump_pending_logs(log_interval)
             # lines 2 and 16: every task's trajectories, of which the next contexts are made
-            collected = self._collect_epoch(callback)
-            if collected is None:  # a callback ended training
+            try:
+                collected = self._collect_epoch(callback)
+            except CollectionStoppedError:
                 break
             callback.on_rollout_end()
             # lines 4 to 15
@@ -359,17 +360,13 @@ class PEARLSAC(SAC):
             )
         return total
 
-    def _collect_epoch(self, callback: BaseCallback) -> int | None:
-        """Roll out every task, and make the contexts: environment steps, None if it was ended."""
+    def _collect_epoch(self, callback: BaseCallback) -> int:
+        """Roll out every task, and make the contexts: environment steps."""
         started, steps_before = time.perf_counter(), self.num_timesteps
         collector = self.make_collector(callback)
         waves = collector.collect()
-        if waves is None:
-            return None
         epoch = concatenate(waves, len(self.train_tasks) * self.trajectories_per_task)
         returns = self.measure_returns(epoch, collector)
-        if returns is None:
-            return None
         # after the returns, which the policies that collected the epoch must earn
         self.policy.update_statistics(waves)
         self._replace_context(epoch, returns)
@@ -380,9 +377,9 @@ class PEARLSAC(SAC):
         self._logs_pending = True
         return collected
 
-    def measure_returns(self, epoch: Segment, collector: EpochCollector) -> np.ndarray | None:
+    def measure_returns(self, epoch: Segment, collector: EpochCollector) -> np.ndarray:
         """J[i, j]: the return of task j's policy on task i, (n_train_tasks, n_train_tasks); NaN
-        where unknown, None if a callback ended the ``collector``'s further rollouts.
+        where unknown.
         """
         n_tasks = len(self.train_tasks)
         own = (epoch.rewards * epoch.first_episode).sum(axis=1).reshape(n_tasks, -1).mean(axis=1)
@@ -449,7 +446,8 @@ class PEARLSAC(SAC):
         transitions, generator = self._known_context.transitions, self.generators.torch
         picks = th.randperm(transitions.shape[1], generator=generator, device=self.device)
         posteriors = self.policy.encoder(transitions[:, picks[: self.context_size]])
-        self.train_tasks.set_posteriors(*(part.double().cpu().numpy() for part in posteriors))
+        means, variances = (part.double().cpu().numpy() for part in posteriors)
+        self.train_tasks.latent_means, self.train_tasks.latent_variances = means, variances
 
     @th.no_grad()
     def _measure_decoder(self) -> None:
@@ -462,13 +460,11 @@ class PEARLSAC(SAC):
         data = self.replay_buffer.sample_rows(sources, generator)
         rewards = self.family.compute_rewards(tasks[:, None, :], data.features.cpu().numpy())
         embedding = policy.reward_embedding(policy.tensor(self.task_latents))
+        embedding = rows(embedding, MEASURED_PER_TASK)
         obs, next_obs = map(policy.standardise, (data.observations, data.next_observations))
-        predicted = policy.decode_rewards(
-            obs, data.actions, next_obs, rows(embedding, MEASURED_PER_TASK)
-        )
-        self.predicted_rewards_error = float(
-            np.sqrt(np.mean((predicted.cpu().numpy() - rewards) ** 2))
-        )
+        predicted = policy.decode_rewards(obs, data.actions, next_obs, embedding)
+        errors = predicted.cpu().numpy() - rewards
+        self.predicted_rewards_error = float(np.sqrt(np.mean(errors**2)))
         self.logger.record("train/decoder_error", self.predicted_rewards_error)
 
     def resume(

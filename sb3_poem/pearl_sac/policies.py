@@ -110,16 +110,16 @@ class LatentPolicy(SACPolicy):
     def _build(self, lr_schedule: Schedule) -> None:
         arch, latent_dim = self.net_arch, self.latent_dim
         obs_dim, action_dim = int(self.observation_space.shape[0]), int(self.action_space.shape[0])
-        hidden = self.activation_fn, self.layer_norm
+        hidden, transition_dim = (self.activation_fn, self.layer_norm), 2 * obs_dim + action_dim
         self.obs_norm = RunningNorm(obs_dim, clip=OBSERVATION_CLIP)
         self.reward_norm = RunningNorm(1)  # of the first epoch, in whose units the critics learn
-        context_dim = 2 * obs_dim + action_dim + 1 + int(self.context_has_value)
+        context_dim = transition_dim + 1 + int(self.context_has_value)
         self.encoder = ContextEncoder(context_dim, latent_dim, arch["encoder"])
         self._build_embeddings(arch["embedding"])
-        self.decoder = RewardDecoder(obs_dim, action_dim, latent_dim, arch["decoder"], *hidden)
-        self.actor = LatentActor(obs_dim, latent_dim, action_dim, arch["pi"], *hidden)
-        critics = (obs_dim, action_dim, latent_dim, arch["qf"], *hidden, self.n_critics)
-        self.critic, self.critic_target = LatentCritic(*critics), LatentCritic(*critics)
+        self.decoder = RewardDecoder(transition_dim + latent_dim, arch["decoder"], *hidden)
+        self.actor = LatentActor(obs_dim + latent_dim, action_dim, arch["pi"], *hidden)
+        shape = (obs_dim + action_dim + latent_dim, self.n_critics, arch["qf"], *hidden)
+        self.critic, self.critic_target = LatentCritic(*shape), LatentCritic(*shape)
         self.critic_target.load_state_dict(self.critic.state_dict())
         self.critic_target.requires_grad_(False)
         trained = [parameter for parameter in self.parameters() if parameter.requires_grad]

@@ -119,7 +119,12 @@ class MetaBatchSampler:
         slots = buffer.draw_slots(sources, generator)
 
         def seen(slots: th.Tensor) -> TaskBatch:
-            return self._relabelled(buffer.at(sources, slots), chosen, n_foreign)
+            batch = buffer.at(sources, slots)
+            if not n_foreign:
+                return batch
+            rewards = batch.rewards.clone()
+            rewards[:, -n_foreign:] = self._rewards(chosen, batch.features[:, -n_foreign:])
+            return batch._replace(rewards=rewards)
 
         transitions = seen(slots)
         if self.n_steps == 1 and self.shaping_coef == 0:
@@ -144,14 +149,6 @@ class MetaBatchSampler:
         potential = self.family.compute_potential(tasks, observations.cpu().numpy())
         values = th.as_tensor(potential, dtype=th.float32, device=self.device)
         return values * (self.shaping_coef / (1.0 - self.gamma))
-
-    def _relabelled(self, transitions: TaskBatch, chosen: np.ndarray, n_foreign: int) -> TaskBatch:
-        """With the tasks' own rewards in the last ``n_foreign`` transitions of each."""
-        if not n_foreign:
-            return transitions
-        rewards = transitions.rewards.clone()
-        rewards[:, -n_foreign:] = self._rewards(chosen, transitions.features[:, -n_foreign:])
-        return transitions._replace(rewards=rewards)
 
     def _rewards(self, chosen: np.ndarray, features: th.Tensor) -> th.Tensor:
         """Rewards (tasks, batch) of features (tasks, batch, feat_dim)."""

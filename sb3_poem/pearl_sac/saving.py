@@ -40,6 +40,8 @@ WEIGHTS, CONFIG, CARD = FILES
 #: What a configuration holds of a model, as it is, and of its policy
 FACTS = ("env_id", "env_kwargs", "reward_feature_dim", "num_timesteps", "n_envs")
 POLICY_FACTS = ("net_arch", "layer_norm", "n_critics", "optimizer_kwargs")
+#: Classes that it names: where they are, and their base class
+CLASSES = {"activation_fn": (nn, nn.Module), "optimizer_class": (th.optim, th.optim.Optimizer)}
 SPACES = ("observation_space", "action_space", "task_space")
 ARRAYS = {
     "train_tasks": "tasks",
@@ -128,16 +130,14 @@ def _facts(path: str | Path) -> dict[str, Any]:
 
 def _check_is_file(path: Path, algorithm: str) -> None:
     """:raises ValueError: if it is what another method reads: a checkpoint, a folder"""
-    what, method = "", "from_pretrained"
-    if path.is_file():
-        if is_checkpoint(path):
-            what, method = "a checkpoint", "load_checkpoint"
+    what, method = "the name of a model that ships", "from_pretrained"
+    if path.is_file() and is_checkpoint(path):
+        what, method = "a checkpoint", "load_checkpoint"
     elif path.is_dir():
         what = "a folder"
-    elif not path.with_name(f"{path.name}.zip").is_file() and str(path) in pretrained_names():
-        what = "the name of a model that ships"
-    if what:
-        raise ValueError(f"{path} is {what}: use {algorithm}.{method}({str(path)!r})")
+    elif path.with_name(f"{path.name}.zip").is_file() or str(path) not in pretrained_names():
+        return
+    raise ValueError(f"{path} is {what}: use {algorithm}.{method}({str(path)!r})")
 
 
 # ---------------------------------------------------------------------- checkpoints
@@ -200,13 +200,11 @@ def model_contents(
     model: Any, card: dict[str, Any] | None = None
 ) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
     """What a model is made of, from which :func:`build_model` makes it again: its configuration,
-    which :func:`config_text` writes, and its tensors by name.
-
-    :raises ValueError: see :meth:`PEARLSAC.save_pretrained`
+    which :func:`config_text` writes, and its tensors by name; raises as
+    :meth:`PEARLSAC.save_pretrained`.
     """
     policy, error = model.policy, model.predicted_rewards_error
-    classes = {"activation_fn": nn, "optimizer_class": th.optim}
-    for argument, module in classes.items():
+    for argument, (module, _) in CLASSES.items():
         value = getattr(policy, argument)
         if getattr(module, value.__name__, None) is not value:
             raise ValueError(f"{argument} must be in {module.__name__} to be saved, but is {value}")
@@ -223,7 +221,7 @@ def model_contents(
         "n_updates": model._n_updates,
         "arguments": _arguments(model),
         **{name: getattr(policy, name) for name in POLICY_FACTS},
-        **{name: getattr(policy, name).__name__ for name in classes},
+        **{name: getattr(policy, name).__name__ for name in CLASSES},
         "predicted_rewards_error": None if np.isnan(error) else error,  # NaN is no JSON
         "context_reward_statistics": model.context_reward_statistics,
         "card": card or {},
@@ -341,17 +339,13 @@ def build_model(
         for name in FACTS:
             setattr(model, name, config[name])
         model._n_updates = config["n_updates"]
-        if config["predicted_rewards_error"] is not None:
-            model.predicted_rewards_error = config["predicted_rewards_error"]
-        if config["context_reward_statistics"] is not None:
-            model.context_reward_statistics = tuple(config["context_reward_statistics"])
+        error, statistics = config["predicted_rewards_error"], config["context_reward_statistics"]
+        model.predicted_rewards_error = float("nan") if error is None else error
+        model.context_reward_statistics = None if statistics is None else tuple(statistics)
         if model.target_entropy == "auto":  # which SAC would look up in the environment
             model.target_entropy = -float(np.prod(model.action_space.shape))
         model.policy_kwargs |= {name: config[name] for name in POLICY_FACTS}
-        for name, module, base in (
-            ("activation_fn", nn, nn.Module),
-            ("optimizer_class", th.optim, th.optim.Optimizer),
-        ):
+        for name, (module, base) in CLASSES.items():
             kind = getattr(module, config[name], None)
             if not (isinstance(kind, type) and issubclass(kind, base)):
                 raise ValueError(f"{config[name]!r} is no {base.__name__} of {module.__name__}")
@@ -382,12 +376,9 @@ def _check_numbers(algorithm: type, config: dict[str, Any], tensors: dict[str, t
     expected, n_tasks = arguments.get("n_train_tasks"), len(tensors["train_tasks"])
     if expected not in (None, n_tasks):
         raise ValueError(f"`n_train_tasks` is {expected}, but there are {n_tasks} train_tasks")
-    for name, least in zip(
-        ("n_envs", "reward_feature_dim", "n_critics", "num_timesteps", "n_updates"),
-        (1, 1, 1, 0, 0),
-        strict=True,
-    ):
-        check_whole(name, config[name], least, LARGEST.get(name))
+    least = {"n_envs": 1, "reward_feature_dim": 1, "n_critics": 1}
+    for name in (*least, "num_timesteps", "n_updates"):
+        check_whole(name, config[name], least.get(name, 0), LARGEST.get(name))
     arch = config["net_arch"]
     if not isinstance(arch, dict) or not DEFAULT_NET_ARCH.keys() <= arch.keys():
         names = ", ".join(DEFAULT_NET_ARCH)

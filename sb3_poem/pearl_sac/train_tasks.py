@@ -46,10 +46,6 @@ class TrainTasks:
     def __len__(self) -> int:
         return len(self.tasks)
 
-    def set_posteriors(self, means: np.ndarray, variances: np.ndarray) -> None:
-        """Replace every task's posterior, (n, latent_dim) each."""
-        self.latent_means, self.latent_variances = means, variances
-
     def draw_latents(self, task_ids: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """One latent from the posterior of each of some tasks, (len(task_ids), latent_dim)."""
         noise = rng.standard_normal((len(task_ids), self.latent_means.shape[1]))

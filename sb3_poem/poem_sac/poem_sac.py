@@ -164,7 +164,7 @@ class POEMSAC(PEARLSAC):
         """Groups of tasks, whose policies are run on each other's."""
         return np.array_split(tasks, max(1, len(tasks) // self.preference_group_size))
 
-    def measure_returns(self, epoch: Segment, collector: EpochCollector) -> np.ndarray | None:
+    def measure_returns(self, epoch: Segment, collector: EpochCollector) -> np.ndarray:
         """J[i, j] by relabelling or, within random groups of tasks, by running the policies."""
         family, tasks, n_tasks = self.family, self.train_tasks.tasks, len(self.train_tasks)
         if self.relabels:
@@ -178,7 +178,5 @@ class POEMSAC(PEARLSAC):
         for wave in in_waves(np.array(pairs, dtype=np.int64).reshape(-1, 2), family.num_envs):
             task_ids, policy_ids = wave.T
             segment = collector.roll_out(task_ids, own_latents[policy_ids])
-            if segment is None or returns is None:
-                return None
             returns[task_ids, policy_ids] = (segment.rewards * segment.first_episode).sum(axis=1)
         return returns

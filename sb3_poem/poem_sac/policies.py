@@ -41,9 +41,8 @@ class POEMPolicy(LatentPolicy):
 
     def similarity(self, task_latents: th.Tensor, policy_latents: th.Tensor) -> th.Tensor:
         """S(z_i, z_j) (eq. 3): (m, d), (n, d) -> (m, n)."""
-        return self.compare(
-            self.reward_embedding(task_latents), self.policy_embedding(policy_latents)
-        )
+        policies = self.policy_embedding(policy_latents)
+        return self.compare(self.reward_embedding(task_latents), policies)
 
     def compare(self, rewards: th.Tensor, policies: th.Tensor) -> th.Tensor:
         """S of embeddings z_r (m, d) and z_pi (n, d): (m, n)."""

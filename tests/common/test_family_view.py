@@ -121,7 +121,7 @@ def test_the_horizon_of_a_goal_family_is_that_of_its_environment() -> None:
 
 @pytest.mark.parametrize("horizon", [0, -5])
 def test_the_horizon_must_be_positive(horizon: int) -> None:
-    with pytest.raises(ValueError, match=rf"horizon must be at least 1.*{horizon}"):
+    with pytest.raises(ValueError, match=rf"`horizon` must be at least 1.*{horizon}"):
         FamilyView.for_training(walks(1), horizon)
 
 

@@ -79,9 +79,9 @@ def test_normalised_layers_are_linear_layers_less_their_mean_over_their_deviatio
 
 @pytest.mark.parametrize("layer_norm", [False, True])
 def test_actor_critics_and_decoder_normalise_when_asked(layer_norm: bool) -> None:
-    actor = LatentActor(3, 2, 2, [8], layer_norm=layer_norm)
-    critic = LatentCritic(3, 2, 2, [8], layer_norm=layer_norm)
-    decoder = RewardDecoder(3, 2, 2, [8], layer_norm=layer_norm)
+    actor = LatentActor(5, 2, [8], layer_norm=layer_norm)
+    critic = LatentCritic(7, 2, [8], layer_norm=layer_norm)
+    decoder = RewardDecoder(10, [8], layer_norm=layer_norm)
     obs, two = th.randn(5, 3), th.randn(5, 2)
     networks = {
         "actor": (actor.mlp, lambda: actor(obs, two)[0]),
@@ -98,7 +98,7 @@ def test_actor_critics_and_decoder_normalise_when_asked(layer_norm: bool) -> Non
 
 @pytest.mark.parametrize("layer_norm", [False, True])
 def test_frozen_gives_gradients_to_the_input_only(layer_norm: bool) -> None:
-    critic = LatentCritic(3, 2, 4, [8, 8], layer_norm=layer_norm)
+    critic = LatentCritic(9, 2, [8, 8], layer_norm=layer_norm)
     obs, actions, latents = (th.randn(6, width, requires_grad=True) for width in (3, 2, 4))
     critic(obs, actions, latents, frozen=True).sum().backward()
     assert all(parameter.grad is None for parameter in critic.parameters())
@@ -165,7 +165,7 @@ def test_overconfident_factors_stay_finite() -> None:
 
 
 def test_log_probability_is_that_of_a_transformed_distribution() -> None:
-    actor = LatentActor(5, 3, 2, [16])
+    actor = LatentActor(8, 2, [16])
     obs, embedding, noise = (th.randn(4, 6, width) for width in (5, 3, 2))
     with th.no_grad():
         mean, log_std = (x.double() for x in actor.distribution(obs, embedding))
@@ -178,7 +178,7 @@ def test_log_probability_is_that_of_a_transformed_distribution() -> None:
 
 
 def test_log_probability_does_not_saturate() -> None:
-    actor = LatentActor(1, 1, 1, [])
+    actor = LatentActor(2, 1, [])
     mean, log_std = 40.0, 0.0
     set_output(actor.mlp, [mean, log_std])
     actions, log_prob = actor(th.zeros(1, 1), th.zeros(1, 1), th.zeros(1, 1))
@@ -191,16 +191,15 @@ def test_log_probability_does_not_saturate() -> None:
     assert all(parameter.grad.isfinite().all() for parameter in actor.parameters())
 
 
-def test_without_noise_the_actor_takes_the_mean() -> None:
-    actor = LatentActor(5, 3, 2, [16])
+def test_where_the_noise_is_zero_the_actor_takes_the_mean() -> None:
+    actor = LatentActor(8, 2, [16])
     obs, embedding = th.randn(4, 5), th.randn(4, 3)
-    actions, log_prob = actor(obs, embedding)
-    assert log_prob is None
+    actions, _ = actor(obs, embedding, th.zeros(4, 2))
     th.testing.assert_close(actions, th.tanh(actor.distribution(obs, embedding)[0]))
 
 
 def test_standard_deviation_is_bounded() -> None:
-    actor = LatentActor(1, 1, 1, [])
+    actor = LatentActor(2, 1, [])
     set_output(actor.mlp, [0.0, 50.0])
     draws = th.randn(10, 1)
     actions, _ = actor(th.zeros(10, 1), th.zeros(10, 1), draws)
@@ -211,7 +210,7 @@ def test_standard_deviation_is_bounded() -> None:
 
 
 def test_critics_are_different_functions_of_all_their_inputs() -> None:
-    critic = LatentCritic(3, 2, 4, [32], n_critics=3)
+    critic = LatentCritic(9, 3, [32])
     inputs = [th.randn(6, width, requires_grad=True) for width in (3, 2, 4)]
     values = critic(*inputs)
     assert values.shape == (3, 6)
@@ -221,7 +220,7 @@ def test_critics_are_different_functions_of_all_their_inputs() -> None:
 
 
 def test_decoder_broadcasts_over_leading_dimensions() -> None:
-    decoder = RewardDecoder(3, 2, 4, [32])
+    decoder = RewardDecoder(12, [32])
     obs, actions, next_obs, embedding = (th.randn(5, 6, width) for width in (3, 2, 3, 4))
     rewards = decoder(obs, actions, next_obs, embedding)
     assert rewards.shape == (5, 6)

@@ -135,7 +135,7 @@ def test_float32_changes_nothing(mlp: MLP) -> None:
 @pytest.mark.parametrize("layer_norm", [False, True])
 def test_frozen_and_unused_networks_get_no_gradient(layer_norm: bool) -> None:
     networks = nn.ModuleList(
-        [MLP(6, 3, [8], layer_norm=layer_norm), LatentCritic(2, 2, 2, [8], layer_norm=layer_norm)]
+        [MLP(6, 3, [8], layer_norm=layer_norm), LatentCritic(6, 2, [8], layer_norm=layer_norm)]
     )
     obs = th.randn(4, 2, requires_grad=True)
     for _ in range(2):

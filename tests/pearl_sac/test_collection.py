@@ -17,7 +17,7 @@ from sb3_poem.common.buffers import Segment
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.random import Generators
 from sb3_poem.common.vec_env import make_task_vec_env
-from sb3_poem.pearl_sac.collector import EpochCollector, relabelled_returns
+from sb3_poem.pearl_sac.collector import CollectionStoppedError, EpochCollector, relabelled_returns
 from sb3_poem.pearl_sac.train_tasks import TrainTasks
 
 
@@ -45,7 +45,7 @@ def collect(
     seed: int = 3,
     on_step=lambda _: True,
     policy: RandomPolicy | None = None,
-) -> Segment | None:
+) -> Segment:
     """A rollout of each task, the copies' seeds from ``seed`` on; it must be what is stored."""
     n, stored, generators = env.num_envs, [], Generators(0)
     generators.integer_seed = lambda: seed
@@ -62,7 +62,7 @@ def collect(
         on_step=on_step,
     )
     segment = collector.roll_out(np.arange(n), np.arange(2.0 * n).reshape(n, 2))
-    assert stored == ([] if segment is None else [segment])
+    assert stored == [segment]
     return segment
 
 
@@ -116,7 +116,8 @@ def test_a_false_step_ends_the_collection() -> None:
         seen.append(sorted(step_locals["infos"][0])[0])
         return len(seen) < 4
 
-    assert collect(env, np.zeros((2, 1)), horizon=10, on_step=on_step) is None
+    with pytest.raises(CollectionStoppedError):
+        collect(env, np.zeros((2, 1)), horizon=10, on_step=on_step)
     assert len(seen) == 4
 
 
