@@ -256,7 +256,6 @@ class GoalFamily(TaskFamily):
         return {} if self._success is None else {"success": bool(self._success)}
 
     def render(self) -> Any:
-        """Render the current state as the environment does."""
         if self._task is None:
             raise RuntimeError("render() was called before the first reset()")
         renderer = renderer_inside(self.env)
@@ -273,7 +272,6 @@ class GoalFamily(TaskFamily):
                 self._place_goal(self._task)
 
     def close(self) -> None:
-        """Close the environment."""
         for env in (self.env, self._goal_env):
             if env is not None:
                 env.close()

@@ -55,7 +55,6 @@ class StateRenderer:
         return np.ascontiguousarray(image) if isinstance(image, np.ndarray) else image
 
     def close(self) -> None:
-        """Close windows and graphics contexts."""
         close_viewers(self._renderer)
 
 

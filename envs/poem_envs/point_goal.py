@@ -214,7 +214,6 @@ class ImageWindow:
         glfw.poll_events()
 
     def close(self) -> None:
-        """Close the window."""
         if self._window is not None:
             self._glfw.destroy_window(self._window)
             self._window = None

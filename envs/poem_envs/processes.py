@@ -50,7 +50,6 @@ class CopyGroup:
     def make(
         self, make: Callable[[], TaskFamily], n: int, first: int, attributes: dict[str, Any]
     ) -> None:
-        """Make the copies."""
         self.envs, self.first = [make() for _ in range(n)], first
         for name, value in attributes.items():
             self.set_attribute(name, value)
@@ -60,7 +59,6 @@ class CopyGroup:
         self._call = partial(getattr(self, method), *arguments)
 
     def receive(self) -> Any:
-        """The result of the last call."""
         return self._call()
 
     def begin(
@@ -89,7 +87,6 @@ class CopyGroup:
         return np.stack(observations), np.stack(features), np.array(terminated, bool), together
 
     def call(self, copy: int, method: str, *arguments: Any) -> Any:
-        """Call a method of one copy."""
         try:
             return getattr(self.envs[copy], method)(*arguments)
         except Exception as error:
@@ -98,12 +95,10 @@ class CopyGroup:
             ) from error
 
     def set_attribute(self, name: str, value: Any) -> None:
-        """Set an attribute of every copy."""
         for env in self.envs:
             setattr(env, name, value)
 
     def close(self) -> None:
-        """Close every copy."""
         for env in self.envs:
             env.close()
 
@@ -150,7 +145,6 @@ class RemoteGroup:
             raise self._gone() from None
 
     def receive(self) -> Any:
-        """The result of the oldest call that is under way."""
         try:
             succeeded, result = pickle.loads(self._connection.recv_bytes())
         except (EOFError, ConnectionResetError):
@@ -199,7 +193,6 @@ class ProcessCopies:
         self._last_infos: dict[str, np.ndarray] = {}
 
     def set_attribute(self, name: str, value: Any) -> None:
-        """Set an attribute of every copy."""
         self._attributes[name] = value  # for copies that are made anew
         self._call("set_attribute", dict.fromkeys(range(len(self._firsts)), (name, value)))
 

@@ -26,7 +26,6 @@ class _RoboticsFamily(MujocoFilms, GoalFamily):
         return robot.model, robot.data
 
     def close(self) -> None:
-        """Close the environment."""
         self._close_films()
         super().close()
 

@@ -75,7 +75,6 @@ class TaskReplayBuffer(ReplayBuffer):
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything."""
         super().reset()
         # One row more than there is room for, in which the first is repeated: it follows the last.
         self.rows = th.zeros(self.n_tasks, 1, sum(self.widths), dtype=th.int32, device=self.device)

@@ -83,7 +83,6 @@ class Objective:
         return TaskEmbeddings(latents, *embeddings)
 
     def standardised(self, batch: TaskBatch) -> TaskBatch:
-        """The same with standardised observations."""
         seen = map(self.policy.standardise, (batch.observations, batch.next_observations))
         observations, next_observations = seen
         return batch._replace(observations=observations, next_observations=next_observations)

@@ -536,13 +536,11 @@ class PEARLSAC(SAC):
 
     @property
     def entropy_coefficient(self) -> EntropyCoefficient:
-        """SAC's entropy coefficient."""
         tensor = self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef
         return EntropyCoefficient(tensor, self.ent_coef_optimizer, float(self.target_entropy))
 
     @property
     def hidden_dtype(self) -> th.dtype:
-        """Type of the hidden layers' arithmetic in training."""
         return hidden_dtype(self.precision, self.device.type)
 
     @property

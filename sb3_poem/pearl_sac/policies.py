@@ -274,7 +274,6 @@ class LatentPolicy(SACPolicy):
         return self.tensor(act(observation.cpu().numpy(), noise))
 
     def set_training_mode(self, mode: bool) -> None:
-        """Put all networks in training or evaluation mode."""
         self.train(mode)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:

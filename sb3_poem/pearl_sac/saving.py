@@ -150,14 +150,12 @@ class Experience:
         self.model = model
 
     def state_dict(self) -> dict[str, dict[str, th.Tensor]]:
-        """Tensors by name."""
         context = self.model.epoch_context
         kept = {} if context is None else vars(context)
         tensors = {name: value for name, value in kept.items() if value is not None}
         return {"replay_buffer": self.model.replay_buffer.state(), "context": tensors}
 
     def load_state_dict(self, state: dict[str, dict[str, th.Tensor]], strict: bool = True) -> None:
-        """Continue from what :meth:`state_dict` returned."""
         self.model.replay_buffer.load_state(state["replay_buffer"])
         if state["context"]:
             self.model.epoch_context = ContextStore(**state["context"])
@@ -231,7 +229,6 @@ def model_contents(
 
 
 def config_text(config: dict[str, Any]) -> str:
-    """A configuration as JSON."""
     return json.dumps(config, indent=2, default=_to_json)
 
 
