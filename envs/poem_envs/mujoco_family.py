@@ -15,7 +15,7 @@ from mujoco.rollout import Rollout
 
 from poem_envs.films import MujocoFilms
 from poem_envs.mujoco_rendering import StateRenderer, arrow, renders_fast
-from poem_envs.vector import BatchFamily, DivergenceError
+from poem_envs.vector import BatchFamily
 
 RENDER_MODES = ["human", "rgb_array", "depth_array", "rgbd_tuple"]
 
@@ -166,10 +166,10 @@ class MujocoFamily(MujocoFilms, BatchFamily):
         if diverged.any():
             copy = int(np.flatnonzero(diverged)[0])
             qpos, qvel = np.split(np.abs(self.states[copy, 1:]), [self.model.nq])
-            raise DivergenceError(
-                copy,
+            raise RuntimeError(
+                f"the simulation of {type(self).__name__} diverged at {self._describe(copy)}: "
                 "MuJoCo met a state that is not finite or too large; the state before had "
-                f"max|qpos|={qpos.max():.3g} and max|qvel|={qvel.max():.3g}",
+                f"max|qpos|={qpos.max():.3g} and max|qvel|={qvel.max():.3g}"
             )
 
     def _observations(self) -> np.ndarray:

@@ -254,9 +254,7 @@ class ProcessCopies:
                 self._last_observations[copy], drawn[copy] = observation, rng
         return drawn
 
-    def advance(
-        self, actions: np.ndarray, describe: Callable[[int], str]
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Step all copies; returns reward features and early ends."""
         chunks = np.split(actions, self._firsts[1:])
         results = self._call("step", {index: (chunk,) for index, chunk in enumerate(chunks)})

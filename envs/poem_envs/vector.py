@@ -26,14 +26,6 @@ NO_RENDER_MODE = "without a render_mode; pass one to the constructor, say 'rgb_a
 OF_ONE_COPY = frozenset({"task", "set_task"})
 
 
-class DivergenceError(Exception):
-    """The simulation of a copy, by number, blew up; the message is what was seen of it."""
-
-    def __init__(self, copy: int, what: str) -> None:
-        super().__init__(what)
-        self.copy = copy
-
-
 @dataclass(kw_only=True, eq=False, repr=False)
 class BatchFamily(TaskFamily):
     """A family whose simulator steps any number of copies at once. By itself it is an environment
@@ -94,8 +86,6 @@ class BatchFamily(TaskFamily):
     def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Step all copies by valid actions ``(n, action_dim)`` float64; return new arrays of reward
         features ``(n, reward_feature_dim)`` and of early ends ``(n,)``.
-
-        :raises DivergenceError: if the simulation of a copy blows up
         """
 
     def _step_infos(self) -> dict[str, np.ndarray]:
@@ -113,24 +103,16 @@ class BatchFamily(TaskFamily):
     def _release(self) -> None:
         """Free threads, windows and the like. Called by ``close``, possibly more than once."""
 
-    def advance(
-        self, actions: np.ndarray, describe: Callable[[int], str]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """:meth:`_advance`, whose errors say where a copy's episode is."""
-        try:
-            return self._advance(actions)
-        except DivergenceError as error:
-            raise RuntimeError(
-                f"the simulation of {type(self).__name__} diverged at {describe(error.copy)}: "
-                f"{error}"
-            ) from error
+    def _describe(self, copy: int) -> str:
+        """Where a copy's episode is, for error messages."""
+        return self._describe_episode()
 
     def _begin_episode(self, rng: np.random.Generator) -> np.ndarray:
         self._begin_episodes(np.zeros(1, dtype=np.intp), [rng])
         return self._observations()[0]
 
     def _simulate(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
-        features, terminated = self.advance(action[None], lambda _: self._describe_episode())
+        features, terminated = self._advance(action[None])
         return self._observations()[0], features[0], bool(terminated[0])
 
     def _step_info(self) -> dict[str, Any]:
@@ -249,6 +231,7 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         if isinstance(one, BatchFamily):
             self._copies, one.nthread = one, nthread
             one._allocate(num_envs)
+            one._describe = self._describer()  # type: ignore[assignment]
         else:
             self._copies = ProcessCopies(make, num_envs, nthread, one.observation_space)
         self.closed = False
@@ -338,7 +321,7 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         assert isinstance(self.single_action_space, spaces.Box)
         checked = checked_actions(actions, self.single_action_space, self.num_envs)
         self._elapsed_steps += 1
-        features, terminations = self._copies.advance(checked, self._describe_episode)
+        features, terminations = self._copies._advance(checked)
         rewards = self.family.compute_rewards(self._tasks, features)
         observations = self._copies._observations()
         limit = np.inf if self.max_episode_steps is None else self.max_episode_steps
@@ -404,10 +387,12 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         ]
         self._rngs |= self._copies.begin(starts)  # which have drawn, in other processes
 
-    def _describe_episode(self, copy: int) -> str:
-        return (
-            f"step {self._elapsed_steps[copy]} of episode {self._episodes[copy]} since "
-            f"reset(seed={self._seeds[copy]}) in environment copy {copy}"
+    def _describer(self) -> Callable[[int], str]:
+        """A :meth:`BatchFamily._describe` that keeps no reference to this object."""
+        steps, episodes, seeds = self._elapsed_steps, self._episodes, self._seeds
+        return lambda copy: (
+            f"step {steps[copy]} of episode {episodes[copy]} since reset(seed={seeds[copy]}) in "
+            f"environment copy {copy}"
         )
 
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import torch as th
 
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.family_view import FamilyView, demanded, reward_features, seed_copies
@@ -112,7 +112,10 @@ def _episodes(
         # spare copies repeat the last one, and are not read
         wave = np.minimum(first + np.arange(copies), n - 1)
         wave_seeds = [int(seeds[i]) for i in wave]
-        with _seeded_noise(wave_seeds[0], deterministic):
+        # SB3's action noise is drawn from torch's global generator, which is handed back as it was
+        with th.random.fork_rng(enabled=not deterministic):
+            if not deterministic:
+                th.manual_seed(wave_seeds[0])
             if family is not None and tasks is None:
                 family.seed_episodes(wave_seeds)
             else:
@@ -121,19 +124,6 @@ def _episodes(
                 seed_copies(vec_env, wave_seeds)
             how = (deterministic, frames, int(steps), first, min(copies, n - first))
             yield from _wave(model, vec_env, latents[wave], *how)
-
-
-@contextlib.contextmanager
-def _seeded_noise(seed: int, deterministic: bool) -> Iterator[None]:
-    """Seed torch's global generator, of SB3's action noise, and hand it back as it was."""
-    if deterministic:
-        yield
-        return
-    import torch
-
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        yield
 
 
 def _wave(

@@ -245,7 +245,7 @@ class _Copy:
     """One copy of a vectorised task family, as a single environment is seen."""
 
     # what a step or a reset of one copy alone would put out of step with the others
-    _HIDDEN = frozenset({"reset", "step", "close", "advance"})
+    _HIDDEN = frozenset({"reset", "step", "close"})
 
     def __init__(self, vector_env: TaskFamilyVector, index: int) -> None:
         self._vector_env, self._index = vector_env, index

@@ -417,11 +417,11 @@ class PEARLSAC(SAC):
     def train(self, gradient_steps: int, batch_size: int = 128) -> None:
         """Gradient steps on meta-batches (Algorithm 1, lines 4 to 15); then new posteriors."""
         self.policy.set_training_mode(True)
-        optimizers = [self.policy.optimizer, *self.entropy_coefficient.optimizers]
-        self._update_learning_rate(optimizers)
+        updater = self.make_updater()
+        self._update_learning_rate(updater.optimizers)
         started = time.perf_counter()
         history: dict[str, list[th.Tensor]] = {}
-        with self.make_updater() as updater:
+        with updater.precision:
             for block in self.make_sampler().blocks(gradient_steps, batch_size):
                 first = updater.n_updates
                 for batch in block:

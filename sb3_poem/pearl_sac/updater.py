@@ -26,11 +26,6 @@ class EntropyCoefficient:
     target: float
 
     @property
-    def optimizers(self) -> list[th.optim.Optimizer]:
-        """The optimizer, if there is one."""
-        return [] if self.optimizer is None else [self.optimizer]
-
-    @property
     def value(self) -> th.Tensor:
         """The coefficient, a scalar without a graph."""
         return self.tensor if self.optimizer is None else self.tensor.detach().exp().squeeze()
@@ -45,7 +40,7 @@ class EntropyCoefficient:
 
 @dataclass
 class Updater:
-    """Changes the networks; a context, in which hidden layers compute in ``hidden_dtype``."""
+    """Changes the networks, in the context of its ``precision``, that of the hidden layers."""
 
     policy: LatentPolicy
     objective: Objective
@@ -58,23 +53,17 @@ class Updater:
 
     def __post_init__(self) -> None:
         policy, on_gpu = self.policy, self.policy.device.type == "cuda"
-        optimizers = [policy.optimizer, *self.entropy_coefficient.optimizers]
-        prepare_optimizers(optimizers, policy.device)
+        optimizers = policy.optimizer, self.entropy_coefficient.optimizer
+        self.optimizers = [optimizer for optimizer in optimizers if optimizer is not None]
+        prepare_optimizers(self.optimizers, policy.device)
         learning = [policy.encoder, policy.decoder, policy.actor]
         learning += [policy.critic, policy.critic_target]
-        self._precision = MixedPrecision(nn.ModuleList(learning), self.hidden_dtype)
+        self.precision = MixedPrecision(nn.ModuleList(learning), self.hidden_dtype)
         #: By whether everything learns
         self._steps: dict[bool, Callable[[MetaBatch], Metrics]]
         self._steps = {whole: partial(self._step, whole) for whole in (True, False)}
         if on_gpu and self.target_update_interval == 1:
             self._steps = {whole: GraphedStep(step) for whole, step in self._steps.items()}
-
-    def __enter__(self) -> "Updater":
-        self._precision.__enter__()
-        return self
-
-    def __exit__(self, *exception: Any) -> None:
-        self._precision.__exit__(*exception)
 
     def step(self, batch: MetaBatch) -> Metrics:
         """A step of everything or, in between, of critics and encoder. Returns what to log."""
@@ -83,7 +72,7 @@ class Updater:
         return metrics
 
     def _step(self, whole: bool, batch: MetaBatch) -> Metrics:
-        self._precision.refresh()
+        self.precision.refresh()
         loss, metrics = self.objective.loss(batch, self.entropy_coefficient.value, whole)
         metrics["gradient_norm"] = self._descend(loss)
         if whole:

@@ -242,7 +242,8 @@ def test_target_update_interval(algorithm: type[PEARLSAC]) -> None:
         small(algorithm, gradient_steps=0, target_update_interval=3, tau=1.0).learn(1),
         [],
     )
-    with model.make_updater() as updater:
+    updater = model.make_updater()
+    with updater.precision:
         for batch in model.make_sampler().sample(7, 16):
             updater.step(batch)
             copied.append(th.equal(target_networks(model), critic_networks(model)))
