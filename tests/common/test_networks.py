@@ -84,7 +84,7 @@ def test_actor_critics_and_decoder_normalise_when_asked(layer_norm: bool) -> Non
     decoder = RewardDecoder(10, [8], layer_norm=layer_norm)
     obs, two = th.randn(5, 3), th.randn(5, 2)
     networks = {
-        "actor": (actor.mlp, lambda: actor(obs, two)[0]),
+        "actor": (actor.mlp, lambda: actor(obs, two, th.zeros(5, 2))[0]),
         "critic": (critic.members[1], lambda: critic(obs, two, two)[1]),
         "decoder": (decoder.mlp, lambda: decoder(obs, two, obs, two)),
     }
