@@ -1,7 +1,5 @@
 """Ant with a hidden speed, direction or goal."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

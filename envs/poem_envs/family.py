@@ -4,8 +4,6 @@ parameter, the *task*.
 :class:`TaskFamily` is their base class; :mod:`poem_envs.vector` makes vectorised ones of them.
 """
 
-from __future__ import annotations
-
 from abc import ABCMeta, abstractmethod
 from typing import Any, ClassVar
 

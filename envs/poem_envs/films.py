@@ -2,8 +2,6 @@
 went, and several robots in one picture.
 """
 
-from __future__ import annotations
-
 import copy
 import itertools
 from collections.abc import Sequence
@@ -121,7 +119,7 @@ class MujocoFilms:
 
     #: How it is filmed.
     look = Look()
-    _film_renderer: FilmRenderer | None = None
+    _film_renderer: "FilmRenderer | None" = None
 
     def _simulation(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """The model, and the data that the simulation is at."""

@@ -1,7 +1,5 @@
 """Goal-conditioned environments as task families: the desired goal becomes the hidden task."""
 
-from __future__ import annotations
-
 import contextlib
 import sys
 from collections.abc import Callable, Iterable, Iterator

@@ -1,7 +1,5 @@
 """HalfCheetah with a hidden speed or direction."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Humanoid with a hidden direction."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Meta-World's benchmarks: placements of one manipulation (ML1), or of ten (ML10)."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """MuJoCo task families, any number of whose copies are stepped by MuJoCo's own threads."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Rendering of MuJoCo states, with a camera that follows the robot and markers for its task."""
 
-from __future__ import annotations
-
 import atexit
 import weakref
 from typing import Any

@@ -1,7 +1,5 @@
 """A point in the plane with a hidden goal on the half-circle: the smallest task family."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ A worker process starts with this module alone, so that user scripts need no ``i
 steps a group of its own meanwhile.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pickle

@@ -1,7 +1,5 @@
 """Environments of gymnasium-robotics as task families."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import mujoco

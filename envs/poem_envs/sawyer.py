@@ -1,7 +1,5 @@
 """Meta-World's Sawyer manipulations, made reproducible: a start depends on the placement alone."""
 
-from __future__ import annotations
-
 import copy
 import difflib
 import functools

@@ -1,7 +1,5 @@
 """Does an environment keep the contract of a task family? A check like SB3's ``check_env``."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cached_property, partial
 from typing import Any, NamedTuple
@@ -69,7 +67,7 @@ class Episode(NamedTuple):
     rewards: np.ndarray
     features: np.ndarray
 
-    def equals(self, other: Episode) -> bool:
+    def equals(self, other: "Episode") -> bool:
         """To the bit."""
         return all(np.array_equal(one, two) for one, two in zip(self, other, strict=True))
 

@@ -1,7 +1,5 @@
 """Many copies of a task family at once, the same as single ones bit for bit."""
 
-from __future__ import annotations
-
 import functools
 import os
 from abc import abstractmethod

@@ -1,11 +1,9 @@
 """What an algorithm needs to know of a task family, asked of any SB3 ``VecEnv`` of it."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cloudpickle
 import gymnasium as gym
@@ -16,10 +14,8 @@ from stable_baselines3.common import vec_env as sb3_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
 from poem_envs.family import definition_problem
+from sb3_poem.common.buffers import Segment
 from sb3_poem.common.checks import check_whole
-
-if TYPE_CHECKING:
-    from sb3_poem.common.buffers import Segment
 
 # Arguments that change how an environment is drawn, not what it is.
 DRAWING_ARGUMENTS = {"render_mode", "render_task"}
@@ -89,12 +85,12 @@ class FamilyView:
         self._experience_is_right = False
 
     @classmethod
-    def of(cls, env: VecEnv) -> FamilyView | None:
+    def of(cls, env: VecEnv) -> "FamilyView | None":
         """The family of an environment; None if it is of none."""
         return cls(env) if env.has_attr("shared_dynamics") else None
 
     @classmethod
-    def for_training(cls, env: VecEnv, horizon: int | None = None) -> FamilyView:
+    def for_training(cls, env: VecEnv, horizon: int | None = None) -> "FamilyView":
         """The same of what can be trained on: spaces fit, an episode's length is known, no wrapper
         changes what is seen, done or paid: those of Gymnasium and SB3 are refused by name, others
         by the first experience, see :meth:`check_experience`.

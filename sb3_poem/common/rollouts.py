@@ -1,19 +1,15 @@
 """Roll out many latent-conditioned policies in lockstep on one vector environment."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.family_view import FamilyView, demanded, reward_features, seed_copies
 from sb3_poem.common.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    from stable_baselines3.common.vec_env import VecEnv
 
 
 def rollout_latents(

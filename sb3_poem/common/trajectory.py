@@ -1,7 +1,5 @@
 """What an oracle is shown: one episode, without its rewards."""
 
-from __future__ import annotations
-
 import base64
 import io
 import zlib
@@ -88,7 +86,7 @@ class Trajectory:
         return {name: None if a is None else encode_array(a) for name, a in arrays.items()}
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Trajectory:
+    def from_dict(cls, data: dict[str, Any]) -> "Trajectory":
         """Read what :meth:`to_dict` wrote.
 
         :raises ValueError: If the data is incomplete or broken.

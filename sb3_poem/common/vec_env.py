@@ -1,7 +1,5 @@
 """SB3's face of a vectorised task family: infos are as with ``DummyVecEnv`` and ``Monitor``."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import functools
@@ -84,7 +82,6 @@ class TaskVecEnv(VecEnv):
         observation_space = vector_env.single_observation_space
         super().__init__(vector_env.num_envs, observation_space, vector_env.single_action_space)
         self.metadata = vector_env.metadata
-        self._actions: np.ndarray | None = None
         #: (num_envs, reward_feature_dim), those of the last step; None before the first
         self.last_reward_features: np.ndarray | None = None
         self._returns = np.zeros(self.num_envs)
@@ -116,13 +113,11 @@ class TaskVecEnv(VecEnv):
         return observations
 
     def step_async(self, actions: np.ndarray) -> None:
-        self._actions = actions
+        self._actions = actions  # of the step under way
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        if self._actions is None:
-            raise RuntimeError("step_wait() was called without step_async(actions)")
-        actions, self._actions = self._actions, None
-        observations, rewards, terminations, truncations, given = self.vector_env.step(actions)
+        stepped = self.vector_env.step(self._actions)
+        observations, rewards, terminations, truncations, given = stepped
         self.last_reward_features = features = given["reward_features"]
         self._returns += rewards
         self._lengths += 1
@@ -252,7 +247,7 @@ class _Copy:
         self.spec, self.max_episode_steps = vector_env.spec, vector_env.max_episode_steps
 
     @property
-    def unwrapped(self) -> _Copy:
+    def unwrapped(self) -> "_Copy":
         return self
 
     @property
