@@ -144,6 +144,8 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
     :param split: one of :attr:`splits`, to draw tasks from
     """
 
+    observation_space: spaces.Box
+    action_space: spaces.Box
     #: Where tasks live: a bounded box of shape ``(task_dim,)``.
     task_space: spaces.Box
     #: Every task of a finite family, ``(n, task_dim)``; None where there are infinitely many.
@@ -223,7 +225,6 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
         """
         if self._task is None:
             raise ResetNeeded("step() was called before the first reset()")
-        assert isinstance(self.action_space, spaces.Box)
         checked = checked_actions(action, self.action_space)
         self._elapsed_steps += 1
         observation, features, terminated = self._simulate(checked)

@@ -108,7 +108,7 @@ class GoalFamily(TaskFamily):
         boxes = [(own[key].low, own[key].high) for key in self._observed]
         low, high = (np.concatenate(b).astype(np.float64) for b in zip(*boxes, strict=True))
         self.observation_space = spaces.Box(low, high, dtype=np.float64)
-        self.action_space = self.env.action_space  # a Box, as check_goal_env saw to
+        self.action_space = self.env.action_space  # type: ignore[assignment]  # see check_goal_env
         self._rewards_broadcast = self._check_reward()
 
     def _make(self) -> gym.Env:

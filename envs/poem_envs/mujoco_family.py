@@ -177,15 +177,10 @@ class MujocoFamily(MujocoFilms, BatchFamily):
         markers = [] if task is None else self._task_markers(task, self._qpos[copy, :3])
         if self._renderer is None:
             camera = {**self.camera_config, **(self.default_camera_config or {})}
-            self._renderer = StateRenderer(
-                self.model,
-                self.width,
-                self.height,
-                fast=self._renders_fast,
-                max_geom=self.max_geom,
-                camera_name=self.camera_name,
-                default_cam_config=camera,
-            )
+            names = ("width", "height", "camera_name", "max_geom")
+            view: dict[str, Any] = {name: getattr(self, name) for name in names}
+            view["default_cam_config"] = camera
+            self._renderer = StateRenderer(self.model, fast=self._renders_fast, **view)
         return self._renderer.render(self.states[copy], render_mode, markers)
 
     def film_state(self) -> np.ndarray:

@@ -9,12 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from poem_envs.mujoco_rendering import (
-    close_viewers,
-    fit_buffer,
-    leave_out_details,
-    prepared_viewer,
-)
+from poem_envs.mujoco_rendering import close_viewers, fit_buffer, leave_out_details, prepared_viewer
 
 INSTALL = "pip install 'sb3_poem[metaworld]'"
 

@@ -168,6 +168,7 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
     """
 
     _reset_options: ClassVar[frozenset[str]] = frozenset({"tasks"})
+    single_action_space: spaces.Box
 
     def __init__(
         self,
@@ -204,8 +205,6 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
                 f"render_mode='human' shows one environment, but num_envs={num_envs}; use "
                 "'rgb_array'"
             )
-        assert isinstance(one.observation_space, spaces.Box)
-        assert isinstance(one.action_space, spaces.Box)
         self.metadata = {**one.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}
         self.num_envs = num_envs
         limit = getattr(one, "max_episode_steps", None)
@@ -316,7 +315,6 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         """Step every copy by ``(num_envs, action_dim)``; errors as of :meth:`TaskFamily.step`."""
         if self._tasks is None:
             raise ResetNeeded("step() was called before the first reset()")
-        assert isinstance(self.single_action_space, spaces.Box)
         checked = checked_actions(actions, self.single_action_space, self.num_envs)
         self._elapsed_steps += 1
         features, terminations = self._copies._advance(checked)
