@@ -45,13 +45,9 @@ class MetaWorldEnv(MujocoFilms, TaskFamily):
         super().__init__(**kwargs)
         self.observation_space = spaces.Box(-np.inf, np.inf, (OBSERVATION_DIM,), np.float64)
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
-        self._sawyer_arguments: dict[str, Any] = {
-            "renders_fast": renders_fast(render_quality, self.render_mode),
-            "render_mode": self.render_mode,
-            "width": width,
-            "height": height,
-            "camera_name": camera_name,
-        }
+        view = {"width": width, "height": height, "camera_name": camera_name}
+        fast = renders_fast(render_quality, self.render_mode)
+        self._sawyer_arguments = {"renders_fast": fast, "render_mode": self.render_mode, **view}
         # Meta-World's models have these cameras upside down.
         self._upside_down = (camera_name or "").startswith("corner")
         self._success = False
@@ -193,9 +189,6 @@ class MetaWorldML1Env(MetaWorldEnv):
     | `width`, `height` | **int**  | `480`       | Size of the rendered image, pixels           |
     | `camera_name`     | **str**  | `"corner2"` | One of Meta-World's cameras                  |
     | `render_quality`  | **str**  | `"full"`    | `"fast"` leaves out shadows and antialiasing |
-
-    ## Version History
-    * v0: Initial version
     """
 
     splits = ("train", "test")
@@ -212,10 +205,9 @@ class MetaWorldML1Env(MetaWorldEnv):
         placements = sawyer.placements_of(self.env_name)
         low, high = placements.low, placements.high
         self._reaching = self.shared_dynamics = self.env_name in REACHING
-        if self._reaching:
-            self.look = replace(self.look, hidden=("obj",))
         self.reward_feature_dim = 3 if self._reaching else 1
         if self._reaching:
+            self.look = replace(self.look, hidden=("obj",))
             self._puck_low, self._puck_high = low[:3].copy(), high[:3].copy()
             self._puck_high[1] = min(high[1], low[4] - PUCK_TO_GOAL)
             low, high = low[3:], high[3:]
@@ -280,9 +272,6 @@ class MetaWorldML10Env(MetaWorldEnv):
 
     ## Arguments
     `split`, and those of :class:`MetaWorldML1Env` but `env_name`.
-
-    ## Version History
-    * v0: Initial version
     """
 
     splits = ("train", "test", "held-out")

@@ -57,7 +57,7 @@ class StateRenderer:
 
 
 def renders_fast(render_quality: str, render_mode: str | None) -> bool:
-    """Whether images come from a :class:`FastRenderer`; refuses what is unknown or does not fit."""
+    """Whether images are to be drawn fast; refuses what is unknown or does not fit."""
     if render_quality not in RENDER_QUALITIES:
         raise ValueError(f"{render_quality=} must be one of {RENDER_QUALITIES}")
     if render_quality == "fast" and render_mode not in (None, "rgb_array"):
