@@ -229,7 +229,9 @@ class ProcessCopies:
                     results[index] = self._groups[index].receive()
                 except Exception as problem:
                     failures.append(problem)
-        except (KeyboardInterrupt, SystemExit):  # answers under way would be taken for later ones
+        except Exception:
+            raise
+        except BaseException:  # answers under way would be taken for later ones
             self._release()
             self._interrupted = True
             raise
