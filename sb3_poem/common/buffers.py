@@ -103,9 +103,8 @@ class TaskReplayBuffer(ReplayBuffer):
             start, count = int(self.positions[task]), int(self.counts[task])
             self._reserve(min(count + steps, self.buffer_size))
             slots = th.from_numpy((start + np.arange(steps)) % self.buffer_size).to(self.device)
-            overwritten = self.rows[task, slots[self.buffer_size - count :], self._mark]
-            released = overwritten[overwritten != 0].abs().cpu().numpy()
-            self._free_ends = np.concatenate([self._free_ends, released])
+            marked = self.rows[task, slots[self.buffer_size - count :], self._mark].cpu().numpy()
+            self._free_ends = np.concatenate([self._free_ends, np.abs(marked[marked != 0])])
             own_ends = np.flatnonzero(is_end[copy])
             numbers = self._store_ends(next_observations[copy, own_ends])
             marks = np.zeros(steps, dtype=np.int32)

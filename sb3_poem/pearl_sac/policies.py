@@ -138,7 +138,7 @@ class LatentPolicy(SACPolicy):
 
     def tensor(self, values: npt.ArrayLike) -> th.Tensor:
         """Numbers as float32 on the policy's device."""
-        return th.as_tensor(values, dtype=th.float32, device=self.device)
+        return th.as_tensor(values, dtype=th.float32, device=self.obs_norm.mean.device)
 
     def standardise(self, obs: th.Tensor) -> th.Tensor:
         """Standardised observations, bounded so that a fall does not saturate the networks."""
