@@ -298,7 +298,8 @@ def check_vector_parity(case: Case, env_id: str, env_kwargs: dict[str, Any]) -> 
             "bit, but do not: let both run the same code"
         )
 
-    singles: list[Any] = [gym.wrappers.TimeLimit(case.make(), horizon) for _ in range(n)]
+    singles = [case.make() for _ in range(n)]  # whose time limit is counted here
+    lengths = np.zeros(n, dtype=int)
     observations, _ = vector_env.reset(seed=case.seed)
     for i, single in enumerate(singles):
         compare(single.reset(seed=case.seed + i)[0], observations[i], "observations", "'s reset")
@@ -308,17 +309,20 @@ def check_vector_parity(case: Case, env_id: str, env_kwargs: dict[str, Any]) -> 
             tasks = case.tasks[[0, 1, 0]]
             vector_env.set_tasks(tasks)
             for single, task in zip(singles, tasks, strict=True):
-                single.unwrapped.set_task(task)
+                single.set_task(task)
         together = vector_env.step(np.stack([own[step] for own in actions]))
         observations, rewards, terminations, truncations, infos = together
         for i, single in enumerate(singles):
-            observation, reward, terminated, truncated, info = single.step(actions[i][step])
+            observation, reward, terminated, _, info = single.step(actions[i][step])
+            lengths[i] += 1
+            truncated = lengths[i] == horizon
             compare(reward, rewards[i], "rewards")
             compare((terminated, truncated), (terminations[i], truncations[i]), "ends")
             for key, value in info.items():
                 compare(value, infos[key][i], f"infos[{key!r}]")
             if terminated or truncated:
                 observation, _ = single.reset()
+                lengths[i] = 0
             compare(observation, observations[i], "observations")
     for env in (vector_env, *singles):
         env.close()
