@@ -228,7 +228,9 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         if isinstance(one, BatchFamily):
             self._copies, one.nthread = one, nthread
             one._allocate(num_envs)
-            one._describe = self._describer()  # type: ignore[assignment]
+            # no method of this object, which would live as long as the family does
+            facts = self._elapsed_steps, self._episodes, self._seeds
+            one._describe = functools.partial(_describe, *facts)  # type: ignore[method-assign]
         else:
             self._copies = ProcessCopies(make, num_envs, nthread, one.observation_space)
         self.closed = False
@@ -383,13 +385,12 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         ]
         self._rngs |= self._copies.begin(starts)  # which have drawn, in other processes
 
-    def _describer(self) -> Callable[[int], str]:
-        """A :meth:`BatchFamily._describe` that keeps no reference to this object."""
-        steps, episodes, seeds = self._elapsed_steps, self._episodes, self._seeds
-        return lambda copy: (
-            f"step {steps[copy]} of episode {episodes[copy]} since reset(seed={seeds[copy]}) in "
-            f"environment copy {copy}"
-        )
+
+def _describe(steps: np.ndarray, episodes: np.ndarray, seeds: dict[int, int], copy: int) -> str:
+    return (
+        f"step {steps[copy]} of episode {episodes[copy]} since reset(seed={seeds[copy]}) in "
+        f"environment copy {copy}"
+    )
 
 
 def set_task(env: Any, task: npt.ArrayLike) -> None:
