@@ -38,7 +38,8 @@ def make_model(latent_dim: int) -> POEMSAC:
     model = POEMSAC("MlpPolicy", "poem/HalfCheetahVel-v0", **settings)
     model.predicted_rewards_error = 0.05  # a trained model's; an untrained one has measured none
     means = np.random.default_rng(0).standard_normal((120, latent_dim))
-    model.train_tasks.set_posteriors(means, np.full((120, latent_dim), 0.01))
+    model.train_tasks.latent_means = means
+    model.train_tasks.latent_variances = np.full((120, latent_dim), 0.01)
     return model
 
 

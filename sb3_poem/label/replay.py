@@ -90,7 +90,7 @@ def _most_alike(model: Any, latents: np.ndarray, recorded: Trajectory) -> tuple[
     seen = recorded.observations[:-1]
     errors = []
     for latent in latents:
-        actions, _ = model.predict(seen, np.tile(latent, (len(seen), 1)), deterministic=True)
+        actions, _ = model.predict(seen, state=np.tile(latent, (len(seen), 1)), deterministic=True)
         errors.append(float(np.sqrt(np.mean(np.square(actions - recorded.actions)))))
     best = int(np.argmin(errors))
     return replace(recorded, latent=latents[best].copy()), errors[best]
