@@ -59,7 +59,7 @@ VARIANTS: dict[str, tuple[type[PEARLSAC], str, dict[str, Any]]] = {
     "POEMSAC PointGoal n_steps": (
         POEMSAC,
         POINT_GOAL,
-        {"n_steps": 3, "relabel_fraction": 0.5, "noise_color": 1},
+        {"n_steps": 3, "relabel_fraction": 0.5},
     ),
     "POEMSAC PointGoal rollouts": (POEMSAC, POINT_GOAL, {"preference_source": "rollout"}),
     "POEMSAC PointGoal ablations": (

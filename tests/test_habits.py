@@ -166,7 +166,7 @@ WITHOUT = [
     ),
     refused("train_freq", lambda _: made(train_freq=1), EPISODES),
     refused("train_freq tuple", lambda _: made(train_freq=(1, "episode")), EPISODES),
-    refused("action_noise", lambda _: made(action_noise=NOISE), "action_noise...noise_color"),
+    refused("action_noise", lambda _: made(action_noise=NOISE), "action_noise...target_entropy"),
     refused(
         "optimize_memory_usage",
         lambda _: made(optimize_memory_usage=True),
@@ -182,18 +182,20 @@ WITHOUT = [
         lambda _: made(replay_buffer_kwargs={}),
         "replay_buffer_kwargs...buffer_size|relabel",
     ),
-    refused("use_sde", lambda _: made(use_sde=True), "use_sde...noise_color"),
-    refused("sde_sample_freq", lambda _: made(sde_sample_freq=4), "sde_sample_freq...noise_color"),
+    refused("use_sde", lambda _: made(use_sde=True), "use_sde...target_entropy"),
+    refused(
+        "sde_sample_freq", lambda _: made(sde_sample_freq=4), "sde_sample_freq...target_entropy"
+    ),
     refused(
         "use_sde_at_warmup",
         lambda _: made(use_sde_at_warmup=True),
-        "use_sde_at_warmup...noise_color",
+        "use_sde_at_warmup...target_entropy",
     ),
-    refused("use_sde of the policy", lambda _: policy(use_sde=True), "use_sde...noise_color"),
+    refused("use_sde of the policy", lambda _: policy(use_sde=True), "use_sde...target_entropy"),
     refused(
         "log_std_init",
         lambda _: policy(log_std_init=-3),
-        "log_std_init...ent_coef|target_entropy|noise_color",
+        "log_std_init...ent_coef|target_entropy",
     ),
     refused(
         "features_extractor_class",

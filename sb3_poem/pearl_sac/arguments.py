@@ -28,12 +28,12 @@ LEAST = {
 OPTIONAL = ("n_train_tasks", "seed", "relabel_fraction", "context_relabel_fraction")
 #: The most of arguments that are numbers from 0 on
 MOST = {
-    **dict.fromkeys(("kl_coef", "reward_coef", "policy_coef", "noise_color"), np.inf),
+    **dict.fromkeys(("kl_coef", "reward_coef", "policy_coef"), np.inf),
     **dict.fromkeys(("gamma", "tau", "shaping_coef"), 1.0),
     **dict.fromkeys(("relabel_fraction", "context_relabel_fraction"), 1.0),
 }
 
-_NOISE = "training explores by the policy's own noise; with noise_color=1 it keeps a direction"
+_NOISE = "training explores by the policy's own noise; see ent_coef and target_entropy"
 _BUFFER = (
     "experience is kept for each training task, so that it can be relabelled for others, as HER "
     "does for goals; see buffer_size, relabel_fraction, and poem_envs.GoalFamily for "

@@ -1,12 +1,11 @@
 """The collection of an epoch: every training task is rolled out under its own latest latent."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 import torch as th
-from colorednoise import powerlaw_psd_gaussian
 
 from sb3_poem.common.buffers import Segment, TaskReplayBuffer
 from sb3_poem.common.family_view import FamilyView
@@ -33,7 +32,6 @@ class EpochCollector:
     replay_buffer: TaskReplayBuffer
     generators: Generators
     trajectories_per_task: int
-    noise_color: float
     explores: Callable[[], bool]
     episode_count: Callable[[], int]
     on_step: Callable[[dict[str, Any]], bool]
@@ -108,26 +106,17 @@ class EpochCollector:
     ) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
         """How to act: from observations to actions in the environment's units, and in [-1, 1]."""
         space, shape = self.policy.action_space, (len(latents), self.family.action_dim)
-        policy_action, noises = self.policy.acting_on(latents), self.action_noises(shape)
+        policy_action, device = self.policy.acting_on(latents), self.policy.device
 
         def act(obs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             if self.explores():
                 scaled = self.generators.numpy.uniform(-1.0, 1.0, shape).astype(np.float32)
             else:
-                scaled = policy_action(obs, next(noises))
+                noise = th.randn(shape, generator=self.generators.torch, device=device)
+                scaled = policy_action(obs, noise)
             return np.clip(self.policy.unscale_action(scaled), space.low, space.high), scaled
 
         return act
-
-    def action_noises(self, shape: tuple[int, int]) -> Iterator[th.Tensor]:
-        """Standard normal noise of each step of a horizon, (copies, action_dim)."""
-        device, color, rng = self.policy.device, self.noise_color, self.generators.numpy
-        if color == 0:
-            while True:
-                yield th.randn(shape, generator=self.generators.torch, device=device)
-        steps = max(2, self.family.horizon)
-        noise = powerlaw_psd_gaussian(color, (*shape, steps), random_state=rng)
-        yield from th.as_tensor(noise, dtype=th.float32, device=device).movedim(-1, 0)
 
 
 def in_waves(rows: np.ndarray, n_envs: int) -> np.ndarray:

@@ -105,9 +105,6 @@ class PEARLSAC(SAC):
         action changes values by a small part of their spread, as on the way to a place, they are
         learned sooner. Action values, those in POEM's contexts too, are then without that share.
         Needs a family with a potential
-    :param noise_color: Exponent b of the power spectrum 1 / f^b of the policy's noise in training
-        rollouts: 0 white, as in SAC; 1 pink, 2 red (Eberhard et al., ICLR 2023). Noise that keeps a
-        direction for some steps moves a robot farther
     :param policy_delay: Gradient steps of critics and encoder for each of everything else, that is
         the actor, the decoder, the embeddings and the entropy coefficient (as in TD3)
     :param horizon: Steps of an episode; None takes the environment's time limit
@@ -165,7 +162,6 @@ class PEARLSAC(SAC):
         reward_scale: float | str = "auto",
         n_steps: int = 3,
         shaping_coef: float = 0.0,
-        noise_color: float = 0.0,
         policy_delay: int = 2,
         horizon: int | None = None,
         precision: str = "auto",
@@ -193,7 +189,6 @@ class PEARLSAC(SAC):
         self.context_relabel_fraction = context_relabel_fraction
         self.reward_scale = reward_scale
         self.shaping_coef = shaping_coef
-        self.noise_color = noise_color
         self.policy_delay = policy_delay
         self.horizon = horizon
         self.precision = precision

@@ -73,7 +73,7 @@ FRACTIONS = ("gamma", "tau", "relabel_fraction", "shaping_coef")
                 value,
                 f"`{name}` must be {'at least 0' if value == -0.5 else 'a finite number'}, but is {value}",
             )
-            for name in ("kl_coef", "reward_coef", "policy_coef", "noise_color", *FRACTIONS)
+            for name in ("kl_coef", "reward_coef", "policy_coef", *FRACTIONS)
             for value in (-0.5, NAN)
         ],
         *[(name, 1.01, f"`{name}` must be at most 1, but is 1.01") for name in FRACTIONS],
@@ -121,11 +121,14 @@ def test_arguments_of_poem(argument: str, value: Any, message: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "instead"),
     [
-        ({"action_noise": NormalActionNoise(np.zeros(2), np.ones(2))}, "noise_color=1"),
+        (
+            {"action_noise": NormalActionNoise(np.zeros(2), np.ones(2))},
+            "ent_coef and target_entropy",
+        ),
         ({"optimize_memory_usage": True}, "buffer_size"),
-        ({"use_sde": True}, "noise_color=1"),
-        ({"sde_sample_freq": 4}, "noise_color=1"),
-        ({"use_sde_at_warmup": True}, "noise_color=1"),
+        ({"use_sde": True}, "ent_coef and target_entropy"),
+        ({"sde_sample_freq": 4}, "ent_coef and target_entropy"),
+        ({"use_sde_at_warmup": True}, "ent_coef and target_entropy"),
         ({"train_freq": 1}, "trajectories_per_task and gradient_steps"),
         (
             {"replay_buffer_class": HerReplayBuffer},

@@ -56,7 +56,6 @@ def collect(
         replay_buffer=SimpleNamespace(extend=stored.append),
         generators=generators,
         trajectories_per_task=1,
-        noise_color=0.0,
         explores=lambda: False,
         episode_count=lambda: 0,
         on_step=on_step,

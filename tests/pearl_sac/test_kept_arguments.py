@@ -16,7 +16,6 @@ ANT_GOAL = "poem/AntGoal-v0"  # has all that the arguments need
 def test_arguments_come_back(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
     arguments = {
         "n_steps": 2,
-        "noise_color": 1.0,
         "policy_delay": 2,
         "shaping_coef": 0.5,
     }
