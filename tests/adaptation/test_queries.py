@@ -44,7 +44,7 @@ def test_the_tolerance_widens_the_half_space():
     n=st.integers(2, 7),
     epsilon=st.sampled_from([0.0, 0.1, 0.4]),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_eq_10_against_brute_force(seed, m, n, epsilon):
     similarities = np.random.default_rng(seed).normal(size=(m, n))
 

@@ -84,7 +84,7 @@ class ListBuffer:
             self.kept[task] = (self.kept[task] + row)[-self.size :]
 
 
-@settings(max_examples=60, deadline=None, database=None, derandomize=True)
+@settings(max_examples=60)
 @given(
     size=st.integers(1, 20),
     n_tasks=st.integers(1, 4),
