@@ -56,25 +56,21 @@ SMALL: dict[str, Any] = {
 VARIANTS: dict[str, tuple[type[PEARLSAC], str, dict[str, Any]]] = {
     "POEMSAC PointGoal": (POEMSAC, POINT_GOAL, {}),
     "POEMSAC PointGoal fp32": (POEMSAC, POINT_GOAL, {"precision": "fp32", "policy_delay": 2}),
-    "POEMSAC PointGoal n_steps": (
-        POEMSAC,
-        POINT_GOAL,
-        {"n_steps": 3, "relabel_fraction": 0.5},
-    ),
+    "POEMSAC PointGoal n_steps": (POEMSAC, POINT_GOAL, {"n_steps": 1, "relabel_fraction": 0.2}),
     "POEMSAC PointGoal rollouts": (POEMSAC, POINT_GOAL, {"preference_source": "rollout"}),
     "POEMSAC PointGoal ablations": (
         POEMSAC,
         POINT_GOAL,
         {"similarity": "inner", "context": "pearl"},
     ),
-    "POEMSAC HalfCheetahVel": (POEMSAC, HALF_CHEETAH, {"relabel_fraction": 0.5}),
+    "POEMSAC HalfCheetahVel": (POEMSAC, HALF_CHEETAH, {}),
     "PEARLSAC PointGoal": (PEARLSAC, POINT_GOAL, {}),
     "PEARLSAC PointGoal contexts": (
         PEARLSAC,
         POINT_GOAL,
-        {"context_relabel_fraction": 0.5, "relabel_fraction": 0.5},
+        {"context_relabel_fraction": 0.0, "relabel_fraction": 0.2},
     ),
-    "PEARLSAC HalfCheetahVel n_steps": (PEARLSAC, HALF_CHEETAH, {"n_steps": 3}),
+    "PEARLSAC HalfCheetahVel n_steps": (PEARLSAC, HALF_CHEETAH, {"n_steps": 5}),
 }
 
 
