@@ -390,5 +390,6 @@ class FilmRenderer(StateRenderer):
     def _add_shape(
         self, kind: int, place: np.ndarray, size: np.ndarray, colour: Sequence[float]
     ) -> None:
-        rgba = np.array([*colour, 1.0])
-        self._viewer._add_marker_to_scene({"type": kind, "pos": place, "size": size, "rgba": rgba})
+        shape, upright = self._scene.geoms[self._scene.ngeom], np.eye(3).ravel()
+        mujoco.mjv_initGeom(shape, kind, size, place, upright, np.array([*colour, 1.0], np.float32))
+        self._scene.ngeom += 1

@@ -73,9 +73,9 @@ class AdaptationEvalCallback(EpochCallback):
             raise ValueError(f"record_at must hold at least one number, got {record_at!r}")
         self.n_tasks, self.n_episodes, self.seed = n_tasks, n_episodes, seed
         self.record_at = tuple(record_at)
-        self._best_model: Path | None = None
-        if best_model_save_path is not None:
-            self._best_model = Path(best_model_save_path) / "best_model.zip"
+        folder = best_model_save_path
+        self.best_model_save_path = None if folder is None else Path(folder)
+        self._best_model = None if folder is None else Path(folder) / "best_model.zip"
         self.adaptation_kwargs = dict(adaptation_kwargs or {})
         self.env_kwargs = dict(env_kwargs or {})
         for name in self.adaptation_kwargs:

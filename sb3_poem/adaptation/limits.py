@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 from scipy.optimize import minimize_scalar
-from scipy.stats import entropy
+from scipy.special import entr
 
 from sb3_poem.adaptation.noise import BoltzmannNoise, ExactNoise, MistakeNoise, NoiseModel
 
@@ -236,7 +236,7 @@ def answer_capacity(noise: NoiseModel | None, spread: float, n_answers: int = 2)
             odds = np.exp(min(2.0 if noise.beta is None else noise.beta * spread, 700.0))
             rows = [[*[odds] * r, *[1.0] * (4 - r)] for r in (1, 2, 3)]
         said = np.array(rows) / np.sum(rows, axis=1, keepdims=True)
-        return float(2.0 - entropy(said, base=2, axis=1).min())
+        return float(2.0 - entr(said).sum(axis=1).min() / np.log(2.0))
     if isinstance(noise, MistakeNoise):
         mistake = noise.rate
     elif isinstance(noise, BoltzmannNoise):
@@ -248,7 +248,7 @@ def answer_capacity(noise: NoiseModel | None, spread: float, n_answers: int = 2)
     else:
         known, name = "ExactNoise, MistakeNoise or BoltzmannNoise", type(noise).__name__
         raise ValueError(f"`noise_model` must be {known}, but is of type {name}")
-    told = 1.0 - float(entropy([mistake, 1.0 - mistake], base=2))
+    told = 1.0 - float(entr([mistake, 1.0 - mistake]).sum()) / np.log(2.0)
     return float(np.log2(n_answers // 2 * 2.0**told + n_answers % 2))
 
 

@@ -77,7 +77,10 @@ class _Noise:
     """The larger return is perceived to be larger, unless a subclass says otherwise."""
 
     kind: str
-    mistakes = 0.0
+
+    @property
+    def mistakes(self) -> float:
+        return 0.0
 
     def probability_above(self, difference: Values, error: Values, magnitude: Values) -> Any:
         return _logistic(difference, PROBIT_SLOPE / np.maximum(error, 1e-12))
@@ -118,7 +121,7 @@ class MistakeNoise(_Noise):
             raise ValueError(f"`rate` must lie in [0, 0.5], but is {self.rate}")
 
     @property
-    def mistakes(self) -> float:  # type: ignore[override]
+    def mistakes(self) -> float:
         return self.rate
 
     def probability_left(self, difference: Values, error: Values, magnitude: Values) -> Any:

@@ -59,10 +59,9 @@ def kernel_neighbours(
     """A neighbour of each particle (n, d), without a look at the likelihood.
 
     The kernel shrinks towards the mean as much as it spreads by the covariance, so that both stay
-    (Liu & West 2001). Where the prior has holes
-    (between the modes of a mixture, off the surface on which its latents lie) there should be no
-    particles however the likelihood looks: then a step is taken with the ratio of the prior's
-    densities.
+    (Liu & West 2001). Where the prior has holes (between the modes of a mixture, off the surface on
+    which its latents lie) there should be no particles however the likelihood looks: then a step is
+    taken with the ratio of the prior's densities.
 
     :param width: Of the kernel, as a share of the particles' spread, in (0, 1).
     :param log_prior: Maps (m, d) to (m,), up to a constant; None where the prior has no holes.
