@@ -89,7 +89,8 @@ class _FamilyType(ABCMeta):
                 "poem_envs.TaskFamily"
             )
         if not has_display():  # Gymnasium's checker tries every mode that is named
-            modes = [mode for mode in family.metadata["render_modes"] if mode != "human"]
+            modes = family.metadata.get("render_modes", ())
+            modes = [mode for mode in modes if mode != "human"]
             family.metadata = {**family.metadata, "render_modes": modes}
         return family
 
@@ -351,14 +352,15 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
             )
         if self.all_tasks is None:
             return clipped
-        distance = np.abs(clipped[..., None, :] - self.all_tasks).max(axis=-1)
+        all_tasks = np.asarray(self.all_tasks, dtype=np.float64)
+        distance = np.abs(clipped[..., None, :] - all_tasks).max(axis=-1)
         member = distance.min(axis=-1) <= BOUNDS_TOLERANCE
         if not member.all():
             raise ValueError(
                 f"{_first(array, ~member, name)} is not among this family's tasks, which are "
-                f"{self.all_tasks.tolist()}"
+                f"{all_tasks.tolist()}"
             )
-        return self.all_tasks[distance.argmin(axis=-1)]
+        return all_tasks[distance.argmin(axis=-1)]
 
 
 def task_stream(rng: np.random.Generator) -> np.random.Generator:
@@ -372,7 +374,7 @@ def check_render_mode(render_mode: str | None, metadata: dict[str, Any]) -> None
     :raises TypeError: if it cannot render at all; upon that SB3's ``make_vec_env``, which always
         asks, makes it without
     """
-    modes = metadata["render_modes"]
+    modes = metadata.get("render_modes")
     if render_mode is None:
         return
     if not modes:

@@ -4,6 +4,7 @@ costs.
 
 import subprocess
 import sys
+from typing import ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -14,7 +15,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 from worlds import Walk1D
 
-from poem_envs import TaskFamily, sawyer
+from poem_envs import TaskFamily, TaskFamilyVector, sawyer
+from poem_envs.testing import check_task_family
 
 
 @pytest.mark.filterwarnings("ignore:.*A Box observation space m.*imum value is")
@@ -91,6 +93,29 @@ class NoSpaces(TaskFamily):
 def test_what_a_family_lacks_is_said_when_it_is_made(family, message):
     with pytest.raises(TypeError, match=message):
         family()
+
+
+@pytest.mark.parametrize("all_tasks", [[[-1.0], [1.0]], np.array([[-1], [1]])])
+def test_finitely_many_tasks_as_numbers_of_any_kind(all_tasks):
+    class Two(Walk1D):
+        pass
+
+    Two.all_tasks = all_tasks
+    check_task_family(Two)
+    single, several = Two(), TaskFamilyVector(Two, num_envs=2, nthread=1, max_episode_steps=5)
+    single.set_task([1.0])
+    single.reset(seed=0)
+    several.set_tasks([[1.0], [-1.0]])
+    several.reset(seed=0)
+    assert single.task.dtype == np.float64
+    assert np.array_equal(several.tasks[0], single.task)
+
+
+def test_metadata_without_render_modes():
+    class Blind(Walk1D):
+        metadata: ClassVar = {"render_fps": 20}
+
+    assert Blind().metadata["render_fps"] == 20
 
 
 def run_python(code):
