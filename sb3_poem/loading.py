@@ -47,7 +47,7 @@ def load_model(name: str | Path, device: th.device | str = "auto") -> PEARLSAC:
     :raises ValueError: if a file is truncated, or of another program
     """
     path = Path(name)
-    archive = path if path.is_file() else path.with_name(f"{path.name}.zip")
+    archive = path if path.is_file() else Path(f"{path}.zip")
     if archive.suffix == ".safetensors":
         instead = "AdaptedPolicy.load reads a policy, and of a model name the folder"
         raise ValueError(f"{name} holds no whole model: {instead}")

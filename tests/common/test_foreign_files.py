@@ -95,6 +95,13 @@ READERS: dict[str, Callable[[Path], Any]] = {
 reader = pytest.mark.parametrize("read", READERS.values(), ids=READERS)
 
 
+def test_the_working_folder_may_be_the_models(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder / "model")
+    assert load_model(".").digest == load_model(folder / "model").digest
+
+
 @reader
 def test_a_sound_file_is_read(folder: Path, read: Callable[[Path], Any]) -> None:
     spoil(folder, {"card": {"note": "of somebody else"}})
