@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 from poem_envs.family import TaskFamily, check_options
 from poem_envs.registration import plain_id
 from poem_envs.vector import TaskFamilyVector
+from sb3_poem.common.checks import check_whole
 from sb3_poem.common.family_view import no_family
 
 # What these do, the vectorised environment or TaskVecEnv does itself.
@@ -221,6 +222,7 @@ def make_task_vec_env(
     :param nthread: As of :class:`TaskVecEnv`
     :param env_kwargs: Arguments of the environment
     """
+    check_whole("n_envs", n_envs, 1)
     env_id = plain_id(env_id)
     make = functools.partial(gym.make, env_id, **env_kwargs)
     if gym.spec(env_id).vector_entry_point is not None:
@@ -258,6 +260,10 @@ class _Copy:
     @property
     def np_random(self) -> np.random.Generator:
         return self._vector_env.np_random[self._index]
+
+    @property
+    def np_random_seed(self) -> int:
+        return self._vector_env.np_random_seed[self._index]
 
     def set_task(self, task: npt.ArrayLike) -> None:
         self._vector_env.set_tasks([np.asarray(task)], copies=[self._index])

@@ -137,6 +137,7 @@ def test_seeding():
     assert np.array_equal(env.reset(), first)
     single = gym.make("poem/HalfCheetahVel-v0")
     assert np.array_equal(single.reset(seed=6)[0], first[2])
+    assert env.get_attr("np_random_seed") == [4, 5, 6]
 
 
 def test_only_the_first_function_is_called():
@@ -210,6 +211,9 @@ def test_refused_environments():
             TaskVecEnv([make] * 2)
     with pytest.raises(ValueError, match="env_fns is empty"):
         TaskVecEnv([])
+    for n_envs in (0, 2.5):
+        with pytest.raises(ValueError, match="`n_envs` must be"):
+            make_task_vec_env("poem/PointGoal-v0", n_envs)
 
 
 def test_bad_actions_and_options():
