@@ -95,7 +95,7 @@ class PEARLSAC(SAC):
         policy does rather than from the rewards, and is then at a loss when it sees a new task's
         first rollouts. Needs a family with shared dynamics; None: 0.5 of those, else 0
     :param reward_scale: Factor on the rewards that the critics learn; "auto" divides by the
-        deviation of the first epoch's
+        deviation of the first epoch's, or leaves them as they are where these do not differ
     :param n_steps: Steps of rewards in the critics' targets before the value takes over; more carry
         rewards back faster, and rely more on what older policies, and with ``relabel_fraction``
         other tasks', did
@@ -390,8 +390,7 @@ class PEARLSAC(SAC):
         beyond = (obs.abs() == OBSERVATION_CLIP).any(dim=-1).float().mean()
         self.logger.record("train/clipped_observations", beyond.item())
         actions, rewards = tensor(epoch.actions), tensor(epoch.rewards)
-        deviation = max(float(rewards.std()), MIN_STD)
-        self.context_reward_statistics = float(rewards.mean()), deviation
+        self.context_reward_statistics = float(rewards.mean()), float(_unit(rewards.std()))
         parts = [obs, actions, next_obs, _standardised(rewards)[..., None]]
         if policy.context_has_value:  # eq. 8; 0 before the first update (Algorithm 1, line 2)
             values = th.zeros_like(rewards)
@@ -522,7 +521,7 @@ class PEARLSAC(SAC):
         """What gradient steps minimise."""
         auto, variance = self.reward_scale == "auto", self._known_context.rewards.var()
         scale = 1.0 / self.policy.reward_norm.std if auto else float(self.reward_scale)
-        variance = variance.clamp(min=MIN_STD**2)
+        variance = _unit(variance, MIN_STD**2)
         return self._part(self.objective_class, reward_scale=scale, reward_variance=variance)
 
     def make_updater(self) -> Updater:
@@ -783,4 +782,9 @@ class PEARLSAC(SAC):
 
 
 def _standardised(values: th.Tensor) -> th.Tensor:
-    return (values - values.mean()) / values.std().clamp(min=MIN_STD)
+    return (values - values.mean()) / _unit(values.std())
+
+
+def _unit(deviation: th.Tensor, least: float = MIN_STD) -> th.Tensor:
+    """What to divide values of this deviation by: 1 where they do not differ."""
+    return th.where(deviation > least, deviation, 1.0)

@@ -379,6 +379,34 @@ def test_sample_latents_and_sources(algorithm: type[PEARLSAC]) -> None:
         model.sample_latents(3, np.random.default_rng(0), "posterior")
 
 
+class Distant(Walk):
+    """Rewards are far away: in the first epoch there is none."""
+
+    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
+        return (np.abs(features[..., 0] - tasks[..., 0]) > 100.0).astype(np.float64)
+
+
+def test_rewards_that_do_not_differ_yet_keep_their_unit(algorithm: type[PEARLSAC]) -> None:
+    model = small(algorithm, walks(4, Distant), horizon=10).learn(1)
+    assert model.make_objective().reward_scale == 1.0
+    assert model.make_objective().reward_variance == 1.0
+    assert model.context_reward_statistics == (0.0, 1.0)
+    assert model.policy.reward_norm.std == 1.0
+
+
+@pytest.mark.filterwarnings("ignore:.*degrees of freedom")
+def test_one_step_of_one_task(algorithm: type[PEARLSAC]) -> None:
+    model = small(algorithm, walks(1, steps=1), horizon=1, n_train_tasks=1).learn(3)
+    assert (model.epoch, model._n_updates) == (3, 15)
+
+
+def test_numbers_of_numpy(algorithm: type[PEARLSAC]) -> None:
+    numbers = {"seed": np.int64(3), "reward_scale": np.float32(0.5), "latent_dim": np.int32(2)}
+    model = small(algorithm, **numbers).learn(1)
+    plain = small(algorithm, seed=3, reward_scale=0.5, latent_dim=2).learn(1)
+    assert not differing(parameters(model), parameters(plain))
+
+
 def test_no_task_family_after_all(algorithm: type[PEARLSAC]) -> None:
     """It has some of what a family has."""
 
