@@ -57,7 +57,8 @@ def make_segment(shape: tuple[int, int, int], rng: np.random.Generator) -> Segme
 def make_buffer(size: int, shape: tuple[int, int, int]) -> TaskReplayBuffer:
     obs_dim, action_dim, feature_dim = shape
     obs, action = spaces.Box(-np.inf, np.inf, (obs_dim,)), spaces.Box(-1.0, 1.0, (action_dim,))
-    return TaskReplayBuffer(size, obs, action, "cpu", n_tasks=N_TASKS, feature_dim=feature_dim)
+    tasks = np.zeros((N_TASKS, 1))
+    return TaskReplayBuffer(size, obs, action, "cpu", tasks=tasks, feature_dim=feature_dim)
 
 
 def filling(size: int, marks: tuple[float, ...] = (0.1, 0.25, 0.5, 1.0)) -> list[dict[str, Any]]:

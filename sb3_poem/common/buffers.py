@@ -49,6 +49,8 @@ class TaskReplayBuffer(ReplayBuffer):
     single gather, of rows that reach into their successors. What follows an end is kept apart.
     Actions are stored in 16 bits (to within 1.6e-5 of their range from -1 to 1), all else as
     float32. ``buffer_size`` transitions are kept per task; memory is taken as it fills.
+
+    :param tasks: Whose experience it is, ``(n_tasks, task_dim)``
     """
 
     def __init__(
@@ -59,15 +61,14 @@ class TaskReplayBuffer(ReplayBuffer):
         device: th.device | str = "auto",
         n_envs: int = 1,
         optimize_memory_usage: bool = False,
-        n_tasks: int = 1,
-        feature_dim: int = 1,
+        *,
+        tasks: np.ndarray,
+        feature_dim: int,
     ) -> None:
-        BaseBuffer.__init__(
-            self, buffer_size, observation_space, action_space, get_device(device), n_envs=n_tasks
-        )
-        self.n_tasks = n_tasks
-        self.optimize_memory_usage = False
-        self.handle_timeout_termination = True
+        place = get_device(device)
+        BaseBuffer.__init__(self, buffer_size, observation_space, action_space, place, len(tasks))
+        self.tasks, self.n_tasks = tasks, len(tasks)
+        self.handle_timeout_termination = True  # SB3 looks for it in what it loads
         assert isinstance(observation_space, spaces.Box)
         self.obs_dim = int(observation_space.shape[0])
         #: Words of a row: observation, features, reward, mark of an end, actions (two a word)

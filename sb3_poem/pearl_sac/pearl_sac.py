@@ -242,8 +242,8 @@ class PEARLSAC(SAC):
             self.task_space, self.reward_feature_dim = family.task_space, family.reward_feature_dim
             self.train_tasks = TrainTasks.draw(family, self.n_train_tasks, self.latent_dim, rng)
         self._complete_policy_kwargs()
-        n_tasks, feature_dim = len(self.train_tasks), self.reward_feature_dim
-        self.replay_buffer_kwargs = {"n_tasks": n_tasks, "feature_dim": feature_dim}
+        tasks, feature_dim = self.train_tasks.tasks, self.reward_feature_dim
+        self.replay_buffer_kwargs = {"tasks": tasks, "feature_dim": feature_dim}
         with warnings.catch_warnings():
             # SB3 says that another replay buffer ignores n_steps; our sampler does not
             warnings.filterwarnings("ignore", "`n_steps=")
@@ -659,6 +659,24 @@ class PEARLSAC(SAC):
             if isinstance(error.__context__, (OSError, KeyboardInterrupt)):
                 raise error.__context__ from None
             raise
+
+    def load_replay_buffer(
+        self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True
+    ) -> None:
+        """As SB3's.
+
+        :raises ValueError: if it is the experience of other tasks than this model's
+        """
+        own = self.replay_buffer
+        super().load_replay_buffer(path, truncate_last_traj)
+        loaded = self.replay_buffer
+        same_rows = getattr(loaded, "widths", None) == own.widths
+        if not (same_rows and np.array_equal(loaded.tasks, own.tasks)):
+            self.replay_buffer = own
+            raise ValueError(
+                f"{path} is the experience of other tasks than this model's training tasks, which "
+                "have rewards of their own: load what was saved with the model"
+            )
 
     @classmethod
     def load(

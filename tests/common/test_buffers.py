@@ -24,7 +24,7 @@ WIDTHS = {
 
 
 def make_buffer(size: int, n_tasks: int) -> TaskReplayBuffer:
-    return TaskReplayBuffer(size, OBS, ACTION, "cpu", n_tasks=n_tasks, feature_dim=4)
+    return TaskReplayBuffer(size, OBS, ACTION, "cpu", tasks=np.zeros((n_tasks, 1)), feature_dim=4)
 
 
 def fields_of(numbers: np.ndarray) -> dict[str, np.ndarray]:
@@ -218,7 +218,9 @@ def test_ends_do_not_pile_up() -> None:
 def test_takes_three_fifths_of_the_memory_of_plain_transitions() -> None:
     obs_dim, action_dim, steps, tasks = 27, 8, 200, 2
     space, actions = spaces.Box(-np.inf, np.inf, (obs_dim,)), spaces.Box(-1.0, 1.0, (action_dim,))
-    buffer = TaskReplayBuffer(4000, space, actions, "cpu", n_tasks=tasks, feature_dim=3)
+    buffer = TaskReplayBuffer(
+        4000, space, actions, "cpu", tasks=np.zeros((tasks, 1)), feature_dim=3
+    )
     rng = np.random.default_rng(0)
     for _ in range(20):
         states = rng.standard_normal((tasks, steps + 1, obs_dim)).astype(np.float32)
@@ -252,4 +254,6 @@ def test_reset_forgets() -> None:
 
 def test_needs_a_flat_box() -> None:
     with pytest.raises((AssertionError, ValueError)):
-        TaskReplayBuffer(10, spaces.Discrete(3), ACTION, "cpu", n_tasks=1, feature_dim=1)
+        TaskReplayBuffer(
+            10, spaces.Discrete(3), ACTION, "cpu", tasks=np.zeros((1, 1)), feature_dim=1
+        )

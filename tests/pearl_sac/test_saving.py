@@ -227,6 +227,37 @@ def test_replay_buffer_saves_alone(algorithm: type[PEARLSAC], tmp_path: Path) ->
     assert other.replay_buffer.size() == 2 * EPOCH
 
 
+@one_is_enough
+@pytest.mark.parametrize("other", [{"seed": 5}, {"n_train_tasks": 5}, {"n_train_tasks": 20}])
+def test_a_replay_buffer_of_other_tasks_is_refused(
+    algorithm: type[PEARLSAC], tmp_path: Path, other: dict[str, int]
+) -> None:
+    small(algorithm).learn(EPOCH).save_replay_buffer(tmp_path / "buffer")
+    model = small(algorithm, **other)
+    with pytest.raises(ValueError, match="buffer is the experience of other tasks than"):
+        model.load_replay_buffer(tmp_path / "buffer")
+    assert model.learn(1).replay_buffer.size() == model.num_timesteps  # and it goes on
+    foreign = SAC("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [4]}, buffer_size=10)
+    foreign.save_replay_buffer(tmp_path / "of_sac")
+    with pytest.raises(ValueError, match="of_sac is the experience of other tasks than"):
+        model.load_replay_buffer(tmp_path / "of_sac")
+
+
+@one_is_enough
+def test_a_model_and_its_buffer_go_on_as_if_they_had_never_stopped(
+    algorithm: type[PEARLSAC], tmp_path: Path
+) -> None:
+    """SB3's way, of ``save`` and ``save_replay_buffer``."""
+    whole = small(algorithm).learn(2 * EPOCH)
+    half = small(algorithm).learn(EPOCH)
+    half.save(tmp_path / "model")
+    half.save_replay_buffer(tmp_path / "buffer")
+    loaded = algorithm.load(tmp_path / "model", POINT_GOAL, device="cpu")
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    loaded.learn(EPOCH, reset_num_timesteps=False)
+    assert not differing(parameters(whole), parameters(loaded))
+
+
 def test_parameters_come_with_their_standardisation(trained: PEARLSAC) -> None:
     copy = small(type(trained), gradient_steps=0)
     copy.set_parameters(trained.get_parameters())
