@@ -104,7 +104,7 @@ def check_arguments(given: Mapping[str, Any], algorithm: type) -> None:
             check_number(name, given[name], 0.0, most)
     check_number_or_auto("ent_coef", given["ent_coef"], 0.0)
     check_number_or_auto("target_entropy", given["target_entropy"])
-    if scale != "auto" and not (isinstance(scale, int | float) and scale > 0):
+    if scale != "auto" and not (isinstance(scale, int | float | np.number) and 0 < scale < np.inf):
         raise ValueError(f'reward_scale must be a positive number or "auto", got {scale!r}')
     if given["shaping_coef"] > 0 and given["gamma"] == 1:
         raise ValueError("shaping_coef must be 0 with gamma=1: staying has no finite value then")

@@ -176,7 +176,7 @@ class PEARLSAC(SAC):
     ) -> None:
         refuse_unknown(unsupported, type(self))
         arguments = locals()
-        check_arguments(arguments, type(self))
+        self._check_arguments(arguments)
         self.n_train_tasks = n_train_tasks
         self.meta_batch_size = meta_batch_size
         self.context_size = context_size
@@ -227,6 +227,10 @@ class PEARLSAC(SAC):
             "policy_kwargs": dict(policy_kwargs or {}),  # ours to complete, not the caller's
         }
         super().__init__(**inherited)
+
+    def _check_arguments(self, given: Mapping[str, Any]) -> None:
+        """Refuse the first that is outside its range."""
+        check_arguments(given, type(self))
 
     def __repr__(self) -> str:
         env_id, steps = getattr(self, "env_id", None), self.num_timesteps
@@ -701,6 +705,7 @@ class PEARLSAC(SAC):
             env = vectorise(env, data["n_envs"])
         others = (custom_objects, print_system_info, force_reset)
         model = super().load(path, env, device, *others, **kwargs)
+        model._check_arguments(vars(model))
         if kwargs.get("seed") is not None:
             model.set_random_seed(kwargs["seed"])
         return model

@@ -1,5 +1,6 @@
 """POEM: meta-RL whose task embedding preserves the order of preferences."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -18,6 +19,13 @@ from sb3_poem.pearl_sac.pearl_sac import PEARLSAC
 from sb3_poem.pearl_sac.sampler import MetaBatchSampler
 from sb3_poem.poem_sac.objective import POEMObjective
 from sb3_poem.poem_sac.policies import MlpPolicy, POEMPolicy
+
+#: Arguments that are words, and which
+CHOICES = {
+    "similarity": ("two-encoder", "cosine", "inner"),
+    "context": ("optimal", "pearl"),
+    "preference_source": ("auto", "relabel", "rollout"),
+}
 
 
 @dataclass
@@ -95,21 +103,7 @@ class POEMSAC(PEARLSAC):
         **kwargs: Any,
     ) -> None:
         refuse_unknown(kwargs.keys() & {"context_relabel_fraction"}, type(self))
-        check_number("preference_coef", preference_coef, 0.0)
-        check_whole("preference_group_size", preference_group_size, 2)
-        for name, value, known in (
-            ("similarity", similarity, ("two-encoder", "cosine", "inner")),
-            ("context", context, ("optimal", "pearl")),
-            ("preference_source", preference_source, ("auto", "relabel", "rollout")),
-        ):
-            if value not in known:
-                names = ", ".join(map(repr, known))
-                raise ValueError(f"{name} must be one of {names}, got {value!r}")
         self.preference_coef = preference_coef
-        if not 0.0 < similarity_temperature < float("inf"):
-            raise ValueError(
-                f"similarity_temperature must be positive and finite, got {similarity_temperature}"
-            )
         self.similarity = similarity
         self.similarity_temperature = similarity_temperature
         self.context = context
@@ -120,6 +114,17 @@ class POEMSAC(PEARLSAC):
         kwargs |= {"kl_coef": kl_coef, "reward_coef": reward_coef, "policy_coef": policy_coef}
         kwargs["context_relabel_fraction"] = 0.0
         super().__init__(policy, env, *args, **kwargs)
+
+    def _check_arguments(self, given: Mapping[str, Any]) -> None:
+        super()._check_arguments(given)
+        check_number("preference_coef", self.preference_coef, 0.0)
+        check_number("similarity_temperature", self.similarity_temperature, 1e-6)
+        check_whole("preference_group_size", self.preference_group_size, 2)
+        for name, known in CHOICES.items():
+            value = getattr(self, name)
+            if value not in known:
+                names = ", ".join(map(repr, known))
+                raise ValueError(f"{name} must be one of {names}, got {value!r}")
 
     def _complete_policy_kwargs(self) -> None:
         super()._complete_policy_kwargs()

@@ -291,6 +291,27 @@ def test_arguments_of_a_model_that_is_loaded(
             algorithm.load(tmp_path / "m.zip", **{name: value})
 
 
+@one_is_enough
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("gamma", 1.5),
+        ("batch_size", 0),
+        ("reward_scale", float("inf")),
+        ("preference_coef", -1.0),
+        ("preference_source", "human"),
+    ],
+)
+def test_an_argument_outside_its_range(
+    algorithm: type[PEARLSAC], tmp_path: Path, name: str, value: Any
+) -> None:
+    """Whether a model is made or loaded."""
+    small(algorithm).save(tmp_path / "m.zip")
+    for make in (small, lambda kind, **given: kind.load(tmp_path / "m.zip", **given)):
+        with pytest.raises(ValueError, match=name):
+            make(algorithm, **{name: value})
+
+
 def test_a_seed_changes_what_follows(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
     small(algorithm).learn(EPOCH).save(tmp_path / "m.zip")
 

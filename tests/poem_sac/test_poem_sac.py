@@ -396,7 +396,7 @@ def test_the_cosine_has_a_scale_of_its_own(tmp_path: Path) -> None:
         ValueError, match=r"similarity_temperature is 0\.2 in .* cannot become 0\.5"
     ):
         POEMSAC.load(tmp_path / "model.zip", device="cpu", similarity_temperature=0.5)
-    with pytest.raises(ValueError, match="similarity_temperature must be positive and finite"):
+    with pytest.raises(ValueError, match="`similarity_temperature` must be at least 1e-06"):
         small(POEMSAC, similarity="cosine", similarity_temperature=0.0)
 
 
