@@ -284,17 +284,19 @@ class PEARLSAC(SAC):
         """
         entry = zoo_entry(config_file(cls.zoo_name), plain_id(env_id), **arguments)
         timesteps, n_envs = int(entry.pop("n_timesteps")), entry.pop("n_envs", None)
+        entry.setdefault("env", env_id)
         rate = entry.get("learning_rate")
         if isinstance(rate, str):  # rl_zoo3's syntax
             entry["learning_rate"] = LinearSchedule(float(rate.removeprefix("lin_")), 0.0, 1.0)
-        entry["env"] = vectorise(entry.get("env", env_id), n_envs)
+        if n_envs is not None:
+            entry["env"] = vectorise(entry["env"], n_envs)
         model = cls(**entry)
         model.n_timesteps = timesteps
         return model
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """As SB3's: what follows depends on the seed. The training tasks stay."""
-        super().set_random_seed(seed)
+        super().set_random_seed(None if seed is None else int(seed))  # random takes no NumPy's
         if seed is not None:
             self.generators = Generators(seed, self.device)
 

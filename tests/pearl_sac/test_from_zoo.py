@@ -53,6 +53,24 @@ def test_every_entry_makes_a_model(algorithm: type[PEARLSAC]) -> None:
         assert model.n_timesteps > 0
 
 
+@pytest.mark.parametrize(
+    ("env_id", "arguments", "n_envs"),
+    [
+        (POINT_GOAL, {"n_train_tasks": 10}, 10),  # more copies would collect tasks twice
+        ("poem/HalfCheetahFwdBack-v0", {}, 120),  # two tasks, sixty rollouts of each
+        (POINT_GOAL, {"n_train_tasks": 10, "n_envs": 3}, 3),
+    ],
+)
+def test_an_epoch_s_rollouts_have_a_copy_each(
+    algorithm: type[PEARLSAC], env_id: str, arguments: dict[str, Any], n_envs: int
+) -> None:
+    model = algorithm.from_zoo(env_id, device="cpu", **arguments)
+    assert model.n_envs == n_envs
+    if n_envs != 3:
+        rollouts = len(model.train_tasks) * model.trajectories_per_task
+        assert model.epoch_steps == rollouts * model.horizon
+
+
 def test_learn_takes_the_entrys_steps(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
     model = algorithm.from_zoo(
         POINT_GOAL, seed=0, n_timesteps=3000, gradient_steps=1, device="cpu"
