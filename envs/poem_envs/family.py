@@ -247,7 +247,7 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
         """Apply a valid action; new arrays of observation and features, and whether it ended."""
 
     def _step_info(self) -> dict[str, Any]:
-        """Further entries of the info of the step just taken, say ``{"success": True}``."""
+        """Further entries of the info of every step, say ``{"success": True}``; always the same."""
         return {}
 
     def _describe_episode(self) -> str:

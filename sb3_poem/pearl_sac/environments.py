@@ -1,6 +1,7 @@
 """What a model may be given as its environment."""
 
 import contextlib
+from typing import Any
 
 import gymnasium as gym
 from stable_baselines3.common.type_aliases import GymEnv
@@ -18,9 +19,10 @@ def vectorise(
     n_copies: int | None = None,
     n_train_tasks: int | None = None,
     trajectories_per_task: int = 1,
+    **env_kwargs: Any,
 ) -> GymEnv | None:
-    """An environment as SB3 takes it. A registered id becomes ``n_copies``: unless given,
-    :func:`default_copies`; of a family without a vectorised version, as many as
+    """An environment as SB3 takes it. A registered id becomes ``n_copies`` with these arguments:
+    unless given, :func:`default_copies`; of a family without a vectorised version, as many as
     :func:`make_task_vec_env` steps in turn.
     """
     if isinstance(env, gym.vector.VectorEnv):
@@ -35,7 +37,7 @@ def vectorise(
         )
     env = plain_id(env)
     if n_copies is not None:
-        return make_task_vec_env(env, n_copies, max_sequential=n_copies)
+        return make_task_vec_env(env, n_copies, max_sequential=n_copies, **env_kwargs)
     return make_task_vec_env(env, default_copies(env, n_train_tasks, trajectories_per_task))
 
 

@@ -25,6 +25,7 @@ from sb3_poem.common.checks import check_number
 from sb3_poem.common.digest import digest_of
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.files import write_atomically
+from sb3_poem.common.foreign import environment_of
 from sb3_poem.common.networks import RunningNorm
 from sb3_poem.common.precision import hidden_dtype
 from sb3_poem.common.random import Generators
@@ -245,6 +246,8 @@ class PEARLSAC(SAC):
             self.env_id, self.env_kwargs = family.env_id, family.env_kwargs
             self.task_space, self.reward_feature_dim = family.task_space, family.reward_feature_dim
             self.train_tasks = TrainTasks.draw(family, self.n_train_tasks, self.latent_dim, rng)
+        if self.target_entropy == "auto":  # which SAC looks up in an environment
+            self.target_entropy = -float(np.prod(self.action_space.shape))
         self._complete_policy_kwargs()
         tasks, feature_dim = self.train_tasks.tasks, self.reward_feature_dim
         self.replay_buffer_kwargs = {"tasks": tasks, "feature_dim": feature_dim}
@@ -318,6 +321,7 @@ class PEARLSAC(SAC):
         :param tb_log_name: None is the algorithm's name
         """
         steps = self._checked_steps(total_timesteps, callback)
+        self.env_id, self.env_kwargs = self.family.env_id, self.family.env_kwargs
         how = (callback, reset_num_timesteps, tb_log_name or self.algorithm, progress_bar)
         total_timesteps, callback = self._setup_learn(steps, *how)
         callback.on_training_start(locals(), globals())
@@ -587,8 +591,13 @@ class PEARLSAC(SAC):
             )
 
     def set_env(self, env: GivenEnv, force_reset: bool = True) -> None:
-        """Train on another environment of the family; an id gets as many copies as before."""
-        given = vectorise(env, self.n_envs)
+        """Train on another environment of the family. An id gets as many copies as before, and the
+        model's own id the arguments with which it was trained.
+        """
+        own = {}
+        if isinstance(env, str):
+            _, own = environment_of(repr(self), self.env_id, self.env_kwargs, plain_id(env))
+        given = vectorise(env, self.n_envs, **own)
         if given is None:
             raise TypeError("env is None, but set_env needs an environment")
         vec_env = self._wrap_env(given, self.verbose)
@@ -695,19 +704,19 @@ class PEARLSAC(SAC):
         force_reset: bool = True,
         **kwargs: Any,
     ) -> SelfPEARLSAC:
-        """As SB3's. ``env`` may be a registered id too: it becomes as many copies as the model was
-        trained with. Further arguments are the constructor's; a ``seed`` begins new random streams.
+        """As SB3's. ``env`` may be a registered id too, see :meth:`set_env`. Further arguments are
+        the constructor's; a ``seed`` begins new random streams.
 
         :raises ValueError: if it is a folder, the file is truncated or holds another algorithm's
             model, env is of another family, or an argument would change what the networks are
         """
         refuse_unknown(kwargs.keys() - inspect.signature(cls).parameters.keys(), cls)
-        data = saving.read_archive(path, cls, kwargs)
-        if env is not None:
-            env = vectorise(env, data["n_envs"])
+        saving.check_archive(path, cls, kwargs)
         others = (custom_objects, print_system_info, force_reset)
-        model = super().load(path, env, device, *others, **kwargs)
+        model = super().load(path, None, device, *others, **kwargs)
         model._check_arguments(vars(model))
+        if env is not None:
+            model.set_env(env, force_reset)
         if kwargs.get("seed") is not None:
             model.set_random_seed(kwargs["seed"])
         return model

@@ -80,10 +80,10 @@ def kept_arguments(algorithm: type) -> list[str]:
 # ---------------------------------------------------------------------- SB3's zip
 
 
-def read_archive(
+def check_archive(
     path: str | Path | io.BufferedIOBase, algorithm: type, changes: Mapping[str, Any]
-) -> dict[str, Any]:
-    """The attributes in a zip that ``save`` wrote.
+) -> None:
+    """Refuse a zip of which ``load`` cannot make the model.
 
     :param changes: Arguments of the constructor that shall differ
     :raises ValueError: if it is a folder, the file is truncated or holds another algorithm's model,
@@ -111,7 +111,6 @@ def read_archive(
             why = ": a coefficient that is learned stays one, as does a fixed one"
         if fixed and value != (kept := found.get(name)):
             raise ValueError(f"{name} is {kept!r} in {path}, and cannot become {value!r}{why}")
-    return data
 
 
 def algorithm_of(path: str | Path) -> str:
@@ -339,8 +338,6 @@ def build_model(
         error, statistics = config["predicted_rewards_error"], config["context_reward_statistics"]
         model.predicted_rewards_error = float("nan") if error is None else error
         model.context_reward_statistics = None if statistics is None else tuple(statistics)
-        if model.target_entropy == "auto":  # which SAC would look up in the environment
-            model.target_entropy = -float(np.prod(model.action_space.shape))
         model.policy_kwargs |= {name: config[name] for name in POLICY_FACTS}
         for name, (module, base) in CLASSES.items():
             kind = getattr(module, config[name], None)

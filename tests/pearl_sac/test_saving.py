@@ -355,6 +355,38 @@ def test_an_id_becomes_as_many_copies_as_in_training(
 
 
 @one_is_enough
+def test_the_models_own_id_has_the_arguments_of_its_training(
+    algorithm: type[POEMSAC], tmp_path: Path
+) -> None:
+    def step_length(model: POEMSAC) -> float:
+        return model.get_env().get_attr("step_length")[0]
+
+    model = small(algorithm, make_task_vec_env(POINT_GOAL, N_TASKS, step_length=0.2))
+    model.save(tmp_path / "m.zip")
+    model.save_checkpoint(tmp_path / "c.zip")
+    model.save_pretrained(tmp_path / "p")
+    loaded = (
+        algorithm.load(tmp_path / "m.zip", POINT_GOAL),
+        algorithm.load_checkpoint(tmp_path / "c.zip", f"poem_envs:{POINT_GOAL}"),
+        algorithm.from_pretrained(tmp_path / "p", POINT_GOAL),
+    )
+    assert [step_length(each) for each in loaded] == [0.2] * 3
+    model.set_env(POINT_GOAL)
+    assert step_length(model) == 0.2
+    model.set_env(make_vec_env(POINT_GOAL, 2))  # one says so oneself
+    model.learn(1)
+    assert (step_length(model), dict(model.env_kwargs)) == (0.05, {})
+
+
+@one_is_enough
+def test_a_target_entropy_is_found_without_an_environment(
+    algorithm: type[POEMSAC], tmp_path: Path
+) -> None:
+    small(algorithm, target_entropy=0.5).save(tmp_path / "m.zip")
+    assert algorithm.load(tmp_path / "m.zip", target_entropy="auto").target_entropy == -2.0
+
+
+@one_is_enough
 def test_an_id_without_a_vectorised_version(algorithm: type[POEMSAC], tmp_path: Path) -> None:
     gym.register("Strolling-v0", Walk, max_episode_steps=10)
     try:
