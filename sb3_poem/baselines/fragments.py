@@ -110,7 +110,7 @@ def transition_rows(
 ) -> th.Tensor:
     """(T, ...) standardised (s, a, s') and a last column."""
     obs = standardised(policy, trajectory)
-    actions = policy.scale_action_batch(_tensor(policy, trajectory.actions))
+    actions = _tensor(policy, policy.scale_action(trajectory.actions))
     column = _tensor(policy, np.full(len(actions), last))[:, None]
     return th.cat([obs[:-1], actions, obs[1:], column], dim=1)
 

@@ -70,7 +70,6 @@ class FamilyView:
             raise ValueError(no_family(env.env_method("__str__", indices=[0])[0]))
         self.env, self.num_envs = env, env.num_envs
         self.observation_space, self.action_space = env.observation_space, env.action_space
-        self.action_dim = spaces.flatdim(env.action_space)
         self.task_space: spaces.Box = self._get("task_space")
         self.task_dim = int(self.task_space.shape[0])
         self.reward_feature_dim: int = self._get("reward_feature_dim")

@@ -105,7 +105,8 @@ class EpochCollector:
         self, latents: np.ndarray
     ) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
         """How to act: from observations to actions in the environment's units, and in [-1, 1]."""
-        space, shape = self.policy.action_space, (len(latents), self.family.action_dim)
+        space = self.policy.action_space
+        shape = (len(latents), *space.shape)
         policy_action, device = self.policy.acting_on(latents), self.policy.device
 
         def act(obs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -594,7 +594,7 @@ class PEARLSAC(SAC):
         """Train on another environment of the family. An id gets as many copies as before, and the
         model's own id the arguments with which it was trained.
         """
-        own = {}
+        own: dict[str, Any] = {}
         if isinstance(env, str):
             _, own = environment_of(repr(self), self.env_id, self.env_kwargs, plain_id(env))
         given = vectorise(env, self.n_envs, **own)
@@ -744,7 +744,10 @@ class PEARLSAC(SAC):
         :raises ValueError: if the file is truncated or of another algorithm, or env of another
             family
         """
-        saving.check_checkpoint(path, cls.__name__)
+        if not saving.is_checkpoint(path):
+            raise ValueError(f"{path} is truncated, or no checkpoint of sb3_poem")
+        if (found := saving.algorithm_of(path)) != cls.__name__:
+            raise ValueError(f"{path} holds a {found}; load it with {found}.load_checkpoint")
         with open(path, "rb") as file:
             model = cls.load(file, env, device)
         model.keeps_experience = False

@@ -178,7 +178,7 @@ class LatentPolicy(SACPolicy):
             steps = _evenly_spaced(len(trajectory), max_steps)
             seen = (trajectory.observations[at] for at in (steps, steps + 1))
             obs, next_obs = (self.standardise(self.tensor(values)) for values in seen)
-            actions = self.scale_action_batch(self.tensor(trajectory.actions[steps]))
+            actions = self.tensor(self.scale_action(trajectory.actions[steps]))
             rows.append(th.cat([obs, actions, next_obs], dim=1))
             lengths.append(len(steps))
             shares.append(len(trajectory) / len(steps))
@@ -187,11 +187,6 @@ class LatentPolicy(SACPolicy):
         norm = self.reward_norm
         sums = sums * norm.std + norm.mean * sums.new_tensor(lengths)
         return (sums * sums.new_tensor(shares)).cpu().numpy()
-
-    def scale_action_batch(self, actions: th.Tensor) -> th.Tensor:
-        """Actions in the environment's units -> [-1, 1]."""
-        low, high = self.tensor(self.action_space.low), self.tensor(self.action_space.high)
-        return 2.0 * (actions - low) / (high - low) - 1.0
 
     def decode_rewards(
         self, obs: th.Tensor, actions: th.Tensor, next_obs: th.Tensor, reward_embedding: th.Tensor

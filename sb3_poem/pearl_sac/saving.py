@@ -165,14 +165,6 @@ def is_checkpoint(path: str | Path) -> bool:
     return bool(_facts(path).get("keeps_experience"))
 
 
-def check_checkpoint(path: str | Path, algorithm: str) -> None:
-    """:raises ValueError: if a file is no checkpoint, or of another algorithm than the one named"""
-    if not is_checkpoint(path):
-        raise ValueError(f"{path} is truncated, or no checkpoint of sb3_poem")
-    if (found := algorithm_of(path)) != algorithm:
-        raise ValueError(f"{path} holds a {found}; load it with {found}.load_checkpoint")
-
-
 # ---------------------------------------------------------------------- pretrained folders
 
 
