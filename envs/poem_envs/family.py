@@ -45,8 +45,8 @@ REQUIRED_ATTRIBUTES = {
 }
 
 
-def definition_problem(family: Any) -> str | None:
-    """What is wrong with a family's attributes, and what would be right; None if nothing is."""
+def check_definition(family: Any) -> None:
+    """Refuse a family whose attributes are not what they must be, and say what would be right."""
     given: list[Any] = [getattr(family, name, None) for name in REQUIRED_ATTRIBUTES]
     observations, actions, tasks, features = given
     fits = (
@@ -55,20 +55,24 @@ def definition_problem(family: Any) -> str | None:
         is_flat(tasks) and tasks.dtype == np.float64,
         isinstance(features, (int, np.integer)) and features >= 1,
     )
-    for (name, what), value, right in zip(REQUIRED_ATTRIBUTES.items(), given, fits, strict=True):
-        if not right:
-            return f"{name} must be {what}, but is {value!r}"
-    if getattr(family, "all_tasks", None) is None:
-        return None
-    all_tasks, size = np.asarray(family.all_tasks), tasks.shape[0]
-    if all_tasks.shape[1:] != (size,) or not all(task in tasks for task in all_tasks):
-        return (
-            f"all_tasks must have shape (n, {size}) and lie in task_space {tasks}, but is "
-            f"{family.all_tasks}"
+    wrong = [
+        f"{name} must be {what}, but is {value!r}"
+        for (name, what), value, right in zip(REQUIRED_ATTRIBUTES.items(), given, fits, strict=True)
+        if not right
+    ]
+    if not wrong and family.all_tasks is not None:
+        all_tasks, size = np.asarray(family.all_tasks), tasks.shape[0]
+        if all_tasks.shape[1:] != (size,) or not all(task in tasks for task in all_tasks):
+            wrong.append(
+                f"all_tasks must have shape (n, {size}) and lie in task_space {tasks}, but is "
+                f"{family.all_tasks}"
+            )
+        elif len(np.unique(all_tasks, axis=0)) < len(all_tasks):
+            wrong.append(f"all_tasks must hold every task once, but is {all_tasks.tolist()}")
+    if wrong:
+        raise TypeError(
+            f"the task family {type(family).__name__}: {'; '.join(wrong)}; see poem_envs.TaskFamily"
         )
-    if len(np.unique(all_tasks, axis=0)) < len(all_tasks):
-        return f"all_tasks must hold every task once, but is {all_tasks.tolist()}"
-    return None
 
 
 def is_flat(space: Any) -> bool:
@@ -81,13 +85,7 @@ class _FamilyType(ABCMeta):
 
     def __call__(cls, *args: Any, **kwargs: Any) -> Any:
         family = super().__call__(*args, **kwargs)
-        required = REQUIRED_ATTRIBUTES.items()
-        missing = [f"{name} ({what})" for name, what in required if not hasattr(family, name)]
-        if missing:
-            raise TypeError(
-                f"the task family {cls.__name__} must set {', '.join(missing)}; see "
-                "poem_envs.TaskFamily"
-            )
+        check_definition(family)
         if not has_display():  # Gymnasium's checker tries every mode that is named
             modes = family.metadata.get("render_modes", ())
             modes = [mode for mode in modes if mode != "human"]

@@ -13,7 +13,6 @@ from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common import vec_env as sb3_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
-from poem_envs.family import definition_problem
 from sb3_poem.common.buffers import Segment
 from sb3_poem.common.checks import check_whole
 
@@ -90,17 +89,14 @@ class FamilyView:
 
     @classmethod
     def for_training(cls, env: VecEnv, horizon: int | None = None) -> "FamilyView":
-        """The same of what can be trained on: spaces fit, an episode's length is known, no wrapper
-        changes what is seen, done or paid: those of Gymnasium and SB3 are refused by name, others
-        by the first experience, see :meth:`check_experience`.
+        """The same of what can be trained on: an episode's length is known, no wrapper changes what
+        is seen, done or paid: those of Gymnasium and SB3 are refused by name, others by the first
+        experience, see :meth:`check_experience`.
 
         :param horizon: Steps of an episode; None reads the time limit of the registration
         """
         family = cls(env)
         family._unknown_wrappers = ", ".join(family.unknown_wrappers())
-        problem = definition_problem(family)
-        if problem is not None:
-            raise ValueError(f"env {env.env_method('__str__', indices=[0])[0]}: {problem}")
         family.horizon = family._horizon(horizon)
         return family
 

@@ -85,8 +85,8 @@ class NoSpaces(TaskFamily):
         (NoReward, "abstract.*NoReward.*_reward"),
         (
             NoSpaces,
-            r"NoSpaces must set action_space \(a flat .*Box, bounded.*\), task_space \(a .*Box of "
-            r"shape \(task_dim,\) and dtype float64\), reward_feature_dim \(a whole number",
+            r"NoSpaces: action_space must be a flat .*Box, bounded.*, but is None; task_space must "
+            r"be a .*Box of shape \(task_dim,\) and dtype float64, .*; reward_feature_dim must be a",
         ),
     ],
 )
