@@ -17,7 +17,10 @@ from sb3_poem.common.buffers import Segment
 from sb3_poem.common.checks import check_whole
 
 # Arguments that change how an environment is drawn, not what it is.
-DRAWING_ARGUMENTS = {"render_mode", "render_task"}
+DRAWING_ARGUMENTS = {
+    *("render_mode", "render_task", "render_quality", "max_geom", "camera_name"),
+    "default_camera_config",
+}
 #: Test tasks have a stream of their own: no seed gives the tasks of a training
 TEST_TASK_STREAM = 0x7E57
 #: Steps by which it is seen whether a wrapper changes a family

@@ -18,9 +18,7 @@ from sb3_poem.common.family_view import DRAWING_ARGUMENTS
 PLAIN_ID = re.compile(r"\w[\w.-]{0,99}(/\w[\w.-]{0,99})?", re.ASCII)
 WORD = re.compile(r"[\w-]{0,100}", re.ASCII)
 #: Which an image depends on, or something else that only the user of a family knows
-IMAGE_ARGUMENTS = DRAWING_ARGUMENTS | {
-    *("width", "height", "render_quality", "max_geom", "camera_name", "default_camera_config"),
-}
+IMAGE_ARGUMENTS = DRAWING_ARGUMENTS | {"width", "height"}
 # How far an argument may be from its default, and how many numbers it may hold.
 TIMES_DEFAULT, LONGEST = 100, 64
 

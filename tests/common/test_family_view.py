@@ -54,6 +54,12 @@ def test_sampling_leaves_the_environments_generator_alone() -> None:
     )
 
 
+def test_how_an_environment_is_drawn_is_no_argument_of_the_family() -> None:
+    drawn = {"render_quality": "fast", "camera_name": "track", "max_geom": 2000}
+    env = make_task_vec_env("poem/HalfCheetahVel-v0", 1, ctrl_cost_weight=0.0, **drawn)
+    assert FamilyView(env).env_kwargs == {"ctrl_cost_weight": 0.0}
+
+
 # ---------------------------------------------------------------- refusals
 
 
