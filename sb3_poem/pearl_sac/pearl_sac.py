@@ -400,7 +400,8 @@ class PEARLSAC(SAC):
         beyond = (obs.abs() == OBSERVATION_CLIP).any(dim=-1).float().mean()
         self.logger.record("train/clipped_observations", beyond.item())
         actions, rewards = tensor(epoch.actions), tensor(epoch.rewards)
-        self.context_reward_statistics = float(rewards.mean()), float(_unit(rewards.std()))
+        deviation = float(_unit(rewards, rewards.std()))
+        self.context_reward_statistics = float(rewards.mean()), deviation
         parts = [obs, actions, next_obs, _standardised(rewards)[..., None]]
         if policy.context_has_value:  # eq. 8; 0 before the first update (Algorithm 1, line 2)
             values = th.zeros_like(rewards)
@@ -529,9 +530,9 @@ class PEARLSAC(SAC):
 
     def make_objective(self) -> Objective:
         """What gradient steps minimise."""
-        auto, variance = self.reward_scale == "auto", self._known_context.rewards.var()
+        auto, rewards = self.reward_scale == "auto", self._known_context.rewards
         scale = 1.0 / self.policy.reward_norm.std if auto else float(self.reward_scale)
-        variance = _unit(variance, MIN_STD**2)
+        variance = _unit(rewards, rewards.var(), MIN_STD**2)
         return self._part(self.objective_class, reward_scale=scale, reward_variance=variance)
 
     def make_updater(self) -> Updater:
@@ -819,9 +820,9 @@ class PEARLSAC(SAC):
 
 
 def _standardised(values: th.Tensor) -> th.Tensor:
-    return (values - values.mean()) / _unit(values.std())
+    return (values - values.mean()) / _unit(values, values.std())
 
 
-def _unit(deviation: th.Tensor, least: float = MIN_STD) -> th.Tensor:
-    """What to divide values of this deviation by: 1 where they do not differ."""
-    return th.where(deviation > least, deviation, 1.0)
+def _unit(values: th.Tensor, spread: th.Tensor, least: float = MIN_STD) -> th.Tensor:
+    """What to divide values by: their spread or, where they do not differ, 1."""
+    return th.where(values.max() > values.min(), spread.clamp(min=least), 1.0)

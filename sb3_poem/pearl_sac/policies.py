@@ -153,7 +153,7 @@ class LatentPolicy(SACPolicy):
         if self.reward_norm.count == 0:
             rewards = np.concatenate([segment.rewards for segment in segments])
             self.reward_norm.update(rewards.reshape(-1, 1))
-            if rewards.std() < RunningNorm.MIN_STD:  # they do not differ, and give no unit
+            if np.ptp(rewards) == 0.0:  # they do not differ, and give no unit
                 self.reward_norm.std.fill_(1.0)
 
     def action_values(self, obs: th.Tensor, actions: th.Tensor, latents: np.ndarray) -> th.Tensor:

@@ -380,14 +380,26 @@ class Distant(Walk):
     """Rewards are far away: in the first epoch there is none."""
 
     def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
-        return (np.abs(features[..., 0] - tasks[..., 0]) > 100.0).astype(np.float64)
+        return 0.1 + (np.abs(features[..., 0] - tasks[..., 0]) > 100.0)
+
+
+class Tiny(Walk):
+    """Rewards are in units of their own."""
+
+    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
+        return 1e-3 * super()._reward(tasks, features)
+
+
+def test_tiny_rewards_are_measured_by_their_deviation(algorithm: type[PEARLSAC]) -> None:
+    model = small(algorithm, walks(4, Tiny), horizon=10).learn(1)
+    assert model.make_objective().reward_scale == pytest.approx(1000.0)
 
 
 def test_rewards_that_do_not_differ_yet_keep_their_unit(algorithm: type[PEARLSAC]) -> None:
     model = small(algorithm, walks(4, Distant), horizon=10).learn(1)
     assert model.make_objective().reward_scale == 1.0
     assert model.make_objective().reward_variance == 1.0
-    assert model.context_reward_statistics == (0.0, 1.0)
+    assert model.context_reward_statistics == pytest.approx((0.1, 1.0))
     assert model.policy.reward_norm.std == 1.0
 
 
