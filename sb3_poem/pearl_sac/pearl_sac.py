@@ -322,8 +322,9 @@ class PEARLSAC(SAC):
         """
         steps = self._checked_steps(total_timesteps, callback)
         self.env_id, self.env_kwargs = self.family.env_id, self.family.env_kwargs
-        how = (callback, reset_num_timesteps, tb_log_name or self.algorithm, progress_bar)
-        total_timesteps, callback = self._setup_learn(steps, *how)
+        total_timesteps, callback = self._setup_learn(
+            steps, callback, reset_num_timesteps, tb_log_name or self.algorithm, progress_bar
+        )
         callback.on_training_start(locals(), globals())
         while self.num_timesteps < total_timesteps:
             # between two epochs: evaluations and checkpoints belong here
@@ -713,8 +714,7 @@ class PEARLSAC(SAC):
         """
         refuse_unknown(kwargs.keys() - inspect.signature(cls).parameters.keys(), cls)
         saving.check_archive(path, cls, kwargs)
-        others = (custom_objects, print_system_info, force_reset)
-        model = super().load(path, None, device, *others, **kwargs)
+        model = super().load(path, None, device, custom_objects, print_system_info, **kwargs)
         model._check_arguments(vars(model))
         if env is not None:
             model.set_env(env, force_reset)
