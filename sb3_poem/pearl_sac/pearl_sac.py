@@ -289,7 +289,7 @@ class PEARLSAC(SAC):
         timesteps, n_envs = int(entry.pop("n_timesteps")), entry.pop("n_envs", None)
         entry.setdefault("env", env_id)
         rate = entry.get("learning_rate")
-        if isinstance(rate, str):  # rl_zoo3's syntax
+        if isinstance(rate, str) and rate.startswith("lin_"):  # rl_zoo3's syntax
             entry["learning_rate"] = LinearSchedule(float(rate.removeprefix("lin_")), 0.0, 1.0)
         if n_envs is not None:
             entry["env"] = vectorise(entry["env"], n_envs)

@@ -43,6 +43,8 @@ def test_schedules_and_python_are_read_as_rl_zoo3_reads_them(algorithm: type[PEA
     model._setup_lr_schedule()
     for remaining in (1.0, 0.37, 0.0):
         assert model.lr_schedule(remaining) == pytest.approx(expected(remaining), rel=1e-12)
+    with pytest.raises(ValueError, match="`learning_rate` must be a finite number, but is '1e-3'"):
+        algorithm.from_zoo(env_id, n_envs=2, learning_rate="1e-3")
     assert model.policy_kwargs.items() >= eval(entry["policy_kwargs"], {"nn": th.nn}).items()
 
 
