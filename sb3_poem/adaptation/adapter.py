@@ -74,7 +74,8 @@ class PreferenceAdapter:
     :param n_queries: How many answers are asked for at most (K).
     :param oracle: Who answers in :meth:`adapt`; a callable (left, right) -> Preference, or of as
         many trajectories as the rule's questions show. If it has ``needs_frames``, trajectories
-        carry frames. If it has ``bind`` and no environment yet, it is bound to ``env``.
+        carry frames. If it has ``bind`` and no environment of its own, it is bound to ``env`` until
+        another adapter takes it.
     :param seed: Makes everything reproducible; None draws one, kept in ``seed``.
     :param deterministic: Whether policies act by their mode.
     :param library: Trajectories to ask about instead of rolling out new ones, for a rule that can.
@@ -108,18 +109,18 @@ class PreferenceAdapter:
             seed = int(np.random.SeedSequence().generate_state(1)[0] >> 1)
         check_whole("seed", seed, 0)
         _check_oracle(oracle)
-        self.rule = (Bayes() if rule is None else as_rule(rule)).answered_by(oracle)
+        self._chosen_rule = Bayes() if rule is None else as_rule(rule)
+        self.rule = self._chosen_rule.answered_by(oracle)
         self.n_queries, self.seed = int(n_queries), int(seed)
         self.deterministic, self.render = deterministic, render
         frames = render or bool(getattr(oracle, "needs_frames", False))
         self.model, self.env = model_and_env(model, env, 1, frames)
         self._owns_env = isinstance(env, str)
         self.library = None if library is None else list(library)
-        setting = Setting(self.n_queries, self.library, self.env, None, self._visibility)
-        self.rule.check(self.model, setting)
+        self._setting = Setting(self.n_queries, self.library, self.env, None, self._visibility)
+        self._start()
         warn_if_untrained(self.model)
         self._take_oracle(oracle)
-        self.inference = self.rule.start(self.model, inference_rng(self.seed), setting)
         if self.inference.library is not None and self._owns_env:
             self.env.seed(self.seed)  # nothing is rolled out there: draw the task now
             self.env.reset()
@@ -127,6 +128,10 @@ class PreferenceAdapter:
         self._seen: dict[tuple[int, bytes], Trajectory] = {}
         self.pending = None
         self._previous: tuple[Snapshot, Query] | None = None
+
+    def _start(self) -> None:
+        self.rule.check(self.model, self._setting)
+        self.inference = self.rule.start(self.model, inference_rng(self.seed), self._setting)
 
     @property
     def n_answers(self) -> int:
@@ -227,14 +232,25 @@ class PreferenceAdapter:
         return f"PreferenceAdapter({describe_model(self.model)}, {self.rule}, {answers})"
 
     def adapt(self, oracle: Oracle | None = None, progress_bar: bool = False) -> AdaptedPolicy:
-        """Ask the oracle (None takes the one given at construction) until done."""
+        """Ask the oracle (None takes the one given at construction) until done. A ``ValueError`` if
+        another one errs in a way that the questions asked so far did not count on.
+        """
         oracle = self.oracle if oracle is None else oracle
         if oracle is None:
             raise ValueError(
                 "adapt() needs an oracle: pass it here or at construction, or use ask() and tell()"
             )
         _check_oracle(oracle)
-        self.rule.answered_by(oracle)  # refuses one that answers other questions
+        rule = self._chosen_rule.answered_by(oracle)  # refuses one that answers other questions
+        if rule != self.rule:
+            if self.n_answers or self.pending is not None:
+                raise ValueError(
+                    f"adapt() was given {oracle!r}, for which the rule is {rule}, but questions "
+                    f"were asked by {self.rule}: pass the oracle to PreferenceAdapter, or a rule "
+                    "with its `noise_model`"
+                )
+            self.rule = rule
+            self._start()
         self._take_oracle(oracle)
         n, shows = self.n_queries, not progress_bar
         with tqdm(total=n, initial=self.n_answers, unit="query", disable=shows) as bar:
@@ -261,9 +277,11 @@ class PreferenceAdapter:
         self.oracle = oracle
         #: Whether somebody looks at the questions, also while answers given before are told again
         self._watched = getattr(oracle, "needs_frames", self.render and oracle is None)
-        bind = getattr(oracle, "bind", None)
-        if bind is not None and getattr(oracle, "env", None) is None:
+        bind, env = getattr(oracle, "bind", None), getattr(oracle, "env", None)
+        # Nor is one that another adapter lent it its own
+        if bind is not None and (env is None or env is getattr(oracle, "lent_env", None)):
             bind(self.env)
+            oracle.lent_env = self.env  # type: ignore[union-attr]
 
     def _number_of(self, query: Query) -> int:
         """Of the answer about the very trajectories of a question; else the next one's."""
@@ -355,8 +373,9 @@ class PreferenceAdapter:
         render: bool = False,
     ) -> Self:
         """Continue where :meth:`to_dict` stood: the same answers lead to the same policy as without
-        the interruption. Model, task and library must be the same; a stochastic oracle's own
-        generator is its own affair. For the arguments see :class:`PreferenceAdapter`.
+        the interruption. Model, task and library must be the same (an id's task is drawn again); a
+        stochastic oracle's own generator is its own affair. For the arguments see
+        :class:`PreferenceAdapter`.
 
         :raises OtherModelError: If the model has other weights, another family or another latent's
             dimension.
@@ -380,6 +399,12 @@ class PreferenceAdapter:
             kept["rule"] = Rule.from_dict(data["rule"])
             adapter = cls(own, env, oracle=oracle, library=library, render=render, **kept)
         adapter.restore(data)
+        has_asked = adapter.n_answers or adapter.pending is not None
+        if adapter._owns_env and library is None and has_asked:
+            family = FamilyView.of(adapter.env)
+            if family is not None:
+                family.seed_episodes([rollout_seed(adapter.seed, 0)])  # as the first question did
+                adapter.env.reset()
         return adapter
 
     def restore(self, data: dict[str, Any]) -> None:
@@ -405,7 +430,8 @@ class PreferenceAdapter:
     @classmethod
     def from_json(cls, text: str, model: MetaModel | str | Path, env: Env, **kwargs: Any) -> Self:
         """:meth:`from_dict`, with its arguments, of a JSON text."""
-        return cls.from_dict(parse_json(text, "the text is"), model, env, **kwargs)
+        data = parse_json(text, "the text is no saved adaptation")
+        return cls.from_dict(data, model, env, **kwargs)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the state as a JSON file, which replaces an existing one only when it is whole."""
@@ -416,7 +442,7 @@ class PreferenceAdapter:
         cls, path: str | os.PathLike[str], model: MetaModel | str | Path, env: Env, **kwargs: Any
     ) -> Self:
         """:meth:`from_dict`, with its arguments, of a file of :meth:`save`."""
-        return cls.from_dict(read_json(path), model, env, **kwargs)
+        return cls.from_dict(read_json(path, "saved adaptation"), model, env, **kwargs)
 
 
 @contextlib.contextmanager

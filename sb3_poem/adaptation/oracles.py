@@ -77,7 +77,7 @@ class TaskOracle(ABC):
         self.rng = np.random.default_rng(None if seed is None else [seed, ORACLE_STREAM])
 
     def __repr__(self) -> str:
-        hidden = ["env", "task", "rng", "noise_model"]
+        hidden = ["env", "lent_env", "task", "rng", "noise_model"]
         hidden += ["question"] * (self.question != BEST_OF_FOUR)  # thresholds or none say it
         own = "".join(f"{k}={value}, " for k, value in vars(self).items() if k not in hidden)
         task = "the environment's" if self.task is None else self.task.tolist()

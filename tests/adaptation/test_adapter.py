@@ -231,8 +231,8 @@ def test_saving_replaces_the_file_only_once_the_new_one_is_whole(tmp_path, monke
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("", "is not a saved adaptation"),
-        ('{"format": "sb3_poem.Pref', "is not a saved adaptation"),
+        ("", "is no saved adaptation"),
+        ('{"format": "sb3_poem.Pref', "is no saved adaptation"),
         ("[1]", "holds a list"),
         ('{"format": "optuna"}', "`format` is 'optuna'"),
         ('{"format": "sb3_poem.PreferenceAdapter", "version": 99}', "version 99"),
@@ -667,6 +667,22 @@ def test_an_adaptation_resumes_by_names():
     a.tell("left")
     resumed = PreferenceAdapter.from_json(a.to_json(), POINT_GOAL, POINT)
     np.testing.assert_array_equal(resumed.policy().latent, a.policy().latent)
+    for one in (a, resumed):  # on the task that the first question drew
+        one.ask()
+    assert a.env.get_attr("task") == resumed.env.get_attr("task")
+    np.testing.assert_array_equal(a.pending.left.observations, resumed.pending.left.observations)
+
+
+def test_an_oracle_without_an_environment_judges_by_that_of_each_adapter():
+    elsewhere = make_env(np.array([0.3]))
+    elsewhere.reset()
+    lent, own = ReturnOracle(), ReturnOracle(elsewhere)
+    for goal in (0.3, 2.5):
+        env = make_env(np.array([goal]))
+        for oracle, wanted in ((lent, goal), (own, 0.3)):
+            policy = adapter(env, oracle=oracle).adapt()
+            assert SpeedModel.speed(policy.latent) == pytest.approx(wanted, abs=0.3)
+    assert own.env is elsewhere
 
 
 @pytest.mark.parametrize(
@@ -772,6 +788,15 @@ def test_the_oracles_noise_model_is_taken():
     chosen = Bayes(noise_model=BoltzmannNoise())
     assert adapter(oracle=MistakeOracle(0.3), rule=chosen).rule == chosen
     assert adapter(oracle=outside_oracle).inference.noise_model == ExactNoise()
+    told = adapter(oracle=MistakeOracle(0.3, seed=0)).adapt()
+    late = adapter()
+    np.testing.assert_array_equal(late.adapt(MistakeOracle(0.3, seed=0)).latent, told.latent)
+    assert late.inference.noise_model == late.rule.noise_model == MistakeNoise(0.3)
+    begun = adapter()
+    begun.ask()
+    with pytest.raises(ValueError, match="pass the oracle to PreferenceAdapter, or a rule"):
+        begun.adapt(MistakeOracle(0.3))
+    assert begun.adapt(ReturnOracle()).n_answers == 10
 
 
 def test_graded_questions_are_asked_kept_and_answered_by_five_words():
@@ -809,6 +834,8 @@ def test_the_best_of_four_is_asked_kept_and_answered_by_five_words():
         np.testing.assert_array_equal(kept.observations, item.observations)
     assert [answer.preference.value for answer in again.answers] == words
     np.testing.assert_array_equal(again.policy().latent, a.policy().latent)
+    with pytest.raises(ValueError, match="`library` must hold at least 4 trajectories"):
+        adapter(rule=rule, library=shown[:3])
     first = a.ask_again(0)
     assert [x.latent.tobytes() for x in first.shown] == [
         x.latent.tobytes() for x in a.answers[0].shown
