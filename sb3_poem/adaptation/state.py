@@ -1,4 +1,4 @@
-"""Adaptation state as JSON: files that are whole or absent."""
+"""JSON files that are whole or absent."""
 
 import json
 import os
@@ -13,18 +13,18 @@ def write_json_atomically(path: str | os.PathLike[str], data: dict[str, Any]) ->
     write_atomically(Path(path), json.dumps(data, indent=1, allow_nan=False).encode())
 
 
-def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read a JSON object; a ``ValueError`` if the file is truncated, or holds none."""
-    return parse_json(Path(path).read_text(encoding="utf-8"), f"{os.fspath(path)} is")
+def read_json(path: str | os.PathLike[str], what: str) -> dict[str, Any]:
+    """Read a JSON object, such as ``what``; a ``ValueError`` if the file is truncated, or no such."""
+    text = Path(path).read_text(encoding="utf-8")
+    return parse_json(text, f"{os.fspath(path)} is no {what}")
 
 
-def parse_json(text: str, this_is: str) -> dict[str, Any]:
-    """A saved adaptation as data; ``this_is`` begins the message of a ``ValueError``."""
+def parse_json(text: str, message: str) -> dict[str, Any]:
+    """A JSON object as data; ``message`` begins that of a ``ValueError``."""
     try:
         data = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{this_is} not a saved adaptation: {error}") from error
+        raise ValueError(f"{message}: {error}") from error
     if not isinstance(data, dict):
-        holds = f"it holds a {type(data).__name__}, not an object"
-        raise ValueError(f"{this_is} not a saved adaptation: {holds}")
+        raise ValueError(f"{message}: it holds a {type(data).__name__}, not an object")
     return data

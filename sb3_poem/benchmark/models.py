@@ -39,6 +39,7 @@ from sb3_poem.pearl_sac.saving import CONFIG, WEIGHTS, is_checkpoint, read_confi
 from sb3_poem.resources import config_file, zoo_entry
 
 MODEL, BEGUN, FINISHED, REWARD = "model.zip", "begun.json", "trained.json", "reward"
+RECORD = "record of a training"
 
 Say = Callable[[str], None]
 
@@ -69,7 +70,7 @@ def try_lock(path: Path) -> Iterator[bool]:
 class Workplace:
     """Where models are kept, and how they are trained and run.
 
-    :param runs: Folder of the trainings, and of locks.
+    :param runs: Folder of the trainings.
     :param models: Folders with models that were handed over, see :meth:`ModelLibrary.given`.
     :param named: Models that were handed over one by one: family, variant, seed, path.
     """
@@ -104,9 +105,10 @@ class ModelLibrary:
     def given(self, key: ModelKey) -> Path | None:
         """The file or folder of a model that was handed over: one that was named;
         ``<Family>/<variant>/seed<seed>`` (a folder, or with ``.zip`` a file) in a folder of models;
-        or ``<Family>`` there, a pretrained model of that variant and seed. None if there is none.
+        or ``<Family>`` there, a pretrained model of that variant and seed. None if there is none,
+        or the variant is made from another one's model.
         """
-        if not key.training.is_default:
+        if not key.training.is_default or key.base is not None:
             return None
         for family, variant, seed, path in self.workplace.named:
             if (family_id(family), variant, seed) == (key.env_id, key.variant, key.seed):
@@ -125,8 +127,9 @@ class ModelLibrary:
             if (pretrained / CONFIG).is_file():
                 config, wanted = read_config(pretrained), VARIANTS[key.variant]
                 own = config["algorithm"] == ALGORITHMS[wanted.algorithm].__name__
-                facts = {"seed": None, **config["arguments"], "env_id": config["env_id"]}
-                if own and key.base is None and not _departures(facts, key):
+                own_env = {name: config[name] for name in ("env_id", "env_kwargs")}
+                facts = {"seed": None, **config["arguments"], **own_env}
+                if own and not _departures(facts, key):
                     return pretrained
         return None
 
@@ -152,7 +155,7 @@ class ModelLibrary:
         hyperparameters, begun = training_plan(key).hyperparameters, self.folder(key) / BEGUN
         found = {"hyperparameters": hyperparameters, "revision": REVISION}
         if self.state(key) != "missing":
-            found = read_json(begun) if begun.exists() else {"hyperparameters": None}
+            found = read_json(begun, RECORD) if begun.exists() else {"hyperparameters": None}
         if found["hyperparameters"] != hyperparameters:
             raise ValueError(
                 f"{begun.parent} was trained with other hyperparameters than zoo_configs/ has for "
@@ -190,7 +193,7 @@ class ModelLibrary:
                 if not finished.exists():
                     made = self._train(key, lock, say) if key.base is None else self._derive(key)
                     write_json_atomically(finished, {**made, **provenance()})
-        return read_json(finished)
+        return read_json(finished, RECORD)
 
     def load(self, key: ModelKey, env: VecEnv, snapshot: float | None = None) -> Any:
         """A model that :meth:`ensure` has made sure of, or a :class:`MAMLRewardModel`; with its
@@ -200,11 +203,10 @@ class ModelLibrary:
         :param snapshot: The share of the training after which to take it; None: all.
         :raises ValueError: If one that was handed over is another, or not saved along its training.
         """
-        path = self.given(key)
-        if key.base is not None and path is None:
+        if key.base is not None:
             model = self.load(key.base, env)
             return MAMLRewardModel(MetaReward.load(self.folder(key) / REWARD, model.policy), model)
-        algorithm = ALGORITHMS[VARIANTS[key.variant].algorithm]
+        path, algorithm = self.given(key), ALGORITHMS[VARIANTS[key.variant].algorithm]
         if path is not None:
             if snapshot is not None:
                 raise ValueError(f"{key} was handed over, and so has no models along its training")
@@ -212,7 +214,7 @@ class ModelLibrary:
         elif snapshot is not None:
             file = self.snapshot_file(key, snapshot)
         else:
-            run = self.folder(key) / read_json(self.folder(key) / FINISHED)["run"]
+            run = self.folder(key) / read_json(self.folder(key) / FINISHED, RECORD)["run"]
             # PEARL's replay buffer is asked about
             file = run / (CHECKPOINT if algorithm is PEARLSAC else _zip_name(key.env_id))
         read: Callable[..., Any] = algorithm.load
@@ -266,7 +268,7 @@ class ModelLibrary:
                 f"{file} stopped after {model.num_timesteps:,} of {plan.timesteps:,} steps; "
                 "remove it"
             )
-        sessions = [read_json(each) for each in folder.glob(f"{SESSIONS}/*.json")]
+        sessions = [read_json(each, RECORD) for each in folder.glob(f"{SESSIONS}/*.json")]
         names = ("seconds", "cpu_seconds")
         took = {name: round(sum(session[name] for session in sessions), 1) for name in names}
         say(f"trained {key} in {took['seconds']:.0f} s")
@@ -274,7 +276,7 @@ class ModelLibrary:
             "source": "trained",
             "run": str(file.parent.relative_to(folder)),
             "command": "sb3-poem " + " ".join(arguments),
-            "revision": read_json(begun)["revision"],
+            "revision": read_json(begun, RECORD)["revision"],
             "hyperparameters": plan.hyperparameters,
             "overrides": plan.overrides,
             "env_steps": int(model.num_timesteps),
@@ -336,7 +338,7 @@ def _departures(found: Mapping[str, Any], key: ModelKey) -> list[str]:
     made = zoo_entry(config_file(variant.algorithm), key.env_id, **overrides(key))
     if variant.algorithm == "poem_sac":
         made = {"similarity": "two-encoder", "context": "optimal", **made}
-    expected = {"env_id": key.env_id, "seed": key.seed}
+    expected = {"env_id": key.env_id, "env_kwargs": {}, "seed": key.seed}
     both = [(name, found[name], value) for name, value in expected.items()]
     kinds = "(similarity, context, latent_dim, without preferences)"
     both.append((kinds, _kind(found), _kind(made)))
