@@ -435,8 +435,9 @@ class BayesInference(Inference):
         :meth:`agreements`, if that is less than 0.2, and less than 0.5 given all. What was asked
         about twice is left alone.
         """
-        asked = [tuple(np.concatenate([*map(latent_of, a.shown)])) for a in self.answers]
-        asked_twice = np.array([asked.count(latents) > 1 for latents in asked], dtype=bool)
+        # by what was seen: fragments of one policy differ, and have one latent
+        asked = [[getattr(s, "observations", s).tobytes() for s in a.shown] for a in self.answers]
+        asked_twice = np.array([asked.count(shown) > 1 for shown in asked], dtype=bool)
         others, everything = self.agreements().T
         found = np.where(asked_twice | (everything >= BELIEVED), 1.0, others)
         return int(np.argmin(found)) if np.any(found < CONTRADICTED) else None

@@ -69,8 +69,10 @@ class AdaptationEvalCallback(EpochCallback):
         super().__init__(every, verbose)
         check_whole("n_tasks", n_tasks, 1)
         check_whole("n_episodes", n_episodes, 1)
-        if not record_at:
+        if len(record_at) == 0:
             raise ValueError(f"record_at must hold at least one number, got {record_at!r}")
+        for k in record_at:
+            check_whole("record_at", k, 0)
         self.n_tasks, self.n_episodes, self.seed = n_tasks, n_episodes, seed
         self.record_at = tuple(record_at)
         folder = best_model_save_path

@@ -8,6 +8,7 @@ from pathlib import Path
 from sb3_poem.adaptation.noise import MistakeNoise, NoiseModel
 from sb3_poem.adaptation.preference import ANSWERS, BEST_OF_FOUR, Preference, Query
 from sb3_poem.adaptation.rule import check_choice
+from sb3_poem.common.checks import check_number
 from sb3_poem.common.trajectory import Trajectory
 
 PROMPTS = {
@@ -94,6 +95,7 @@ class HumanOracle:
         if video_format not in ("gif", "mp4"):
             raise ValueError(f'`video_format` must be "gif" or "mp4", but is {video_format!r}')
         check_choice("question", question, tuple(PROMPTS))
+        check_number("mistake_rate", mistake_rate, 0.0, 0.5)
         self.question = question
         self.folder, self.video_format, self.fps = Path(folder), video_format, fps
         self.noise_model: NoiseModel = MistakeNoise(mistake_rate)

@@ -117,6 +117,8 @@ class PaperInference(Inference):
 
     def satisfied(self, latents: np.ndarray) -> np.ndarray:
         """(m,) how many answers each latent (m, d) satisfies within the tolerance (eq. 9)."""
+        if not self.answers:
+            return np.zeros(len(latents), dtype=np.int64)
         return self._satisfied(self._differences(latents))
 
     def _most_informative(self, similarities: np.ndarray) -> tuple[int, int]:

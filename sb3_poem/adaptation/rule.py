@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.adaptation.environments import check_model_fits
 from sb3_poem.adaptation.meta_model import MetaModel
-from sb3_poem.adaptation.preference import Preference
+from sb3_poem.adaptation.preference import PLACES, Preference
 from sb3_poem.common.trajectory import Trajectory, decode_array, encode_array
 
 # What a question compares: trajectories, or the latents of policies to roll out.
@@ -183,9 +183,10 @@ class Rule(ABC):
             check_model_fits(model, setting.env)
         if setting.library is not None and self.refuses_library:
             raise ValueError(f"`library` must be None: {self.refuses_library}")
-        if setting.library is not None and len(setting.library) < 2:
+        needed = len(PLACES[self.question])
+        if setting.library is not None and len(setting.library) < needed:
             n = len(setting.library)
-            raise ValueError(f"`library` must hold at least 2 trajectories, but holds {n}")
+            raise ValueError(f"`library` must hold at least {needed} trajectories, but holds {n}")
 
     @abstractmethod
     def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> Inference:

@@ -24,7 +24,7 @@ from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.pearl_sac import PEARLSAC
 
 STRATEGIES = ("berlekamp", "greedy", "random")
-MAX_GREEDY_QUERIES = 14  # 2^K candidates, each with a predicted return for every fragment
+MAX_CANDIDATES = 2**14  # each has a predicted return for every fragment
 
 
 @dataclass(frozen=True, repr=False)
@@ -89,11 +89,13 @@ class ANOLE(Rule):
     def check(self, model: MetaModel, setting: Setting) -> None:
         """See :class:`Rule`: it needs a decoder, experience, and tasks that share dynamics."""
         super().check(model, setting)
-        n_queries = setting.n_queries
-        if self.strategy == "greedy" and n_queries > MAX_GREEDY_QUERIES:
+        most = max(MAX_CANDIDATES, self.n_candidates)
+        allowed = [k for k in range(1, setting.n_queries + 1) if self.total_candidates(k) <= most]
+        if setting.n_queries not in allowed:
             raise ValueError(
-                f'`n_queries` must be at most {MAX_GREEDY_QUERIES} with strategy="greedy", which '
-                f"keeps 2^n_queries candidates, but is {n_queries}"
+                f"`n_queries` must be at most {max(allowed)} with {self}, which keeps no more than "
+                f"{most:,} candidates, but is {setting.n_queries}, which takes "
+                f"{self.total_candidates(setting.n_queries):,}"
             )
         untrained = isinstance(model, PEARLSAC) and model.reward_coef == 0
         if untrained or not isinstance(model, HasRewardDecoder):

@@ -56,6 +56,10 @@ def vec_env(n=10, **kwargs):
         (lambda: known_task_return(MODEL, vec_env(1), GOALS, 0), "`n_latents` must be at least 1"),
         (lambda: known_task_return(MODEL, vec_env(1), GOALS, source="all"), "`source` must be"),
         (
+            lambda: known_task_return(MODEL, vec_env(1), GOALS, selection_episodes=0),
+            "`selection_episodes` must be at least 1",
+        ),
+        (
             lambda: evaluate_adaptation(MODEL, vec_env(1), GOALS, record_at=()),
             "`record_at` must hold",
         ),

@@ -55,6 +55,7 @@ def test_candidates_satisfy_every_answer_within_the_tolerance(epsilon):
 
 def test_equal_excludes_nobody():
     inference = make(epsilon=0.0)
+    assert np.all(inference.satisfied(inference.candidates) == 0)  # there are no answers yet
     inference.tell(EQUAL, latent(0.5), latent(-0.5))
     grid = np.stack([latent(x) for x in np.linspace(-3, 3, 31)])
     assert np.all(inference.satisfied(grid) == 1)

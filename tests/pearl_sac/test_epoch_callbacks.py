@@ -60,6 +60,8 @@ def test_every_must_be_positive(tmp_path: Path) -> None:
             TrainingCheckpointCallback(tmp_path / "c.pt", every)
         with pytest.raises(ValueError, match="every must be at least 1 epoch, got"):
             AdaptationEvalCallback(every)
+    with pytest.raises(ValueError, match="`record_at` must be at least 0, but is -1"):
+        AdaptationEvalCallback(record_at=(0, -1))
 
 
 def test_checkpoints_replace_each_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
