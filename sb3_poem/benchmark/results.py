@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from scipy.stats import sem, trim_mean
@@ -22,6 +22,7 @@ from sb3_poem.benchmark.suites import (
     Suite,
     Training,
     digest,
+    family_id,
     family_label,
     family_name,
 )
@@ -152,22 +153,24 @@ class Reference(_Measured):
 
 
 class Selection:
-    """What there is of a suite, of some families (None: all). Models that were trained with other
-    hyperparameters than the newest of their kind are left out.
+    """What there is of a suite, of some families (None: all), by their names or ids. Of models of
+    one seed the newest counts, and of those that were trained here only such as have the
+    hyperparameters of the newest of all seeds.
     """
 
     def __init__(
         self, suite: Suite, records: Iterable[Record], families: Sequence[str] | None = None
     ) -> None:
         self.suite = suite
-        of_families = [one for one in records if families is None or one.family in families]
-        in_order = sorted(of_families, key=lambda record: record.created)
-        newest = {_kind(one): one.identity["model"] for one in in_order if not _handed_over(one)}
+        ids = None if families is None else {family_id(name) for name in families}
+        wanted = [one for one in records if ids is None or one.identity["env_id"] in ids]
+        in_order = sorted(wanted, key=lambda record: record.created)
+        newest = {kind: one.identity["model"] for one in in_order for kind in _kinds(one)}
         #: By the key of a cell whose model is not told
         self.records = {
-            digest({**record.identity, "model": None}): record
-            for record in in_order
-            if _handed_over(record) or record.identity["model"] == newest[_kind(record)]
+            digest({**one.identity, "model": None}): one
+            for one in in_order
+            if all(one.identity["model"] == newest[kind] for kind in _kinds(one))
         }
         shares: dict[Condition, set[float]] = {}
         for record in self.records.values():
@@ -210,12 +213,11 @@ class Selection:
                     yield cell, self.records[cell.key]
 
 
-def _kind(record: Record) -> tuple[Condition, str]:
-    return Condition.of(record), record.identity["variant"]
-
-
-def _handed_over(record: Record) -> bool:
-    return str(record.identity["model"]).startswith(FILE)
+def _kinds(record: Record) -> list[tuple[Any, ...]]:
+    """Of what the record's model must be the newest."""
+    kind = Condition.of(record), record.identity["variant"]
+    is_file = str(record.identity["model"]).startswith(FILE)
+    return [(*kind, record.seed)] + [kind] * (not is_file)
 
 
 @dataclass(frozen=True)

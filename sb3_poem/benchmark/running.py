@@ -171,18 +171,19 @@ def run_cells(
             library.ensure(key, say)
             is_trained = True
             record = run_cell(cell, library, say)
+            store.add(record)
         except Exception as error:
             traceback.print_exc()
             failures.append(f"{cell}: {error}")
             if not is_trained:
                 broken[key] = str(error)
             return
-        store.add(record)
         say(f"    {summary(record.result)}, {record.result['seconds']:.0f} s")
 
     def lock_file(cell: Cell) -> Path:
-        # another store's cell of the same key is another piece of work
-        return library.runs / ".locks" / store.path.name / cell.key
+        # beside the store, wherever each process keeps its models
+        path = store.path.resolve()
+        return path.with_name(f".{path.name}.locks") / cell.key
 
     for position, cell in enumerate(cells, start=1):
         with try_lock(lock_file(cell)) as mine:

@@ -64,8 +64,8 @@ class Store:
                     f"--store {path}: there is no such file; `sb3-poem benchmark run` makes it"
                 )
             self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._database = sqlite3.connect(self.path, timeout=BUSY_SECONDS)
         try:
+            self._database = sqlite3.connect(self.path, timeout=BUSY_SECONDS)
             about = self._about(create)
         except sqlite3.DatabaseError as error:
             raise ValueError(

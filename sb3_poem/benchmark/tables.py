@@ -92,7 +92,9 @@ def make_report(
     :raises ValueError: If the store holds nothing of what is asked for.
     """
     records = [record for record in store.records() if seeds is None or record.seed in seeds]
-    texts, files = [], []
+    texts: list[str] = []
+    rows: list[Row] = []
+    files: list[Path] = []
     for name in suites or SUITES:
         # A small family's cells belong to the suite that declares it, unless a suite is asked for
         # by its name.
@@ -109,16 +111,20 @@ def make_report(
         if kind in ("md", "latex"):
             text = format_tables(selection.suite.title, suite_tables(selection), kind)
         else:
-            text = format_rows(suite_rows(selection), kind)
+            own_rows = suite_rows(selection)
+            rows += own_rows
+            text = format_rows(own_rows, kind)
         texts.append(text)
         if out is not None:
             file = out / f"{name}{SUFFIX[kind]}"
             file.write_text(text)
             files += [file, *write_figures(selection, out)]
     if not texts:
-        of = ", ".join([*(families or []), *(f"seed {seed}" for seed in seeds or [])])
-        raise ValueError(f"{store.path} holds no finished cell" + (f" of {of}" if of else ""))
-    return "\n".join(texts), files
+        of = [*(families or []), *(f"seed {seed}" for seed in seeds or [])]
+        known = "" if suites or families else ": name families that are in no suite by --families"
+        asked = f" of {', '.join(of)}" if of else ""
+        raise ValueError(f"{store.path} holds no finished cell{asked}{known}")
+    return format_rows(rows, kind) if rows else "\n".join(texts), files
 
 
 def suite_rows(selection: Selection) -> list[Row]:

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import yaml
 
 from sb3_poem.adaptation.state import write_json_atomically
@@ -108,11 +109,18 @@ def training_plan(key: ModelKey) -> TrainingPlan:
     facts, tasks = family_facts(key.env_id), hyperparameters.get("n_train_tasks")
     if tasks is None:
         tasks = min(DEFAULT_TRAIN_TASKS, facts.n_tasks or DEFAULT_TRAIN_TASKS)
-    epoch_steps = tasks * hyperparameters.get("trajectories_per_task", 1) * facts.horizon
+    rollouts = tasks * hyperparameters.get("trajectories_per_task", 1)
+    if variant.algorithm == "poem_sac" and not facts.shared_dynamics:
+        # each policy is run on the other tasks of its group, too
+        n_groups = max(1, tasks // hyperparameters.get("preference_group_size", 4))
+        sizes = map(len, np.array_split(np.arange(tasks), n_groups))
+        rollouts += sum(size * (size - 1) for size in sizes)
+    epoch_steps = rollouts * facts.horizon
     per_epoch = int(hyperparameters.get("gradient_steps", 1000))
     updates = -(-timesteps // epoch_steps) * (epoch_steps if per_epoch < 0 else per_epoch)
-    sizes = timesteps, int(epoch_steps), updates
-    return TrainingPlan(variant.algorithm, hyperparameters, changes, *sizes)
+    return TrainingPlan(
+        variant.algorithm, hyperparameters, changes, timesteps, int(epoch_steps), updates
+    )
 
 
 def train_arguments(key: ModelKey, plan: TrainingPlan) -> list[str]:

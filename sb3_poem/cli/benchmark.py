@@ -6,20 +6,19 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sb3_poem.benchmark.methods import VARIANTS
 from sb3_poem.benchmark.suites import (
     SUITES,
     Budget,
     Training,
     family_id,
     family_label,
-    family_name,
     hashable,
 )
 from sb3_poem.cli.needs import check_writable, import_packages, parse_pairs
 
 if TYPE_CHECKING:
     from sb3_poem.benchmark.models import ModelLibrary
+    from sb3_poem.benchmark.running import Plan
 
 _say = partial(print, flush=True)
 
@@ -44,17 +43,18 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.export is not None and (suite.name != "shipped" or arguments.methods):
         raise ValueError("--export is for --suite shipped with all of its methods")
     library = _library(arguments, arguments.device, arguments.num_threads)
-    _check_models(arguments.model, library, arguments.families or suite.families, seeds)
-    store = Store(arguments.store) if not arguments.list or arguments.store.exists() else None
+    store = Store(arguments.store) if arguments.store.exists() else None
     usual = suite.budget
     budget = Budget(arguments.tasks or usual.tasks, arguments.episodes or usual.episodes)
     about = (suite, library, store, arguments.families, arguments.methods, seeds)
     plan = make_plan(*about, budget, training, arguments.snapshots)
-    if store is None or arguments.list:
+    _check_models(arguments.model, library, plan)
+    if arguments.list:
         print("\n".join(describe(plan, library)))
         return 0
     for folder in filter(None, (arguments.runs, arguments.export)):
         check_writable(folder)
+    store = store or Store(arguments.store)
     _say(f"{plan}; results in {arguments.store}")
     if arguments.backend == "ray":
         from sb3_poem.benchmark.ray_backend import RayOptions, run_with_ray
@@ -78,31 +78,38 @@ def _run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _check_models(
-    given: Sequence[str], library: "ModelLibrary", names: Sequence[str], seeds: range
-) -> None:
+def _check_models(given: Sequence[str], library: "ModelLibrary", plan: "Plan") -> None:
     """Refuse what would quietly be trained instead of being taken."""
-    families = {family_id(name) for name in names}
-    for text, (family, _, seed, _) in zip(given, library.workplace.named, strict=True):
-        if family not in families:
-            known = ", ".join(sorted(map(family_label, families)))
-            what = f"{family_label(family)} is none of the families of this run: {known}"
-            raise ValueError(f"--model {text}: {what}")
-        if seed not in seeds:
-            known = ", ".join(map(str, seeds))
-            raise ValueError(f"--model {text}: {seed} is none of the seeds of this run: {known}")
+    cells = [*plan.todo, *plan.done, *(cell for cell, _ in plan.skipped)]
+    keys = {cell.model_key.base or cell.model_key for cell in cells}
+    used = {
+        "families": {family_label(key.env_id) for key in keys},
+        "models": {key.variant for key in keys},
+        "seeds": {key.seed for key in keys},
+    }
+    for text, (family, variant, seed, _) in zip(given, library.workplace.named, strict=True):
+        named = (family_label(family), variant, seed)
+        for one, (what, known) in zip(named, used.items(), strict=True):
+            if one not in known:
+                listed = ", ".join(map(str, sorted(known)))
+                none = f"{one} is none of the {what} of this run: {listed}"
+                raise ValueError(f"--model {text}: {none}")
 
 
 def _report(arguments: argparse.Namespace) -> int:
     from sb3_poem.benchmark.store import Store
     from sb3_poem.benchmark.tables import make_report
 
-    families = arguments.families and [family_name(family_id(name)) for name in arguments.families]
     if arguments.out is not None:
         check_writable(arguments.out)
     store = Store(arguments.store, create=False)
     text, files = make_report(
-        store, arguments.suite, families, arguments.format, arguments.out, arguments.seeds
+        store,
+        arguments.suite,
+        arguments.families,
+        arguments.format,
+        arguments.out,
+        arguments.seeds,
     )
     if arguments.out is None:
         print(text)
@@ -159,9 +166,6 @@ def _parse_named(text: str) -> tuple[str, str, int, str]:
     if not equals or len(parts) != 3 or not parts[2].isdigit():
         raise ValueError(f"--model {text}: must have the form FAMILY:VARIANT:SEED=PATH")
     family, variant, seed = parts
-    if variant not in VARIANTS:
-        known = ", ".join(VARIANTS)
-        raise ValueError(f"--model {text}: there is no variant {variant!r}; there are: {known}")
     if not Path(path).exists():
         raise ValueError(f"--model {text}: there is no such file or folder")
     return family_id(family), variant, int(seed), path

@@ -21,6 +21,7 @@ from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.resources import shipped_folder
 
 POINT = "poem/PointGoal-v0"
+ML10 = FamilyFacts("poem/MetaWorldML10-v0", 200, None, False)  # which takes seconds to make
 
 
 def plan_for(
@@ -35,7 +36,9 @@ def plan_for(
     )
 
 
-def test_the_training_plan_follows_the_hyperparameter_file(tmp_path: Path) -> None:
+def test_the_training_plan_follows_the_hyperparameter_file(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     plan = training_plan(ModelKey("poem/HalfCheetahVel-v0", "poem-d2", 0))
     assert (plan.timesteps, plan.epoch_steps, plan.updates) == (720_000, 24_000, 30_000)
     assert plan.save_steps == 48_000
@@ -43,6 +46,11 @@ def test_the_training_plan_follows_the_hyperparameter_file(tmp_path: Path) -> No
     assert plan.overrides == {"latent_dim": 2}
     two_tasks = training_plan(ModelKey("poem/HalfCheetahFwdBack-v0", "poem", 0))
     assert (two_tasks.epoch_steps, two_tasks.updates) == (24_000, 120_000)
+    monkeypatch.setattr("sb3_poem.benchmark.training.family_facts", lambda name: ML10)
+    # 120 tasks, and each policy on the three other tasks of its group
+    ml10 = [training_plan(ModelKey(ML10.env_id, name, 0)) for name in ("poem", "pearl")]
+    assert [plan.epoch_steps for plan in ml10] == [4 * 24_000, 24_000]
+    monkeypatch.undo()
     shorter = training_plan(ModelKey(POINT, "pearl", 0, Training(3000, (("gradient_steps", 7),))))
     assert (shorter.timesteps, shorter.updates) == (3000, 7)
     assert shorter.overrides == {"gradient_steps": 7}
@@ -149,6 +157,13 @@ def test_models_are_found_in_a_folder_or_by_name_and_checked(tmp_path: Path) -> 
     ):
         gone.given(ModelKey(POINT, "poem", 0))
     env.close()
+    # made from another one's model, and of another environment than the cells'
+    pearl.save(tmp_path / "models/PointGoal/maml-reward/seed0.zip")
+    assert library.given(ModelKey(POINT, "maml-reward", 0)) is None
+    short = small(POEMSAC, make_task_vec_env(POINT, 4, step_length=0.1)).learn(300)
+    short.save(tmp_path / "models/PointGoal/poem/seed0.zip")
+    with pytest.raises(ValueError, match=r"env_kwargs {'step_length': 0.1} instead of {}"):
+        library.load(ModelKey(POINT, "poem", 0), make_task_vec_env(POINT, 4))
 
 
 def test_the_model_saved_nearest_to_a_share_of_the_training(tmp_path: Path) -> None:
@@ -168,13 +183,10 @@ def test_a_method_that_cannot_run_on_a_family_says_so_before_training(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     known = family_facts("PointGoal")
-    ml10 = FamilyFacts(
-        "poem/MetaWorldML10-v0", 200, None, False
-    )  # Meta-World takes seconds to make it
     for module in ("running", "training", "estimate"):
         monkeypatch.setattr(
             f"sb3_poem.benchmark.{module}.family_facts",
-            lambda name: ml10 if "ML10" in name else family_facts(name),
+            lambda name: ML10 if "ML10" in name else family_facts(name),
         )
     monkeypatch.setattr("sb3_poem.benchmark.running.measure_pace", lambda *where: Pace(1e-4, 1e-2))
     assert known.shared_dynamics
@@ -277,16 +289,26 @@ def test_a_named_folder_without_a_model(tmp_path: Path) -> None:
         ),
         (["--model", "PointGoal:poem:5=."], "5 is none of the seeds of this run: 0, 1, 2"),
         (
+            ["--model", "PointGoal:maml-reward:0=."],
+            "maml-reward is none of the models of this run: pearl, poem",
+        ),
+        (
             ["--params", "net_arch:{'pi': [64]}"],
             "--params net_arch: .* is a dictionary; write it as text",
         ),
     ],
 )
 def test_what_would_quietly_train_something_else_is_refused(
-    words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+    words: list[str],
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    assert main(["benchmark", "run", "--suite", "smoke", "--list", *words]) != 0
+    monkeypatch.chdir(tmp_path)
+    assert main(["benchmark", "run", "--suite", "smoke", *words]) != 0
     assert re.search(message, capsys.readouterr().err)
+    assert not any(tmp_path.iterdir())
 
 
 def test_lists_are_taken_as_hyperparameters(

@@ -220,6 +220,22 @@ def test_one_table_never_mixes_versions(tmp_path: Path) -> None:
     assert (old.rows[0][1:3], new.rows[0][1:3]) == (("3", "-120.0 ± 5.0"), ("2", "-17.5 ± 10.6"))
 
 
+def test_one_table_shows_one_model_of_a_seed(tmp_path: Path) -> None:
+    """Of two that were handed over for the same seed the one that was measured last, whatever the
+    methods.
+    """
+    with Store(tmp_path / "store.sqlite") as store:
+        for year, (method, model) in enumerate(
+            [("poem-bayes", "file 1"), ("poem-paper", "file 1"), ("poem-bayes", "file 2")], 2001
+        ):
+            [cell] = SUITES["shipped"].cells([VEL], [0], [method], FOUR)
+            record = finished(replace(cell, model=model), ladder)
+            store.add(replace(record, created=f"{year}-01-01"))
+        [selection] = [Selection(SUITES["shipped"], store.records())]
+    assert {row.method for row in suite_rows(selection)} == {"poem-bayes"}
+    assert [one.identity["model"] for one in selection.records.values()] == ["file 2"]
+
+
 def test_the_table_of_what_ships(tmp_path: Path) -> None:
     """Seeds' means and standard errors over tasks, with success rates and times."""
     facts = {"training_cpu_seconds": 1234.0}
@@ -253,6 +269,11 @@ def test_families_of_one_name_and_curves_of_different_parts_stay_apart(tmp_path:
     measured: dict[str, set[float | None]] = {}
     for row in suite_rows(selection):
         measured.setdefault(row.condition.split(":")[0], set()).add(row.snapshot)
+    with Store(tmp_path / "store.sqlite") as store:
+        for family, conditions in (("mine/HalfCheetahVel-v0", 1), ("HalfCheetahVel", 1), (None, 2)):
+            rows = json.loads(make_report(store, ["table3"], family and [family], "json")[0])
+            assert len({row["condition"] for row in rows}) == conditions
+            assert family is None or rows[0]["condition"].startswith(f"{family}:")
     assert measured == {
         "HalfCheetahVel": {None, 0.2, 0.4, 0.6, 0.8},
         "mine/HalfCheetahVel-v0": {None, 0.5},
@@ -295,6 +316,9 @@ def test_every_format(tmp_path: Path) -> None:
     data = json.loads(make_report(store, ["table3"], kind="json")[0])
     assert len(table) == len(data)
     assert [float(row["mean"]) for row in table] == [row["mean"] for row in data]
+    both = json.loads(make_report(store, ["table3", "shipped"], kind="json")[0])  # of one list
+    assert both[: len(data)] == data
+    assert {row["suite"] for row in both} == {"table3", "shipped"}
 
 
 @pytest.mark.parametrize(
@@ -338,6 +362,8 @@ def test_a_store_without_the_suite_is_refused(tmp_path: Path) -> None:
     store = fill(tmp_path / "store.sqlite", "epsilon", seeds=1, methods=["poem-paper-epsilon-0.4"])
     with pytest.raises(ValueError, match=r"--suite smoke: .* holds no finished cell of it"):
         make_report(store, ["smoke"])
+    with pytest.raises(ValueError, match=r"name families that are in no suite by --families"):
+        make_report(Store(tmp_path / "empty.sqlite"))
     assert make_report(store)[0].count("# Tolerance of the paper's rule") == 1
 
 

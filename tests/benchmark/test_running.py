@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -28,6 +29,7 @@ from sb3_poem.benchmark.suites import (
     TABLE_METHODS,
     TABLE_REFERENCES,
     Budget,
+    Cell,
     Entry,
     ModelKey,
     Suite,
@@ -157,6 +159,13 @@ def test_a_finished_cell_is_verified(
     assert f"task_returns: 1 of {n} numbers differ, the most at [1, 0]" in capsys.readouterr().out
     assert main(["benchmark", "verify", *words, "--cell", "x"]) != 0
     assert "--cell x is no cell's key" in capsys.readouterr().err
+    trained = ModelLibrary(Workplace(str(tmp_path))).origin(ModelKey(POINT, "poem", 0))
+    with Store(words[-1]) as store:
+        missing = Cell.of_identity("poem-paper", {**record.identity, "model": trained})
+        store.add(replace(record, key=missing.key, identity=missing.identity()))
+    nowhere = ["--runs", str(tmp_path / "nowhere"), "--store", words[-1], "--cell", missing.key]
+    assert main(["benchmark", "verify", *nowhere]) != 0  # and nothing is trained
+    assert "missing: say where it is by --runs" in capsys.readouterr().err
     words[1] = str(handed_over / "without")
     assert main(["benchmark", "verify", *words, "--cell", key]) != 0
     assert "say where it is by --runs, --models or --model" in capsys.readouterr().err
@@ -291,6 +300,35 @@ def test_cells_whose_model_another_process_trains_come_last(
     shown = [line.split(", ")[1] for line in lines if line.startswith("[")]
     assert shown == ["reward-oracle", "poem-paper"]
     assert len(store.keys()) == 2
+
+
+def test_processes_that_keep_models_apart_share_the_cells_of_a_store(
+    tmp_path: Path, handed_over: Path
+) -> None:
+    """One finds a cell taken, waits, and has nothing to do."""
+    workplaces = [Workplace(str(tmp_path / name), (str(handed_over / "all"),)) for name in "ab"]
+    first, second = map(ModelLibrary, workplaces)
+    path, lines = tmp_path / "store.sqlite", []
+    how = (None, None, ["poem-paper"], range(1), BUDGET, Training(), 1)
+    cells = make_plan(TINY, first, *how).todo
+
+    def other_process() -> None:
+        with Store(path) as store:
+            lines.append(run_cells(cells, second, store, lines.append))
+
+    other = threading.Thread(target=other_process)
+
+    def say(line: str) -> None:
+        if line.startswith("[1/1]"):
+            other.start()
+            while not lines:
+                time.sleep(0.01)
+
+    with Store(path) as store:
+        assert run_cells(cells, first, store, say) == []
+        other.join()
+        assert len(store.keys()) == 1
+    assert lines == [f"waiting for another process: {cells[0]}", []]
 
 
 def test_an_interrupted_training_goes_on_from_its_checkpoint(tmp_path: Path) -> None:

@@ -102,6 +102,8 @@ def test_other_files_are_refused_and_stay_as_they_are(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=message):
             Store(path)
         assert path.read_bytes() == before
+    with pytest.raises(ValueError, match=r"cannot be used as a store .*: unable to open"):
+        Store(tmp_path)
     with pytest.raises(FileNotFoundError, match="benchmark run"):
         Store(tmp_path / "missing.sqlite", create=False)
     assert not (tmp_path / "missing.sqlite").exists()
