@@ -73,7 +73,6 @@ bench: $(STAMP)
 bench-gpu: $(STAMP)
 	$(BIN)/python -m pytest -m gpu $(PYTEST_ARGS)
 	$(BIN)/python benchmarks/bench_gradient_step.py --device cuda --threads 2
-	$(BIN)/python benchmarks/time_to_result.py --device cuda --conf zoo_configs/poem_sac_gpu.yml --from-step 192000 --every 2
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .

@@ -6,8 +6,6 @@ changes the work, but for how often particles thin out. Figures are the means ov
 questions.
 """
 
-from __future__ import annotations
-
 import time
 from typing import Any
 

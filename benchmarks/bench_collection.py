@@ -9,8 +9,6 @@ steps its own versions of these robots.
     python benchmarks/bench_collection.py --env poem/AntVel-v0 poem/MetaWorldML1-v0
 """
 
-from __future__ import annotations
-
 import functools
 import importlib.util
 import multiprocessing
@@ -32,8 +30,6 @@ from sb3_poem.benchmark.suites import family_name
 from sb3_poem.common.vec_env import make_task_vec_env
 
 N_TASKS, STEPS = 120, 25
-# 24 GB of memory did not hold 120 Meta-World environments of each kind.
-OTHERS = {"MetaWorld": 16}
 ENVPOOL = {"HalfCheetah": "HalfCheetah-v4", "Ant": "Ant-v4", "Humanoid": "Humanoid-v4"}
 DEFAULT_IDS = [
     f"poem/{name}-v0" for name in ("HalfCheetahVel", "AntVel", "HumanoidDir2D", "MetaWorldML1")
@@ -117,8 +113,10 @@ def training(model: POEMSAC) -> Callable[[], None]:
 
 
 def others_of(env_id: str) -> int:
-    """How many copies SB3's and Gymnasium's vectorised environments step."""
-    return next((copies for name, copies in OTHERS.items() if name in env_id), N_TASKS)
+    """How many copies SB3's and Gymnasium's vectorised environments step: 24 GB of memory did not
+    hold 120 of Meta-World of each kind.
+    """
+    return 16 if "MetaWorld" in env_id else N_TASKS
 
 
 def measure(env_id: str, nthread: int, repeats: int) -> dict[str, Any]:

@@ -297,8 +297,7 @@ def main() -> None:
     ratios = [f"ours to {rival}", "ours to SAC", "share of the products' rate"]
     text = table(["size", "threads", *(f"{key}, ms" for key in columns), *ratios], rows)
     name = "gradient-step" if on_cpu else f"gradient-step-{given.device}"
-    settings = {"turns": given.turns, "device": given.device}
-    settings |= {"tasks": N_TRAIN_TASKS}
+    settings = {"turns": given.turns, "device": given.device, "tasks": N_TRAIN_TASKS}
     sections, threads = [DESCRIPTION, text], max(given.threads)
     write(name, "Gradient step", sections, results, given.out, settings, threads)
 

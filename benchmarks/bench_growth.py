@@ -4,8 +4,6 @@ matrix J against tasks.
 Writes ``growth.png`` beside the table.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,6 +21,7 @@ from sb3_poem.pearl_sac.collector import relabelled_returns
 COPIES = (1, 4, 16, 64, 256, 1024)
 BATCH_TASKS, TASKS = (2, 4, 8, 16, 32, 64), (120, 300, 1000)
 IDS = ("poem/HalfCheetahVel-v0", "poem/AntVel-v0")
+Rows = list[dict[str, Any]]
 
 
 def steps(env: TaskVecEnv, actions: np.ndarray) -> None:
@@ -31,7 +30,7 @@ def steps(env: TaskVecEnv, actions: np.ndarray) -> None:
         env.step(row)
 
 
-def copies_and_threads(env_id: str, thread_counts: list[int], repeats: int) -> list[dict[str, Any]]:
+def copies_and_threads(env_id: str, thread_counts: list[int], repeats: int) -> Rows:
     """Environment steps per second of TaskVecEnv under random actions."""
     rows = []
     for copies in COPIES:
@@ -49,7 +48,7 @@ def copies_and_threads(env_id: str, thread_counts: list[int], repeats: int) -> l
     return rows
 
 
-def update_against_tasks(repeats: int, steps: int = 10) -> list[dict[str, Any]]:
+def update_against_tasks(repeats: int, steps: int = 10) -> Rows:
     """Milliseconds of one gradient step, 128 transitions a task, by ``model.train`` after one epoch
     of ``learn``.
     """
@@ -65,7 +64,7 @@ def update_against_tasks(repeats: int, steps: int = 10) -> list[dict[str, Any]]:
     return [{"tasks": n, "ms": 1000.0 * (taken - nothing) / steps} for n, taken in median.items()]
 
 
-def returns_matrix(repeats: int) -> list[dict[str, Any]]:
+def returns_matrix(repeats: int) -> Rows:
     """Milliseconds of J[i, j] for N tasks with a trajectory of 200 steps each."""
     rng, rows = np.random.default_rng(0), []
     for env_id in IDS:
@@ -77,18 +76,12 @@ def returns_matrix(repeats: int) -> list[dict[str, Any]]:
             call = partial(relabelled_returns, family.compute_rewards, tasks, features, mask)
             turns = repeats if n_tasks < 1000 else 1
             [taken] = common.seconds_in_turns({"": call}, turns, warm_up=0).values()
-            rows.append(
-                {"family": env_id, "tasks": n_tasks, "ms": 1000.0 * float(np.median(taken))}
-            )
+            milliseconds = 1000.0 * float(np.median(taken))
+            rows.append({"family": env_id, "tasks": n_tasks, "ms": milliseconds})
     return rows
 
 
-def plot(
-    copies: list[dict[str, Any]],
-    updates: list[dict[str, Any]],
-    returns: list[dict[str, Any]],
-    path: Path,
-) -> None:
+def plot(copies: Rows, updates: Rows, returns: Rows, path: Path) -> None:
     """Three panels, one for each question."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -7,8 +7,6 @@ transition, and neither the flags nor the reward features that training needs; i
 gather, as the buffer does.
 """
 
-from __future__ import annotations
-
 import os
 import statistics
 from pathlib import Path

@@ -2,8 +2,6 @@
 ``learn``, in fresh processes.
 """
 
-from __future__ import annotations
-
 import statistics
 import subprocess
 import sys

@@ -1,19 +1,14 @@
-"""What the measurements share: arguments, timing in turns, tables, a server of the page, and the
-files that results are written to.
+"""What the measurements share: arguments, timing in turns, tables, and the files that results are
+written to.
 """
 
-from __future__ import annotations
-
 import argparse
-import contextlib
 import json
 import re
 import statistics
-import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +16,12 @@ from poem_envs.vector import available_cores
 from sb3_poem.benchmark.provenance import commit, machine
 
 RESULTS = Path(__file__).parent / "results"
-ZOO = Path(__file__).parents[1] / "zoo_configs"
 OUT = {"type": Path, "default": RESULTS / "speed", "help": "folder of the results"}
 
 
 def arguments(description: str | None, /, **options: Any) -> argparse.Namespace:
-    """Parse the command line.
+    """Parse the command line, as a script's docstring describes it.
 
-    :param description: The script's docstring
     :param options: By name, each by its default, a list where there may be several; or by the
         arguments of ``add_argument``, as a dictionary
     """
@@ -49,8 +42,6 @@ def arguments(description: str | None, /, **options: Any) -> argparse.Namespace:
 def available_device(name: str) -> str:
     """The type of an argument that names a device: one that is there, since results are filed under
     its name.
-
-    :raises argparse.ArgumentTypeError: if it is not
     """
     import torch
 
@@ -67,13 +58,8 @@ DEVICE = {"type": available_device, "default": "cpu"}
 def seconds_in_turns(
     contenders: dict[str, Callable[[], Any]], repeats: int, warm_up: int = 1
 ) -> dict[str, list[float]]:
-    """Time contenders one after the other, again and again, so that a slow minute of the machine
-    hits all of them.
-
-    :param contenders: Functions of the same amount of work
-    :param repeats: Timed calls of each
-    :param warm_up: Calls before that
-    :return: Seconds of every call
+    """The seconds of every timed call of contenders, which do the same amount of work, one after
+    the other, again and again, so that a slow minute of the machine hits all of them.
     """
     for function in contenders.values():
         for _ in range(warm_up):
@@ -113,14 +99,9 @@ def write(
     settings: dict[str, Any],
     threads: int = 1,
 ) -> None:
-    """Write ``<out>/<name>.md`` and ``.json``, and print the former.
-
-    :param sections: Paragraphs and tables in Markdown
-    :param data: What the tables were made of; None writes no JSON
-    :param settings: Of this run, printed below
-    :param threads: The most that any contender used
-    :raises RuntimeError: if the process has fewer cores than that, as when it was pinned after it
-        began
+    """Write ``<out>/<name>.md`` of sections in Markdown and, unless ``data`` is None, what they
+    were made of as ``.json``; print the former. A ``RuntimeError`` if the process has fewer cores
+    than the most ``threads`` of a contender, as when it was pinned after it began.
     """
     if available_cores() < threads:
         raise RuntimeError(
@@ -140,23 +121,3 @@ def write(
     if data is not None:
         (out / f"{name}.json").write_text(json.dumps({**origin, "results": data}, indent=1) + "\n")
     print(text, flush=True)
-
-
-@contextlib.contextmanager
-def label_server(model: str, *words: str) -> Iterator[tuple[subprocess.Popen[str], str, Path]]:
-    """``sb3-poem label`` on loopback: its process, its address, and the folder of its store."""
-    with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-u", "-m", "sb3_poem.cli", "label", "--model", model]
-        command += ["--port", "0", "--store", folder, *words]
-        server = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-        )
-        try:
-            for line in server.stdout or ():
-                if found := re.search(r"http://\S+", line):
-                    yield server, found.group(), Path(folder)
-                    return
-            raise RuntimeError("the server did not start")
-        finally:
-            server.terminate()
-            server.wait()

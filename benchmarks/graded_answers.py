@@ -78,20 +78,16 @@ def main() -> None:
             print(key, record[key], flush=True)
             file.write_text(json.dumps({"results": record}, indent=1))
         env.close()
-    rows = [
-        [*key.split(" | "), *values, *after_films(key, values)] for key, values in record.items()
-    ]
+    rows = []
+    for key, values in record.items():
+        words = key.split(" | ")
+        answers = [n // len(PLACES[words[2]]) for n in FILMS]
+        rows.append([*words, *values, *(values[ANSWERS.index(k)] for k in answers)])
     head = ["family", "oracle", "question", "how it errs", *(f"{n} answers" for n in ANSWERS)]
     head += [f"{n} films" for n in FILMS]
     settings = {"tasks": args.tasks, "episodes": args.episodes, "seed": args.seed}
     title = "Graded answers, the best of four and an inferred person"
     write("answers", title, [table(head, rows)], record, args.out, settings)
-
-
-def after_films(key: str, values: list[float]) -> list[float]:
-    """A row's returns after :data:`FILMS`."""
-    films = len(PLACES[key.split(" | ")[2]])
-    return [values[ANSWERS.index(n // films)] for n in FILMS]
 
 
 if __name__ == "__main__":

@@ -7,24 +7,26 @@ waits for what comes next.
     python benchmarks/label_load.py --people 8 --seconds 90 --watch 8
 """
 
-from __future__ import annotations
-
+import contextlib
 import json
 import os
 import random
 import re
 import statistics
+import subprocess
 import sys
+import tempfile
 import threading
 import time
 import urllib.parse
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import requests
-from common import arguments, label_server
+from common import arguments
 
-from sb3_poem.adaptation.preference import Preference
+from sb3_poem.adaptation.preference import ANSWERS
 from sb3_poem.label.store import Store
 
 POLL_SECONDS = 0.15
@@ -59,7 +61,7 @@ class Person(threading.Thread):
         self.first = time.monotonic() - begun
         while time.monotonic() < self.until and view["phase"] == "question":
             time.sleep(self.random.uniform(0.5, 1.5) * self.watch)
-            preference = self.random.choice([each.value for each in Preference])
+            preference = self.random.choice(ANSWERS[view["question"]]).value
             asked = time.monotonic()
             answer = {"question": view["turn"]["id"], "preference": preference}
             self._call(f"/s/{self.token}/answer", json=answer)
@@ -83,6 +85,26 @@ class Person(threading.Thread):
         response = call(f"{self.server}{path}", timeout=60, allow_redirects=False, **posted)
         response.raise_for_status()
         return response
+
+
+@contextlib.contextmanager
+def label_server(model: str, *words: str) -> Iterator[tuple[subprocess.Popen[str], str, Path]]:
+    """``sb3-poem label`` on loopback: its process, its address, and the folder of its store."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-u", "-m", "sb3_poem.cli", "label", "--model", model]
+        command += ["--port", "0", "--store", folder, *words]
+        server = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        )
+        try:
+            for line in server.stdout or ():
+                if found := re.search(r"http://\S+", line):
+                    yield server, found.group(), Path(folder)
+                    return
+            raise RuntimeError("the server did not start")
+        finally:
+            server.terminate()
+            server.wait()
 
 
 def memory_of(pid: int) -> float:

@@ -31,10 +31,9 @@ class Adapted:
         split = "held-out" if split == "test" else split
         self.family = make_task_vec_env(model.env_id, 2 * envs.num_envs, split=split)
         self.dim = self.family.get_attr("task_space", [0])[0].shape[0]
-        numbers = {
-            f"{n}-v3": i for i, n in enumerate(self.family.get_attr("manipulations", [0])[0])
-        }
-        self.numbers = {ALL_V3_ENVIRONMENTS[name].__name__: i for name, i in numbers.items()}
+        manipulations = self.family.get_attr("manipulations", [0])[0]
+        classes = [ALL_V3_ENVIRONMENTS[f"{name}-v3"].__name__ for name in manipulations]
+        self.numbers = {name: i for i, name in enumerate(classes)}
 
     def init(self) -> None:
         tasks = np.zeros((self.envs.num_envs, self.dim))
@@ -64,12 +63,11 @@ def main() -> None:
     model, rows = load_model(args.model), {}
     for n_queries in args.answers:
         how = {
-            "terminate_on_success": True,
             "task_select": "pseudorandom",
-            "seed": 1,
             "total_tasks_per_cls": 40,
+            "terminate_on_success": True,
         }
-        envs = make_ml_envs("ML10", meta_batch_size=20, split=args.split, **how)
+        envs = make_ml_envs("ML10", seed=1, meta_batch_size=20, split=args.split, **how)
         agent = Adapted(model, envs, args.split, n_queries)
         success, _, each = metalearning_evaluation(agent, envs, args.evals, adaptation_steps=0)
         rows[n_queries] = {"mean": success, **each}
@@ -80,10 +78,8 @@ def main() -> None:
     head = ["manipulation", *(f"after {k} answers" for k in rows)]
     shares = [[name, *(f"{row[name]:.2f}" for row in rows.values())] for name in names]
     text = f"{args.evals} draws of 20 goals, 3 episodes each; success rates. Rewards version 2."
-    name = f"metaworld-evaluation-{args.split}"
-    write(
-        name, "ML10 by Meta-World's own evaluation", [text, table(head, shares)], None, args.out, {}
-    )
+    name, title = f"metaworld-evaluation-{args.split}", "ML10 by Meta-World's own evaluation"
+    write(name, title, [text, table(head, shares)], None, args.out, {})
 
 
 if __name__ == "__main__":

@@ -1,20 +1,21 @@
 """A model of a family against Stable-Baselines3's SAC that is trained on one known task, with as
 many updates, once for each of a few tasks.
 
-    python benchmarks/single_task_sac.py MODEL.zip --gym-packages gymnasium_robots --out record.json
+    python benchmarks/single_task_sac.py --model MODEL.zip --gym-packages gymnasium_robots
 
 Both earn the mean return of deterministic episodes on the same tasks. SAC has its own defaults and
 makes an update a step; the model adapts by ten exact answers (``adapted``), or takes the best of
 its latents (``known``). ``random`` is SAC before its first update, the zero of shares.
 """
 
-import argparse
 import importlib
 import json
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import torch as th
+from common import arguments
 from stable_baselines3 import SAC
 from stable_baselines3.common.evaluation import evaluate_policy
 
@@ -25,14 +26,15 @@ from sb3_poem.loading import load_model
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("model")
-    parser.add_argument("--gym-packages", nargs="*", default=[])
-    parser.add_argument("--tasks", type=int, default=5)
-    parser.add_argument("--episodes", type=int, default=10)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out")
-    args = parser.parse_args()
+    args = arguments(
+        __doc__,
+        model={"required": True},
+        gym_packages={"nargs": "*", "default": []},
+        tasks=5,
+        episodes=10,
+        seed=0,
+        out={"type": Path, "help": "write the figures to this file, as JSON"},
+    )
     for package in args.gym_packages:
         importlib.import_module(package)
     th.set_num_threads(1)
@@ -62,9 +64,8 @@ def main() -> None:
     for name in ("before", "adapted", "known"):
         record[f"{name}_share"] = (record[name] - nothing) / (sac - nothing)
     print(json.dumps(record, indent=1))
-    if args.out:
-        with open(args.out, "w") as file:
-            json.dump(record, file, indent=1)
+    if args.out is not None:
+        args.out.write_text(json.dumps(record, indent=1) + "\n")
 
 
 if __name__ == "__main__":
