@@ -143,7 +143,8 @@ def family_section(family: str) -> str:
         for page, text in PAGES.items()
         if (folder / f"{page}.md").exists()
     ]
-    lines += ["More: " + ",\n".join(links) + ".", ""]
+    if links:
+        lines += ["More: " + ",\n".join(links) + ".", ""]
     for picture in sorted(folder.glob("*.png")):
         caption = next(text for start, text in CAPTIONS.items() if picture.stem.startswith(start))
         lines += [f"![{caption}]({where}/{picture.name})", "", f"*{caption}.*", ""]
