@@ -430,7 +430,7 @@ class PreferenceAdapter:
     @classmethod
     def from_json(cls, text: str, model: MetaModel | str | Path, env: Env, **kwargs: Any) -> Self:
         """:meth:`from_dict`, with its arguments, of a JSON text."""
-        data = parse_json(text, "the text is no saved adaptation")
+        data = parse_json(text, "the text is not a saved adaptation")
         return cls.from_dict(data, model, env, **kwargs)
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -442,7 +442,7 @@ class PreferenceAdapter:
         cls, path: str | os.PathLike[str], model: MetaModel | str | Path, env: Env, **kwargs: Any
     ) -> Self:
         """:meth:`from_dict`, with its arguments, of a file of :meth:`save`."""
-        return cls.from_dict(read_json(path, "saved adaptation"), model, env, **kwargs)
+        return cls.from_dict(read_json(path, "a saved adaptation"), model, env, **kwargs)
 
 
 @contextlib.contextmanager

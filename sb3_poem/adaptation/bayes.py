@@ -132,32 +132,26 @@ class Bayes(Rule):
     the answer. The predicted difference is trusted only as far as the decoder's own residual
     allows.
 
-    *Likelihood from S*: S(z, z_left) - S(z, z_right) takes the place of the returns' difference. S
-    has an order but no unit: for error-free answers every positive multiple of it makes the same
-    predictions. What scale it has comes from training, where it is the log-odds of being right
-    about error-free labels. So the model's doubt is one logistic unit of S while training is young.
-    Once training separates nearly all pairs, however, the cross-entropy is lowered by scaling S up
-    without end, and its odds turn overconfident. So the unit is never taken smaller than a fixed
-    share of the spread of S.
+    *Likelihood from S*: S(z, z_left) - S(z, z_right) takes the place of the returns' difference. In
+    training S is the log-odds of being right about error-free labels, so the model's doubt is one
+    logistic unit of it. Once nearly all pairs are separated, however, the cross-entropy is lowered
+    by scaling S up without end: so the unit is at least a fixed share of the spread of S.
 
     *Where a person answers*, what a question tells is multiplied by how much of the difference can
     be seen (:func:`~sb3_poem.adaptation.queries.best_pair`), which the family says
     (:meth:`poem_envs.TaskFamily.visible_difference`). That holds for ``"information-gain"``.
 
     *Thinning*: when half of the particles carry no weight they are resampled and moved by
-    elliptical slice sampling around the posterior's own mean and covariance. Moves are bounded. One
-    by the decoder evaluates all trajectories that were ever shown, so only as many particles move
-    as a budget allows; the copies that are left over are replaced by neighbours, drawn from a
-    kernel that keeps the particles' mean and covariance (Liu & West 2001). A pool of fixed draws
-    would be empty after a few answers; this one has as many different particles after fifty, in any
-    dimension.
+    elliptical slice sampling around the posterior's own mean and covariance. A move by the decoder
+    evaluates all trajectories that were ever shown, so only as many particles move as a budget
+    allows; the copies that are left over are replaced by neighbours, drawn from a kernel that keeps
+    the particles' mean and covariance (Liu & West 2001).
 
     *Who answers*: how an oracle errs can be told (``noise_model``) or inferred with the task: the
     posterior is then one of latent and person together, of whom there is a grid in the place of
     each particle (:class:`~sb3_poem.adaptation.people.People` states the prior), and both answers
     and questions are averaged over it. What a person calls equal and much better, which graded
-    answers depend on, is always inferred. Widths and doubts are in units of the family's spread of
-    returns, which S gives, in returns by the slope between S and the decoder's.
+    answers depend on, is always inferred.
 
     >>> from sb3_poem import PreferenceAdapter
     >>> rule = Bayes(n_particles=100)

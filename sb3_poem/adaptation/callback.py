@@ -11,6 +11,7 @@ from sb3_poem.adaptation.bayes import Bayes
 from sb3_poem.adaptation.environments import check_model_fits
 from sb3_poem.adaptation.evaluation import evaluate_adaptation, evaluate_episodes
 from sb3_poem.adaptation.known_task import known_task_return, preference_order
+from sb3_poem.adaptation.many_tasks import check_record_at
 from sb3_poem.adaptation.meta_model import HasSimilarity
 from sb3_poem.adaptation.rule import as_rule
 from sb3_poem.common.checks import check_whole
@@ -69,12 +70,8 @@ class AdaptationEvalCallback(EpochCallback):
         super().__init__(every, verbose)
         check_whole("n_tasks", n_tasks, 1)
         check_whole("n_episodes", n_episodes, 1)
-        if len(record_at) == 0:
-            raise ValueError(f"record_at must hold at least one number, got {record_at!r}")
-        for k in record_at:
-            check_whole("record_at", k, 0)
         self.n_tasks, self.n_episodes, self.seed = n_tasks, n_episodes, seed
-        self.record_at = tuple(record_at)
+        self.record_at = check_record_at(record_at)
         folder = best_model_save_path
         self.best_model_save_path = None if folder is None else Path(folder)
         self._best_model = None if folder is None else Path(folder) / "best_model.zip"

@@ -9,7 +9,13 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.adaptation.environments import Env, model_and_env
-from sb3_poem.adaptation.many_tasks import Library, OracleFactory, TaskAdaptations, adapt_tasks
+from sb3_poem.adaptation.many_tasks import (
+    Library,
+    OracleFactory,
+    TaskAdaptations,
+    adapt_tasks,
+    check_record_at,
+)
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.oracles import ReturnOracle
 from sb3_poem.adaptation.rule import Rule
@@ -183,11 +189,7 @@ def evaluate_adaptation(
     :param seed: Task i adapts with seed + i; the episodes' seeds follow from it too.
     :param on_record: Called with all that is measured so far, after each measurement.
     """
-    if len(record_at) == 0:
-        given = tuple(record_at)
-        raise ValueError(f"`record_at` must hold at least one number of answers, but is {given}")
-    for k in record_at:
-        check_whole("record_at", k, 0)
+    record_at = check_record_at(record_at)
     check_whole("n_episodes", n_episodes, 1)
     own, vec_env = model_and_env(model, env)
     tasks, start = choose_test_tasks(own, vec_env, tasks, seed), evaluation_seed(seed)

@@ -92,8 +92,7 @@ class HumanOracle:
         record: Callable[[HumanAnswer], None] | None = None,
         question: str = "pair",
     ) -> None:
-        if video_format not in ("gif", "mp4"):
-            raise ValueError(f'`video_format` must be "gif" or "mp4", but is {video_format!r}')
+        check_choice("video_format", video_format, ("gif", "mp4"))
         check_choice("question", question, tuple(PROMPTS))
         check_number("mistake_rate", mistake_rate, 0.0, 0.5)
         self.question = question

@@ -11,6 +11,7 @@ from scipy.optimize import minimize_scalar
 from scipy.special import entr
 
 from sb3_poem.adaptation.noise import BoltzmannNoise, ExactNoise, MistakeNoise, NoiseModel
+from sb3_poem.common.checks import check_number, check_whole
 
 # Up to this many codebooks are tried one by one; beyond, greedy choice and swaps.
 EXACT_CODEBOOKS = 5000
@@ -88,8 +89,7 @@ class AnswerLimits:
         :param n_answers: Kinds of answers to a question: m of them name m^k policies. Between two
             powers of 2 the codebooks' returns are interpolated.
         """
-        if k < 0:
-            raise ValueError(f"`k` must not be negative, but is {k}")
+        check_whole("k", k, 0)
         capacity = answer_capacity(noise_model, self.spread, n_answers)
         most = k * np.log2(n_answers)
         exact = float(np.interp(most, range(len(self.codebooks)), self.codebooks))
@@ -129,8 +129,7 @@ def information_limit(
     :raises ValueError: If the matrix is empty or not finite, k is negative, or the noise model is
         of an unknown kind.
     """
-    if k < 0:
-        raise ValueError(f"`k` must not be negative, but is {k}")
+    check_whole("k", k, 0)
     returns = check_returns(returns)
     capacity = answer_capacity(noise_model, float(np.ptp(returns, axis=1).max()), n_answers)
     n_tasks, n_policies = returns.shape
@@ -161,8 +160,7 @@ def best_codebook(returns: np.ndarray, size: int, *, ordered: bool = False) -> n
         search is tried too.
     """
     returns = check_returns(returns)
-    if size < 1:
-        raise ValueError(f"`size` must be at least 1, but is {size}")
+    check_whole("size", size, 1)
     n_policies = returns.shape[1]
     if size >= n_policies:
         return np.arange(n_policies)
@@ -224,8 +222,7 @@ def answer_capacity(noise: NoiseModel | None, spread: float, n_answers: int = 2)
         ``beta`` an answer is the surer the larger it is.
     :param n_answers: See :func:`information_limit`.
     """
-    if n_answers < 2:
-        raise ValueError(f"`n_answers` must be at least 2, but is {n_answers}")
+    check_whole("n_answers", n_answers, 2)
     if noise is None or isinstance(noise, ExactNoise):
         return float(np.log2(n_answers))
     if n_answers == 4 and isinstance(noise, (MistakeNoise, BoltzmannNoise)):
@@ -266,8 +263,7 @@ def rate_distortion_limit(returns: np.ndarray, bits: float) -> float:
 
     :param returns: (n_tasks, n_policies), finite.
     """
-    if not bits >= 0:
-        raise ValueError(f"`bits` must not be negative, but is {bits}")
+    check_number("bits", bits, 0.0)
     best = float(returns.max(axis=1).mean())
     scale = float(np.ptp(returns))
     if scale == 0.0 or bits >= np.log2(len(returns)):

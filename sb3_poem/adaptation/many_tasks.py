@@ -97,7 +97,9 @@ def adapt_tasks(
             f"{tasks.shape}"
         )
     check_whole("seed", seed, 0)
-    kept, numbered = _check_record_at(record_at, n_queries), list(enumerate(tasks, seed))
+    check_whole("n_queries", n_queries, 1)
+    kept = check_record_at(range(n_queries + 1) if record_at is None else record_at, n_queries)
+    numbered = list(enumerate(tasks, seed))
     oracles = [oracle_factory(env=vec_env, task=task, seed=number) for number, task in numbered]
     rule = (Bayes() if rule is None else as_rule(rule)).answered_by(oracles[0])
     libraries = [library(task) if callable(library) else library for task in tasks]
@@ -146,15 +148,12 @@ def _check_factory(oracle_factory: OracleFactory) -> None:
         ) from error
 
 
-def _check_record_at(record_at: Sequence[int] | None, n_queries: int) -> tuple[int, ...]:
-    check_whole("n_queries", n_queries, 1)
-    if record_at is None:
-        return tuple(range(n_queries + 1))
+def check_record_at(record_at: Sequence[int], n_queries: int | None = None) -> tuple[int, ...]:
+    """Numbers of answers, ascending, each once; refused if they are none, or not from 0 to
+    ``n_queries``.
+    """
     for k in record_at:
-        check_whole("record_at", k, 0)
-    kept = tuple(sorted({int(k) for k in record_at}))
-    if not kept or kept[-1] > n_queries:
-        given = tuple(record_at)
-        allowed = f"numbers from 0 to n_queries={n_queries}"
-        raise ValueError(f"`record_at` must hold {allowed}, but is {given}")
-    return kept
+        check_whole("record_at", k, 0, n_queries)
+    if len(record_at) == 0:
+        raise ValueError("`record_at` must hold at least one number of answers, but holds none")
+    return tuple(sorted({int(k) for k in record_at}))

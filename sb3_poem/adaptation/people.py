@@ -11,8 +11,9 @@ from sb3_poem.adaptation.preference import ANSWERS, BEST_OF_FOUR
 
 INFER = "infer"
 
-# What people may be like, and how many of them are so before the first answer. Differences are in
-# units of the family's spread of returns (root mean square between two random policies).
+# What people may be like, and how many of them are so before the first answer: rates, and standard
+# deviations, widths and differences in units of the family's spread of returns, the root mean
+# square difference of two random policies' returns on a random task.
 MISTAKES = {0.0: 0.8, 0.25: 0.2}
 DOUBTS = {0.0: 0.8, 2.0: 0.2}
 INDIFFERENCES = {0.0: 0.4, 0.12: 0.4, 0.4: 0.2}
@@ -30,12 +31,9 @@ class People:
     EQUAL is that none leads all others by the width of indifference (Rao & Kupper 1967), and a
     mistake is any other one.
 
-    The prior is a product of independent ones: rates of mistakes of 0 and 0.25 with 0.8 and 0.2;
-    doubts, standard deviations, of 0 and 2 with 0.8 and 0.2; widths of indifference of 0, 0.12
-    and 0.4 with 0.4, 0.4 and 0.2; and "much" from 0.45, 1 and 2 on with 0.3, 0.5 and 0.2. All but
-    rates are in units of the family's spread of returns, the root mean square difference of two
-    random policies' returns on a random task. A width of 0 is that of somebody who never says
-    EQUAL. One answer in a hundred is a slip, which may be any.
+    The prior is a product of independent ones, ``MISTAKES``, ``DOUBTS``, ``INDIFFERENCES`` and
+    ``MUCH``. A width of 0 is that of somebody who never says EQUAL. One answer in a hundred is a
+    slip, which may be any.
 
     :param kind: Of the questions, see :class:`~sb3_poem.adaptation.preference.Query`.
     :param noise: How they err, if that is known: then only their widths are not.

@@ -166,7 +166,7 @@ class MetaReward:
         weights, settings = Path(folder) / WEIGHTS, Path(folder) / CONFIG
         if not settings.is_file():
             raise FileNotFoundError(f"{folder} holds no meta-trained reward: it has no {CONFIG}")
-        config = read_json(settings, "settings of a meta-trained reward")
+        config = read_json(settings, "the settings of a meta-trained reward")
         if config.get("format") != FORMAT:
             expected = f"expected format {FORMAT!r}"
             raise ValueError(f"{settings} is not of this version of sb3_poem ({expected})")

@@ -66,13 +66,8 @@ def make_oracle_factory(spec: OracleSpec) -> Callable[..., TaskOracle]:
     """What makes a task's oracle: a function of ``env``, ``task`` and ``seed``."""
     if spec.kind == "return":
         return ReturnOracle
-    if spec.kind == "boltzmann":
-        return partial(BoltzmannOracle, spec.value)
-    if spec.kind == "mistake" and spec.value is not None:
-        return partial(MistakeOracle, spec.value)
-    raise ValueError(
-        f"there is no oracle {spec}; there are return, boltzmann, and mistake with a rate"
-    )
+    kinds: dict[str, Any] = {"boltzmann": BoltzmannOracle, "mistake": MistakeOracle}
+    return partial(kinds[spec.kind], spec.value)
 
 
 def _episode_seed(cell: Cell) -> int:

@@ -168,16 +168,3 @@ def _methods() -> Iterator[Method]:
 
 
 METHODS = {method.name: method for method in _methods()}
-
-
-def find_method(name: str) -> Method:
-    """A method by its name; a ``ValueError`` that lists all if there is none.
-
-    >>> find_method("anole-greedy").rule
-    'ANOLE'
-    """
-    if name not in METHODS:
-        raise ValueError(
-            f"--methods {name}: there is no such method; there are: {', '.join(METHODS)}"
-        )
-    return METHODS[name]

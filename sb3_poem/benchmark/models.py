@@ -39,7 +39,7 @@ from sb3_poem.pearl_sac.saving import CONFIG, WEIGHTS, is_checkpoint, read_confi
 from sb3_poem.resources import config_file, zoo_entry
 
 MODEL, BEGUN, FINISHED, REWARD = "model.zip", "begun.json", "trained.json", "reward"
-RECORD = "record of a training"
+RECORD = "a record of a training"
 
 Say = Callable[[str], None]
 
@@ -112,10 +112,6 @@ class ModelLibrary:
             return None
         for family, variant, seed, path in self.workplace.named:
             if (family_id(family), variant, seed) == (key.env_id, key.variant, key.seed):
-                if not Path(path).exists():
-                    raise ValueError(
-                        f"--model {family}:{variant}:{seed}={path}: there is no such file or folder"
-                    )
                 _content(Path(path))
                 return Path(path)
         for folder in map(Path, self.workplace.models):
@@ -200,16 +196,15 @@ class ModelLibrary:
         replay buffer where that was kept.
 
         :param env: An environment of its family, which it gets.
-        :param snapshot: The share of the training after which to take it; None: all.
-        :raises ValueError: If one that was handed over is another, or not saved along its training.
+        :param snapshot: The share of the training after which to take it; None: all, as of one
+            that was handed over.
+        :raises ValueError: If one that was handed over is another.
         """
         if key.base is not None:
             model = self.load(key.base, env)
             return MAMLRewardModel(MetaReward.load(self.folder(key) / REWARD, model.policy), model)
         path, algorithm = self.given(key), ALGORITHMS[VARIANTS[key.variant].algorithm]
         if path is not None:
-            if snapshot is not None:
-                raise ValueError(f"{key} was handed over, and so has no models along its training")
             file = _content(path)
         elif snapshot is not None:
             file = self.snapshot_file(key, snapshot)

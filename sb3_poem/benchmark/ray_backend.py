@@ -123,5 +123,5 @@ def _run_trial(
     if isinstance(job, ModelKey):
         library.ensure(job, print)
     else:
-        record = json.dumps(run_cell(job, library, print).to_dict())
+        record = json.dumps(vars(run_cell(job, library, print)))
     tune.report({"record": record, "name": str(job)})

@@ -210,7 +210,7 @@ def export_model(cells: Sequence[Cell], library: ModelLibrary, store: Store, fol
     """Write the model of finished cells (of its methods with preferences, and what is known) as a
     pretrained folder, with how it was trained and what it earns on its card.
     """
-    records = {record.key: record for record in store.records(cell.key for cell in cells)}
+    records = {record.key: record for record in store.records()}
     missing = [str(cell) for cell in cells if cell.key not in records]
     if missing:
         raise ValueError(f"{folder} cannot be written before its cells are finished: {missing}")

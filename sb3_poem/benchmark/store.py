@@ -3,7 +3,7 @@
 import json
 import sqlite3
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -45,9 +45,6 @@ class Record:
     result: dict[str, Any]
     provenance: dict[str, Any]
     created: str = ""
-
-    def to_dict(self) -> dict[str, Any]:
-        return dict(vars(self))
 
 
 class Store:
@@ -109,24 +106,22 @@ class Store:
 
     def add(self, record: Record) -> bool:
         """Keep a finished cell, and tell whether it is new; if not, what is there stays."""
-        row = record.to_dict() | {name: _pack(getattr(record, name)) for name in PACKED}
+        row = vars(record) | {name: _pack(getattr(record, name)) for name in PACKED}
         row["created"] = record.created or datetime.now(UTC).isoformat(timespec="seconds")
         names = f"({', '.join(row)}) VALUES (:{', :'.join(row)})"
         with self._database:
             added = self._database.execute(f"INSERT OR IGNORE INTO cells {names}", row)
         return added.rowcount == 1
 
-    def records(self, keys: Iterable[str] | None = None) -> Iterator[Record]:
-        """Finished cells, in the order of their names; all, or those of some keys."""
-        wanted = None if keys is None else set(keys)
+    def records(self) -> Iterator[Record]:
+        """Finished cells, in the order of their names."""
         order = "SELECT * FROM cells ORDER BY family, method, seed, key"
         found = self._database.execute(order)
         names = [column[0] for column in found.description]
         for values in found.fetchall():
             row = dict(zip(names, values, strict=True))
-            if wanted is None or row["key"] in wanted:
-                packed = {name: json.loads(zlib.decompress(row[name])) for name in PACKED}
-                yield Record(**row | packed)
+            packed = {name: json.loads(zlib.decompress(row[name])) for name in PACKED}
+            yield Record(**row | packed)
 
 
 def _pack(value: dict[str, Any]) -> bytes:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
-from sb3_poem.benchmark.methods import EPSILONS, METHODS, QUERY_RULES, VARIANTS, Method, find_method
+from sb3_poem.benchmark.methods import EPSILONS, METHODS, QUERY_RULES, VARIANTS, Method
 
 PAPER_FAMILIES = (
     "HalfCheetahVel",
@@ -299,7 +299,7 @@ class Suite:
         methods, and the suite's own numbers (``record_at`` is always the entries').
         """
         for name in methods or ():
-            if find_method(name).name not in self.methods:
+            if name not in self.methods:
                 raise ValueError(
                     f"--methods {name} is not in the suite {self.name!r}, which has: "
                     f"{', '.join(self.methods)}"

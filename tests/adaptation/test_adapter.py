@@ -231,8 +231,8 @@ def test_saving_replaces_the_file_only_once_the_new_one_is_whole(tmp_path, monke
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("", "is no saved adaptation"),
-        ('{"format": "sb3_poem.Pref', "is no saved adaptation"),
+        ("", "is not a saved adaptation"),
+        ('{"format": "sb3_poem.Pref', "is not a saved adaptation"),
         ("[1]", "holds a list"),
         ('{"format": "optuna"}', "`format` is 'optuna'"),
         ('{"format": "sb3_poem.PreferenceAdapter", "version": 99}', "version 99"),
@@ -983,7 +983,7 @@ def test_lockstep_options():
     assert result.latents.shape == (1, 2, 5)
     assert len(result.preferences[0]) == 2  # nothing is asked that nobody will look at
     for arguments, message in [
-        ({"record_at": [5]}, "`record_at` must hold numbers from 0 to n_queries=4"),
+        ({"record_at": [5]}, "`record_at` must be at most 4, but is 5"),
         ({"record_at": []}, "`record_at` must hold"),
         ({"n_queries": 0}, "`n_queries` must be at least 1"),
     ]:

@@ -281,7 +281,7 @@ def test_fair_limits_on_a_line():
         assert limits.after(0) < noisy < limits.after(k)
     assert limits.after(1) < limits.after(1, n_answers=3) < limits.after(2)
     assert limits.after(1, n_answers=4) == limits.after(2)
-    with pytest.raises(ValueError, match="`k` must not be negative"):
+    with pytest.raises(ValueError, match="`k` must be at least 0"):
         limits.after(-1)
 
 
@@ -292,7 +292,7 @@ class OtherNoise:
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: information_limit(np.zeros((2, 2)), -1), "`k` must not be negative"),
+        (lambda: information_limit(np.zeros((2, 2)), -1), "`k` must be at least 0"),
         (lambda: information_limit(np.zeros(3), 1), "neither 0, but has shape"),
         (lambda: information_limit(np.full((2, 2), np.nan), 1), "`returns` must be finite"),
         (
@@ -300,7 +300,7 @@ class OtherNoise:
             "`noise_model` must be .* OtherNoise",
         ),
         (lambda: best_codebook(np.zeros((2, 2)), 0), "`size` must be at least 1"),
-        (lambda: rate_distortion_limit(np.zeros((2, 2)), -0.1), "`bits` must not be negative"),
+        (lambda: rate_distortion_limit(np.zeros((2, 2)), -0.1), "`bits` must be at least 0"),
     ],
 )
 def test_bad_arguments(call, message):

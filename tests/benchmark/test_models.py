@@ -145,17 +145,6 @@ def test_models_are_found_in_a_folder_or_by_name_and_checked(tmp_path: Path) -> 
         match=r"handed over as PointGoal poem-inner seed 0, but has \(similarity, context, latent",
     ):
         library.load(ModelKey(POINT, "poem-inner", 0), env)
-    with pytest.raises(
-        ValueError, match="was handed over, and so has no models along its training"
-    ):
-        library.load(ModelKey(POINT, "poem-d2", 0), env, snapshot=0.5)
-    gone = ModelLibrary(
-        Workplace(str(tmp_path), named=(("PointGoal", "poem", 0, str(tmp_path / "gone")),))
-    )
-    with pytest.raises(
-        ValueError, match=r"--model PointGoal:poem:0=.*gone: there is no such file or folder"
-    ):
-        gone.given(ModelKey(POINT, "poem", 0))
     env.close()
     # made from another one's model, and of another environment than the cells'
     pearl.save(tmp_path / "models/PointGoal/maml-reward/seed0.zip")
@@ -287,6 +276,7 @@ def test_a_named_folder_without_a_model(tmp_path: Path) -> None:
             ["--model", "PointGaol:poem:0=."],
             "PointGaol is none of the families of this run: PointGoal",
         ),
+        (["--model", "PointGoal:poem:0=gone"], "0=gone: there is no such file or folder"),
         (["--model", "PointGoal:poem:5=."], "5 is none of the seeds of this run: 0, 1, 2"),
         (
             ["--model", "PointGoal:maml-reward:0=."],

@@ -143,7 +143,7 @@ def test_a_finished_cell_is_verified(
         assert capsys.readouterr().out.endswith("the same, bit for bit\n")
     key = next(line.split()[0] for line in listed if line.endswith("poem-paper, seed 0 return"))
     with Store(tmp_path / "s.sqlite") as store:
-        [record] = store.records([key])
+        [record] = [one for one in store.records() if one.key == key]
     false = json.loads(json.dumps(record.result))
     false["task_returns"][1][0] += 0.0001
     other = {**record.identity, "tasks": 3}

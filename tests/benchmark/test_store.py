@@ -36,7 +36,7 @@ def test_a_record_comes_back_as_it_was(tmp_path: Path) -> None:
         assert cell.key in store
         assert "other" not in store
         [read] = store.records()
-    assert {**read.to_dict(), "created": ""} == record.to_dict()
+    assert replace(read, created="") == record
     assert read.created.endswith("+00:00")
 
 
@@ -59,7 +59,6 @@ def test_what_is_there_stays(tmp_path: Path) -> None:
         assert [record.result["value"] for record in store.records()] == [1.0]
     with Store(tmp_path / "store.sqlite", create=False) as store:
         assert store.keys() == {"key1"}
-        assert [record.key for record in store.records(["key2"])] == []
 
 
 def test_a_store_whose_creation_was_interrupted_is_completed(tmp_path: Path) -> None:

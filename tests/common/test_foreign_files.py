@@ -180,7 +180,7 @@ def test_a_saved_adaptation_names_no_environment_to_make(trap: Path) -> None:
     data["model"]["env_id"] = "trap:Foo-v0"
     with refused("saved with a model for trap:Foo-v0, but this one is for poem/PointGoal-v0"):
         PreferenceAdapter.from_json(json.dumps(data), model, env)
-    with refused("no saved adaptation"):
+    with refused("not a saved adaptation"):
         PreferenceAdapter.from_json("[" * 100_000, model, env)
     assert not trap.exists()
 
