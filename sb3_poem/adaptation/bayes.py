@@ -430,7 +430,8 @@ class BayesInference(Inference):
         about twice is left alone.
         """
         # by what was seen: fragments of one policy differ, and have one latent
-        asked = [[getattr(s, "observations", s).tobytes() for s in a.shown] for a in self.answers]
+        seen = [[getattr(item, "observations", item) for item in a.shown] for a in self.answers]
+        asked = [[np.asarray(item).tobytes() for item in shown] for shown in seen]
         asked_twice = np.array([asked.count(shown) > 1 for shown in asked], dtype=bool)
         others, everything = self.agreements().T
         found = np.where(asked_twice | (everything >= BELIEVED), 1.0, others)

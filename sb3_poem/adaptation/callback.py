@@ -11,10 +11,9 @@ from sb3_poem.adaptation.bayes import Bayes
 from sb3_poem.adaptation.environments import check_model_fits
 from sb3_poem.adaptation.evaluation import evaluate_adaptation, evaluate_episodes
 from sb3_poem.adaptation.known_task import known_task_return, preference_order
-from sb3_poem.adaptation.many_tasks import check_record_at
 from sb3_poem.adaptation.meta_model import HasSimilarity
 from sb3_poem.adaptation.rule import as_rule
-from sb3_poem.common.checks import check_whole
+from sb3_poem.common.checks import check_whole, check_whole_numbers
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.pearl_sac.callbacks import EpochCallback
@@ -71,7 +70,7 @@ class AdaptationEvalCallback(EpochCallback):
         check_whole("n_tasks", n_tasks, 1)
         check_whole("n_episodes", n_episodes, 1)
         self.n_tasks, self.n_episodes, self.seed = n_tasks, n_episodes, seed
-        self.record_at = check_record_at(record_at)
+        self.record_at = check_whole_numbers("record_at", record_at, 0)
         folder = best_model_save_path
         self.best_model_save_path = None if folder is None else Path(folder)
         self._best_model = None if folder is None else Path(folder) / "best_model.zip"
@@ -115,8 +114,8 @@ class AdaptationEvalCallback(EpochCallback):
     def _on_epoch(self) -> None:
         env, tasks = self._make_env()
         options: dict[str, Any] = {"seed": self.seed, "n_episodes": self.n_episodes}
-        if not isinstance(self.model, HasSimilarity):
-            self.adaptation_kwargs.setdefault("rule", Bayes(query_rule="random"))
+        if not isinstance(self.model, HasSimilarity) and self.adaptation_kwargs.get("rule") is None:
+            self.adaptation_kwargs["rule"] = Bayes(query_rule="random")
         result = evaluate_adaptation(
             self.model, env, tasks, record_at=self.record_at, **options, **self.adaptation_kwargs
         )

@@ -9,17 +9,11 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.adaptation.environments import Env, model_and_env
-from sb3_poem.adaptation.many_tasks import (
-    Library,
-    OracleFactory,
-    TaskAdaptations,
-    adapt_tasks,
-    check_record_at,
-)
+from sb3_poem.adaptation.many_tasks import Library, OracleFactory, TaskAdaptations, adapt_tasks
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.oracles import ReturnOracle
 from sb3_poem.adaptation.rule import Rule
-from sb3_poem.common.checks import check_whole
+from sb3_poem.common.checks import check_whole, check_whole_numbers
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.rollouts import rollout_outcomes
 
@@ -189,7 +183,7 @@ def evaluate_adaptation(
     :param seed: Task i adapts with seed + i; the episodes' seeds follow from it too.
     :param on_record: Called with all that is measured so far, after each measurement.
     """
-    record_at = check_record_at(record_at)
+    record_at = check_whole_numbers("record_at", record_at, 0)
     check_whole("n_episodes", n_episodes, 1)
     own, vec_env = model_and_env(model, env)
     tasks, start = choose_test_tasks(own, vec_env, tasks, seed), evaluation_seed(seed)

@@ -34,11 +34,6 @@ READ = {
     | NUMBERED[kind]
     for kind, answers in ANSWERS.items()
 }
-KEYS = {
-    "pair": "l, r or e",
-    "graded": "a number from 1 to 5",
-    BEST_OF_FOUR: "a number from 0 to 4",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,4 +119,4 @@ class HumanOracle:
                 if self._record is not None:
                     self._record(HumanAnswer(answer, query, path, self.fps, asked, seen))
                 return answer
-            self._write(f"{line.strip()!r} is no answer; type {KEYS[self.question]}.")
+            self._write(f"{line.strip()!r} is no answer.")

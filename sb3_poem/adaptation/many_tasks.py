@@ -14,7 +14,7 @@ from sb3_poem.adaptation.environments import Env, model_and_env, warn_if_untrain
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.preference import PLACES, Preference, as_preference
 from sb3_poem.adaptation.rule import Rule, Setting, as_rule, inference_rng, latent_of, rollout_seed
-from sb3_poem.common.checks import check_whole
+from sb3_poem.common.checks import check_whole, check_whole_numbers
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
 
@@ -98,7 +98,8 @@ def adapt_tasks(
         )
     check_whole("seed", seed, 0)
     check_whole("n_queries", n_queries, 1)
-    kept = check_record_at(range(n_queries + 1) if record_at is None else record_at, n_queries)
+    record_at = range(n_queries + 1) if record_at is None else record_at
+    kept = check_whole_numbers("record_at", record_at, 0, n_queries)
     numbered = list(enumerate(tasks, seed))
     oracles = [oracle_factory(env=vec_env, task=task, seed=number) for number, task in numbered]
     rule = (Bayes() if rule is None else as_rule(rule)).answered_by(oracles[0])
@@ -146,14 +147,3 @@ def _check_factory(oracle_factory: OracleFactory) -> None:
             "return a task's oracle, such as the class ReturnOracle or "
             f"functools.partial(MistakeOracle, 0.1), but is {oracle_factory!r}: {error}"
         ) from error
-
-
-def check_record_at(record_at: Sequence[int], n_queries: int | None = None) -> tuple[int, ...]:
-    """Numbers of answers, ascending, each once; refused if they are none, or not from 0 to
-    ``n_queries``.
-    """
-    for k in record_at:
-        check_whole("record_at", k, 0, n_queries)
-    if len(record_at) == 0:
-        raise ValueError("`record_at` must hold at least one number of answers, but holds none")
-    return tuple(sorted({int(k) for k in record_at}))

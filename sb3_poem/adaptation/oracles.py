@@ -55,7 +55,7 @@ class TaskOracle(ABC):
         question: str | None = None,
     ) -> None:
         if thresholds is not None:
-            equal, much = thresholds
+            equal, much = thresholds if len(thresholds) == 2 else (np.nan, np.nan)
             if not 0.0 <= equal <= much < np.inf:
                 raise ValueError(
                     "`thresholds` must be two finite differences of returns, the first not the "

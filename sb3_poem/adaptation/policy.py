@@ -75,8 +75,11 @@ class AdaptedPolicy:
 
     def to_bytes(self) -> bytes:
         """The policy as one safetensors file: the model, its configuration in the header, the
-        latent and the number of answers. Nothing in it can run code.
+        latent and the number of answers. Nothing in it can run code. Only of this package's models.
         """
+        if type(self.model).__name__ not in BY_CLASS_NAME:
+            known = " or ".join(BY_CLASS_NAME)
+            raise TypeError(f"a policy of {describe_model(self.model)} has no file, as of {known}")
         config, tensors = model_contents(self.model)
         named = {MODEL_PREFIX + name: value for name, value in tensors.items()}
         facts = {"format": FORMAT, "config": config_text(config), "n_answers": str(self.n_answers)}

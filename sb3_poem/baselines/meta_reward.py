@@ -254,6 +254,7 @@ def meta_train_reward(
         empty = "has an empty replay buffer (a loaded model has none)"
         raise ValueError(f"`model` {empty}: call load_replay_buffer")
     sizes = {"n_iterations": n_iterations, "n_support": n_support, "n_query": n_query}
+    sizes |= {"n_fragments": n_fragments, "tasks_per_batch": tasks_per_batch}
     for name, size in sizes.items():
         check_whole(name, size, 1)
     rng = np.random.default_rng([seed, 5])

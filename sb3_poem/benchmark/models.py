@@ -2,13 +2,12 @@
 
 import contextlib
 import hashlib
-import os
 import re
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 # A model that rl_zoo3 trained may hold its schedules. Importing it replaces Gymnasium's TimeLimit,
 # so it comes first.
@@ -68,7 +67,8 @@ def try_lock(path: Path) -> Iterator[bool]:
 
 @dataclass(frozen=True)
 class Workplace:
-    """Where models are kept, and how they are trained and run.
+    """Where models are kept, and how they are trained and run. Paths should be absolute where other
+    processes take part.
 
     :param runs: Folder of the trainings.
     :param models: Folders with models that were handed over, see :meth:`ModelLibrary.given`.
@@ -80,15 +80,6 @@ class Workplace:
     named: tuple[tuple[str, str, int, str], ...] = ()
     device: str = "cpu"
     num_threads: int = 1
-
-    def absolute(self) -> Self:
-        """The same for a process with another working folder."""
-        return replace(
-            self,
-            runs=os.path.abspath(self.runs),
-            models=tuple(map(os.path.abspath, self.models)),
-            named=tuple((f, v, seed, os.path.abspath(path)) for f, v, seed, path in self.named),
-        )
 
 
 class ModelLibrary:

@@ -54,11 +54,10 @@ def run_with_ray(
     models = [key for key in plan.models if library.state(key) in ("missing", "interrupted")]
     derived = [key for key in models if key.base is not None]
     trained = [key for key in models if key.base is None]
-    workplace = library.workplace.absolute()
     failures: list[str] = []
     try:
         for jobs in (trained, derived, plan.todo):  # what is made from others comes after them
-            failures += _run_trials(jobs, workplace, store.path.absolute(), options, say)
+            failures += _run_trials(jobs, library.workplace, store.path.absolute(), options, say)
     finally:
         if own:
             ray.shutdown()

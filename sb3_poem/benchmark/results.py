@@ -275,8 +275,6 @@ class Comparison:
 
 def compare(one: np.ndarray, other: np.ndarray) -> Comparison:
     """Compare returns (n_seeds, n_tasks) of two methods, of the same seeds and tasks."""
-    if one.shape != other.shape:
-        raise ValueError(f"`one` {one.shape} and `other` {other.shape} must have the same shape")
     gaps = one - other
     mean, iqm, probability = map(float, (gaps.mean(), _iqm(gaps), _probability(one, other)))
     low, high = interval(lambda drawn: drawn.mean(axis=(-2, -1)), gaps)

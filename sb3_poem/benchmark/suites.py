@@ -301,7 +301,7 @@ class Suite:
         for name in methods or ():
             if name not in self.methods:
                 raise ValueError(
-                    f"--methods {name} is not in the suite {self.name!r}, which has: "
+                    f"--methods {name}: it is not in the suite {self.name!r}, which has: "
                     f"{', '.join(self.methods)}"
                 )
         parts = snapshots or self.snapshots

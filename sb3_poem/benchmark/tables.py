@@ -111,9 +111,8 @@ def make_report(
         if kind in ("md", "latex"):
             text = format_tables(selection.suite.title, suite_tables(selection), kind)
         else:
-            own_rows = suite_rows(selection)
-            rows += own_rows
-            text = format_rows(own_rows, kind)
+            rows += suite_rows(selection)
+            text = format_rows([row for row in rows if row.suite == name], kind)
         texts.append(text)
         if out is not None:
             file = out / f"{name}{SUFFIX[kind]}"

@@ -3,6 +3,7 @@
 import argparse
 from collections.abc import Sequence
 from functools import partial
+from os.path import abspath
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -85,14 +86,13 @@ def _check_models(given: Sequence[str], library: "ModelLibrary", plan: "Plan") -
     used = {
         "families": {family_label(key.env_id) for key in keys},
         "models": {key.variant for key in keys},
-        "seeds": {key.seed for key in keys},
+        "seeds": {str(key.seed) for key in keys},
     }
     for text, (family, variant, seed, _) in zip(given, library.workplace.named, strict=True):
-        named = (family_label(family), variant, seed)
+        named = (family_label(family), variant, str(seed))
         for one, (what, known) in zip(named, used.items(), strict=True):
             if one not in known:
-                listed = ", ".join(map(str, sorted(known)))
-                none = f"{one} is none of the {what} of this run: {listed}"
+                none = f"{one} is none of the {what} of this run: {', '.join(sorted(known))}"
                 raise ValueError(f"--model {text}: {none}")
 
 
@@ -103,13 +103,9 @@ def _report(arguments: argparse.Namespace) -> int:
     if arguments.out is not None:
         check_writable(arguments.out)
     store = Store(arguments.store, create=False)
+    families, seeds = arguments.families, arguments.seeds
     text, files = make_report(
-        store,
-        arguments.suite,
-        arguments.families,
-        arguments.format,
-        arguments.out,
-        arguments.seeds,
+        store, arguments.suite, families, arguments.format, arguments.out, seeds
     )
     if arguments.out is None:
         print(text)
@@ -145,8 +141,8 @@ def _library(arguments: argparse.Namespace, device: str, num_threads: int) -> "M
         if not Path(folder).is_dir():
             raise ValueError(f"--models {folder}: there is no such folder")
     named = tuple(_parse_named(text) for text in arguments.model)
-    place = (arguments.runs, tuple(arguments.models), named)
-    return ModelLibrary(Workplace(*place, device, num_threads))
+    runs, models = abspath(arguments.runs), tuple(map(abspath, arguments.models))
+    return ModelLibrary(Workplace(runs, models, named, device, num_threads))
 
 
 def _parse_params(pairs: list[str]) -> tuple[tuple[str, object], ...]:
@@ -168,4 +164,4 @@ def _parse_named(text: str) -> tuple[str, str, int, str]:
     family, variant, seed = parts
     if not Path(path).exists():
         raise ValueError(f"--model {text}: there is no such file or folder")
-    return family_id(family), variant, int(seed), path
+    return family_id(family), variant, int(seed), abspath(path)

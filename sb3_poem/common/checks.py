@@ -1,5 +1,6 @@
 """Checks of numbers that users and files give."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,19 @@ def check_whole(name: str, value: Any, least: int, most: int | None = None) -> N
         raise ValueError(f"`{name}` must be at least {least}, but is {value}")
     if most is not None and value > most:
         raise ValueError(f"`{name}` must be at most {most}, but is {value}")
+
+
+def check_whole_numbers(
+    name: str, values: Sequence[int], least: int, most: int | None = None
+) -> tuple[int, ...]:
+    """Refuse what holds others than whole numbers in the range, or none; they come back ascending,
+    each once.
+    """
+    if np.shape(values) in ((), (0,)):
+        raise ValueError(f"`{name}` must hold at least one whole number, but is {values!r}")
+    for value in values:
+        check_whole(name, value, least, most)
+    return tuple(sorted(map(int, set(values))))
 
 
 def check_number(name: str, value: Any, low: float = -np.inf, high: float = np.inf) -> None:

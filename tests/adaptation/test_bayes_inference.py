@@ -1,6 +1,7 @@
 """The Bayesian rule against the posterior on a grid."""
 
 import math
+from dataclasses import replace
 from functools import partial
 
 import gymnasium as gym
@@ -298,6 +299,21 @@ def test_what_the_other_answers_contradict_is_found_and_asked_again(question, se
     assert kept == [asked.preference, opposite[asked.preference]]  # the first stays
     with pytest.raises(RuntimeError, match="all 10 questions"):
         adapter.ask_again(wrong)
+
+
+def test_fragments_of_one_policy_are_told_apart():
+    """Their latents are the same, and what was asked about them is not asked twice."""
+    oracle = ReturnOracle(SpeedEnv(), task=[1.5])
+    source = PreferenceAdapter(SpeedModel(), SpeedEnv(), rule=Bayes(query_rule="random"), seed=3)
+    source.adapt(oracle)
+    seen = [item for answer in source.answers for item in answer.shown]
+    library = [replace(item, latent=np.zeros(5)) for item in seen]
+    rule = Bayes(noise_model="infer")
+    adapter = PreferenceAdapter(SpeedModel(), SpeedEnv(), rule=rule, library=library, seed=0)
+    for number in range(9):
+        left, right = adapter.ask().shown
+        adapter.tell(oracle(right, left) if number == 2 else oracle(left, right))
+    assert adapter.contradicted == 2
 
 
 def test_a_choice_that_the_others_contradict_is_found():

@@ -64,6 +64,10 @@ def vec_env(n=10, **kwargs):
             "`record_at` must hold",
         ),
         (
+            lambda: evaluate_adaptation(MODEL, vec_env(1), GOALS, record_at=2),
+            "`record_at` must hold at least one whole number, but is 2",
+        ),
+        (
             lambda: evaluate_adaptation(MODEL, vec_env(1), GOALS, record_at=(-1, 2)),
             "`record_at` must be at least 0",
         ),

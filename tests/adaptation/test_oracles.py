@@ -115,7 +115,9 @@ def test_graded_answers_with_mistakes_and_doubts():
     assert answers.count(EQUAL) / 4000 == pytest.approx(equal, abs=0.01)
 
 
-@pytest.mark.parametrize("thresholds", [(20.0, 10.0), (-1.0, 10.0), (1.0, np.inf), (0.0, np.nan)])
+@pytest.mark.parametrize(
+    "thresholds", [(20.0, 10.0), (-1.0, 10.0), (1.0, np.inf), (0.0, np.nan), (1.0,)]
+)
 def test_bad_thresholds(thresholds):
     with pytest.raises(ValueError, match="`thresholds` must be two finite differences"):
         ReturnOracle(thresholds=thresholds)
@@ -214,7 +216,7 @@ def test_a_person_says_how_much_better(tmp_path):
     words = [oracle(left, right).value for _ in range(9)]
     five = ["much left", "left", "equal", "right", "much right"]
     assert words == [*five, "much left", "much right", "equal", "left"]
-    assert "'6' is no answer; type a number from 1 to 5." in shown
+    assert "'6' is no answer." in shown
     assert set(terminal.prompts) == {PROMPTS["graded"]}
     with pytest.raises(ValueError, match="`question` must be one of"):
         HumanOracle(tmp_path, question="numbers")
@@ -263,7 +265,7 @@ def test_a_person_sees_four_in_two_rows(tmp_path, video_format):
     shown = [at_speed(1.0, n, [frames(1, 60 * i)[0] for i in range(n)]) for n in (2, 3, 2, 1)]
     words = [oracle(*shown).value for _ in range(8)]
     assert words == ["first", "second", "third", "fourth", "equal", "equal", "fourth", "third"]
-    assert "'l' is no answer; type a number from 0 to 4." in lines
+    assert "'l' is no answer." in lines
     assert set(terminal.prompts) == {PROMPTS["best-of-four"]}
     film = imageio.imread(tmp_path / f"query-001.{video_format}")
     one = shown[0].frames[0].shape

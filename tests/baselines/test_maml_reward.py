@@ -9,7 +9,7 @@ from meta_toys import WindyWalk, small, walks
 from worlds import SpeedEnv, SpeedModel
 
 from sb3_poem import PEARLSAC, MAMLReward, PreferenceAdapter
-from sb3_poem.adaptation import ReturnOracle, adapt_tasks
+from sb3_poem.adaptation import AdaptedPolicy, ReturnOracle, adapt_tasks
 from sb3_poem.baselines import MAMLRewardModel, MetaReward
 from sb3_poem.common.rollouts import rollout_latents
 
@@ -125,6 +125,8 @@ def test_what_will_not_do(trained, model):
         PreferenceAdapter(SpeedModel(), SpeedEnv(), rule=FAST)
     with pytest.raises(ValueError, match="a family whose tasks share their dynamics"):
         PreferenceAdapter(model, walks(1, WindyWalk), rule=FAST)
+    with pytest.raises(TypeError, match="a policy of MAMLRewardModel has no file"):
+        AdaptedPolicy(model, np.zeros(2)).to_bytes()
     with pytest.raises(ValueError, match="`gradient_steps` must be at least 1, but is 0"):
         MAMLReward(gradient_steps=0)
     with pytest.raises(ValueError, match=r"`gamma` must lie in \[0, 1\], but is 1.5"):

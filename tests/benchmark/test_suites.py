@@ -164,7 +164,7 @@ def test_whatever_changes_a_result_changes_the_key() -> None:
 
 
 def test_unknown_methods_are_refused() -> None:
-    with pytest.raises(ValueError, match="--methods anole is not in the suite 'epsilon'"):
+    with pytest.raises(ValueError, match="--methods anole: it is not in the suite 'epsilon'"):
         SUITES["epsilon"].cells(["poem/AntVel-v0"], [0], ["anole"])
 
 

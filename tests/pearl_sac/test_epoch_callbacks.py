@@ -213,6 +213,13 @@ def test_evaluation_of_a_finite_family_is_on_all_its_tasks() -> None:
     assert env.get_attr("spec")[0].id == "poem/HalfCheetahFwdBack-v0"
 
 
+def test_a_model_without_a_similarity_is_asked_at_random_unless_a_rule_is_named() -> None:
+    how = {"adaptation_kwargs": {"rule": None}, "n_tasks": 2, "record_at": (0, 1), "n_episodes": 1}
+    callback = AdaptationEvalCallback(every=1, **how)
+    small(PEARLSAC).learn(EPOCH, callback)
+    assert np.isfinite(callback.last_evaluation["return_after_1_queries"])
+
+
 def test_evaluation_takes_the_training_environments_arguments() -> None:
     from sb3_poem.common.vec_env import make_task_vec_env
 
