@@ -121,9 +121,8 @@ class PreferenceAdapter:
         self._start()
         warn_if_untrained(self.model)
         self._take_oracle(oracle)
-        if self.inference.library is not None and self._owns_env:
-            self.env.seed(self.seed)  # nothing is rolled out there: draw the task now
-            self.env.reset()
+        if self.inference.library is not None:
+            self._begin_episode(self.seed)
         # What was rolled out to choose a question, by the question's number and latent
         self._seen: dict[tuple[int, bytes], Trajectory] = {}
         self.pending = None
@@ -132,6 +131,13 @@ class PreferenceAdapter:
     def _start(self) -> None:
         self.rule.check(self.model, self._setting)
         self.inference = self.rule.start(self.model, inference_rng(self.seed), self._setting)
+
+    def _begin_episode(self, seed: int) -> None:
+        """Where nothing is rolled out, let the chosen task take effect, or draw the first one."""
+        family = FamilyView.of(self.env)
+        if family is not None:
+            family.seed_episodes([seed] * self.env.num_envs)
+            self.env.reset()
 
     @property
     def n_answers(self) -> int:
@@ -399,12 +405,8 @@ class PreferenceAdapter:
             kept["rule"] = Rule.from_dict(data["rule"])
             adapter = cls(own, env, oracle=oracle, library=library, render=render, **kept)
         adapter.restore(data)
-        has_asked = adapter.n_answers or adapter.pending is not None
-        if adapter._owns_env and library is None and has_asked:
-            family = FamilyView.of(adapter.env)
-            if family is not None:
-                family.seed_episodes([rollout_seed(adapter.seed, 0)])  # as the first question did
-                adapter.env.reset()
+        if adapter._owns_env and library is None and (adapter.n_answers or adapter.pending):
+            adapter._begin_episode(rollout_seed(adapter.seed, 0))  # as the first question did
         return adapter
 
     def restore(self, data: dict[str, Any]) -> None:

@@ -914,9 +914,13 @@ def test_a_library_in_an_environment_that_was_not_reset(point_goal):
     )
     adapter.adapt()
     assert adapter.done
-    env = gym.make("poem/PointGoal-v0")
-    with pytest.raises(RuntimeError, match=r"no task before its first reset\(\): reset it"):
-        PreferenceAdapter(model, env, oracle=ReturnOracle(), library=library, seed=0).adapt()
+    env, how = gym.make("poem/PointGoal-v0"), {"library": library, "seed": 0, "n_queries": 2}
+    drawn = PreferenceAdapter(model, env, oracle=ReturnOracle(), **how).adapt()
+    np.testing.assert_array_equal(drawn.latent, adapter.policy().latent)
+    np.testing.assert_array_equal(env.unwrapped.task, adapter.env.get_attr("task")[0])
+    set_task(env, [0.5])  # which takes effect at the next reset
+    PreferenceAdapter(model, env, oracle=ReturnOracle(), **how).adapt()
+    np.testing.assert_array_equal(env.unwrapped.task, [0.5])
 
 
 class Looks:
