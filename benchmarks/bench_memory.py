@@ -121,7 +121,7 @@ def main() -> None:
         f"Ant, {N_TASKS} tasks, room for {given.size:,} transitions each; a plain store takes "
         f"{plain} bytes a transition.",
         common.table(header, rows),
-        "Microseconds of a batch, 20,000 transitions a task.",
+        f"Microseconds of a batch, {some:,} transitions a task.",
         common.table(["family", "tasks x batch", *others], [[*row.values()] for row in sampled]),
     ]
     settings = {"threads of torch": 1, "steps of a segment": STEPS, "turns": given.repeats}

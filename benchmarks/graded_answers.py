@@ -32,7 +32,6 @@ USUAL, OTHER = (0.12, 1.0), (0.3, 1.6)
 ANSWERS = (0, 1, 2, 5, 10)
 # Films watched that answers of either number of films, 2 or 4, come to
 FILMS = (4, 20)
-KINDS = tuple(PLACES)
 
 
 def main() -> None:
@@ -52,7 +51,7 @@ def main() -> None:
         model = load_model(path)
         env = make_task_vec_env(model.env_id, 30)
         spread = return_spread(model, env)
-        ways = [(kind, infer) for infer in (False, True) for kind in KINDS]
+        ways = [(kind, infer) for infer in (False, True) for kind in PLACES]
         cells = [(who, *way, USUAL) for who in args.oracles for way in ways]
         if "exact" in args.oracles:
             cells += [("exact", "graded", infer, OTHER) for infer in (False, True)]

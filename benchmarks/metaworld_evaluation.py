@@ -62,12 +62,8 @@ def main() -> None:
     )
     model, rows = load_model(args.model), {}
     for n_queries in args.answers:
-        how = {
-            "task_select": "pseudorandom",
-            "total_tasks_per_cls": 40,
-            "terminate_on_success": True,
-        }
-        envs = make_ml_envs("ML10", seed=1, meta_batch_size=20, split=args.split, **how)
+        how = {"task_select": "pseudorandom", "terminate_on_success": True}
+        envs = make_ml_envs("ML10", 1, 20, total_tasks_per_cls=40, split=args.split, **how)
         agent = Adapted(model, envs, args.split, n_queries)
         success, _, each = metalearning_evaluation(agent, envs, args.evals, adaptation_steps=0)
         rows[n_queries] = {"mean": success, **each}
