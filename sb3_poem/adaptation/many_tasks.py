@@ -113,14 +113,15 @@ def adapt_tasks(
 
     preferences: list[list[Preference]] = [[] for _ in tasks]
     latents = np.empty((len(tasks), len(kept), model.latent_dim))
-    for query in tqdm(range(n_queries + 1), unit="query", disable=not progress_bar):
+    bar = tqdm(total=kept[-1], unit="query", disable=not progress_bar)
+    for query in range(kept[-1] + 1):
         if query in kept:
             rows = kept.index(query) + 1
             latents[:, rows - 1] = [inference.estimate() for inference in inferences]
             if on_record is not None:
                 told = list(map(list, preferences))
                 on_record(TaskAdaptations(tasks, kept[:rows], latents[:, :rows].copy(), told))
-        if query == n_queries or query >= kept[-1]:
+        if query == kept[-1]:
             break
         asked = [item for inference in inferences for item in inference.ask()]
         n_shown = len(PLACES[rule.question])
@@ -135,6 +136,8 @@ def adapt_tasks(
             answer = as_preference(oracle(*own), rule.question)
             inference.tell(answer, *own)
             preferences[i].append(answer)
+        bar.update()
+    bar.close()
     return TaskAdaptations(tasks, kept, latents, preferences)
 
 

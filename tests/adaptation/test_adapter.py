@@ -980,9 +980,11 @@ def test_many_tasks_in_lockstep_as_each_alone(rule):
         assert together.preferences[i] == [item.preference for item in alone.answers]
 
 
-def test_lockstep_options():
+def test_lockstep_options(capsys):
     env, model, tasks = DummyVecEnv([SpeedEnv] * 2), SpeedModel(), np.array([[0.4]])
-    result = adapt_tasks(model, env, tasks, ReturnOracle, n_queries=4, record_at=[2, 0])
+    how = {"n_queries": 4, "record_at": [2, 0], "progress_bar": True}
+    result = adapt_tasks(model, env, tasks, ReturnOracle, **how)
+    assert "2/2" in capsys.readouterr().err
     assert result.record_at == (0, 2)
     assert result.latents.shape == (1, 2, 5)
     assert len(result.preferences[0]) == 2  # nothing is asked that nobody will look at
