@@ -91,6 +91,8 @@ class ModelLibrary:
         variant = key.variant
         if not key.training.is_default:
             variant += "-" + digest(key.training.to_dict())[:8]
+        if key.base is not None and self.given(key.base) is not None:
+            variant += "-" + digest(self.origin(key.base))[:8]  # another is made of another one
         return self.runs / model_folder(key.env_id) / variant / f"seed{key.seed}"
 
     def given(self, key: ModelKey) -> Path | None:

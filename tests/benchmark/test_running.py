@@ -37,6 +37,7 @@ from sb3_poem.benchmark.suites import (
 )
 from sb3_poem.benchmark.tables import suite_rows
 from sb3_poem.cli import main
+from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.pearl_sac.callbacks import EpochCallback, TrainingCheckpointCallback
 
 TINY_MODEL = {
@@ -179,6 +180,21 @@ def test_a_model_without_experience(tmp_path: Path, handed_over: Path) -> None:
     assert "which the model that was handed over does not have; hand over its checkpoint" in failure
     [record] = store.records()
     assert record.result["fragments"] == "rollouts of the training tasks"
+
+
+def test_what_is_made_from_a_model_is_made_anew_of_another(
+    tmp_path: Path, handed_over: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sb3_poem.benchmark.models.META_ITERATIONS_OF", {"PointGoal": 2})
+    checkpoint = tmp_path / "later/PointGoal/pearl/seed0/checkpoint.zip"
+    small(PEARLSAC).learn(600).save_checkpoint(checkpoint)
+    key, env = ModelKey(POINT, "maml-reward", 0), make_task_vec_env(POINT, 2)
+    made = []
+    for models in (handed_over / "all", tmp_path / "later"):
+        library, _ = library_of(tmp_path, models)
+        made.append(library.ensure(key))
+        assert library.load(key, env).reward.digest
+    assert [info["env_steps"] for info in made] == [300, 600]
 
 
 def test_what_ships_is_exported_with_what_it_earns(
