@@ -74,8 +74,8 @@ class AdaptedPolicy:
         return actions, latents
 
     def to_bytes(self) -> bytes:
-        """The policy as one safetensors file: the model, its configuration in the header, the
-        latent and the number of answers. Nothing in it can run code. Only of this package's models.
+        """The policy of one of this package's models as a safetensors file: the model, its
+        configuration in the header, latent and number of answers. Nothing in it can run code.
         """
         if type(self.model).__name__ not in BY_CLASS_NAME:
             known = " or ".join(BY_CLASS_NAME)

@@ -94,8 +94,7 @@ class ANOLE(Rule):
         if setting.n_queries not in allowed:
             raise ValueError(
                 f"`n_queries` must be at most {max(allowed)} with {self}, which keeps no more than "
-                f"{most:,} candidates, but is {setting.n_queries}, which takes "
-                f"{self.total_candidates(setting.n_queries):,}"
+                f"{most:,} candidates, but is {setting.n_queries}"
             )
         untrained = isinstance(model, PEARLSAC) and model.reward_coef == 0
         if untrained or not isinstance(model, HasRewardDecoder):

@@ -135,18 +135,15 @@ def _measure_known(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) -> di
     if known.successes is not None:
         data["task_success_rates"] = _rounded(known.successes.mean(axis=1))
     if isinstance(model, HasSimilarity):
-        accuracy, tau = preference_order(model, known)
-        data |= {"preference_accuracy": _number(accuracy), "kendall_tau": _number(tau)}
+        names = "preference_accuracy", "kendall_tau"
+        order = zip(names, preference_order(model, known), strict=True)
+        # JSON has no NaN
+        data |= {name: None if np.isnan(value) else round(value, 6) for name, value in order}
     return data
 
 
 def _rounded(values: Any) -> Any:
     return np.round(np.asarray(values, dtype=np.float64), DIGITS).tolist()
-
-
-def _number(value: float) -> float | None:
-    """JSON has no NaN."""
-    return None if np.isnan(value) else round(value, 6)
 
 
 def find_record(store: Store, cell_id: str) -> Record:

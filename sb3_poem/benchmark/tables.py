@@ -119,10 +119,9 @@ def make_report(
             file.write_text(text)
             files += [file, *write_figures(selection, out)]
     if not texts:
-        of = [*(families or []), *(f"seed {seed}" for seed in seeds or [])]
-        known = "" if suites or families else ": name families that are in no suite by --families"
-        asked = f" of {', '.join(of)}" if of else ""
-        raise ValueError(f"{store.path} holds no finished cell{asked}{known}")
+        own = ["the suites' families (name others by --families)"]
+        of = ", ".join([*(families or own), *(f"seed {seed}" for seed in seeds or [])])
+        raise ValueError(f"{store.path} holds no finished cell of {of}")
     return format_rows(rows, kind) if rows else "\n".join(texts), files
 
 

@@ -362,7 +362,7 @@ def test_a_store_without_the_suite_is_refused(tmp_path: Path) -> None:
     store = fill(tmp_path / "store.sqlite", "epsilon", seeds=1, methods=["poem-paper-epsilon-0.4"])
     with pytest.raises(ValueError, match=r"--suite smoke: .* holds no finished cell of it"):
         make_report(store, ["smoke"])
-    with pytest.raises(ValueError, match=r"name families that are in no suite by --families"):
+    with pytest.raises(ValueError, match=r"no finished cell of the suites' families \(name others"):
         make_report(Store(tmp_path / "empty.sqlite"))
     assert make_report(store)[0].count("# Tolerance of the paper's rule") == 1
 
