@@ -85,8 +85,8 @@ def find_folder(name: str | Path) -> Path:
     if path.is_dir():
         return path
     if path.exists():
-        needed = "the folder of a model; POEMSAC.load reads a model's file"
-        raise FileNotFoundError(f"{name} is a file, but must be {needed}")
+        written = "as POEMSAC.load(file).save_pretrained(folder) writes it"
+        raise FileNotFoundError(f"{name} is a file, but must be the folder of a model, {written}")
     if is_repository(name):
         return download(str(name))
     if path.suffix == ".zip" or len(path.parts) > 1:

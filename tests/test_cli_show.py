@@ -92,6 +92,30 @@ def test_a_policy_that_was_saved_is_shown_as_it_is(
     assert "is a policy that is adapted already" in capsys.readouterr().err
 
 
+class UndrawnEnv(PointGoalEnv):
+    metadata = {"render_modes": []}  # noqa: RUF012
+
+
+@pytest.mark.parametrize(
+    "command", ["record-video --out a.gif", "adapt --tasks 1 --video a.gif", "label --port 0"]
+)
+def test_what_cannot_be_drawn_is_refused_before_it_is_adapted_or_served(
+    command: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    gym.register("Undrawn-v0", UndrawnEnv, max_episode_steps=25)
+    try:
+        assert show(*command.split(), "--model", "PointGoal", "--env", "Undrawn-v0") == 1
+    finally:
+        del gym.registry["Undrawn-v0"]
+    said = capsys.readouterr()
+    assert 'needs metadata = {"render_modes": ["rgb_array"]}, and a render()' in said.err
+    assert not said.out
+
+
 def test_record_video_films_before_and_after_or_one_policy(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

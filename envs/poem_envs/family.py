@@ -376,7 +376,8 @@ def check_render_mode(render_mode: str | None, metadata: dict[str, Any]) -> None
     if render_mode is None:
         return
     if not modes:
-        raise TypeError(f"render_mode={render_mode!r}: this environment cannot be rendered")
+        needed = 'its class needs metadata = {"render_modes": ["rgb_array"]}, and a render()'
+        raise TypeError(f"render_mode={render_mode!r}: this environment cannot be drawn; {needed}")
     if render_mode not in modes:
         raise ValueError(f"render_mode={render_mode!r} is not supported, choose one of {modes}")
     if render_mode == "human" and not has_display():

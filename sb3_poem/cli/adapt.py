@@ -58,6 +58,8 @@ def run_adapt(arguments: argparse.Namespace) -> int:
     if subject.latent is not None:
         what = "a policy that is adapted already; name the model instead"
         raise ValueError(f"--model {arguments.model} is {what}")
+    if arguments.video is not None:
+        subject.check_shown("rgb_array")
     adaptation = Adaptation(arguments, subject)
     try:
         return adaptation.ask_person() if human else adaptation.ask_oracle()

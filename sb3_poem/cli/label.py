@@ -29,7 +29,7 @@ def run_page(arguments: argparse.Namespace) -> None:
     from sb3_poem.label.access import LOOPBACK, Access, is_loopback
     from sb3_poem.label.families import find_models
     from sb3_poem.label.render_queue import RenderQueue, process_pool
-    from sb3_poem.label.rendering import session_rule
+    from sb3_poem.label.rendering import make_env, session_rule
     from sb3_poem.label.server import bind, link_host, make_app, make_server
     from sb3_poem.label.sessions import SessionManager
     from sb3_poem.label.store import Store
@@ -49,6 +49,9 @@ def run_page(arguments: argparse.Namespace) -> None:
     session_rule(options)  # says now what is out of range
     env_kwargs = parse_pairs("--env-kwargs", arguments.env_kwargs)
     models = find_models(arguments.model, arguments.env, env_kwargs)
+    if arguments.model is not None:  # of those that ship, one may need an extra
+        for info in models:
+            make_env(info.env_id, **dict(info.env_kwargs)).close()
     listener = bind(arguments.host, arguments.port)
     port = listener.getsockname()[1]
     store = Store(arguments.store)

@@ -21,9 +21,9 @@ def run_enjoy(arguments: argparse.Namespace) -> None:
     if not has_display() and not arguments.no_render:
         film = shlex.join(["sb3-poem", "record-video", *arguments.given[1:], "--out", "policy.mp4"])
         raise OSError(f"there is no display to draw on: film it by `{film}`, or add --no-render")
-    shown = Shown(arguments)
-    subject, steps = shown.subject, arguments.n_timesteps
     mode = None if arguments.no_render else "human"
+    shown = Shown(arguments, mode)
+    subject, steps = shown.subject, arguments.n_timesteps
     env = subject.make_env(mode, show_task=shown.has_task and mode is not None)
     episodes = arguments.episodes if steps is None else ceil(steps / subject.model.horizon)
     try:
@@ -39,7 +39,7 @@ def run_enjoy(arguments: argparse.Namespace) -> None:
 def run_record_video(arguments: argparse.Namespace) -> None:
     """Film a policy, or one before and after adaptation side by side."""
     check_output("--out", arguments.out, (".mp4", ".gif"))
-    shown = Shown(arguments)
+    shown = Shown(arguments, "rgb_array")
     shown.subject.film(shown.latents, shown.captions, arguments.out, shown.has_task)
     shown.subject.env.close()
 
@@ -49,10 +49,11 @@ class Shown:
     both are printed. ``has_task`` is whether the task says anything of the policy.
     """
 
-    def __init__(self, arguments: argparse.Namespace) -> None:
+    def __init__(self, arguments: argparse.Namespace, render_mode: str | None) -> None:
         if arguments.model is None:
             arguments.model = _last_run(arguments)
         self.subject = subject = Subject(arguments, Console(), 1, COPIES_FOR_ONE_TASK)
+        subject.check_shown(render_mode)
         self.has_task = subject.latent is None or arguments.task is not None
         if subject.latent is not None and arguments.known_task:
             what = f"but --model {arguments.model} is a policy"
