@@ -3,6 +3,7 @@ should point to some place. No setting of the package was chosen on them.
 
     cd docs/examples
     sb3-poem train --env example/Walker2dVel-v0 --gym-packages gymnasium_robots
+    sb3-poem record-video --env example/Walker2dVel-v0 --gym-packages gymnasium_robots --out a.mp4
 """
 
 import functools
@@ -14,21 +15,25 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from poem_envs import TaskFamily, TaskFamilyVector
+from poem_envs.films import Look, MujocoFilms
 
 Array = NDArray[Any]
 
 
-class Walker2dVel(TaskFamily):
+class Walker2dVel(MujocoFilms, TaskFamily):
     """Gymnasium's Walker2d, which should walk at a speed from 0 to 2 m/s. Reward of a step: 1 while
     it is up, minus how far its speed is from the task's, minus the cost of its actions. An episode
-    ends when it falls.
+    ends when it falls. It can be drawn, and filmed for the page on which people answer.
     """
 
     task_space = spaces.Box(0.0, 2.0, (1,), np.float64)
     reward_feature_dim = 2  # speed (m/s), cost of the action
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 125}  # noqa: RUF012
+    look = Look(marks="metres")
 
-    def __init__(self) -> None:
-        self.robot = gym.make("Walker2d-v5")
+    def __init__(self, render_mode: str | None = None) -> None:
+        super().__init__(render_mode=render_mode)
+        self.robot = gym.make("Walker2d-v5", render_mode=render_mode)
         self.observation_space = self.robot.observation_space
         self.action_space = self.robot.action_space
 
@@ -42,7 +47,15 @@ class Walker2dVel(TaskFamily):
     def _reward(self, tasks: Array, features: Array) -> Array:
         return 1.0 - np.abs(features[..., 0] - tasks[..., 0]) - features[..., 1]
 
+    def render(self) -> Any:
+        return self.robot.render()
+
+    def _simulation(self) -> tuple[Any, Any]:  # what films are drawn from
+        robot: Any = self.robot.unwrapped
+        return robot.model, robot.data
+
     def close(self) -> None:
+        self._close_films()
         self.robot.close()
 
 
