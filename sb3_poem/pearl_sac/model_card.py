@@ -1,5 +1,6 @@
 """The card of a pretrained folder: what the model is, how to use it, what it earned."""
 
+from textwrap import fill
 from typing import Any
 
 RULES = {"bayes": "`Bayes()`", "paper": "`Paper()`"}
@@ -59,8 +60,10 @@ def _training(config: dict[str, Any]) -> str:
         rows.append(("wall time", f"{card['wall_seconds'] / 60:.0f} minutes"))
     text = "| | |\n|---|---|\n" + "".join(f"| {key} | {value} |\n" for key, value in rows)
     if "command" in card:
-        alone = "" if "note" not in card else " (`note` in `config.json` says what differs)"
-        text += f"\nTrained with{alone}:\n\n```\n{card['command']}\n```\n"
+        text += f"\nTrained with:\n\n```\n{card['command']}\n```\n"
+    if "note" in card:
+        note = f"`config.json` notes: {card['note']}"
+        text += f"\n{fill(note, 100, break_on_hyphens=False)}\n"
     return text
 
 

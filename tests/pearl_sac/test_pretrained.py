@@ -144,7 +144,7 @@ def test_the_card_says_where_the_model_comes_from(trained: PEARLSAC, folder: Pat
         "| gradient steps | 10 |",
         "| machine | 2 cores |",
         CARD["command"],
-        "`note` in `config.json`",
+        f"`config.json` notes: {CARD['note']}",
         "| `Bayes()` | prior | -30.0 | -20.0 | -12.5 | -11.0 |",
     ):
         assert str(part) in text, part
