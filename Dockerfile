@@ -1,4 +1,4 @@
-# The page on which people answer. Not built yet where it was written, which had no Docker.
+# The page on which people answer. Written without Docker, and so never built.
 #
 #   docker build -t sb3-poem .
 #   docker run --rm -p 7860:7860 -v poem-answers:/answers sb3-poem

@@ -38,7 +38,7 @@ PAGES = {
     "ablation": "ablations",
     "epsilon": "tolerances of eq. 9",
     "smoke": "all methods",
-    "adaptation": "an earlier record",
+    "adaptation": "a record by `sb3-poem adapt`",
     "metaworld-evaluation-test": "Meta-World's own evaluation, held-out manipulations",
     "metaworld-evaluation-train": "the ten to train on",
 }
@@ -174,8 +174,8 @@ after exact answers. Of *seeds* trainings seed 0 ships.
 `sb3-poem benchmark run --suite shipped --families FAMILY --seeds N` trains and measures (with
 `--models pretrained --seeds 1` it measures what ships), `python docs/tables.py` writes this page
 from [its stores](../benchmarks/results/shipped/manifest.md). The figures below a family compare
-methods over training seeds: they are of models of their own, of an
-earlier revision. What is not listed was not measured.
+methods over training seeds, with models of their own, by the revision of the code that each record
+names. What is not listed was not measured.
 
 {summary()}
 """
