@@ -323,3 +323,12 @@ def test_each_measurement_is_told_as_it_comes_and_changes_nothing():
             MODEL, vec_env(4), adapted.latents[:, n - 1], tasks, 2, evaluation_seed(0)
         ).returns
         np.testing.assert_array_equal(one.returns[:, -1], alone)
+
+
+def test_the_progress_bar_counts_answers_and_comes_to_its_end(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    adapt_tasks(
+        MODEL, vec_env(), GOALS[:2], ReturnOracle, record_at=(0, 2), n_queries=5, progress_bar=True
+    )
+    assert "2/2" in capsys.readouterr().err
