@@ -115,7 +115,9 @@ def moments_of(paths: Sequence[np.ndarray]) -> list[list[int]]:
 
 
 class MujocoFilms:
-    """What makes an environment with a MuJoCo model :class:`Filmed`."""
+    """What makes an environment with a MuJoCo model :class:`Filmed`: a class before the family's
+    own among the bases. A subclass defines ``_simulation``, and sets its ``look``.
+    """
 
     #: How it is filmed.
     look = Look()
