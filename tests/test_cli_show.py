@@ -116,6 +116,14 @@ def test_what_cannot_be_drawn_is_refused_before_it_is_adapted_or_served(
     assert not said.out
 
 
+def test_a_family_of_one_s_own_is_named_with_the_module_that_registers_it(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for command in ("record-video --out a.gif", "label --port 0"):
+        assert show(*command.split(), "--model", "PointGoal", "--env", "my/Own-v0") == 1
+        assert "on the command line --gym-packages" in capsys.readouterr().err
+
+
 def test_record_video_films_before_and_after_or_one_policy(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -31,9 +31,9 @@ class Walker2dVel(MujocoFilms, TaskFamily):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 125}  # noqa: RUF012
     look = Look(marks="metres")
 
-    def __init__(self, render_mode: str | None = None) -> None:
-        super().__init__(render_mode=render_mode)
-        self.robot = gym.make("Walker2d-v5", render_mode=render_mode)
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.robot = gym.make("Walker2d-v5", render_mode=self.render_mode)
         self.observation_space = self.robot.observation_space
         self.action_space = self.robot.action_space
 

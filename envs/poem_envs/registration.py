@@ -21,6 +21,6 @@ def plain_id(env_id: str) -> str:
         hint = f"did you mean {close[0]!r}?" if close else "nor any like it."
         raise gym.error.NameNotFound(
             f"No environment {name!r} is registered with Gymnasium, {hint} One of your own is "
-            "registered by an import of its module, as in 'module:id'"
+            "registered by an import of its module: 'module:id', on the command line --gym-packages"
         )
     return name

@@ -58,9 +58,9 @@ def run_adapt(arguments: argparse.Namespace) -> int:
     if subject.latent is not None:
         what = "a policy that is adapted already; name the model instead"
         raise ValueError(f"--model {arguments.model} is {what}")
-    if arguments.video is not None:
-        subject.check_shown("rgb_array")
     adaptation = Adaptation(arguments, subject)
+    if arguments.video is not None:
+        subject.make_env("rgb_array", adaptation.task_matters).close()  # before it is adapted
     try:
         return adaptation.ask_person() if human else adaptation.ask_oracle()
     finally:
@@ -99,6 +99,8 @@ class Adaptation:
         chosen["noise_model"] = "infer" if arguments.infer_noise else None
         self.options = {name: value for name, value in chosen.items() if value is not None}
         self.rule = named_rule(**self.options)
+        #: Whether who answers knows the task
+        self.task_matters = arguments.oracle != "human" or arguments.task is not None
 
     def ask_oracle(self) -> int:
         """Let a program that knows the tasks answer, and say each measurement as it comes."""
@@ -268,8 +270,8 @@ class Adaptation:
     def _film(self, latents: np.ndarray, answers: Sequence[int]) -> None:
         """Film the policies (n_records, latent_dim) after the fewest and the most answers."""
         captions = (after(answers[0]), after(answers[-1]))
-        task_matters = self.arguments.oracle != "human" or self.arguments.task is not None
-        self.subject.film((latents[0], latents[-1]), captions, self.arguments.video, task_matters)
+        policies, video = (latents[0], latents[-1]), self.arguments.video
+        self.subject.film(policies, captions, video, self.task_matters)
 
     def _save(self, latent: np.ndarray, n_answers: int) -> None:
         if self.arguments.save is not None:

@@ -201,7 +201,8 @@ def _add_adapt_arguments(parser: argparse.ArgumentParser) -> None:
 
     questions = parser.add_argument_group("the questions and who answers them")
     oracles = ("return", "boltzmann", "mistake", "human")
-    questions.add_argument("--oracle", choices=oracles, default="return")
+    told = "a program that knows the task, and answers by the return, or errs; or you"
+    _option(questions, "--oracle", told, default="return", choices=oracles)
     beta = "inverse temperature of --oracle boltzmann (default: the paper's)"
     _option(questions, "--beta", beta, float)
     _option(questions, "--mistake-rate", "of --oracle mistake", float, 0.2)

@@ -24,7 +24,7 @@ def run_enjoy(arguments: argparse.Namespace) -> None:
     mode = None if arguments.no_render else "human"
     shown = Shown(arguments, mode)
     subject, steps = shown.subject, arguments.n_timesteps
-    env = subject.make_env(mode, show_task=shown.has_task and mode is not None)
+    env = subject.make_env(mode, shown.shows_task)
     episodes = arguments.episodes if steps is None else ceil(steps / subject.model.horizon)
     try:
         for number in range(episodes):
@@ -40,7 +40,7 @@ def run_record_video(arguments: argparse.Namespace) -> None:
     """Film a policy, or one before and after adaptation side by side."""
     check_output("--out", arguments.out, (".mp4", ".gif"))
     shown = Shown(arguments, "rgb_array")
-    shown.subject.film(shown.latents, shown.captions, arguments.out, shown.has_task)
+    shown.subject.film(shown.latents, shown.captions, arguments.out, shown.shows_task)
     shown.subject.env.close()
 
 
@@ -53,8 +53,9 @@ class Shown:
         if arguments.model is None:
             arguments.model = _last_run(arguments)
         self.subject = subject = Subject(arguments, Console(), 1, COPIES_FOR_ONE_TASK)
-        subject.check_shown(render_mode)
         self.has_task = subject.latent is None or arguments.task is not None
+        self.shows_task = self.has_task and render_mode is not None
+        subject.make_env(render_mode, self.shows_task).close()  # before it is adapted
         if subject.latent is not None and arguments.known_task:
             what = f"but --model {arguments.model} is a policy"
             raise ValueError(f"--known-task chooses a policy of a model, {what}")

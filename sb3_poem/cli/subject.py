@@ -91,12 +91,10 @@ class Subject:
         with self.console.status("Looking for the best policy of every task, as if it were known"):
             return known_task_return(*about, selection_episodes=selection, limits=limits)
 
-    def check_shown(self, render_mode: str | None) -> None:
-        """Refuse what cannot be drawn so, before anything is adapted."""
-        make_shown_env(self.env_id, render_mode, **self.env_kwargs).close()
-
     def make_env(self, render_mode: str | None, show_task: bool) -> DummyVecEnv:
-        """A single environment with the first task, which is drawn too if it is shown."""
+        """A single environment with the first task, which is drawn too if it is shown; refused if
+        it cannot be drawn so.
+        """
         options = {**self.env_kwargs, "render_task": True} if show_task else self.env_kwargs
         env = DummyVecEnv([partial(make_shown_env, self.env_id, render_mode, **options)])
         FamilyView(env).set_tasks(self.tasks[:1])

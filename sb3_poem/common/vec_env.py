@@ -232,7 +232,7 @@ def make_task_vec_env(
 
 def make_shown_env(env_id: str, render_mode: str | None, **env_kwargs: Any) -> gym.Env:
     """A single environment, to be looked at; refused if it cannot be drawn so."""
-    env = gym.make(env_id, render_mode=render_mode, **env_kwargs)
+    env = gym.make(plain_id(env_id), render_mode=render_mode, **env_kwargs)
     if render_mode is not None and render_mode not in env.metadata.get("render_modes", ()):
         raise ValueError(f"{env_id} cannot be shown: it has no render mode {render_mode!r}")
     return env
