@@ -73,6 +73,7 @@ class Workplace:
     :param runs: Folder of the trainings.
     :param models: Folders with models that were handed over, see :meth:`ModelLibrary.given`.
     :param named: Models that were handed over one by one: family, variant, seed, path.
+    :param packages: Modules that register environments, for processes that train.
     """
 
     runs: str
@@ -80,6 +81,7 @@ class Workplace:
     named: tuple[tuple[str, str, int, str], ...] = ()
     device: str = "cpu"
     num_threads: int = 1
+    packages: tuple[str, ...] = ()
 
 
 class ModelLibrary:
@@ -244,7 +246,8 @@ class ModelLibrary:
             f"{state} {key}: {plan.timesteps:,} steps, {plan.updates:,} updates; "
             f"log in {folder / LOG}"
         )
-        arguments, place = train_arguments(key, plan), self.workplace
+        place = self.workplace
+        arguments = train_arguments(key, plan, place.packages)
         run_training(arguments, plan.save_steps, folder, lock, place.device, place.num_threads)
         files = folder.glob(f"*/*/{_zip_name(key.env_id)}")
         file = max(files, key=lambda file: file.stat().st_mtime, default=None)

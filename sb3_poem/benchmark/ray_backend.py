@@ -6,6 +6,7 @@ which all machines must share: so a lost worker's trial is tried again where it 
 command resumes a whole experiment.
 """
 
+import importlib
 import json
 import logging
 import shutil
@@ -118,6 +119,8 @@ def _run_trial(
 ) -> None:
     from ray import tune
 
+    for package in workplace.packages:
+        importlib.import_module(package)
     job, library, record = jobs[config["number"]], ModelLibrary(workplace), ""
     if isinstance(job, ModelKey):
         library.ensure(job, print)

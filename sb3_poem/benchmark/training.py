@@ -15,7 +15,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -123,14 +123,16 @@ def training_plan(key: ModelKey) -> TrainingPlan:
     )
 
 
-def train_arguments(key: ModelKey, plan: TrainingPlan) -> list[str]:
-    """Those of ``sb3-poem`` that decide what comes out."""
+def train_arguments(key: ModelKey, plan: TrainingPlan, packages: Sequence[str] = ()) -> list[str]:
+    """Those of ``sb3-poem`` that decide what comes out; ``packages`` register the environment."""
     arguments = ["train", "--algo", plan.algorithm, "--env", key.env_id]
     arguments += ["--seed", str(key.seed), "--eval-freq", "-1"]
     if key.training.timesteps is not None:
         arguments += ["-n", str(plan.timesteps)]
     if plan.overrides:
         arguments += ["-params", *(f"{name}:{value!r}" for name, value in plan.overrides.items())]
+    if packages:
+        arguments += ["--gym-packages", *packages]
     return arguments
 
 

@@ -142,7 +142,8 @@ def _library(arguments: argparse.Namespace, device: str, num_threads: int) -> "M
             raise ValueError(f"--models {folder}: there is no such folder")
     named = tuple(_parse_named(text) for text in arguments.model)
     runs, models = abspath(arguments.runs), tuple(map(abspath, arguments.models))
-    return ModelLibrary(Workplace(runs, models, named, device, num_threads))
+    packages = tuple(arguments.gym_packages)
+    return ModelLibrary(Workplace(runs, models, named, device, num_threads, packages))
 
 
 def _parse_params(pairs: list[str]) -> tuple[tuple[str, object], ...]:

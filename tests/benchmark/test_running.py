@@ -14,6 +14,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from meta_toys import small
@@ -266,6 +267,27 @@ def test_every_method_is_trained_and_measured_along_the_training(
     again = make_plan(*arguments)
     assert (len(again.done), again.todo) == (len(plan.todo), [])
     assert len(list((tmp_path / "runs").rglob("sessions/*.json"))) == 2
+
+
+def test_a_family_of_ones_own_is_trained_by_the_module_that_registers_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "own_family.py").write_text(
+        "import gymnasium\nfrom poem_envs.point_goal import PointGoalEnv\n"
+        "gymnasium.register('own/Point-v0', PointGoalEnv, max_episode_steps=25)\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.path", [*sys.path])
+    words = "benchmark run --suite smoke --families own/Point-v0 --methods poem-bayes --seeds 1"
+    little = "--timesteps 100 --params n_train_tasks:4 gradient_steps:1 --tasks 2 --episodes 1"
+    own = "--gym-packages own_family --snapshots 1"
+    try:
+        assert main(f"{words} {little} {own}".split()) == 0
+    finally:
+        gym.registry.pop("own/Point-v0", None)
+        sys.modules.pop("own_family", None)
+    (record, _) = Store(Path("benchmark.sqlite"), create=False).records()
+    assert "--gym-packages own_family" in json.dumps(record.provenance)
 
 
 def test_a_training_that_fails_is_reported_and_the_rest_is_run(tmp_path: Path) -> None:
