@@ -38,11 +38,10 @@ from sb3_poem.cli.subject import (
     POLICY_SUFFIX,
     Subject,
     after,
-    describe_task,
     say,
 )
 from sb3_poem.label import Store, StoreRecorder
-from sb3_poem.label.beliefs import belief
+from sb3_poem.label.beliefs import believed_in_words
 
 DEFAULT_TASKS = 30
 
@@ -215,11 +214,7 @@ class Adaptation:
             self._report(self._measure(latents, adapter), known)
         if arguments.video is not None and not interrupted:
             self._film(latents, (0, adapter.n_answers))
-        believed = belief(adapter, subject.env_id)
-        if believed["picture"] == "projection":  # whose sentence is about the picture
-            task = describe_task(latents[-1])
-            believed["sentence"] = f"It takes the policy of the latent ({task})."
-        say(f"\n{believed['sentence']}")
+        say(f"\n{believed_in_words(adapter, subject.env_id)}")
         say(f"The answers are in {recorder.store.folder}, session {recorder.session.id}. Next:")
         words = [word for word in arguments.given if word != "--resume"]
         again = shlex.join(["sb3-poem", *words, "--resume"])
@@ -228,8 +223,10 @@ class Adaptation:
         if arguments.save is None:
             say(f"  keep the policy:  {again} --save policy{POLICY_SUFFIX}")
         else:
-            file = shlex.quote(str(arguments.save))
-            say(f"  watch the policy: sb3-poem record-video --model {file} --out policy.mp4")
+            film = ["sb3-poem", "record-video", "--model", str(arguments.save)]
+            if arguments.gym_packages:
+                film += ["--gym-packages", *arguments.gym_packages]
+            say(f"  watch the policy: {shlex.join([*film, '--out', 'policy.mp4'])}")
         return 130 if interrupted else 0
 
     def _measure(self, latents: np.ndarray, adapter: PreferenceAdapter) -> AdaptationEvaluation:

@@ -294,6 +294,8 @@ def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
     told = "with observations, actions and reward features, which minari always has"
     _switch(export, "--trajectories", told)
     _switch(export, "--undone", "with answers that were taken back")
+    told = "modules that register environments, for --format minari"
+    _option(export, "--gym-packages", told, nargs="+", metavar="MODULE", **own)
     replay = _add_command(
         commands,
         "replay --inference paper --json replay.json",

@@ -53,6 +53,15 @@ def belief(adapter: Any, env_id: str) -> dict[str, Any]:
     }
 
 
+def believed_in_words(adapter: Any, env_id: str) -> str:
+    """:func:`belief` in a sentence, for who sees no picture."""
+    believed = belief(adapter, env_id)
+    if believed["picture"] != "projection":
+        return str(believed["sentence"])
+    numbers = ", ".join(f"{value:.3g}" for value in adapter.inference.estimate())
+    return f"It takes the policy of the latent ({numbers})."
+
+
 def posterior(inference: Any) -> tuple[np.ndarray, np.ndarray]:
     """The latents (n, d) that are still possible, and weights (n,) summing to one."""
     if hasattr(inference, "particles"):

@@ -10,7 +10,7 @@ from sb3_poem.adaptation.adapter import shown_from_dict
 from sb3_poem.adaptation.preference import BEST_OF_FOUR, PLACES, Preference
 from sb3_poem.adaptation.rule import Setting, inference_rng
 from sb3_poem.common.trajectory import Trajectory
-from sb3_poem.label.beliefs import belief
+from sb3_poem.label.beliefs import believed_in_words
 from sb3_poem.label.rendering import session_rule
 from sb3_poem.label.store import Session, Store
 
@@ -78,7 +78,7 @@ def replay(
         "foretold": foretold,
         "decided": decided,
         "latents": [latent.tolist() for latent in latents],
-        "sentence": belief(replayed, session.env_id)["sentence"],
+        "sentence": believed_in_words(replayed, session.env_id),
         "action_error": float(np.sqrt(np.mean(np.square(errors)))) if errors else None,
     }
 

@@ -22,7 +22,7 @@ from sb3_poem import POEMSAC, Bayes, cli
 from sb3_poem.adaptation import HumanOracle, PreferenceAdapter, ReturnOracle
 from sb3_poem.adaptation.policy import AdaptedPolicy
 from sb3_poem.common.trajectory import Trajectory
-from sb3_poem.label import LabelWidget, StoreRecorder
+from sb3_poem.label import LabelWidget, StoreRecorder, families
 from sb3_poem.label.export import FIELDS, export, records
 from sb3_poem.label.families import ModelInfo
 from sb3_poem.label.rendering import load_shown_model
@@ -192,7 +192,11 @@ def _return(model: Any, env: gym.Env, latent: np.ndarray) -> float:
 
 
 def test_the_commands(
-    answered: Session, store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    answered: Session,
+    store: Store,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     out, folder = tmp_path / "out.jsonl", str(store.folder)
     assert cli.main(["label", "export", "--store", folder, "--out", str(out), "--undone"]) == 0
@@ -214,6 +218,9 @@ def test_the_commands(
     options = ["--store", folder, "--inference", "paper"]
     assert cli.main(["label", *options, "replay", "--json", str(tmp_path / "again.json")]) == 0
     assert (tmp_path / "again.json").read_text() == result.read_text()
+    monkeypatch.delitem(families.DESCRIPTIONS, "PointGoal")  # as of a family of one's own
+    assert cli.main(["label", *options, "replay"]) == 0
+    assert "It takes the policy of the latent (" in capsys.readouterr().out
 
 
 def test_replay_knows_a_model_by_its_folder_and_says_which_it_lacks(
@@ -246,6 +253,7 @@ def test_replay_knows_a_model_by_its_folder_and_says_which_it_lacks(
     [
         (["export", "--store", "nowhere", "--out", "a.jsonl"], "no answers there"),
         (["export", "--out", "a.csv"], "must end in .jsonl or .parquet"),
+        (["export", "--gym-packages", "nowhere", "--out", "a.jsonl"], "--gym-packages nowhere"),
         (["--host", "0.0.0.0"], "--host 0.0.0.0"),
         (["--auth", "ann:short"], "at least 12 characters"),
         (["--auth", "nobody"], "USER:PASSWORD"),
