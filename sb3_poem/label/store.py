@@ -23,7 +23,7 @@ MAX_WISH = 2000  # characters
 LOOK_AGAIN = "look again at the page"
 MOVED_ON = f"the conversation has moved on; {LOOK_AGAIN}"
 SCHEMA_VERSION = 4
-SCHEMA = """
+SCHEMA = f"""
 CREATE TABLE sessions (
     id INTEGER PRIMARY KEY,
     token_hash TEXT NOT NULL UNIQUE,
@@ -58,8 +58,6 @@ CREATE TABLE turns (
     dropped REAL                     -- when an undo, or one asked again, made it void
 );
 CREATE UNIQUE INDEX one_turn ON turns(session, kind, number) WHERE dropped IS NULL;
-"""
-ANSWERS_SCHEMA = f"""
 CREATE TABLE answers (
     id INTEGER PRIMARY KEY,
     session INTEGER NOT NULL REFERENCES sessions(id),
@@ -70,20 +68,6 @@ CREATE TABLE answers (
     undone REAL
 );
 CREATE UNIQUE INDEX one_answer ON answers(session, number) WHERE undone IS NULL;
-"""
-# Version 1 and 2 ask nothing again.
-FROM_VERSION_2 = "ALTER TABLE turns ADD COLUMN repeats INTEGER;"
-# Up to version 3 there are no answers but about two, and in version 1 but three.
-FROM_VERSION_3 = f"""
-DROP INDEX one_answer;
-ALTER TABLE answers RENAME TO answers_3;
-{ANSWERS_SCHEMA}
-INSERT INTO answers SELECT * FROM answers_3;
-DROP TABLE answers_3;
-ALTER TABLE turns RENAME COLUMN left_trajectory TO trajectories;
-UPDATE turns SET trajectories = json_object('left', json(trajectories), 'right',
-    json(right_trajectory)) WHERE trajectories IS NOT NULL;
-ALTER TABLE turns DROP COLUMN right_trajectory;
 """
 # Of a question that is asked again: where the conversation stands, and what is shown.
 STANDS = ("session", "kind", "number", "state", "belief", "latent")
@@ -406,12 +390,10 @@ class Store:
     def _make_tables(self) -> None:
         with self._transaction() as execute:
             version = execute("PRAGMA user_version").fetchone()[0]
-            scripts = {0: SCHEMA + ANSWERS_SCHEMA, 3: FROM_VERSION_3, SCHEMA_VERSION: ""}
-            scripts |= dict.fromkeys((1, 2), FROM_VERSION_2 + FROM_VERSION_3)
-            if version not in scripts:
-                reads = f"this program reads {SCHEMA_VERSION}"
-                raise ValueError(f"{self.path} is a store of version {version}; {reads}")
-            for statement in scripts[version].split(";"):
+            if version not in (0, SCHEMA_VERSION):
+                reads = f"this program reads version {SCHEMA_VERSION}; name another folder"
+                raise ValueError(f"{self.path} is a store of version {version}, and {reads}")
+            for statement in SCHEMA.split(";") if version == 0 else ():
                 execute(statement)
             execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
 
