@@ -139,8 +139,7 @@ class _Pages:
         for model in self.sessions.models:
             groups[model.description.group].append(model)
         pictures = {file.stem for file in ROBOTS.iterdir()}
-        n_queries = self.sessions.n_queries
-        return self._html("start.html", groups=groups, pictures=pictures, n_queries=n_queries)
+        return self._html("start.html", groups=groups, pictures=pictures, sessions=self.sessions)
 
     async def start(self, request: Request) -> Response:
         fields = parse_qs((await request.body()).decode("utf-8", "replace"))

@@ -497,6 +497,7 @@ def test_a_browser_gets_pages_where_something_is_refused(
     [
         ([], Bayes(question="graded", noise_model="infer"), 5),
         (["--question", "pair"], Bayes(noise_model="infer"), 3),
+        (["--question", "best-of-four"], Bayes(question="best-of-four", noise_model="infer"), 5),
         (["--mistake-rate", "0.1"], Bayes(question="graded", noise_model=MistakeNoise(0.1)), 5),
         (["--inference", "paper"], Paper(), 3),
     ],
@@ -509,6 +510,8 @@ def test_what_the_page_asks(
     app = make_app(make_sessions(store, point_goal, options=options))
     with TestClient(app, base_url=HOST, follow_redirects=False) as client:
         assert client.get(begin(client)).text.count("data-preference=") == buttons
+        films = "four short" if "best-of-four" in words else "two short"
+        assert f"You will see {films}" in " ".join(client.get("/").text.split())
 
 
 def test_the_widget_names_the_extra_that_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
