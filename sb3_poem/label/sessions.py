@@ -125,13 +125,12 @@ class SessionManager:
         answered, names = len(answers), ("question", "preference", "fps", "frames")
         view: dict[str, Any] = {
             "phase": "preparing",
+            "due": kind,
             "question": session.question,
-            "model": session.model,
             "answered": answered,
             "answers": [{name: answer[name] for name in names} for answer in answers],
             "target": session.target,
             "step": session.step,
-            "wish": session.wish,
             "can_undo": answered > 0 or session.stopped,
             "belief": json.loads(shown["belief"] or "null") if shown is not None else None,
         }

@@ -311,6 +311,8 @@ def test_undo_and_reload_in_the_middle(
     person.answer(3)
     assert page.text_content("#belief-sentence") == sentences
     page.click("#stop")
+    page.wait_for_selector("text=Filming what it learned")
+    assert page.text_content("#undo-text") == "Back to the questions"
     page.wait_for_selector("#result:visible")
     page.click("#undo")  # back to the questions
     page.wait_for_selector("#answers:visible")
@@ -357,6 +359,14 @@ def test_the_keyboard_alone(
     )
     page.focus("#frame")
     page.keyboard.press("ArrowRight")  # moves the film, and answers nothing
+    assert person.answered() == 2
+    page.keyboard.press("u")  # which means nothing else there
+    page.wait_for_function("() => view.answered === 1 && !busy")
+    person.answer(1)
+    page.focus("#past summary")
+    page.keyboard.press("Space")  # opens the list
+    assert page.get_attribute("#past", "open") is not None
+    assert page.get_attribute("#play", "aria-label") == "Play"
     page.focus("#wish")
     page.keyboard.type("left u right")
     assert person.answered() == 2
@@ -608,7 +618,7 @@ def test_answers_can_be_looked_at_again(
     assert len(items) == 2
     for item, preference in zip(items, person.stored(), strict=True):
         assert item.startswith(said[preference])
-    page.get_by_role("button", name="Show pair 1 again").click()
+    page.get_by_role("button", name="Show again: pair 1").click()
     page.wait_for_selector(".past #then")
     page.evaluate("() => player.seek(20)")
     page.wait_for_function("() => player.drawn === 20")
@@ -624,14 +634,14 @@ def test_answers_can_be_looked_at_again(
     page.wait_for_selector("#answers:visible")
     assert page.is_hidden("#then")
     person.answer(1)
-    page.get_by_role("button", name="Show pair 3 again").click()
+    page.get_by_role("button", name="Show again: pair 3").click()
     page.wait_for_selector(".past #then")
     page.keyboard.press("u")  # of the very pair that is shown
     page.wait_for_function("() => view.answered === 2 && !busy")
     assert page.is_visible("#answers")
     assert page.locator("#past li").count() == 2
     person.answer(3)
-    page.get_by_role("button", name="Show pair 2 again").click()  # from the result
+    page.get_by_role("button", name="Show again: pair 2").click()  # from the result
     page.wait_for_selector(".past #then")
     assert page.is_hidden("#result")
     page.click("#back")
@@ -715,6 +725,19 @@ def test_a_phone_on_its_side(
             assert box["y"] + box["height"] <= LANDSCAPE["height"], selector
         assert person.page.locator(screen).bounding_box()["height"] >= 120
         person.page.click("#race")
+    person.answer(1)
+    person.page.click("#past summary")
+    person.page.get_by_role("button", name="Show again: pair 1").click()
+    person.page.wait_for_selector(".past #then")
+    for selector in ("#race-screen", "#back"):  # where the list is, far below, is no film
+        box = person.page.locator(selector).bounding_box()
+        assert 0 <= box["y"] <= LANDSCAPE["height"] - box["height"], selector
+    person.page.click("#back")
+    person.page.click("#stop")
+    person.page.wait_for_selector("#result:visible")
+    film = person.page.locator("#left-screen").bounding_box()
+    verdict = person.page.locator("[data-verdict=yes]").bounding_box()
+    assert verdict["y"] + verdict["height"] - film["y"] <= LANDSCAPE["height"]
 
 
 def test_what_is_said_offline_is_sent_later(
@@ -752,6 +775,81 @@ def test_what_is_said_offline_is_sent_later(
     page.wait_for_url(f"{server.url}/")
     page.goto(address)
     assert page.input_value("#wish") == "at once"
+
+
+def test_tabs_of_one_conversation_keep_what_each_could_not_send(
+    open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
+) -> None:
+    person = begin(open_page, server, point_goal, 1.0)
+    page, tab = person.page, person.page.context.new_page()
+    tab.goto(page.url)
+    tab.wait_for_function(SHOWN)
+    page.context.set_offline(True)
+    page.click("[data-preference=left]")
+    tab.fill("#wish", "up")
+    tab.wait_for_selector("#error:visible")
+    kept = tab.evaluate("() => JSON.parse(window.localStorage.getItem(base))")
+    assert set(kept) == {"/answer", "/wish"}
+    page.context.set_offline(False)
+    page.wait_for_function("() => view.answered === 1 && !busy")
+    tab.wait_for_function("() => Object.keys(unsent).length === 0")
+    assert tab.evaluate("() => window.localStorage.getItem(base)") == "{}"
+
+
+def test_an_answer_waits_while_the_disk_is_full(
+    open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
+) -> None:
+    person = begin(open_page, server, point_goal, 1.0)
+    page = person.page
+
+    def full(route: Any) -> None:
+        route.fulfill(status=507, json={"error": "The disk of this server is full."})
+
+    page.route("**/answer", full)
+    page.click("[data-preference=left]")
+    page.wait_for_selector("text=The disk of this server is full.")
+    page.wait_for_timeout(500)
+    assert page.is_visible("#error")  # as long as it is so
+    page.unroute("**/answer")
+    page.wait_for_function("() => view.answered === 1 && !busy")
+    assert page.is_hidden("#error")
+    assert person.stored() == ["left"]
+
+
+def test_films_that_cannot_be_shown_are_not_the_servers_fault(
+    open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
+) -> None:
+    person = begin(open_page, server, point_goal, 1.0)
+    page = person.page
+    page.route("**/video/*", lambda route: route.fulfill(body="no film"))
+    page.reload()
+    page.wait_for_selector("text=This browser cannot play H.264 video.")
+    page.unroute("**/video/*")
+    page.wait_for_function(SHOWN)
+    person.answer(1)
+    page.click("#past summary")
+    page.get_by_role("button", name="Show again: pair 1").click()
+    page.wait_for_selector(".past #then")
+    page.context.set_offline(True)
+    page.click("#back")
+    page.wait_for_selector("text=The server does not answer.")
+    page.context.set_offline(False)
+    page.wait_for_function(SHOWN)
+    person.answer(1)
+
+
+def test_a_browser_that_keeps_nothing(
+    open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
+) -> None:
+    """As in a notebook's frame, where cookies of other sites are blocked."""
+    page = open_page("about:blank")
+    page.add_init_script(
+        "Object.defineProperty(window, 'localStorage', { get() { throw new Error('blocked'); } })"
+    )
+    page.goto(server.url)
+    page.click(f"button[value={point_goal.name}]")
+    page.wait_for_function(SHOWN)
+    Person(server, page, point_goal, 1.0).answer(1)
 
 
 def test_the_page_is_readable_for_all(

@@ -18,7 +18,6 @@ class Player {
     this.parts = 2;
     this.wantsToPlay = !window.matchMedia("(prefers-reduced-motion: reduce)").matches;
     this.drawn = -1;
-    this.loading = 0;
     this.video.addEventListener("seeked", () => this.draw());
     this.video.addEventListener("loadeddata", () => this.draw());
     this.video.addEventListener("error", () => onError("This video cannot be played here."));
@@ -35,11 +34,9 @@ class Player {
 
   // Resolves once the first frame is on the screen.
   async load(url, fps, frames) {
-    const mine = ++this.loading;
     const response = await fetch(url);
     if (!response.ok) throw new Error("The video could not be loaded.");
     const blob = await response.blob();
-    if (mine !== this.loading) return;
     if (this.video.src) URL.revokeObjectURL(this.video.src);
     this.fps = fps;
     this.frames = frames;
@@ -49,7 +46,6 @@ class Player {
       this.video.addEventListener("error", () => reject(new Error("This browser cannot play H.264 video.")), { once: true });
       this.video.src = URL.createObjectURL(blob);
     });
-    if (mine !== this.loading) return;
     this.applySpeed();
     this.draw();
     if (this.wantsToPlay) this.play();

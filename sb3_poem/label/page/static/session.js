@@ -15,10 +15,20 @@ const player = new Player(
   { play: byId("play"), frame: byId("frame"), speed: byId("speed"), moment: byId("moment"), icon: byId("play-icon") },
   showError,
 );
+const storage = browserStorage();
 let view = null;
 let shownTurn = null;
 let busy = false;
 let waitingSince = null;
+
+// A browser may refuse to keep anything for a page in another's frame, as in a notebook.
+function browserStorage() {
+  try {
+    return window.localStorage;
+  } catch {
+    return { getItem: () => null, setItem() {} };
+  }
+}
 
 async function ask(path, body) {
   const options = body === undefined ? {} : {
@@ -39,12 +49,21 @@ async function ask(path, body) {
 
 // What the server has not confirmed, by path: it outlives the page, and is sent until it is kept.
 // The server takes the same thing twice as once.
-const unsent = JSON.parse(localStorage.getItem(base) || "{}");
+const unsent = readKept();
 const deliveries = {};
+
+function readKept() {
+  return JSON.parse(storage.getItem(base) || "{}");
+}
+
+// Another tab of this conversation may keep something of its own.
+function keep(path, body) {
+  storage.setItem(base, JSON.stringify({ ...readKept(), [path]: body }));
+}
 
 function send(path, body) {
   unsent[path] = body;
-  localStorage.setItem(base, JSON.stringify(unsent));
+  keep(path, body);
   deliveries[path] ??= deliver(path).finally(() => delete deliveries[path]);
   return deliveries[path];
 }
@@ -57,7 +76,7 @@ async function deliver(path) {
       next = await ask(path, body);
     } catch (error) {
       if (isPassing(error)) {
-        showError(connectionMessage(error));
+        showError(inSentence(error));
         await pause(RETRY_MILLISECONDS, "online");
         continue;
       }
@@ -71,11 +90,11 @@ async function deliver(path) {
 
 function forget(path) {
   delete unsent[path];
-  if (Object.keys(unsent).length) localStorage.setItem(base, JSON.stringify(unsent));
-  else localStorage.removeItem(base);
+  keep(path, undefined);
 }
 
-const isPassing = (error) => error.status === undefined || [502, 503, 504].includes(error.status);
+// No answer, no room, or no disk: it may come.
+const isPassing = (error) => error.status === undefined || error.status >= 500;
 
 function showError(message) {
   byId("error").textContent = message || "";
@@ -101,15 +120,16 @@ async function act(path, body) {
     await show(await send(path, body));
   } catch (error) {
     // Out of step, perhaps because of another tab: see where the conversation is.
-    if (error.status !== 409) showError(connectionMessage(error));
+    if (error.status !== 409) showError(inSentence(error));
   }
   await follow();
   byId("board").classList.remove("busy");
   busy = false;
 }
 
-function connectionMessage(error) {
-  if (error.status !== undefined) return error.message;
+// `fetch` has a TypeError for a server that it does not reach.
+function inSentence(error) {
+  if (!(error instanceof TypeError)) return error.message;
   return "The server does not answer. What you answered is kept in this browser, and sent as soon as it does…";
 }
 
@@ -122,8 +142,8 @@ async function follow() {
       if (next.phase !== "preparing") return;
       await pause(POLL_MILLISECONDS);
     } catch (error) {
-      showError(connectionMessage(error));
-      if (error.status !== undefined && error.status < 500) return;
+      showError(inSentence(error));
+      if (!isPassing(error)) return;
       await pause(RETRY_MILLISECONDS, "online");
     }
   }
@@ -135,7 +155,7 @@ async function show(next) {
   view = next;
   const { phase, answered, target, step } = next;
   const waiting = phase === "preparing";
-  const result = phase === "result" || (waiting && answered >= target);
+  const result = next.due === "result";
   const accepted = result && next.turn && next.turn.verdict === "yes";
   byId("board").dataset.phase = phase;
   showProgress(waiting, answered, result);
@@ -145,7 +165,7 @@ async function show(next) {
     byId("belief-sentence").textContent = next.belief.sentence;
   }
   byId("undo").hidden = !next.can_undo;
-  byId("undo-text").textContent = phase === "result" && answered < target ? "Back to the questions" : "Undo the last answer";
+  byId("undo-text").textContent = result && answered < target ? "Back to the questions" : "Undo the last answer";
   byId("stop").hidden = phase !== "question" || answered === 0;
   for (const button of document.querySelectorAll(".answer")) button.setAttribute("aria-disabled", String(waiting));
   showDoubt();
@@ -184,7 +204,7 @@ function showPast(answers) {
     again.type = "button";
     again.className = "link";
     again.textContent = "Show again";
-    again.setAttribute("aria-label", `Show ${what.toLowerCase()} ${index + 1} again`);
+    again.setAttribute("aria-label", `Show again: ${what.toLowerCase()} ${index + 1}`);
     again.addEventListener("click", () => lookBack(given, index));
     item.append(`${inWords(given.preference)} `, again);
     return item;
@@ -199,10 +219,13 @@ function inWords(preference) {
 
 async function lookBack(given, index) {
   if (busy || view.phase === "preparing") return;
+  busy = true;
   try {
     await player.load(`${base}/video/${given.question}`, given.fps, given.frames);
   } catch (error) {
-    return showError(error.message);
+    return showError(inSentence(error));
+  } finally {
+    busy = false;
   }
   shownTurn = given.question; // what waits takes no answer meanwhile
   byId("board").classList.add("past");
@@ -213,8 +236,13 @@ async function lookBack(given, index) {
   byId("then-text").textContent = `You said: ${inWords(given.preference)}.`;
   say(`${what} ${index + 1} again. ${byId("then-text").textContent}`);
   byId("back").focus();
+  byId("stage").scrollIntoView(); // the films, above the list
 }
-byId("back").addEventListener("click", () => show(view).then(() => byId("past").firstChild.focus()));
+byId("back").addEventListener("click", async () => {
+  if (busy) return;
+  await start();
+  byId("past").firstChild.focus();
+});
 
 function question() {
   const { repeats } = view.turn;
@@ -230,7 +258,7 @@ function showDoubt() {
 byId("again").addEventListener("click", () => act("/again", { question: view.turn.id }));
 
 // Both robots in one picture, instead of the two, where the video has one and it is wanted.
-let wantsRace = (localStorage.getItem("race") ?? byId("board").dataset.race) === "on";
+let wantsRace = (storage.getItem("race") ?? byId("board").dataset.race) === "on";
 
 function showRace() {
   const has = player.parts === 3;
@@ -242,7 +270,7 @@ function showRace() {
 function race() {
   if (player.parts !== 3) return;
   wantsRace = !wantsRace;
-  localStorage.setItem("race", wantsRace ? "on" : "off");
+  storage.setItem("race", wantsRace ? "on" : "off");
   showRace();
   say(wantsRace ? "Both in one picture." : "Two pictures.");
 }
@@ -321,8 +349,10 @@ if (four) KEYS[0] = () => answer("equal");
 document.addEventListener("keydown", (event) => {
   if (!byId("keys").checked) return;
   if (event.altKey || event.ctrlKey || event.metaKey || event.repeat) return;
-  if (event.target.closest("input, textarea, select")) return; // there the arrows mean something else
-  if (event.key === " " && !event.target.closest("button, a")) {
+  if (event.target.closest("textarea, select")) return;
+  const control = event.target.closest("input, button, a, summary"); // has a meaning for some keys
+  if (control && (event.key === " " || (event.key.startsWith("Arrow") && control.matches("input")))) return;
+  if (event.key === " ") {
     event.preventDefault();
     player.toggle();
   } else if (KEYS[event.key]) {
@@ -347,9 +377,9 @@ window.addEventListener("pagehide", () => {
   for (const [path, body] of Object.entries(unsent)) ask(path, body).catch(() => {});
 });
 
-byId("keys").checked = localStorage.getItem("keys") !== "off";
+byId("keys").checked = storage.getItem("keys") !== "off";
 byId("keys").addEventListener("change", () => {
-  localStorage.setItem("keys", byId("keys").checked ? "on" : "off");
+  storage.setItem("keys", byId("keys").checked ? "on" : "off");
 });
 
 // Another tab, or the back button, may have moved the conversation on.
