@@ -5,7 +5,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from sb3_poem.adaptation.noise import MistakeNoise, NoiseModel
+from sb3_poem.adaptation.noise import MistakeNoise
+from sb3_poem.adaptation.people import INFER
 from sb3_poem.adaptation.preference import ANSWERS, BEST_OF_FOUR, Preference, Query
 from sb3_poem.adaptation.rule import check_choice
 from sb3_poem.common.checks import check_number
@@ -66,7 +67,8 @@ class HumanOracle:
 
     :param folder: Where the videos go; it is made if missing.
     :param video_format: "gif" (any viewer plays it) or "mp4" (smaller).
-    :param mistake_rate: How often a person is taken to err, for the Bayesian rule.
+    :param mistake_rate: How often a person is taken to err, for the Bayesian rule; None lets it
+        infer how they do.
     :param question: "pair", "graded" or "best-of-four", as the rule's.
     :param read: Reads a line after showing a prompt; ``input`` by default.
     :param write: Shows a line; ``print`` by default.
@@ -81,7 +83,7 @@ class HumanOracle:
         folder: str | Path = "preference_queries",
         video_format: str = "gif",
         fps: float = 20.0,
-        mistake_rate: float = 0.05,
+        mistake_rate: float | None = None,
         read: Callable[[str], str] = input,
         write: Callable[[str], None] = print,
         record: Callable[[HumanAnswer], None] | None = None,
@@ -89,10 +91,11 @@ class HumanOracle:
     ) -> None:
         check_choice("video_format", video_format, ("gif", "mp4"))
         check_choice("question", question, tuple(PROMPTS))
-        check_number("mistake_rate", mistake_rate, 0.0, 0.5)
+        if mistake_rate is not None:
+            check_number("mistake_rate", mistake_rate, 0.0, 0.5)
         self.question = question
         self.folder, self.video_format, self.fps = Path(folder), video_format, fps
-        self.noise_model: NoiseModel = MistakeNoise(mistake_rate)
+        self.noise_model = INFER if mistake_rate is None else MistakeNoise(mistake_rate)
         self.n_asked = 0
         self._read, self._write, self._record = read, write, record
 

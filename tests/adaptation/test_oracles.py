@@ -9,6 +9,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from worlds import HORIZON, SpeedEnv, SpeedModel
 
 from sb3_poem.adaptation import (
+    Bayes,
     BoltzmannNoise,
     BoltzmannOracle,
     ExactNoise,
@@ -205,7 +206,9 @@ def test_a_person_through_the_adapter(tmp_path):
     np.testing.assert_array_equal(again.left.observations, query.left.observations)
     adapter.adapt()
     assert [a.preference for a in adapter.answers] == [LEFT] * 3
-    assert adapter.rule.noise_model == MistakeNoise(0.05)
+    assert adapter.rule.noise_model == "infer"
+    told = HumanOracle(tmp_path, mistake_rate=0.1)
+    assert Bayes().answered_by(told).noise_model == MistakeNoise(0.1)
 
 
 def test_a_person_says_how_much_better(tmp_path):
