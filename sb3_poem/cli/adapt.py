@@ -43,7 +43,11 @@ from sb3_poem.cli.subject import (
 from sb3_poem.label import Store, StoreRecorder
 from sb3_poem.label.beliefs import believed_in_words
 
-DEFAULT_TASKS = 30
+DEFAULT_TASKS, DEFAULT_MISTAKE_RATE = 30, 0.2
+ORACLE_OF_FLAG = {
+    **{"store": "human", "resume": "human"},
+    **{"beta": "boltzmann", "mistake_rate": "mistake"},
+}
 
 
 def run_adapt(arguments: argparse.Namespace) -> int:
@@ -79,10 +83,15 @@ def _check_tasks(arguments: argparse.Namespace) -> int:
     if human and not named and arguments.plot is not None:
         only = "with --oracle human only --task says by which goal to measure them"
         raise ValueError(f"--plot needs returns, and {only}")
-    for flag in ("store", "resume"):
-        if getattr(arguments, flag) and not human:
-            what = f"about a person's answers, but --oracle is {arguments.oracle}"
-            raise ValueError(f"--{flag} is {what}")
+    for flag, oracle in ORACLE_OF_FLAG.items():
+        given = getattr(arguments, flag)
+        if given is not None and given is not False and arguments.oracle != oracle:
+            name = flag.replace("_", "-")
+            raise ValueError(f"--{name} is for --oracle {oracle}, but that is {arguments.oracle}")
+    equal, much = arguments.thresholds
+    if not 0.0 <= equal <= much < np.inf:
+        shares = "must be two shares, the first not the larger"
+        raise ValueError(f"--thresholds {equal:g} {much:g}: {shares}")
     if (last := max(arguments.record or (0,))) > arguments.queries:
         raise ValueError(f"--record {last} is more than --queries {arguments.queries}")
     return n_tasks
@@ -93,6 +102,8 @@ class Adaptation:
 
     def __init__(self, arguments: argparse.Namespace, subject: Subject) -> None:
         self.arguments, self.subject = arguments, subject
+        rate = arguments.mistake_rate
+        self.mistake_rate: float = DEFAULT_MISTAKE_RATE if rate is None else rate
         names = ("inference", "query_rule", "candidates", "n_candidates", "question")
         chosen = {name: getattr(arguments, name) for name in names}
         chosen["noise_model"] = "infer" if arguments.infer_noise else None
@@ -107,7 +118,7 @@ class Adaptation:
         factories: dict[str, Callable[..., TaskOracle]] = {
             "return": ReturnOracle,
             "boltzmann": partial(BoltzmannOracle, arguments.beta),
-            "mistake": partial(MistakeOracle, arguments.mistake_rate),
+            "mistake": partial(MistakeOracle, self.mistake_rate),
         }
         factory = factories[arguments.oracle]
         if self.rule.question == BEST_OF_FOUR:
@@ -252,7 +263,7 @@ class Adaptation:
             "env_kwargs": subject.env_kwargs,
             "oracle": oracle,
             "beta": arguments.beta if oracle == "boltzmann" else None,
-            "mistake_rate": arguments.mistake_rate if oracle == "mistake" else None,
+            "mistake_rate": self.mistake_rate if oracle == "mistake" else None,
             "thresholds": arguments.thresholds if self.rule.question == "graded" else None,
             **self.options,
             "episodes": arguments.episodes,

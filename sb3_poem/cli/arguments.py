@@ -205,7 +205,7 @@ def _add_adapt_arguments(parser: argparse.ArgumentParser) -> None:
     _option(questions, "--oracle", told, default="return", choices=oracles)
     beta = "inverse temperature of --oracle boltzmann (default: the paper's)"
     _option(questions, "--beta", beta, float)
-    _option(questions, "--mistake-rate", "of --oracle mistake", float, 0.2)
+    _option(questions, "--mistake-rate", "of --oracle mistake (default: 0.2)", float)
     told = "left or right; graded: much better, too; or which of four is best (default: pair)"
     _option(questions, "--question", told, choices=QUESTIONS)
     told = "from what differences on an oracle says better and much better, as shares of the spread"
@@ -289,7 +289,7 @@ def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
     _file(export, "--store", store, "FOLDER", **own)
     told = "ends in .jsonl or .parquet; with --format minari a data set's name, as answers-v0"
     _file(export, "--out", told, nargs="+", required=True)
-    told = "minari: a data set of pairs of episodes for each environment (default: --out's suffix)"
+    told = "minari: a data set of episodes for each environment (default: --out's suffix)"
     _option(export, "--format", told, choices=("jsonl", "parquet", "minari"))
     told = "with observations, actions and reward features, which minari always has"
     _switch(export, "--trajectories", told)
