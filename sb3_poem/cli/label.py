@@ -3,10 +3,12 @@
 import argparse
 import os
 import secrets
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 from rich.console import Console
 
 from sb3_poem.cli.needs import check_output, import_packages, parse_pairs
@@ -49,7 +51,9 @@ def run_page(arguments: argparse.Namespace) -> None:
     session_rule(options)  # says now what is out of range
     env_kwargs = parse_pairs("--env-kwargs", arguments.env_kwargs)
     models = find_models(arguments.model, arguments.env, env_kwargs)
-    if arguments.model is not None:  # of those that ship, one may need an extra
+    if arguments.env is not None or env_kwargs:
+        check_shown(models)
+    elif arguments.model is not None:  # of those that ship, one may need an extra
         for info in models:
             make_env(info.env_id, **dict(info.env_kwargs)).close()
     listener = bind(arguments.host, arguments.port)
@@ -95,7 +99,7 @@ def read_password(auth: str | None, file: Path | None) -> tuple[str | None, str 
     """Read ``USER:PASSWORD`` from the flag, else from the file, else from the environment."""
     source = "--auth"
     if file is not None:
-        source, auth = f"--auth-file {file}", file.read_text(encoding="utf-8").rstrip("\r\n")
+        source, auth = f"--auth-file {file}", read_text("--auth-file", file).rstrip("\r\n")
     elif auth is None:
         source, auth = AUTH_VARIABLE, os.environ.get(AUTH_VARIABLE)
     if auth is None:
@@ -112,13 +116,30 @@ def read_password(auth: str | None, file: Path | None) -> tuple[str | None, str 
 def read_instructions(file: Path | None) -> str:
     if file is None:
         return ""
-    try:
-        text = file.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"--instructions {file}: must be a text in UTF-8 ({error})") from None
+    text = read_text("--instructions", file)
     if not text.strip():
         raise ValueError(f"--instructions {file}: must be a text or Markdown, but is empty")
     return text
+
+
+def read_text(flag: str, file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        why = getattr(error, "strerror", error)
+        raise ValueError(f"{flag} {file}: must be a text in UTF-8 ({why})") from None
+
+
+def check_shown(models: Sequence[Any]) -> None:
+    """Refuse an environment of the user's in which a model cannot be shown, before people come."""
+    from sb3_poem.label.rendering import renderer_of
+
+    for info in models:
+        try:
+            renderer_of(info)
+        except (TypeError, ValueError, gymnasium.error.Error) as error:
+            words = f"{info.name} cannot be shown in {info.env_id} by --env and --env-kwargs"
+            raise ValueError(f"{words}: {error}") from error
 
 
 def run_export(arguments: argparse.Namespace) -> None:

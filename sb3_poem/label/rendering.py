@@ -163,10 +163,12 @@ class Renderer:
         if env.render_mode != "rgb_array":
             must = '`env` must be made with render_mode="rgb_array" to be shown'
             raise ValueError(f"{must}, but has {env.render_mode!r}")
+        family = FamilyView(env)
+        family.check_same_family(model.task_space, model.reward_feature_dim)
         self.model = model
         self.env = FilmedVecEnv(env)
         self.env_id = env_id
-        self.fps = FamilyView(env).render_fps
+        self.fps = family.render_fps
 
     def turn(self, request: TurnRequest) -> Turn:
         """Make a turn, and write its video."""

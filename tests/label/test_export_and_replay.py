@@ -259,6 +259,14 @@ def test_replay_knows_a_model_by_its_folder_and_says_which_it_lacks(
         (["--auth", "nobody"], "USER:PASSWORD"),
         (["--model", "Nobody"], "PointGoal"),
         (["--mistake-rate", "0.7"], "`rate`"),
+        (["--instructions", "gone.md"], "--instructions gone.md: must be a text in UTF-8 (No such"),
+        (["--auth-file", "."], "--auth-file .: must be a text in UTF-8 (Is a directory)"),
+        (
+            ["--model", "PointGoal", "--env-kwargs", "far:1"],
+            "PointGoal cannot be shown in poem/Poi",
+        ),
+        (["--model", "PointGoal", "--env", "poem/AntVel-v0"], "trained for tasks in"),
+        (["--model", "PointGoal", "--env", "none/X-v0"], "by --env and --env-kwargs: "),
     ],
 )
 def test_wrong_commands_say_what_is_wrong(
