@@ -186,3 +186,12 @@ def test_what_cannot_be_shown_is_said(
         monkeypatch.delenv(name, raising=False)
     assert show(*command) == 1
     assert words in capsys.readouterr().err
+
+
+def test_without_a_display_the_film_that_is_named_can_be_made(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sb3_poem.cli.show.has_display", lambda: False)
+    assert cli.main(["enjoy", "--model", "PointGoal", "-n", "30", "--task", "1"]) == 1
+    film = "sb3-poem record-video --model PointGoal --task 1 --out policy.mp4"
+    assert f"film it by `{film}`" in capsys.readouterr().err

@@ -19,7 +19,10 @@ from sb3_poem.cli.subject import COPIES_FOR_ONE_TASK, Subject, after, describe_t
 def run_enjoy(arguments: argparse.Namespace) -> None:
     """Show a policy in a window."""
     if not has_display() and not arguments.no_render:
-        film = shlex.join(["sb3-poem", "record-video", *arguments.given[1:], "--out", "policy.mp4"])
+        parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+        parser.add_argument("-n", "--n-timesteps")  # of which a film has no part
+        _, shared = parser.parse_known_args(arguments.given[1:])
+        film = shlex.join(["sb3-poem", "record-video", *shared, "--out", "policy.mp4"])
         raise OSError(f"there is no display to draw on: film it by `{film}`, or add --no-render")
     mode = None if arguments.no_render else "human"
     shown = Shown(arguments, mode)
