@@ -19,9 +19,16 @@ TOP = Path(__file__).resolve().parents[1]
 RESULTS = TOP / "benchmarks/results"
 FAMILIES = (*TABLE_3, "FetchReach", "PointGoal")
 ANSWERS = (0, 1, 2, 5, 10)
+#: The store of a family's part of Table 3, of the models that the suite ``shipped`` made
+TABLE3_STORE = "table3.sqlite"
+#: Which row of each part of Table 3 the others are compared with
+OWN = {"methods": "poem-bayes", "informed": "poem-bayes-aggregate"}
+METHODS = """All methods, by the same test tasks and seeds, each with as many updates; "training
+tasks": with candidates from their posteriors, not from the prior. The last columns say where
+`Bayes()` stands against the row: ahead or behind if mean, interquartile mean and the whole 95 %
+interval of the paired difference say so."""
 #: How the models were made that are not what a run of their entry gives
 REMARKS = {
-    "AntFwdBack": "three stages, in the last half of each batch mirrored.",
     "MetaWorldML10": "other hyperparameters than the entry's. The likelihood that `Bayes` has by "
     "default here was chosen by the returns on tasks of this table.",
 }
@@ -119,6 +126,31 @@ def summary() -> str:
     return "\n".join(table([*head, "ours: 1", "10", "limit: 1", "10", "task known"], rows))
 
 
+def methods(family: str) -> list[str]:
+    """A family's part of Table 3: what every method earns, and whether `Bayes()` is ahead of it."""
+    store = Store(RESULTS / family / TABLE3_STORE, create=False)
+    found = json.loads(make_report(store, ["table3"], kind="json")[0])
+    groups = ("methods", "informed")
+    found = [one for one in found if one["entry"] in groups and one["queries"] in (1, 5, 10)]
+    earned: dict[tuple[str, int], Any] = {}
+    for one in found:
+        if one["kind"] == "method":  # some stand in both groups, with the paper's figures in one
+            earned.setdefault((one["label"], one["queries"]), one)
+    ahead = {
+        (one["against"], one["queries"]): one["claim"]
+        for one in found
+        if one["kind"] == "difference" and one["method"] == OWN[one["entry"]]
+    }
+    rows = []
+    for label in dict.fromkeys(label for label, _ in earned):
+        own = [earned[label, k] for k in (1, 5, 10)]
+        paper = ["" if one["paper_mean"] is None else f"{one['paper_mean']:,.0f}" for one in own]
+        claims = [ahead.get((one["method"], one["queries"]), "") for one in own]
+        rows.append([label, *paper, *(cell(one, error=True) for one in own), *claims])
+    head = ["method", "paper: 1", "5", "10", "ours: 1", "5", "10", "Bayes, 1", "5", "10"]
+    return [*table(head, rows), ""]
+
+
 def family_section(family: str) -> str:
     """A family's part of the results page."""
     folder, where = RESULTS / family, f"../benchmarks/results/{family}"
@@ -138,6 +170,8 @@ def family_section(family: str) -> str:
             rows.append([f"{name}, success", *rates])
     lines = [f"## {family}", "", fill(training(family), 120), ""]
     lines += [*table(["rule", *(f"k = {k}" for k in ANSWERS), "task known"], rows), ""]
+    if (folder / TABLE3_STORE).exists():
+        lines += [fill(METHODS, 120), "", *methods(family)]
     links = [
         f"[{text}]({where}/{page}.md)"
         for page, text in PAGES.items()
@@ -167,9 +201,9 @@ after exact answers. Of *seeds* trainings seed 0 ships.
   episodes; so it is an estimate, and a rule that acts on policies outside of that choice may pass
   it.
 - *task known*: the best of the model's policies for each task, found by trying.
-- A model without † is what the family's entry in `zoo_configs/` makes, in one run from nothing. One
-  with † was made by hand, and measured by revision 1 of the benchmark, which had other limits: they
-  are left out.
+- A model without † is what the family's entry in `zoo_configs/` makes, in one run from nothing. The
+  one with † was made by hand, and measured by revision 1 of the benchmark, which had other limits:
+  they are left out.
 
 `sb3-poem benchmark run --suite shipped --families FAMILY --seeds N` trains and measures (with
 `--models pretrained --seeds 1` it measures what ships), `python docs/tables.py` writes this page
