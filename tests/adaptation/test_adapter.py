@@ -323,7 +323,7 @@ def test_people_are_not_asked_about_what_looks_alike(tmp_path):
         a = adapter(env(render_mode="rgb_array"), rule=SMALL, library=library, oracle=oracle)
         return {a.ask().left, a.ask().right}
 
-    person = HumanOracle(tmp_path)
+    person = HumanOracle(tmp_path, mistake_rate=0.05)
     assert asked(ReturnOracle()) == asked(None) == asked(person, SpeedEnv) == set(library[:2])
     assert asked(person) == {library[0], library[2]}
 

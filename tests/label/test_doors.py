@@ -411,7 +411,7 @@ def test_the_printed_links_host_can_be_reached(host: str) -> None:
     ("arguments", "environment", "words"),
     [
         (["--port", "99999999"], None, "--port 99999999: must be between 0 and 65535"),
-        (["--auth-file", "missing"], None, "No such file or directory: 'missing'"),
+        (["--auth-file", "missing"], None, "--auth-file missing: must be a text in UTF-8 (No such"),
         (
             ["--auth-file", "short"],
             None,
@@ -424,7 +424,7 @@ def test_the_printed_links_host_can_be_reached(host: str) -> None:
         ),
         ([], "", "SB3_POEM_AUTH must have the form USER:PASSWORD"),
         (["--auth", "nobody"], f"ann:{PASSWORD}", "--auth must have the form USER:PASSWORD"),
-        (["--instructions", "missing"], None, "No such file or directory: 'missing'"),
+        (["--instructions", "missing"], None, "--instructions missing: must be a text in UTF-8"),
         (["--instructions", "empty"], None, "--instructions empty: must be a text or Markdown"),
         (["--instructions", "picture"], None, "--instructions picture: must be a text in UTF-8"),
     ],
