@@ -22,6 +22,8 @@ from sb3_poem.label.server import ROBOTS
 from sb3_poem.resources import shipped_folder
 
 STATIC = Path(__file__).with_name("_static")
+#: Of a loop on the page's choice of robots: what moves for longer than five seconds needs a button
+LOOP_PICTURES, LOOP_MILLISECONDS = 14, 170
 
 
 def before_and_after(model: str, path: Path, task: str, width: int = 640, every: int = 3) -> None:
@@ -50,14 +52,21 @@ def still(env_id: str, path: Path, size: int = 360, steps: int = 60) -> None:
 
 
 def both(model: str, folder: Path) -> None:
-    """Where two training tasks' policies end, in one picture, for the choice of robots."""
+    """How two training tasks' policies go and where they end, in one scene, for the choice of
+    robots: a loop that plays twice in under five seconds, and its last picture for whoever wants no
+    motion.
+    """
     info = find_models(model)[0]
     renderer, means = renderer_of(info), renderer_of(info).model.train_tasks.latent_means
     apart = np.linalg.norm(means - means[0], axis=1).argmax()
     latents, seeds = means[[0, apart]], [2, 2]
     clips = rollout_latents(renderer.model, renderer.env, latents, None, seeds, frames=True)
-    race = renderer.env.films(*clips)[-1][:, 2 * WIDTH :]
-    Image.fromarray(race).save(folder / f"{info.family}.webp", quality=70)
+    film = renderer.env.films(*clips)
+    shown = np.linspace(0, len(film) - 1, LOOP_PICTURES).round().astype(int)
+    pictures = [Image.fromarray(film[i][:, 2 * WIDTH :]) for i in shown]
+    pictures[-1].save(folder / f"{info.family}.webp", quality=70)
+    how = {"append_images": pictures[1:], "duration": LOOP_MILLISECONDS, "loop": 2, "quality": 50}
+    pictures[0].save(folder / f"{info.family}-loop.webp", save_all=True, **how)
 
 
 def adapted(env: gym.Env) -> AdaptedPolicy:

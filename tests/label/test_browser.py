@@ -18,6 +18,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from label_world import make_sessions
+from PIL import Image
 
 from sb3_poem import Bayes
 from sb3_poem.adaptation import PreferenceAdapter, ReturnOracle, evaluate_episodes
@@ -25,7 +26,7 @@ from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.label.families import ModelInfo, find_models
 from sb3_poem.label.rendering import load_shown_model
-from sb3_poem.label.server import bind, make_app, make_server
+from sb3_poem.label.server import ROBOTS, bind, make_app, make_server
 from sb3_poem.label.store import Store
 
 playwright_api = pytest.importorskip(
@@ -131,7 +132,8 @@ def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
 
     def opened(url: str, viewport: dict[str, int] = DESKTOP, **options: Any) -> Any:
         # Films that play all the time would take this machine's processors from the server.
-        context = browser.new_context(viewport=viewport, reduced_motion="reduce", **options)
+        options = {"reduced_motion": "reduce", **options}
+        context = browser.new_context(viewport=viewport, **options)
         contexts.append(context)
         page = context.new_page()
         page.set_default_timeout(90_000)
@@ -689,6 +691,26 @@ def test_the_choice_of_robots(open_page: Callable[..., Any], server: Server) -> 
     assert page.text_content("h2") == "Where should it go?"
     picture = page.locator("button[value=PointGoal] img")
     assert picture.evaluate("image => [image.complete, image.naturalWidth]") == [True, 320]
+    assert picture.evaluate("image => image.currentSrc").endswith("/PointGoal.webp")
+    page = open_page(server.url, reduced_motion="no-preference")
+    loop = page.locator("button[value=PointGoal] img")
+    assert loop.evaluate("image => image.currentSrc").endswith("/PointGoal-loop.webp")
+
+
+def test_loops_of_the_choice_end_within_five_seconds() -> None:
+    loops = sorted(ROBOTS.glob("*-loop.webp"))
+    assert [loop.stem.removesuffix("-loop") for loop in loops] == sorted(
+        info.family for info in find_models()
+    )
+    for loop in loops:
+        with Image.open(loop) as film:
+            assert film.n_frames > 1
+            seconds = 0.0
+            for number in range(film.n_frames):
+                film.seek(number)
+                film.load()
+                seconds += film.info["duration"] / 1000
+            assert 0 < seconds * film.info["loop"] <= 5, loop.name
 
 
 def test_a_phone(open_page: Callable[..., Any], server: Server, point_goal: ModelInfo) -> None:
