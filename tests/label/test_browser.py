@@ -934,3 +934,44 @@ def test_a_running_robot_learns_its_speed(open_page: Callable[..., Any], tmp_pat
         assert_learned(info, person, 1.3)
     finally:
         server.stop()
+
+
+PIXELS = """name => {
+  const canvas = document.getElementById(name);
+  const data = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+  return Array.from(data.filter((_, i) => i % 16 < 3));
+}"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [info.name for info in find_models()])
+def test_the_films_of_each_family(
+    open_page: Callable[..., Any], tmp_path: Path, name: str, request: pytest.FixtureRequest
+) -> None:
+    """Both films move, and end apart; screens and answers fit a desktop and a phone."""
+    server = Server(tmp_path, name)
+    request.addfinalizer(server.stop)
+    page = open_page(server.url)
+    page.click(f"button[value={name}]")
+    for viewport in (DESKTOP, PHONE):
+        page.set_viewport_size(viewport)
+        if viewport == PHONE:
+            page.reload()
+        page.wait_for_function(SHOWN)
+        moments = []
+        for frame in ("min", "max"):
+            page.evaluate(
+                f"""() => {{ const slider = document.getElementById("frame");
+                slider.value = slider.{frame}; slider.dispatchEvent(new Event("input")); }}"""
+            )
+            page.wait_for_function("() => player.drawn === Number(player.controls.frame.value)")
+            screens = (page.evaluate(PIXELS, f"{side}-screen") for side in ("left", "right"))
+            moments.append(np.array(list(screens), dtype=float))
+        (first, _), (left, right) = moments
+        assert np.std(left) > 5
+        assert np.abs(left - first).mean() > 0.5 or np.abs(right - moments[0][1]).mean() > 0.5
+        assert np.abs(left - right).max() > 50
+        page.screenshot(path=tmp_path / f"{name}-{viewport['width']}.png")
+        assert page.evaluate("() => document.documentElement.scrollWidth") <= viewport["width"]
+        box = page.locator('[data-preference="equal"]').bounding_box()
+        assert box["y"] + box["height"] <= viewport["height"]
