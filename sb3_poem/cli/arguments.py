@@ -128,6 +128,8 @@ def _count(minimum: int) -> Callable[[str], int]:
         value = int(text)
         if value < minimum:
             raise argparse.ArgumentTypeError(f"must be at least {minimum}, got {value}")
+        if value >= 2**63:  # which no database keeps
+            raise argparse.ArgumentTypeError(f"must be less than 2^63, got {value}")
         return value
 
     count.__name__ = "whole number"

@@ -202,8 +202,8 @@ class SessionManager:
                     self.queue.cancel(job)
                 del self._active[number]
         if len(self._active) >= self.max_sessions:
-            all_places = "which is as many as this server takes; come later"
-            raise FullError(f"{self.max_sessions} people are at work already, {all_places}")
+            places = f"all places of this server are taken ({self.max_sessions})"
+            raise FullError(f"{places}; come later")
 
     def _begin_turn(self, session: Session, answered: int, kind: str) -> None:
         active = self._active[session.id]

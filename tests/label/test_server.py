@@ -482,7 +482,7 @@ def test_a_browser_gets_pages_where_something_is_refused(
     assert (begun.status_code, full.status_code, unknown.status_code) == (303, 503, 409)
     assert (lost.status_code, nowhere.status_code) == (404, 404)
     for response, words in (
-        (full, "1 people are at work"),
+        (full, "all places of this server are taken (1)"),
         (lost, "no conversation under this link"),
         (nowhere, "There is nothing here"),
         (unknown, "choose one from the list"),
