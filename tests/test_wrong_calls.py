@@ -555,7 +555,7 @@ COMMANDS = [
     command("--auth...12", "label", "--auth", "me:short"),
     command("--host...--token", "label", "--host", "0.0.0.0"),
     command("PointGaol...PointGoal", "label", "--model", "PointGaol"),
-    command("--seed...less than 2^63...9999999999999999999", "label", "--seed", 10**19 - 1),
+    command("--seed...63...9999999999999999999", "label", "--seed", 10**19 - 1),
     command("rate...2", "label", "--mistake-rate", 2),
     command("pairs...graded", "label", "--inference", "paper", "--question", "graded"),
     command("pairs...best-of-four", *ADAPT, "--inference", "paper", "--question", "best-of-four"),
