@@ -182,9 +182,10 @@ def _finish(figure: Figure, title: str) -> Figure:
                 label = label.split(", ", 1)[-1]
             entries.setdefault(label, handle)
     figure.suptitle(title, fontsize=11)
-    columns = min(2 * figure.axes[0].get_gridspec().ncols + 1, 4)  # type: ignore[union-attr]
-    where = {"loc": "outside lower center", "ncols": columns, "frameon": False, "fontsize": 8}
-    figure.legend(entries.values(), entries.keys(), **where)  # type: ignore[arg-type]
+    fitting = int(figure.get_figwidth() / (0.5 + 0.065 * max(map(len, entries))))  # inches a column
+    columns = max(1, min(fitting, 4))
+    where: dict[str, Any] = {"loc": "outside lower center", "frameon": False, "fontsize": 8}
+    figure.legend(list(entries.values()), list(entries), ncols=columns, **where)
     return figure
 
 
