@@ -261,7 +261,7 @@ def test_a_video_that_was_deleted_is_filmed_again(
 def test_no_more_people_than_the_server_takes(run_server: Callable[..., Any]) -> None:
     async def life(sessions: SessionManager) -> None:
         await begin(sessions)
-        with pytest.raises(FullError, match="1 people"):
+        with pytest.raises(FullError, match="all places of this server are taken"):
             await sessions.begin("PointGoal")
         with pytest.raises(RefusedError, match="no model"):
             await sessions.begin("../PointGoal")
