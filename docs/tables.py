@@ -24,9 +24,10 @@ TABLE3_STORE = "table3.sqlite"
 #: Which row of each part of Table 3 the others are compared with
 OWN = {"methods": "poem-bayes", "informed": "poem-bayes-aggregate"}
 METHODS = """All methods, by the same test tasks and seeds, each with as many updates; "training
-tasks": with candidates from their posteriors, not from the prior. The last columns say where
-`Bayes()` stands against the row: ahead or behind if mean, interquartile mean and the whole 95 %
-interval of the paired difference say so, else open: not distinguishable."""
+tasks": with candidates from their posteriors; `Bayes()` chooses. The last columns say where it
+stands against the row, with candidates of the row's kind: ahead or behind if mean, interquartile
+mean and the whole 95 % interval of the paired difference say so, else open: not
+distinguishable."""
 #: How the models were made that are not what a run of their entry gives
 REMARKS = {
     "MetaWorldML10": "other hyperparameters than the entry's. The likelihood that `Bayes` has by "
@@ -212,9 +213,10 @@ after exact answers. Of *seeds* trainings seed 0 ships.
 
 `sb3-poem benchmark run --suite shipped --families FAMILY --seeds N` trains and measures (with
 `--models pretrained --seeds 1` it measures what ships), `python docs/tables.py` writes this page
-from [its stores](../benchmarks/results/shipped/manifest.md). The figures below a family compare
-methods over training seeds, with models of their own, by the revision of the code that each record
-names. What is not listed was not measured.
+from [its stores](../benchmarks/results/shipped/manifest.md). HalfCheetahVel's table of all methods,
+with its figures, is of the models above and their seeds. The other figures below a family are of
+models of their own, by the revision of the code that each record names. What is not listed was not
+measured.
 
 {summary()}
 """

@@ -113,6 +113,7 @@ def adapt_tasks(
 
     preferences: list[list[Preference]] = [[] for _ in tasks]
     latents = np.empty((len(tasks), len(kept), model.latent_dim))
+    n_shown, by_mode = len(PLACES[rule.question]), deterministic and not rule.explores
     with tqdm(total=kept[-1], unit="query", disable=not progress_bar) as bar:
         for query in range(kept[-1] + 1):
             if query in kept:
@@ -124,17 +125,13 @@ def adapt_tasks(
             if query == kept[-1]:
                 break
             asked = [item for inference in inferences for item in inference.ask()]
-            n_shown = len(PLACES[rule.question])
             shown = [item for item in asked if isinstance(item, Trajectory)]
             if not shown:
                 seeds = [
                     rollout_seed(number, query) for number, _ in numbered for _ in range(n_shown)
                 ]
                 policies = np.stack([latent_of(item) for item in asked])
-                where, by_mode = (
-                    np.repeat(tasks, n_shown, axis=0),
-                    deterministic and not rule.explores,
-                )
+                where = np.repeat(tasks, n_shown, axis=0)
                 shown = rollout_latents(model, vec_env, policies, where, seeds, by_mode)
             for i, (inference, oracle) in enumerate(zip(inferences, oracles, strict=True)):
                 own = shown[n_shown * i : n_shown * (i + 1)]
