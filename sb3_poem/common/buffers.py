@@ -135,6 +135,12 @@ class TaskReplayBuffer(ReplayBuffer):
         slots = th.arange(int(self.counts[task]), device=self.device)[None]
         return self._gather(task * self.rows.shape[1] + slots)
 
+    def reward_magnitudes(self) -> th.Tensor:
+        """(n_tasks,) root mean square of each task's rewards; NaN of a task without any."""
+        rewards = self.rows[..., self._mark - 1].contiguous().view(th.float32)
+        kept = zip(rewards, self.counts.tolist(), strict=True)
+        return th.stack([each[:count].square().mean().sqrt() for each, count in kept])
+
     def state(self) -> dict[str, th.Tensor]:
         """Everything needed to continue, without unused room."""
         used = int(self.counts.max()) if self.n_tasks else 0

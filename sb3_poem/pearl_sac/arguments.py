@@ -104,8 +104,10 @@ def check_arguments(given: Mapping[str, Any], algorithm: type) -> None:
             check_number(name, given[name], 0.0, most)
     check_number_or_auto("ent_coef", given["ent_coef"], 0.0)
     check_number_or_auto("target_entropy", given["target_entropy"])
-    if scale != "auto" and not (isinstance(scale, int | float | np.number) and 0 < scale < np.inf):
-        raise ValueError(f'reward_scale must be a positive number or "auto", got {scale!r}')
+    number = isinstance(scale, int | float | np.number) and 0 < scale < np.inf
+    if not (number or scale in ("auto", "per-task")):
+        needed = 'a positive number, "auto" or "per-task"'
+        raise ValueError(f"reward_scale must be {needed}, but is {scale!r}")
     if given["shaping_coef"] > 0 and given["gamma"] == 1:
         raise ValueError("shaping_coef must be 0 with gamma=1: staying has no finite value then")
     hidden_dtype(given["precision"], "cpu")  # refuses an unknown name

@@ -32,16 +32,16 @@ def kl_to_prior(mean: th.Tensor, variance: th.Tensor) -> th.Tensor:
 
 @dataclass
 class Objective:
-    """PEARL's losses, of transitions that are standardised already. ``reward_scale`` is the factor
-    on the critics' rewards, ``reward_variance`` divides the decoder's squared error; other fields
-    are PEARLSAC's.
+    """PEARL's losses, of transitions that are standardised already. ``reward_scale``,
+    (n_tasks,), is the factor on a task's rewards for the critics, ``reward_variance`` divides the
+    decoder's squared error; other fields are PEARLSAC's.
     """
 
     actor_trains_encoder: ClassVar[bool] = False
 
     policy: LatentPolicy
     gamma: float
-    reward_scale: th.Tensor | float
+    reward_scale: th.Tensor
     reward_variance: th.Tensor
     relabel_fraction: float
     kl_coef: float
@@ -104,7 +104,8 @@ class Objective:
             next_actions, next_log_prob = policy.actor(next_obs, next_embedding, noise)
             next_values = policy.critic_target(next_obs, next_actions, z).amin(dim=0)
             next_values = next_values - alpha * next_log_prob
-            targets = self.reward_scale * rewards + discounts * next_values
+            scale = self.reward_scale[batch.task_ids, None]
+            targets = scale * rewards + discounts * next_values
         values = policy.critic(transitions.observations, transitions.actions, z)
         return 0.5 * len(values) * (values - targets).pow(2).mean()
 

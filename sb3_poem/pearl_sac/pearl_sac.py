@@ -96,7 +96,9 @@ class PEARLSAC(SAC):
         policy does rather than from the rewards, and is then at a loss when it sees a new task's
         first rollouts. Needs a family with shared dynamics; None: 0.5 of those, else 0
     :param reward_scale: Factor on the rewards that the critics learn; "auto" divides by the
-        deviation of the first epoch's, or leaves them as they are where these do not differ
+        deviation of the first epoch's, or leaves them as they are where these do not differ;
+        "per-task" divides each task's by their root mean square in its replay buffer, so that tasks
+        whose rewards are small are learned beside those whose rewards are large
     :param n_steps: Steps of rewards in the critics' targets before the value takes over; more carry
         rewards back faster, and rely more on what older policies, and with ``relabel_fraction``
         other tasks', did
@@ -531,8 +533,13 @@ class PEARLSAC(SAC):
 
     def make_objective(self) -> Objective:
         """What gradient steps minimise."""
-        auto, rewards = self.reward_scale == "auto", self._known_context.rewards
-        scale = 1.0 / self.policy.reward_norm.std if auto else float(self.reward_scale)
+        rewards = self._known_context.rewards
+        if self.reward_scale == "per-task":
+            scale = 1.0 / self.replay_buffer.reward_magnitudes().clamp(min=MIN_STD)
+        elif self.reward_scale == "auto":
+            scale = (1.0 / self.policy.reward_norm.std).expand(len(rewards))
+        else:
+            scale = th.full((len(rewards),), float(self.reward_scale), device=self.device)
         variance = _unit(rewards, rewards.var(), MIN_STD**2)
         return self._part(self.objective_class, reward_scale=scale, reward_variance=variance)
 
