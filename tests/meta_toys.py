@@ -82,6 +82,13 @@ class Walk(TaskFamily):
         return -np.abs(features[..., 0] - tasks[..., 0]) - 0.01 * features[..., 1] ** 2
 
 
+class Unequal(Walk):
+    """Tasks to the left pay a thousandth."""
+
+    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
+        return np.where(tasks[..., 0] < 0, 1e-3, 1.0) * super()._reward(tasks, features)
+
+
 class TwoWalks(Walk):
     """A finite family: left or right."""
 

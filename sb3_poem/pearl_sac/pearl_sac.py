@@ -48,6 +48,9 @@ Part = TypeVar("Part")
 #: Transitions of each task on which the decoder is measured
 MEASURED_PER_TASK = 64
 MIN_STD = RunningNorm.MIN_STD
+#: A task whose rewards are smaller than this share of another's has shown none yet: it gets the
+#: scale of the largest
+LEAST_REWARDS = 1e-4
 
 
 class PEARLSAC(SAC):
@@ -535,7 +538,10 @@ class PEARLSAC(SAC):
         """What gradient steps minimise."""
         rewards = self._known_context.rewards
         if self.reward_scale == "per-task":
-            scale = 1.0 / self.replay_buffer.reward_magnitudes().clamp(min=MIN_STD)
+            sizes = self.replay_buffer.reward_magnitudes()
+            largest = sizes.max()
+            known = th.where(sizes > LEAST_REWARDS * largest, sizes, largest)
+            scale = th.where(largest > 0, 1.0 / known, 1.0)
         elif self.reward_scale == "auto":
             scale = (1.0 / self.policy.reward_norm.std).expand(len(rewards))
         else:

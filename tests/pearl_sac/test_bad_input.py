@@ -17,6 +17,7 @@ from meta_toys import (
     POINT_GOAL,
     Poisoned,
     TwoWalks,
+    Unequal,
     Walk,
     WindyWalk,
     differing,
@@ -392,12 +393,34 @@ class Tiny(Walk):
 
 def test_tiny_rewards_are_measured_by_their_deviation(algorithm: type[PEARLSAC]) -> None:
     model = small(algorithm, walks(4, Tiny), horizon=10).learn(1)
-    assert model.make_objective().reward_scale.tolist() == pytest.approx([1000.0] * 4)
+    assert model.make_objective().reward_scale.tolist() == pytest.approx([1000.0] * 12)
+
+
+def test_each_task_is_measured_by_its_own_rewards(algorithm: type[PEARLSAC]) -> None:
+    """Also by what came after the first epoch."""
+    model = small(algorithm, walks(4, Unequal), horizon=10, reward_scale="per-task").learn(200)
+    scale = model.make_objective().reward_scale
+    for task, factor in enumerate(scale.tolist()):
+        rewards = factor * model.replay_buffer.transitions(task).rewards.numpy()
+        assert np.square(rewards).mean() == pytest.approx(1.0, rel=1e-4)
+    assert scale.max() > 100 * scale.min()
+
+
+class Sparse(Walk):
+    """Only tasks to the right have paid yet."""
+
+    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
+        return np.where(tasks[..., 0] > 0, 2.0, 0.0) * np.ones_like(features[..., 0])
+
+
+def test_a_task_without_rewards_has_the_scale_of_the_others(algorithm: type[PEARLSAC]) -> None:
+    model = small(algorithm, walks(4, Sparse), horizon=10, reward_scale="per-task").learn(1)
+    assert model.make_objective().reward_scale.tolist() == [0.5] * 12
 
 
 def test_rewards_that_do_not_differ_yet_keep_their_unit(algorithm: type[PEARLSAC]) -> None:
     model = small(algorithm, walks(4, Distant), horizon=10).learn(1)
-    assert model.make_objective().reward_scale.tolist() == [1.0] * 4
+    assert model.make_objective().reward_scale.tolist() == [1.0] * 12
     assert model.make_objective().reward_variance == 1.0
     assert model.context_reward_statistics == pytest.approx((0.1, 1.0))
     assert model.policy.reward_norm.std == 1.0

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from meta_toys import LEARN, LEARN_EPOCH, POINT_GOAL, point_goal_bounds
+from meta_toys import LEARN, LEARN_EPOCH, POINT_GOAL, Unequal, point_goal_bounds, small, walks
 
 from sb3_poem import POEMSAC
 from sb3_poem.adaptation.evaluation import evaluate_episodes
@@ -56,3 +56,22 @@ def test_preferences_are_ordered_by_the_preference_loss_alone() -> None:
     """
     model = POEMSAC("MlpPolicy", POINT_GOAL, **QUICK, preference_coef=0.0).learn(STEPS)
     assert preference_accuracy(model, make_task_vec_env(POINT_GOAL, 20)) < 0.7
+
+
+def test_tasks_of_small_rewards_are_learned_beside_others() -> None:
+    """They lie to the left: with one scale for all tasks their policies stay where they begin, or
+    go to the right. Who stays earns minus the distance, ten times.
+    """
+    quick = {"gradient_steps": 100, "learning_rate": 3e-3, "tau": 0.05, "gamma": 0.9}
+    model = small(
+        POEMSAC, walks(8, Unequal), n_train_tasks=8, horizon=10, reward_scale="per-task", **quick
+    ).learn(2_000)
+    goals = model.train_tasks.tasks[:, 0]
+    places, distances = np.zeros(8), np.zeros(8)
+    for step in range(10):
+        seen = np.stack([places, np.full(8, 0.1 * step)], axis=1)
+        actions, _ = model.predict(seen, state=model.task_latents, deterministic=True)
+        places = places + 0.1 * actions[:, 0]
+        distances += np.abs(places - goals)
+    far = goals < -0.2
+    assert distances[far].mean() < 0.5 * 10 * np.abs(goals[far]).mean()
