@@ -58,8 +58,9 @@ def both(model: str, folder: Path) -> None:
     """
     info = find_models(model)[0]
     renderer, means = renderer_of(info), renderer_of(info).model.train_tasks.latent_means
-    apart = np.linalg.norm(means - means[0], axis=1).argmax()
-    latents, seeds = means[[0, apart]], [2, 2]
+    distances = np.linalg.norm(means[:, None] - means, axis=2)
+    pair = np.unravel_index(distances.argmax(), distances.shape)
+    latents, seeds = means[list(pair)], [2, 2]
     clips = rollout_latents(renderer.model, renderer.env, latents, None, seeds, frames=True)
     film = renderer.env.films(*clips)
     shown = np.linspace(0, len(film) - 1, LOOP_PICTURES).round().astype(int)
