@@ -39,7 +39,7 @@ REMARKS = {
     "model earned on these test tasks.",
 }
 MANIPULATIONS = """By manipulation, three test tasks each. An episode succeeds by Meta-World's own
-criterion in its last step, of 200; rewards are version 2."""
+criterion if one of its 200 steps does; rewards are version 2."""
 CAPTIONS = {
     "table3-methods-queries": "Methods, against the number of exact answers",
     "table3-methods-samples": "Methods, against the samples that training had",
