@@ -47,9 +47,9 @@ def test_the_training_plan_follows_the_hyperparameter_file(
     two_tasks = training_plan(ModelKey("poem/HalfCheetahFwdBack-v0", "poem", 0))
     assert (two_tasks.epoch_steps, two_tasks.updates) == (24_000, 120_000)
     monkeypatch.setattr("sb3_poem.benchmark.training.family_facts", lambda name: ML10)
-    # 120 tasks, and each policy on the three other tasks of its group
+    # 120 tasks, and each policy on the three other tasks of its group, or four times on its own
     ml10 = [training_plan(ModelKey(ML10.env_id, name, 0)) for name in ("poem", "pearl")]
-    assert [plan.epoch_steps for plan in ml10] == [4 * 24_000, 24_000]
+    assert [(plan.epoch_steps, plan.updates) for plan in ml10] == [(4 * 24_000, 63_000)] * 2
     monkeypatch.undo()
     shorter = training_plan(ModelKey(POINT, "pearl", 0, Training(3000, (("gradient_steps", 7),))))
     assert (shorter.timesteps, shorter.updates) == (3000, 7)
