@@ -65,7 +65,7 @@ def test_tasks_of_small_rewards_are_learned_beside_others() -> None:
     quick = {"gradient_steps": 100, "learning_rate": 3e-3, "tau": 0.05, "gamma": 0.9}
     model = small(
         POEMSAC, walks(8, Unequal), n_train_tasks=8, horizon=10, reward_scale="per-task", **quick
-    ).learn(2_000)
+    ).learn(1_500)
     goals = model.train_tasks.tasks[:, 0]
     places, distances = np.zeros(8), np.zeros(8)
     for step in range(10):
