@@ -1,8 +1,8 @@
 """Does an environment keep the contract of a task family? A check like SB3's ``check_env``."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -13,6 +13,8 @@ from poem_envs.vector import TaskFamilyVector
 
 #: Steps whose images are compared: drawing is slow.
 N_IMAGES = 3
+#: Of an episode: observations, of which there is one more than steps, rewards and reward features.
+Episode = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def check_task_family(
@@ -61,36 +63,20 @@ def check_task_family(
     check_closing(case)
 
 
-class Episode(NamedTuple):
-    """What a run of actions gave: arrays with one row a step, and of observations one more."""
-
-    observations: np.ndarray
-    rewards: np.ndarray
-    features: np.ndarray
-
-    def equals(self, other: "Episode") -> bool:
-        """To the bit."""
-        return all(np.array_equal(one, two) for one, two in zip(self, other, strict=True))
-
-
 class Case:
     """A family that is checked: how it is made, and what its copies are made to do."""
 
     def __init__(self, make: Callable[..., Any], n_steps: int, seed: int) -> None:
         self.make, self.n_steps, self.seed = make, n_steps, seed
-
-    @cached_property
-    def player(self) -> Any:
-        """The one that played :attr:`episodes`."""
-        return self.make()
-
-    @cached_property
-    def actions(self) -> np.ndarray:
-        return self.draw_actions(self.n_steps, self.seed)
+        self.player = make()
 
     def draw_actions(self, n: int, seed: int) -> np.ndarray:
         space, rng = self.player.action_space, np.random.default_rng([seed, 1])
         return rng.uniform(space.low, space.high, size=(n, *space.shape)).astype(space.dtype)
+
+    @cached_property
+    def actions(self) -> np.ndarray:
+        return self.draw_actions(self.n_steps, self.seed)
 
     @cached_property
     def tasks(self) -> np.ndarray:
@@ -100,22 +86,20 @@ class Case:
     @cached_property
     def episodes(self) -> list[Episode]:
         """One in each of the two tasks, with the same seed and the same actions."""
-        return [self.play(self.player, task) for task in self.tasks]
+        return [self.play(self.player, self.actions, options={"task": task}) for task in self.tasks]
 
     def play(
         self,
         env: TaskFamily,
-        task: np.ndarray | None = None,
-        actions: np.ndarray | None = None,
+        actions: np.ndarray,
         each_step: Callable[[], Any] = lambda: None,
-        seed: int | None = None,
+        **reset_arguments: Any,
     ) -> Episode:
         """An episode, whose arrays are kept as they came, so that one that is reused is caught."""
-        options = None if task is None else {"task": task}
-        observation, _ = env.reset(seed=self.seed if seed is None else seed, options=options)
+        observation, _ = env.reset(**{"seed": self.seed, **reset_arguments})
         observations, rewards, features = [observation], [], []
         each_step()
-        for action in self.actions if actions is None else actions:
+        for action in actions:
             observation, reward, terminated, _, info = env.step(action)
             observations.append(observation)
             rewards.append(reward)
@@ -123,7 +107,7 @@ class Case:
             each_step()
             if terminated:
                 break
-        return Episode(np.array(observations), np.array(rewards), np.array(features))
+        return np.array(observations), np.array(rewards), np.array(features)
 
 
 def check_spaces(case: Case) -> None:
@@ -151,7 +135,7 @@ def check_sampling(case: Case) -> None:
     env.reset(seed=case.seed)
     before = env.np_random.bit_generator.state
     n = 8 if env.all_tasks is None else len(env.all_tasks)
-    tasks = env.sample_tasks(n, np.random.default_rng(case.seed))
+    tasks, again = (env.sample_tasks(n, np.random.default_rng(case.seed)) for _ in range(2))
     shape = (n, *env.task_space.shape)
     assert _is_array(tasks, shape, np.float64), (
         f"sample_tasks({n}, rng) must return a float64 array of shape {shape}, but gave {tasks!r}"
@@ -163,7 +147,6 @@ def check_sampling(case: Case) -> None:
     assert len(np.unique(tasks, axis=0)) > 1, (
         "sample_tasks must draw different tasks, but all of them are equal"
     )
-    again = env.sample_tasks(n, np.random.default_rng(case.seed))
     assert np.array_equal(tasks, again), (
         "sample_tasks must draw from the generator that it is given, but gave other tasks for an "
         "equal one; use no other randomness in _draw_tasks"
@@ -177,10 +160,10 @@ def check_sampling(case: Case) -> None:
 def check_seeds(case: Case) -> None:
     """A seed determines the task and the episode, whatever was done before."""
     env, other = case.make(), case.make()
-    first, task = case.play(env), env.task
-    case.play(other, actions=case.actions[::-1], seed=case.seed + 1)
+    first, task = case.play(env, case.actions), env.task
+    case.play(other, case.actions[::-1], seed=case.seed + 1)
     for family, where in ((env, "again"), (other, "in another copy")):
-        assert case.play(family).equals(first), (
+        assert _equal(case.play(family, case.actions), first), (
             f"reset(seed={case.seed}) and the same actions must give the same episode {where}, but "
             "did not: draw all randomness from the rng that _begin_episode is given, and reset the "
             "whole state of the simulator there"
@@ -203,8 +186,7 @@ def check_set_task(case: Case) -> None:
     env.step(actions[0])
     env.set_task(second)
     _, reward, _, _, info = env.step(actions[1])
-    features = info["reward_features"]
-    kept, changed = (float(env.compute_rewards(task, features)) for task in (first, second))
+    kept, changed = (env.compute_rewards(task, info["reward_features"]) for task in case.tasks)
     ok = np.array_equal(env.task, first) and not (reward == changed != kept)
     assert ok, "set_task must take effect at the next reset only, but changed the episode under way"
     env.reset()
@@ -219,39 +201,35 @@ def check_hidden_task(case: Case) -> None:
     """Where tasks differ in the reward alone, nothing that the agent sees depends on them."""
     if not case.player.shared_dynamics:
         return
-
-    def hidden(same: bool, what: str, advice: str) -> None:
-        assert same, (
+    (seen, rewards, features), (its_seen, its_rewards, its_features) = case.episodes
+    n = min(len(seen), len(its_seen))
+    combine = "return what the reward is computed from, and let _reward combine it with the task"
+    for mine, its, what, advice in (
+        (seen[0], its_seen[0], "the first observation", "leave the task out of it and the start"),
+        (seen[:n], its_seen[:n], "observations", "leave the task out of them and the dynamics"),
+        (features[: n - 1], its_features[: n - 1], "reward features", combine),
+        (len(rewards), len(its_rewards), "an episode's end", "leave the task out of `terminated`"),
+    ):
+        assert np.array_equal(mine, its), (
             f"{what} must not depend on the task, but differs between two with the same seed and "
             f"actions: {advice}, or set shared_dynamics = False"
         )
-
-    first, second = case.episodes
-    n = min(len(first.rewards), len(second.rewards))
-    equal, out = np.array_equal, "leave the task out of"
-    seen, its_seen = first.observations[: n + 1], second.observations[: n + 1]
-    hidden(equal(seen[0], its_seen[0]), "the first observation", f"{out} it and of the start")
-    hidden(equal(seen, its_seen), "observations", f"{out} them and of the dynamics")
-    advice = "return what the reward is computed from, and let _reward combine it with the task"
-    hidden(equal(first.features[:n], second.features[:n]), "reward features", advice)
-    hidden(len(first.rewards) == len(second.rewards), "an episode's end", f"{out} `terminated`")
 
 
 def check_relabelling(case: Case) -> None:
     """Rewards are exactly a pure function of task and features."""
     other = case.make()
     other.reset(seed=case.seed + 1)
-    for task, episode in zip(case.tasks, case.episodes, strict=True):
+    for task, (_, rewards, features) in zip(case.tasks, case.episodes, strict=True):
         for source, name in ((case.player, "this"), (other, "another")):
-            rewards = np.array([float(source.compute_rewards(task, f)) for f in episode.features])
-            assert np.array_equal(rewards, episode.rewards), (
+            given = np.array([float(source.compute_rewards(task, row)) for row in features])
+            assert np.array_equal(given, rewards), (
                 "step must return exactly compute_rewards(task, info['reward_features']), but "
-                f"{name} environment's gives {rewards.tolist()} for the rewards "
-                f"{episode.rewards.tolist()}: compute the reward in _reward alone, from its "
-                "arguments alone, with no state of the environment, and return new arrays of "
-                "features"
+                f"{name} environment's gives {given.tolist()} for the rewards {rewards.tolist()}: "
+                "compute the reward in _reward alone, from its arguments alone, with no state of "
+                "the environment, and return new arrays of features"
             )
-    features = case.episodes[0].features
+    features = case.episodes[0][2]
     together, one_by_one = _both_ways(case.player, other, "compute_rewards", case.tasks, features)
     assert np.array_equal(together, one_by_one), (
         "compute_rewards must give many rewards at once exactly as one after another, but does "
@@ -262,12 +240,11 @@ def check_relabelling(case: Case) -> None:
 
 def check_potential(case: Case) -> None:
     """A potential is a finite, pure function of task and observation, which broadcasts."""
-    env = case.player
-    if not env.has_potential:
+    if not case.player.has_potential:
         return
-    other, observations = case.make(), case.episodes[0].observations
+    other, observations = case.make(), case.episodes[0][0]
     other.reset(seed=case.seed + 1)
-    about = (env, other, "compute_potential", case.tasks, observations)
+    about = (case.player, other, "compute_potential", case.tasks, observations)
     together, one_by_one = _both_ways(*about)
     ok = together.shape == one_by_one.shape and np.allclose(together, one_by_one, rtol=1e-6)
     assert ok, (
@@ -303,17 +280,16 @@ def check_vector_parity(case: Case, env_id: str, env_kwargs: dict[str, Any]) -> 
     for i, single in enumerate(singles):
         compare(single.reset(seed=case.seed + i)[0], observations[i], "observations", "'s reset")
     actions = [case.draw_actions(case.n_steps + 2, case.seed + i) for i in range(n)]
-    for step in range(case.n_steps + 2):
+    for step, together in enumerate(np.stack(actions, axis=1)):
         if step == 1:
             tasks = case.tasks[[0, 1, 0]]
             vector_env.set_tasks(tasks)
             for single, task in zip(singles, tasks, strict=True):
                 single.set_task(task)
-        together = vector_env.step(np.stack([own[step] for own in actions]))
-        observations, rewards, terminations, truncations, infos = together
+        observations, rewards, terminations, truncations, infos = vector_env.step(together)
+        lengths += 1
         for i, single in enumerate(singles):
-            observation, reward, terminated, _, info = single.step(actions[i][step])
-            lengths[i] += 1
+            observation, reward, terminated, _, info = single.step(together[i])
             truncated = lengths[i] == horizon
             compare(reward, rewards[i], "rewards")
             compare((terminated, truncated), (terminations[i], truncations[i]), "ends")
@@ -329,30 +305,26 @@ def check_vector_parity(case: Case, env_id: str, env_kwargs: dict[str, Any]) -> 
 
 def check_rendering(case: Case) -> None:
     """Images are images, show no task unless asked to, and drawing them changes nothing."""
-    plain = case.make()
+    plain, actions = case.make(), case.actions[:N_IMAGES]
     if "rgb_array" not in plain.metadata.get("render_modes", []):
         return
-    env, actions = case.make(render_mode="rgb_array"), case.actions[:N_IMAGES]
+    env = case.make(render_mode="rgb_array")
     drawn: list[Episode] = []
     images: list[list[np.ndarray]] = []
     for task in case.tasks:
         images.append([])
         each_step = lambda: images[-1].append(env.render())  # noqa: E731
-        drawn.append(case.play(env, task, actions, each_step))
-    ok = all(
-        isinstance(image, np.ndarray) and image.dtype == np.uint8 and image.shape[2:] == (3,)
-        for image in images[0]
-    )
-    assert ok, (
+        drawn.append(case.play(env, actions, each_step, options={"task": task}))
+    assert all(_is_image(image) for image in images[0]), (
         'render() with render_mode="rgb_array" must return a uint8 array of shape (height, width, '
         "3)"
     )
-    assert case.play(plain, case.tasks[0], actions).equals(drawn[0]), (
+    assert _equal(case.play(plain, actions, options={"task": case.tasks[0]}), drawn[0]), (
         "rendering must not change the episode, but it did: leave the simulator's state in "
         "render() as it was"
     )
     if env.shared_dynamics and not env.render_task:
-        assert all(map(np.array_equal, *images)), (
+        assert _equal(*images), (
             "images must not show the task unless render_task=True, but two tasks with the same "
             "seed and actions look different: draw what marks the task only if self.render_task"
         )
@@ -385,12 +357,20 @@ def _make(env: str | Callable[..., gym.Env], **kwargs: Any) -> TaskFamily:
     return family
 
 
+def _equal(first: Sequence[np.ndarray], second: Sequence[np.ndarray]) -> bool:
+    return all(map(np.array_equal, first, second))
+
+
 def _is_array(value: Any, shape: tuple[int, ...], dtype: Any) -> bool:
     return isinstance(value, np.ndarray) and value.shape == shape and value.dtype == dtype
 
 
+def _is_image(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.dtype == np.uint8 and value.shape[2:] == (3,)
+
+
 def _check_observation(observation: Any, env: TaskFamily, origin: str) -> None:
-    space: Any = env.observation_space
+    space = env.observation_space
     assert _is_array(observation, space.shape, space.dtype), (
         f"{origin} must return an observation of observation_space's shape {space.shape} and dtype "
         f"{space.dtype}, but gave {getattr(observation, 'shape', type(observation))} of dtype "
