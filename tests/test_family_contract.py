@@ -316,7 +316,7 @@ BROKEN = [
     (UnboundedActions, "action_space must be .* bounded"),
     (Float32Tasks, "task_space must be a .*Box of shape .* float64"),
     (NoFeatureDim, "reward_feature_dim must be a whole number"),
-    (TwiceTheSameTask, "all_tasks must hold every task once"),
+    (TwiceTheSameTask, "all_tasks must have shape .* hold every task once"),
     (TasksOutsideTheirSpace, "all_tasks must have shape .* lie in task_space"),
     (
         Float32Observations,

@@ -5,7 +5,7 @@ parameter, the *task*.
 """
 
 from abc import ABCMeta, abstractmethod
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -61,14 +61,13 @@ def check_definition(family: Any) -> None:
         if not right
     ]
     if not wrong and family.all_tasks is not None:
-        all_tasks, size = np.asarray(family.all_tasks), tasks.shape[0]
-        if all_tasks.shape[1:] != (size,) or not all(task in tasks for task in all_tasks):
+        all_tasks = np.asarray(family.all_tasks)
+        inside = all_tasks.shape[1:] == tasks.shape and all(task in tasks for task in all_tasks)
+        if not inside or len(np.unique(all_tasks, axis=0)) < len(all_tasks):
             wrong.append(
-                f"all_tasks must have shape (n, {size}) and lie in task_space {tasks}, but is "
-                f"{family.all_tasks}"
+                f"all_tasks must have shape (n, {tasks.shape[0]}), lie in task_space {tasks} and "
+                f"hold every task once, but is {all_tasks.tolist()}"
             )
-        elif len(np.unique(all_tasks, axis=0)) < len(all_tasks):
-            wrong.append(f"all_tasks must hold every task once, but is {all_tasks.tolist()}")
     if wrong:
         raise TypeError(
             f"the task family {type(family).__name__}: {'; '.join(wrong)}; see poem_envs.TaskFamily"
@@ -166,12 +165,21 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
     _elapsed_steps: int = 0
     _episode: int = 0
     _succeeded: bool = False
-    _reset_options: ClassVar[frozenset[str]] = frozenset({"task"})
 
     def __init__(
         self, *, render_mode: str | None = None, render_task: bool = False, split: str = "train"
     ) -> None:
-        check_render_mode(render_mode, self.metadata)
+        modes = self.metadata.get("render_modes")
+        if render_mode is not None and not modes:
+            # a TypeError, upon which SB3's make_vec_env, which always asks, makes it without
+            raise TypeError(
+                f"render_mode={render_mode!r}: this environment cannot be drawn; its class needs "
+                'metadata = {"render_modes": ["rgb_array"]}, and a render()'
+            )
+        if render_mode not in (None, *(modes or ())):
+            raise ValueError(f"render_mode={render_mode!r} is not supported, choose one of {modes}")
+        if render_mode == "human" and not has_display():
+            raise ValueError("render_mode='human' needs a display; use 'rgb_array' without one")
         if split not in self.splits:
             raise ValueError(
                 f"split={split!r}: {type(self).__name__} has no such split of its tasks, it has "
@@ -200,16 +208,15 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
             one was chosen
         :param options: ``{"task": task}`` is short for :meth:`set_task` just before
         """
-        options = check_options(options, self._reset_options)
-        if "task" in options:
-            self.set_task(options["task"])
+        if (task := task_option(options, "task")) is not None:
+            self.set_task(task)
         super().reset(seed=seed)
         self._episode = 1 if seed is not None else self._episode + 1
         self._elapsed_steps, self._succeeded = 0, False
         if self._next_task is not None:
             self._task = self._next_task
         elif self._task is None or seed is not None:
-            self._task = self.sample_tasks(1, task_stream(self.np_random))[0]
+            self._task = self._sample_task(self.np_random)
         observation = self._begin_episode(self.np_random)
         if self.render_mode == "human":
             self.render()
@@ -249,7 +256,6 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
         return {}
 
     def _describe_episode(self) -> str:
-        """Where the episode is, for error messages."""
         return (
             f"step {self._elapsed_steps} of episode {self._episode} since "
             f"reset(seed={self.np_random_seed})"
@@ -272,6 +278,10 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
                 f"{size}; ask for at most {size}"
             )
         return np.asarray(rng.permutation(self.all_tasks)[:n], dtype=np.float64)
+
+    def _sample_task(self, rng: np.random.Generator) -> np.ndarray:
+        """A task that a generator's seed determines, without a draw from the generator itself."""
+        return self.sample_tasks(1, rng.spawn(1)[0])[0]
 
     def compute_rewards(self, tasks: npt.ArrayLike, features: npt.ArrayLike) -> np.ndarray:
         """The rewards ``(...)`` float64 that steps with features ``(..., reward_feature_dim)``, as
@@ -361,38 +371,12 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
         return all_tasks[distance.argmin(axis=-1)]
 
 
-def task_stream(rng: np.random.Generator) -> np.random.Generator:
-    """A generator that ``rng``'s seed determines, without a draw from ``rng`` itself."""
-    return rng.spawn(1)[0]
-
-
-def check_render_mode(render_mode: str | None, metadata: dict[str, Any]) -> None:
-    """Refuse a mode in which an environment of this metadata cannot render.
-
-    :raises TypeError: if it cannot render at all; upon that SB3's ``make_vec_env``, which always
-        asks, makes it without
-    """
-    modes = metadata.get("render_modes")
-    if render_mode is None:
-        return
-    if not modes:
-        needed = 'its class needs metadata = {"render_modes": ["rgb_array"]}, and a render()'
-        raise TypeError(f"render_mode={render_mode!r}: this environment cannot be drawn; {needed}")
-    if render_mode not in modes:
-        raise ValueError(f"render_mode={render_mode!r} is not supported, choose one of {modes}")
-    if render_mode == "human" and not has_display():
-        raise ValueError("render_mode='human' needs a display; use 'rgb_array' without one")
-
-
-def check_options(options: dict[str, Any] | None, known: frozenset[str]) -> dict[str, Any]:
-    """The options of a reset; refuses keys that are not known."""
-    unknown = set(options or {}) - known
+def task_option(options: dict[str, Any] | None, name: str) -> Any:
+    """The one option that a reset knows, or None; refuses others."""
+    unknown = sorted(set(options or {}) - {name})
     if unknown:
-        raise ValueError(
-            f"options={options!r} of reset holds unknown keys {sorted(unknown)}, known are "
-            f"{sorted(known)}"
-        )
-    return options or {}
+        raise ValueError(f"options={options!r} of reset holds unknown keys {unknown}, not {name!r}")
+    return (options or {}).get(name)
 
 
 def checked_actions(

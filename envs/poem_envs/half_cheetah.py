@@ -80,11 +80,6 @@ class HalfCheetahVelEnv(_HalfCheetah):
     There is no early end. `gymnasium.make` truncates episodes after 200 steps.
 
     ## Arguments
-    ```python
-    import gymnasium as gym
-    env = gym.make("poem_envs:poem/HalfCheetahVel-v0", ctrl_cost_weight=0.05)
-    ```
-
     | Parameter               | Type      | Default | Description                              |
     | ----------------------- | --------- | ------- | ---------------------------------------- |
     | `forward_reward_weight` | **float** | `1.0`   | Weight of the speed term                 |

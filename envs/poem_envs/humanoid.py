@@ -72,11 +72,6 @@ class HumanoidDir2DEnv(DirectionFamily):
     unless `terminate_when_unhealthy=False`. `gymnasium.make` truncates episodes after 200 steps.
 
     ## Arguments
-    ```python
-    import gymnasium as gym
-    env = gym.make("poem_envs:poem/HumanoidDir2D-v0", ctrl_cost_weight=0.1)
-    ```
-
     | Parameter                  | Type      | Default      | Description                       |
     | -------------------------- | --------- | ------------ | --------------------------------- |
     | `forward_reward_weight`    | **float** | `1.25`       | Weight of the speed term          |

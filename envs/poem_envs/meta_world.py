@@ -175,11 +175,6 @@ class MetaWorldML1Env(MetaWorldEnv):
     ## Arguments
     The extra `metaworld` is needed: `pip install 'sb3_poem[metaworld]'`.
 
-    ```python
-    import gymnasium as gym
-    env = gym.make("poem_envs:poem/MetaWorldML1-v0", env_name="push")
-    ```
-
     | Parameter         | Type     | Default     | Description                                  |
     | ----------------- | -------- | ----------- | -------------------------------------------- |
     | `env_name`        | **str**  | `"reach"`   | One of 50, with or without `-v3`             |

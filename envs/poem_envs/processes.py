@@ -14,7 +14,7 @@ import subprocess
 import sys
 import traceback
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from multiprocessing.connection import Connection, Pipe
 from typing import Any, NamedTuple
@@ -30,9 +30,8 @@ SERVE = "from poem_envs.processes import serve; serve"
 
 
 class EpisodeStart(NamedTuple):
-    """What a copy, by its number, needs to begin an episode, which is the copy's how-manieth."""
+    """What a copy needs to begin an episode, which is the copy's how-manieth."""
 
-    copy: int
     rng: np.random.Generator
     task: np.ndarray
     seed: int
@@ -40,15 +39,15 @@ class EpisodeStart(NamedTuple):
 
 
 class CopyGroup:
-    """Copies of a task family that one process steps in turn, numbered from ``first``."""
+    """Copies of a task family that one process steps in turn, by their numbers."""
 
     def __init__(self) -> None:
-        self.envs: list[TaskFamily] = []
+        self.envs: dict[int, TaskFamily] = {}
 
     def make(
-        self, make: Callable[[], TaskFamily], n: int, first: int, attributes: dict[str, Any]
+        self, make: Callable[[], TaskFamily], copies: list[int], attributes: dict[str, Any]
     ) -> None:
-        self.envs, self.first = [make() for _ in range(n)], first
+        self.envs = {copy: make() for copy in copies}
         for name, value in attributes.items():
             self.set_attribute(name, value)
 
@@ -60,23 +59,23 @@ class CopyGroup:
         return self._call()
 
     def begin(
-        self, starts: Sequence[EpisodeStart]
-    ) -> tuple[list[np.ndarray], list[np.random.Generator]]:
+        self, starts: dict[int, EpisodeStart]
+    ) -> dict[int, tuple[np.ndarray, np.random.Generator]]:
         """Begin episodes in some copies: observations, and generators after all draws."""
-        observations = []
-        for start in starts:
-            env = self.envs[start.copy]
+        begun = {}
+        for copy, start in starts.items():
+            env = self.envs[copy]
             env._task, env._np_random_seed = start.task, start.seed
             env._episode, env._elapsed_steps = start.episode, 0
-            observations.append(self.call(start.copy, "_begin_episode", start.rng))
-        return observations, [start.rng for start in starts]
+            begun[copy] = self.call(copy, "_begin_episode", start.rng), start.rng
+        return begun
 
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
         """Step every copy: observations, reward features, early ends and further infos."""
         results, infos = [], []
-        for copy, (env, action) in enumerate(zip(self.envs, actions, strict=True)):
+        for (copy, env), action in zip(self.envs.items(), actions, strict=True):
             env._elapsed_steps += 1
             results.append(self.call(copy, "_simulate", action))
             infos.append(env._step_info())
@@ -89,15 +88,15 @@ class CopyGroup:
             return getattr(self.envs[copy], method)(*arguments)
         except Exception as error:
             raise RuntimeError(
-                f"environment copy {self.first + copy}: {type(error).__name__}: {error}"
+                f"environment copy {copy}: {type(error).__name__}: {error}"
             ) from error
 
     def set_attribute(self, name: str, value: Any) -> None:
-        for env in self.envs:
+        for env in self.envs.values():
             setattr(env, name, value)
 
     def close(self) -> None:
-        for env in self.envs:
+        for env in self.envs.values():
             env.close()
 
 
@@ -179,45 +178,34 @@ class ProcessCopies:
     def __init__(
         self, make: Callable[[], TaskFamily], n: int, nthread: int, space: spaces.Box
     ) -> None:
-        self._make, self._n = make, n
-        groups = np.array_split(np.arange(n), min(nthread, n))
-        self._firsts = [int(copies[0]) for copies in groups]
-        # Where each copy is: its group, and its number there.
-        self._places = [(group, k) for group, own in enumerate(groups) for k in range(len(own))]
+        self._make = make
+        # The numbers of each group's copies.
+        self._copies = [own.tolist() for own in np.array_split(np.arange(n), min(nthread, n))]
         self._groups: list[CopyGroup | RemoteGroup] = []
-        self._interrupted = False
         self._attributes: dict[str, Any] = {}
         self._last_observations = np.zeros((n, *space.shape), dtype=space.dtype)
         self._last_infos: dict[str, np.ndarray] = {}
 
     def set_attribute(self, name: str, value: Any) -> None:
         self._attributes[name] = value  # for copies that are made anew
-        self._call("set_attribute", dict.fromkeys(range(len(self._firsts)), (name, value)))
+        if self._groups:
+            self._call("set_attribute", dict.fromkeys(range(len(self._groups)), (name, value)))
 
     def _start(self) -> None:
         """Start the workers; this process has the last, smallest group."""
-        ends = [*self._firsts[1:], self._n]
-        try:
-            for first, end in zip(self._firsts, ends, strict=True):
-                group = CopyGroup() if end == self._n else RemoteGroup()
-                self._groups.append(group)
-                group.send("make", self._make, end - first, first, self._attributes)
-            for group in reversed(self._groups):
-                group.receive()
-        except BaseException:  # the next call tries again, rather than to use what is half made
-            self._release()
-            raise
+        self._groups = [*(RemoteGroup() for _ in self._copies[1:]), CopyGroup()]
+        for group, copies in zip(self._groups, self._copies, strict=True):
+            group.send("make", self._make, copies, self._attributes)
+        for group in reversed(self._groups):
+            group.receive()
 
     def _call(self, method: str, arguments: dict[int, tuple[Any, ...]]) -> dict[int, Any]:
         """Call a method of some groups, all at once; arguments and results are by group."""
-        if self._interrupted and method != "begin":
-            raise ResetNeeded(
-                "a call of this environment was interrupted, and left its copies in the middle of "
-                "it; reset it"
-            )
         results: dict[int, Any] = {}
         failures: list[Exception] = []
         try:
+            if not self._groups and method != "begin":
+                raise ResetNeeded("a call of this environment was interrupted, or it closed: reset")
             if not self._groups:
                 self._start()
             for index in arguments:
@@ -229,37 +217,31 @@ class ProcessCopies:
                     results[index] = self._groups[index].receive()
                 except Exception as problem:
                     failures.append(problem)
-        except Exception:
-            raise
         except BaseException:  # answers under way would be taken for later ones
             self._release()
-            self._interrupted = True
             raise
         if failures:
             raise failures[0]
-        self._interrupted = False
-        return results
+        return dict(sorted(results.items()))
 
-    def begin(self, starts: Sequence[EpisodeStart]) -> dict[int, np.random.Generator]:
+    def begin(self, starts: dict[int, EpisodeStart]) -> dict[int, np.random.Generator]:
         """Begin episodes of some copies, and return their generators after all draws."""
-        by_group: dict[int, list[EpisodeStart]] = {}
-        for start in starts:
-            group, place = self._places[start.copy]
-            by_group.setdefault(group, []).append(start._replace(copy=place))
-        results = self._call("begin", {group: (own,) for group, own in by_group.items()})
-        drawn: dict[int, np.random.Generator] = {}
-        for group, answer in results.items():
-            for start, observation, rng in zip(by_group[group], *answer, strict=True):
-                copy = self._firsts[group] + start.copy
+        by_group: dict[int, tuple[dict[int, EpisodeStart]]] = {}
+        for group, copies in enumerate(self._copies):
+            own = {copy: starts[copy] for copy in copies if copy in starts}
+            if own:
+                by_group[group] = (own,)
+        drawn = {}
+        for answer in self._call("begin", by_group).values():
+            for copy, (observation, rng) in answer.items():
                 self._last_observations[copy], drawn[copy] = observation, rng
         return drawn
 
     def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Step all copies; returns reward features and early ends."""
-        chunks = np.split(actions, self._firsts[1:])
-        results = self._call("step", {index: (chunk,) for index, chunk in enumerate(chunks)})
-        in_order = [results[index] for index in sorted(results)]
-        observations, features, terminated, infos = zip(*in_order, strict=True)
+        chunks = {group: (actions[copies],) for group, copies in enumerate(self._copies)}
+        results = self._call("step", chunks).values()
+        observations, features, terminated, infos = zip(*results, strict=True)
         self._last_observations = np.concatenate(observations)
         self._last_infos = {key: np.concatenate([info[key] for info in infos]) for key in infos[0]}
         return np.concatenate(features), np.concatenate(terminated)
@@ -271,8 +253,8 @@ class ProcessCopies:
         return self._last_observations.copy()
 
     def _render_copy(self, copy: int, render_mode: str, task: np.ndarray | None) -> Any:
-        group, place = self._places[copy]
-        return self._call("call", {group: (place, "render")})[group]
+        group = next(group for group, copies in enumerate(self._copies) if copy in copies)
+        return self._call("call", {group: (copy, "render")})[group]
 
     def _release(self) -> None:
         for group in self._groups:

@@ -5,7 +5,7 @@ import os
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -16,7 +16,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from poem_envs.family import TaskFamily, check_options, checked_actions, task_stream
+from poem_envs.family import TaskFamily, checked_actions, task_option
 from poem_envs.processes import EpisodeStart, ProcessCopies
 
 NO_RENDER_MODE = "without a render_mode; pass one to the constructor, say 'rgb_array'"
@@ -167,7 +167,6 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         :class:`GoalFamily`'s environment has, or no limit
     """
 
-    _reset_options: ClassVar[frozenset[str]] = frozenset({"tasks"})
     single_action_space: spaces.Box
 
     def __init__(
@@ -282,7 +281,6 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
             draws other tasks, except for copies whose task was chosen
         :param options: ``{"tasks": tasks}`` is short for :meth:`set_tasks` just before
         """
-        options = check_options(options, self._reset_options)
         if isinstance(seed, (int, np.integer)):
             seed = [int(seed) + copy for copy in range(self.num_envs)]
         given = [None] * self.num_envs if seed is None else seed
@@ -293,8 +291,8 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
                 f"num_envs={self.num_envs}"
             )
         seeded = np.array([own is not None for own in seeds])
-        if "tasks" in options:
-            self.set_tasks(options["tasks"])
+        if (tasks := task_option(options, "tasks")) is not None:
+            self.set_tasks(tasks)
         for copy, own in enumerate(seeds):
             if own is not None or copy not in self._rngs:
                 self._rngs[copy], self._seeds[copy] = seeding.np_random(own)
@@ -305,7 +303,7 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         else:
             undecided &= seeded & ~self._tasks_kept
         for copy in np.flatnonzero(undecided).tolist():
-            self._tasks[copy] = self.family.sample_tasks(1, task_stream(self._rngs[copy]))[0]
+            self._tasks[copy] = self.family._sample_task(self._rngs[copy])
         self._begin(np.arange(self.num_envs))
         if self.render_mode == "human":
             self.render()
@@ -348,8 +346,7 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         """What :meth:`render` would hold for one copy, by number."""
         if self.render_mode is None:
             raise ValueError(f"render_copy() was called {NO_RENDER_MODE}")
-        shown = self._tasks if self.family.render_task else None
-        task = None if shown is None else shown[copy]
+        task = self._tasks[copy] if self.family.render_task and self._tasks is not None else None
         return self._copies._render_copy(copy, self.render_mode, task)
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -374,15 +371,14 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         self._elapsed_steps[copies] = 0
         self._succeeded[copies] = False
         self._episodes[copies] += 1
-        rngs = [self._rngs[copy] for copy in copies]
+        rngs = {copy: self._rngs[copy] for copy in copies.tolist()}
         if isinstance(self._copies, BatchFamily):
-            self._copies._begin_episodes(copies, rngs)
+            self._copies._begin_episodes(copies, list(rngs.values()))
             return
-        tasks, episodes = self._tasks.copy(), self._episodes.tolist()
-        starts = [
-            EpisodeStart(copy, rng, tasks[copy], self._seeds[copy], episodes[copy])
-            for copy, rng in zip(copies.tolist(), rngs, strict=True)
-        ]
+        starts = {
+            copy: EpisodeStart(rng, self._tasks[copy].copy(), self._seeds[copy], episode)
+            for (copy, rng), episode in zip(rngs.items(), self._episodes[copies], strict=True)
+        }
         self._rngs |= self._copies.begin(starts)  # which have drawn, in other processes
 
 

@@ -16,7 +16,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from poem_envs.family import TaskFamily, check_options
+from poem_envs.family import TaskFamily, task_option
 from poem_envs.registration import plain_id
 from poem_envs.vector import TaskFamilyVector
 from sb3_poem.common.checks import check_whole
@@ -104,8 +104,8 @@ class TaskVecEnv(VecEnv):
 
     def reset(self) -> np.ndarray:
         for index, options in enumerate(self._options):
-            if check_options(options, frozenset({"task"})):
-                self.vector_env.set_tasks([options["task"]], copies=[index])
+            if (task := task_option(options, "task")) is not None:
+                self.vector_env.set_tasks([task], copies=[index])
         observations, _ = self.vector_env.reset(seed=self._seeds)
         self._reset_seeds()
         self._reset_options()
