@@ -188,15 +188,9 @@ class MetaWorldML1Env(MetaWorldEnv):
 
     splits = ("train", "test")
 
-    def __init__(self, *, env_name: str = "reach", split: str = "train", **kwargs: Any) -> None:
+    def __init__(self, *, env_name: str = "reach", **kwargs: Any) -> None:
         self.env_name = sawyer.checked_manipulation(env_name)
-        if split == "held-out":
-            raise ValueError(
-                "split='held-out': poem/MetaWorldML1-v0 has one manipulation and holds none back; "
-                "it has 'train' and 'test' placements. poem/MetaWorldML10-v0 holds back five "
-                "manipulations"
-            )
-        super().__init__(split=split, **kwargs)
+        super().__init__(**kwargs)
         placements = sawyer.placements_of(self.env_name)
         low, high = placements.low, placements.high
         self._reaching = self.shared_dynamics = self.env_name in REACHING
@@ -218,7 +212,7 @@ class MetaWorldML1Env(MetaWorldEnv):
         checked = super()._checked_tasks(tasks, shape, name)
         if not self._reaching:
             for placement in checked.reshape(-1, checked.shape[-1]):
-                check_placement(self.env_name, placement, name)
+                sawyer.placements_of(self.env_name).check(placement)
         return checked
 
     def _place(self, task: np.ndarray, rng: np.random.Generator) -> tuple[str, np.ndarray]:
@@ -304,12 +298,14 @@ class MetaWorldML10Env(MetaWorldEnv):
             if abs(task[0] - round(task[0])) > 1e-6:
                 raise ValueError(f"{name}={task.tolist()} must begin with a whole number")
             manipulation, placement = self._place(task, np.random.default_rng(0))
-            if np.any(task[1 + len(placement) :] != 0.0):
+            places = sawyer.placements_of(manipulation)
+            inside = (placement >= places.low - 1e-6) & (placement <= places.high + 1e-6)
+            if not inside.all() or np.any(task[1 + len(placement) :] != 0.0):
                 raise ValueError(
                     f"{name}={task.tolist()}: a placement of {manipulation!r} is {len(placement)} "
-                    "numbers, then zeros"
+                    f"numbers from {places.low} to {places.high}, then zeros"
                 )
-            check_placement(manipulation, placement, name)
+            places.check(placement)
         return checked
 
     def _place(self, task: np.ndarray, rng: np.random.Generator) -> tuple[str, np.ndarray]:
@@ -320,18 +316,6 @@ class MetaWorldML10Env(MetaWorldEnv):
 def split_stream(rng: np.random.Generator, split: int) -> np.random.Generator:
     """A generator that another determines, another for each split but the first."""
     return rng if split == 0 else np.random.default_rng([split, *rng.integers(2**32, size=4)])
-
-
-def check_placement(manipulation: str, placement: np.ndarray, name: str) -> None:
-    """:raises ValueError: if Meta-World has no such placement of the manipulation"""
-    places = sawyer.placements_of(manipulation)
-    what = f"{name}: placement {placement.tolist()} of {manipulation!r}"
-    if np.any(placement < places.low - 1e-6) or np.any(placement > places.high + 1e-6):
-        raise ValueError(f"{what} must be inside {places.low} to {places.high}")
-    try:
-        places.check(placement)
-    except sawyer.PlacementRefusedError as error:
-        raise ValueError(f"{what}: {error}; draw one by sample_tasks") from error
 
 
 def _distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Meta-World's Sawyer manipulations, made reproducible: a start depends on the placement alone."""
 
+import collections
 import copy
 import difflib
 import functools
@@ -47,16 +48,8 @@ def checked_manipulation(env_name: str) -> str:
     if name in known:
         return name
     near = difflib.get_close_matches(name, known, n=5, cutoff=0.4)
-    hint = (
-        f"did you mean {', '.join(map(repr, near))}?"
-        if near
-        else f"choose one of {', '.join(known)}"
-    )
+    hint = f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(known)}"
     raise ValueError(f"{env_name=} is none of Meta-World's {len(known)} manipulations; {hint}")
-
-
-class PlacementRefusedError(ValueError):
-    """Meta-World would redraw the placement, as where object and goal are too near."""
 
 
 class Sawyer:
@@ -92,7 +85,7 @@ class Sawyer:
         :param placement: Meta-World's ``rand_vec``, ``(placement_dim,)``
         :param show_goal: whether rendering shows where the goal is
         :return: the observation, ``(39,)``
-        :raises PlacementRefusedError: if Meta-World would not have it
+        :raises ValueError: if Meta-World would redraw the placement
         """
         env = self.env
         # The first pass moves bodies in the model, from which the second one computes.
@@ -134,9 +127,10 @@ class Sawyer:
         close_viewers(self.env.mujoco_renderer)
 
     def _take_placement(self) -> np.ndarray:
-        if self._placement is None:
-            raise PlacementRefusedError(
-                "Meta-World refuses the placement: it places object and goal too near to each other"
+        if self._placement is None:  # it asks for another one
+            raise ValueError(
+                f"Meta-World refuses the placement of {self.manipulation!r}: it places object and "
+                "goal too near to each other; draw one by sample_tasks"
             )
         placement, self._placement = self._placement, None
         return placement
@@ -145,22 +139,18 @@ class Sawyer:
 # Simulators at rest, by what they were made with. An environment whose tasks are different
 # manipulations changes simulators at its resets; without this, each of many environments would come
 # to hold one for every manipulation.
-_at_rest: dict[tuple[Any, ...], list[Sawyer]] = {}
+_at_rest: dict[tuple[Any, ...], list[Sawyer]] = collections.defaultdict(list)
 
 
 def take_sawyer(manipulation: str, **arguments: Any) -> Sawyer:
     """A simulator made with :class:`Sawyer`'s arguments, anew if none is at rest."""
-    at_rest = _at_rest.get(_key(manipulation, arguments))
+    at_rest = _at_rest[manipulation, *sorted(arguments.items())]
     return at_rest.pop() if at_rest else Sawyer(manipulation, **arguments)
 
 
 def give_back_sawyer(sawyer: Sawyer) -> None:
     """Let others have a simulator that is no longer used."""
-    _at_rest.setdefault(_key(sawyer.manipulation, sawyer.arguments), []).append(sawyer)
-
-
-def _key(manipulation: str, arguments: dict[str, Any]) -> tuple[Any, ...]:
-    return manipulation, *sorted(arguments.items())
+    _at_rest[sawyer.manipulation, *sorted(sawyer.arguments.items())].append(sawyer)
 
 
 class Placements:
@@ -187,7 +177,7 @@ class Placements:
         return np.array(env._last_rand_vec, dtype=np.float64)
 
     def check(self, placement: np.ndarray) -> None:
-        """:raises PlacementRefusedError: if Meta-World would redraw the placement"""
+        """:raises ValueError: if Meta-World would redraw the placement"""
         self._sawyer.env._get_state_rand_vec = self._sawyer._take_placement
         self._sawyer._placement = placement.copy()
         self._sawyer.env.reset_model()

@@ -200,10 +200,6 @@ def test_another_version_of_metaworld(monkeypatch, found):
 
 
 def test_splits_that_there_are_not():
-    with pytest.raises(
-        ValueError, match="poem/MetaWorldML1-v0 has one manipulation and holds none back"
-    ):
-        make(split="held-out")
     for name, splits in (("ML1", "'train', 'test'"), ("ML10", "'train', 'test', 'held-out'")):
         with pytest.raises(ValueError, match=f"split='validation': .* it has {splits}"):
             make(name, split="validation")
@@ -216,8 +212,8 @@ def test_wrong_tasks_of_ml10(rng):
     )
     for index, value, message in (
         (0, 3.5, "a whole number"),
-        (6, 0.1, "is 3 numbers, then zeros"),
-        (1, 0.15, "must be inside"),
+        (6, 0.1, "is 3 numbers from .*, then zeros"),
+        (1, 0.15, "is 3 numbers from"),
     ):
         wrong = three_numbers.copy()
         wrong[index] = value
