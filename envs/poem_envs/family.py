@@ -139,7 +139,6 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
 
     :param render_mode: one of ``metadata["render_modes"]``, or None
     :param render_task: whether rendering shows the hidden task, for a developer who debugs
-    :param split: one of :attr:`splits`, to draw tasks from
     """
 
     observation_space: spaces.Box
@@ -152,10 +151,6 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
     reward_feature_dim: int
     #: Whether tasks differ in the reward alone, so that trajectories can be relabelled.
     shared_dynamics: bool = True
-    #: The names of the sets that tasks can be drawn from, of which the first is for training.
-    splits: tuple[str, ...] = ("train",)
-    #: The one that :meth:`sample_tasks` draws from.
-    split: str = "train"
     metadata: dict[str, Any] = _NothingToRender()  # type: ignore[assignment]
     render_task: bool = False
 
@@ -166,9 +161,7 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
     _episode: int = 0
     _succeeded: bool = False
 
-    def __init__(
-        self, *, render_mode: str | None = None, render_task: bool = False, split: str = "train"
-    ) -> None:
+    def __init__(self, *, render_mode: str | None = None, render_task: bool = False) -> None:
         modes = self.metadata.get("render_modes")
         if render_mode is not None and not modes:
             # a TypeError, upon which SB3's make_vec_env, which always asks, makes it without
@@ -180,13 +173,6 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
             raise ValueError(f"render_mode={render_mode!r} is not supported, choose one of {modes}")
         if render_mode == "human" and not has_display():
             raise ValueError("render_mode='human' needs a display; use 'rgb_array' without one")
-        if split not in self.splits:
-            raise ValueError(
-                f"split={split!r}: {type(self).__name__} has no such split of its tasks, it has "
-                f"{', '.join(map(repr, self.splits))}. Tasks that another generator draws are new "
-                "ones too: sample_tasks(n, np.random.default_rng(seed))"
-            )
-        self.split = split
         self.render_mode = render_mode
         self.render_task = render_task
 

@@ -79,7 +79,6 @@ class GoalFamily(TaskFamily):
         goal_high: npt.ArrayLike | None = None,
         render_mode: str | None = None,
         render_task: bool = False,
-        split: str = "train",
         **env_kwargs: Any,
     ) -> None:
         if isinstance(env, gym.Env):
@@ -97,7 +96,7 @@ class GoalFamily(TaskFamily):
         self._achieved_goal = np.zeros(0)
         self.env = self._make()
         self.metadata = {**self.env.metadata}
-        super().__init__(render_mode=render_mode, render_task=render_task, split=split)
+        super().__init__(render_mode=render_mode, render_task=render_task)
         own: Any = self.env.observation_space  # a Dict of flat boxes, as check_goal_env saw to
         goal = own["desired_goal"]
         low = goal.low if goal_low is None else goal_low

@@ -24,18 +24,22 @@ PUCK_TO_GOAL = 0.15
 class MetaWorldEnv(MujocoFilms, TaskFamily):
     """What ML1 and ML10 have in common: observations, actions, simulators and their rendering.
 
+    :param split: one of :attr:`splits`
     :param width: of rendered images, pixels
     :param height: of rendered images, pixels
     :param camera_name: one of Meta-World's cameras
     :param render_quality: "full", or "fast": without shadows and antialiasing, for RGB images alone
     """
 
+    #: The names of the sets that tasks can be drawn from, of which the first is for training.
+    splits: tuple[str, ...]
     metadata = {"render_modes": ["human", "rgb_array", "depth_array"], "render_fps": 80}  # noqa: RUF012
     look = Look(145.0, -25.0, 1.0, (0.0, 0.68, 0.16), body="hand", follows=False, on_floor=False)
 
     def __init__(
         self,
         *,
+        split: str = "train",
         width: int = 480,
         height: int = 480,
         camera_name: str | None = "corner2",
@@ -43,6 +47,12 @@ class MetaWorldEnv(MujocoFilms, TaskFamily):
         **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
+        if split not in self.splits:
+            raise ValueError(
+                f"split={split!r}: {type(self).__name__} has no such split of its tasks, it has "
+                f"{', '.join(map(repr, self.splits))}"
+            )
+        self.split = split
         self.observation_space = spaces.Box(-np.inf, np.inf, (OBSERVATION_DIM,), np.float64)
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         view = {"width": width, "height": height, "camera_name": camera_name}
@@ -50,8 +60,12 @@ class MetaWorldEnv(MujocoFilms, TaskFamily):
         self._sawyer_arguments = {"renders_fast": fast, "render_mode": self.render_mode, **view}
         # Meta-World's models have these cameras upside down.
         self._upside_down = (camera_name or "").startswith("corner")
-        self._success = False
         self._sawyer: sawyer.Sawyer | None = None
+
+    def _split_stream(self, rng: np.random.Generator) -> np.random.Generator:
+        """A generator that another determines, another for each split but the first."""
+        split = self.splits.index(self.split)
+        return rng if split == 0 else np.random.default_rng([split, *rng.integers(2**32, size=4)])
 
     def _place(self, task: np.ndarray, rng: np.random.Generator) -> tuple[str, np.ndarray]:
         """The manipulation and the placement, ``(placement_dim,)``, of an episode."""
@@ -75,7 +89,6 @@ class MetaWorldEnv(MujocoFilms, TaskFamily):
         if self._sawyer is None or self._sawyer.manipulation != manipulation:
             self._release_sawyer()
             self._sawyer = sawyer.take_sawyer(manipulation, **self._sawyer_arguments)
-        self._success = False
         return self._sawyer.reset(placement, self.render_task)
 
     def _simulate(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
@@ -204,7 +217,7 @@ class MetaWorldML1Env(MetaWorldEnv):
         self.task_space = spaces.Box(low, high, dtype=np.float64)
 
     def _draw_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        rng = split_stream(rng, self.splits.index(self.split))
+        rng = self._split_stream(rng)
         draws = np.stack([sawyer.placements_of(self.env_name).draw(rng) for _ in range(n)])
         return draws[:, 3:] if self._reaching else draws
 
@@ -285,7 +298,7 @@ class MetaWorldML10Env(MetaWorldEnv):
         self.task_space = spaces.Box(low, high, dtype=np.float64)
 
     def _draw_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        rng = split_stream(rng, self.splits.index(self.split))
+        rng = self._split_stream(rng)
         rounds = -(-n // len(self._numbers))
         numbers = np.concatenate([rng.permutation(self._numbers) for _ in range(rounds)])[:n]
         width = self.task_space.shape[0] - 1
@@ -311,11 +324,6 @@ class MetaWorldML10Env(MetaWorldEnv):
     def _place(self, task: np.ndarray, rng: np.random.Generator) -> tuple[str, np.ndarray]:
         number = round(task[0])
         return self.manipulations[number], task[1 : 1 + self._placement_dims[number]].copy()
-
-
-def split_stream(rng: np.random.Generator, split: int) -> np.random.Generator:
-    """A generator that another determines, another for each split but the first."""
-    return rng if split == 0 else np.random.default_rng([split, *rng.integers(2**32, size=4)])
 
 
 def _distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -61,15 +61,12 @@ class BatchFamily(TaskFamily):
 
     render_mode: str | None = None
     render_task: bool = False
-    split: str = "train"
 
     #: How many threads may step the copies.
     nthread = 1
 
     def __post_init__(self) -> None:
-        super().__init__(
-            render_mode=self.render_mode, render_task=self.render_task, split=self.split
-        )
+        super().__init__(render_mode=self.render_mode, render_task=self.render_task)
         self._allocate(1)
 
     @abstractmethod

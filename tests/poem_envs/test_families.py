@@ -242,13 +242,6 @@ def test_unknown_render_mode(env_id):
         make(env_id).__class__(render_mode="ascii")
 
 
-def test_a_split_that_there_is_not(env_id):
-    with pytest.raises(ValueError, match=r"split='test': .* it has 'train'"):
-        make(env_id, split="test")
-    with pytest.raises(ValueError, match=r"split='test'"):
-        gym.make_vec(env_id, num_envs=2, vectorization_mode="vector_entry_point", split="test")
-
-
 @pytest.mark.parametrize(
     ("env_id", "seen"),
     [
