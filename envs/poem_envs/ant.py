@@ -40,14 +40,8 @@ class AntVelEnv(_Ant):
 
     ## Action Space
     The action space is a `Box(-1, 1, (8,), float32)`: torques at the hinge joints in N m, scaled by
-    each motor's gear.
-
-    | Num  | Action                               | Control Min | Control Max | XML name       |
-    | ---- | ------------------------------------ | ----------- | ----------- | -------------- |
-    | 0, 1 | torques on back right hip and ankle  | -1          | 1           | hip_4, ankle_4 |
-    | 2, 3 | torques on front left hip and ankle  | -1          | 1           | hip_1, ankle_1 |
-    | 4, 5 | torques on front right hip and ankle | -1          | 1           | hip_2, ankle_2 |
-    | 6, 7 | torques on back left hip and ankle   | -1          | 1           | hip_3, ankle_3 |
+    each motor's gear, of hip and ankle of each leg: back right (`hip_4`, `ankle_4`), front left
+    (`hip_1`, `ankle_1`), front right (`hip_2`, `ankle_2`), back left (`hip_3`, `ankle_3`).
 
     ## Observation Space
     The observation space is a `Box(-Inf, Inf, (27,), float64)`: positions without x and y, then

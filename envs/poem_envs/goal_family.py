@@ -40,11 +40,6 @@ class GoalFamily(TaskFamily):
     >>> env.observation_space.shape, env.task_space.shape, env.max_episode_steps
     ((28,), (3,), 50)
 
-    So that an id makes it::
-
-        slide = {"env": "gymnasium_robotics:FetchSlide-v4"}
-        gym.register("my/FetchSlide-v0", entry_point=GoalFamily, kwargs=slide)
-
     The environment's resets must depend on their seed alone. Its time limit is the family's too
     (:attr:`max_episode_steps`), unless the family is registered with another or ``gym.make`` is
     given one. Other wrappers than those of ``gym.make`` are refused.

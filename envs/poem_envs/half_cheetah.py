@@ -44,12 +44,8 @@ class HalfCheetahVelEnv(_HalfCheetah):
 
     ## Action Space
     The action space is a `Box(-1, 1, (6,), float32)`: torques at the hinge joints in N m, scaled by
-    each motor's gear.
-
-    | Num   | Action                           | Control Min | Control Max | XML name             |
-    | ----- | -------------------------------- | ----------- | ----------- | -------------------- |
-    | 0 - 2 | torques: back thigh, shin, foot  | -1          | 1           | bthigh, bshin, bfoot |
-    | 3 - 5 | torques: front thigh, shin, foot | -1          | 1           | fthigh, fshin, ffoot |
+    each motor's gear, of back thigh, shin and foot (`bthigh`, `bshin`, `bfoot`), then of front
+    thigh, shin and foot.
 
     ## Observation Space
     The observation space is a `Box(-Inf, Inf, (17,), float64)`: positions without the x-coordinate,

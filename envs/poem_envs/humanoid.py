@@ -29,15 +29,8 @@ class HumanoidDir2DEnv(DirectionFamily):
 
     ## Action Space
     The action space is a `Box(-0.4, 0.4, (17,), float32)`: torques at the hinge joints in N m,
-    scaled by each motor's gear.
-
-    | Num     | Action                                         | Control Min | Control Max |
-    | ------- | ---------------------------------------------- | ----------- | ----------- |
-    | 0 - 2   | torques on the abdomen (y, z, x)               | -0.4        | 0.4         |
-    | 3 - 6   | torques on the right hip (x, z, y) and knee    | -0.4        | 0.4         |
-    | 7 - 10  | torques on the left hip (x, z, y) and knee     | -0.4        | 0.4         |
-    | 11 - 13 | torques on the right shoulder (1, 2) and elbow | -0.4        | 0.4         |
-    | 14 - 16 | torques on the left shoulder (1, 2) and elbow  | -0.4        | 0.4         |
+    scaled by each motor's gear, of abdomen (y, z, x), right hip (x, z, y) and knee, left hip and
+    knee, right shoulder (1, 2) and elbow, left shoulder and elbow.
 
     ## Observation Space
     The observation space is a `Box(-Inf, Inf, (376,), float64)`, in the layout of Gymnasium's

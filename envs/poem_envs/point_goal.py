@@ -14,6 +14,7 @@ from poem_envs.vector import BatchFamily
 
 # Of the first path, the second and so on.
 _COLOURS = np.rint(255 * np.array(PATH_COLOURS))
+GREY = (190, 190, 190)
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
@@ -92,7 +93,7 @@ class PointGoalEnv(BatchFamily):
         return self._reward(tasks, observations)  # the position is seen, and it earns
 
     def _render_copy(self, copy: int, render_mode: str, task: np.ndarray | None) -> Any:
-        canvas = _background(self.width, self.height)
+        canvas = Canvas(self.width, self.height)
         if task is not None:
             canvas.disc(np.cos(task[0]), np.sin(task[0]), 0.07, (60, 160, 75))
         canvas.disc(self._positions[copy, 0], self._positions[copy, 1], 0.045, (31, 90, 180))
@@ -115,7 +116,7 @@ class PointGoalEnv(BatchFamily):
         """See :class:`~poem_envs.films.Filmed`."""
         images, chosen = [], [paths[i] for i in shown]
         for moments in moments_of(chosen):
-            canvas = _background(*size)
+            canvas = Canvas(*size)
             for i, path, now in zip(shown, chosen, moments, strict=True):
                 colour = _COLOURS[i]
                 for x, y in path[:now]:
@@ -131,15 +132,18 @@ class PointGoalEnv(BatchFamily):
 
 
 class Canvas:
-    """A white image, ``width`` by ``height`` pixels, onto which shapes are painted in coordinates
-    of a plane (x right, y up), of which its shorter side shows ``extent`` around ``centre``.
+    """A white image, ``width`` by ``height`` pixels, of the plane (x right, y up) around the upper
+    unit half-circle, which is drawn in it.
     """
 
-    def __init__(self, width: int, height: int, centre: tuple[float, float], extent: float) -> None:
+    def __init__(self, width: int, height: int) -> None:
         self._pixels = np.full((height, width, 3), 255.0)
-        self._per_unit = min(width, height) / extent
-        self._x = centre[0] + (np.arange(width) + 0.5 - width / 2) / self._per_unit
-        self._y = centre[1] - (np.arange(height)[:, None] + 0.5 - height / 2) / self._per_unit
+        self._per_unit = min(width, height) / 2.7
+        self._x = (np.arange(width) + 0.5 - width / 2) / self._per_unit
+        self._y = 0.4 - (np.arange(height)[:, None] + 0.5 - height / 2) / self._per_unit
+        line = np.abs(np.hypot(self._x, self._y) - 1.0) - 0.0075
+        self._paint(np.maximum(line, -self._y), GREY, self._pixels)
+        self.disc(0.0, 0.0, 0.02, GREY)
 
     def disc(self, x: float, y: float, radius: float, colour: npt.ArrayLike) -> None:
         """Paint a filled circle around a point."""
@@ -148,11 +152,6 @@ class Canvas:
         columns = _span(np.abs(self._x - x) <= reach)
         distance = np.hypot(self._x[columns] - x, self._y[rows] - y) - radius
         self._paint(distance, colour, self._pixels[rows, columns])
-
-    def upper_half_circle(self, radius: float, line_width: float, colour: npt.ArrayLike) -> None:
-        """Paint the line of the half-circle around the origin where y >= 0."""
-        line = np.abs(np.hypot(self._x, self._y) - radius) - line_width / 2
-        self._paint(np.maximum(line, -self._y), colour, self._pixels)
 
     def image(self) -> np.ndarray:
         """What was painted, ``(height, width, 3)`` uint8."""
@@ -207,13 +206,4 @@ class ImageWindow:
         glfw.poll_events()
 
     def close(self) -> None:
-        if self._window is not None:
-            self._glfw.destroy_window(self._window)
-            self._window = None
-
-
-def _background(width: int, height: int) -> Canvas:
-    canvas = Canvas(width, height, centre=(0.0, 0.4), extent=2.7)
-    canvas.upper_half_circle(1.0, 0.015, (190, 190, 190))
-    canvas.disc(0.0, 0.0, 0.02, (190, 190, 190))
-    return canvas
+        self._glfw.destroy_window(self._window)
