@@ -167,6 +167,8 @@ class FilmRenderer(StateRenderer):
         self._viewer = viewer = prepared_viewer(self._renderer, "rgb_array", fast=True)
         self._camera, self._scene, self._viewport = viewer.cam, viewer.scn, viewer.viewport
         self._camera.azimuth, self._camera.elevation = look.azimuth, look.elevation
+        # To the right, upwards and away from who looks, (3, 3).
+        self._axes = np.stack([look.right, look.up, np.cross(look.up, look.right)])
         viewer.vopt.sitegroup[:] = 0
         looks_down = look.elevation <= -FIELD_OF_VIEW / 2
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = not looks_down
@@ -236,8 +238,7 @@ class FilmRenderer(StateRenderer):
         look, camera = self.look, self._camera
         if look.follows:
             camera.lookat[:2] = (places.min(axis=0) + places.max(axis=0))[:2] / 2
-        axes = np.stack([look.right, look.up, np.cross(look.up, look.right)], axis=1)
-        aside, upwards, beyond = ((places - camera.lookat) @ axes).T
+        aside, upwards, beyond = self._axes @ (places - camera.lookat).T
         half = HALF_HEIGHT * (1 - (MARGIN if look.follows else LEAST_MARGIN))
         aspect = self._viewport.width / self._viewport.height
         needed = np.maximum(np.abs(aside) / (half * aspect), np.abs(upwards) / half) - beyond
@@ -357,21 +358,18 @@ class FilmRenderer(StateRenderer):
 
     def _labels(self, labels: list[tuple[str, np.ndarray]]) -> list[tuple[str, float, float]]:
         """Where in the picture words are whose places are in it."""
-        forward, up = (
-            np.mean([getattr(one, name) for one in self._scene.camera], axis=0)
-            for name in ("forward", "up")
-        )
         away = np.array([place for _, place in labels]) - self._eye()
-        depth = np.maximum(away @ forward, 1e-6)
+        aside, upwards, beyond = self._axes @ away.T
+        depth = np.maximum(beyond, 1e-6)
         aspect = self._viewport.width / self._viewport.height
-        x = (1 + away @ np.cross(forward, up) / depth / HALF_HEIGHT / aspect) / 2
-        y = (1 + away @ up / depth / HALF_HEIGHT) / 2
+        x = (1 + aside / depth / HALF_HEIGHT / aspect) / 2
+        y = (1 + upwards / depth / HALF_HEIGHT) / 2
         inside = (depth > 1e-3) & (np.abs(x - 0.5) < 0.4) & (np.abs(y - 0.5) < 0.42)
         return [(labels[i][0], x[i], y[i]) for i in np.flatnonzero(inside)]
 
     def _eye(self) -> np.ndarray:
         """Where the camera is, ``(3,)``."""
-        return np.mean([one.pos for one in self._scene.camera], axis=0)
+        return self._camera.lookat - self._camera.distance * self._axes[2]
 
     def _write(self, text: str, x: float, y: float) -> None:
         """Write a word around a point of the picture."""
