@@ -217,9 +217,9 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
         """
         if self._task is None:
             raise ResetNeeded("step() was called before the first reset()")
-        checked = checked_actions(action, self.action_space)
+        action = checked(action, self.action_space, self.action_space.shape, "action")
         self._elapsed_steps += 1
-        observation, features, terminated = self._simulate(checked)
+        observation, features, terminated = self._simulate(action)
         reward = float(self.compute_rewards(self._task, features))
         if self.render_mode == "human":
             self.render()
@@ -335,23 +335,14 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
 
     def _checked_tasks(self, tasks: npt.ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:
         """``tasks`` as a new float64 array; a ValueError says what is wrong with them."""
-        array = _numbers(tasks, shape, name)
-        low, high = self.task_space.low, self.task_space.high
-        clipped = np.clip(array, low, high)
-        inside = np.all(np.abs(array - clipped) <= BOUNDS_TOLERANCE, axis=-1)  # false for NaN
-        if not inside.all():
-            raise ValueError(
-                f"{_first(array, ~inside, name)} must be finite and inside task_space, from {low} "
-                f"to {high}"
-            )
+        given = checked(tasks, self.task_space, shape, name)
         if self.all_tasks is None:
-            return clipped
+            return given
         all_tasks = np.asarray(self.all_tasks, dtype=np.float64)
-        distance = np.abs(clipped[..., None, :] - all_tasks).max(axis=-1)
-        member = distance.min(axis=-1) <= BOUNDS_TOLERANCE
-        if not member.all():
+        distance = np.abs(given[..., None, :] - all_tasks).max(axis=-1)
+        if (distance.min(axis=-1) > BOUNDS_TOLERANCE).any():
             raise ValueError(
-                f"{_first(array, ~member, name)} is not among this family's tasks, which are "
+                f"{name}={given.tolist()} is not among this family's tasks, which are "
                 f"{all_tasks.tolist()}"
             )
         return all_tasks[distance.argmin(axis=-1)]
@@ -365,38 +356,25 @@ def task_option(options: dict[str, Any] | None, name: str) -> Any:
     return (options or {}).get(name)
 
 
-def checked_actions(
-    actions: npt.ArrayLike, space: spaces.Box, num_envs: int | None = None
+def checked(
+    values: npt.ArrayLike, space: spaces.Box, shape: tuple[int, ...], name: str
 ) -> np.ndarray:
-    """Actions as a new float64 array inside the bounds; a ValueError says which are wrong."""
-    array = _numbers(actions, (() if num_envs is None else (num_envs,)) + space.shape, "action")
-    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
-    clipped = np.clip(array, low, high)
-    acceptable = np.abs(array - clipped) <= BOUNDS_TOLERANCE  # false for NaN
-    if acceptable.all():
-        return clipped
-    index = tuple(int(i) for i in np.argwhere(~acceptable)[0])
-    component = index if num_envs is None else index[1:]
-    copy = "" if num_envs is None else f" of environment copy {index[0]}"
-    raise ValueError(
-        f"action{copy} is {array[index]} at component {', '.join(map(str, component))}, but it "
-        f"must be finite and inside [{low[component]:g}, {high[component]:g}]"
-    )
-
-
-def _numbers(values: npt.ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:
+    """One vector of a space, or many ``(n, dim)``, as a new float64 array inside its bounds; a
+    ValueError says which is wrong.
+    """
     try:
         array = np.array(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}={values!r} is no array of numbers of shape {shape}") from error
     if array.shape != shape:
         raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
-    return array
-
-
-def _first(tasks: np.ndarray, wrong: npt.ArrayLike, name: str) -> str:
-    """Describe the first wrong task of one or many."""
-    if tasks.ndim == 1:
-        return f"{name}={tasks.tolist()}"
-    row = int(np.flatnonzero(wrong)[0])
-    return f"{name}[{row}]={tasks[row].tolist()}"
+    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+    clipped = np.clip(array, low, high)
+    acceptable = np.abs(array - clipped) <= BOUNDS_TOLERANCE  # false for NaN
+    if acceptable.all():
+        return clipped
+    *row, component = map(int, np.argwhere(~acceptable)[0])
+    raise ValueError(
+        f"{name}{row or ''} is {array[(*row, component)]:g} at component {component}, but must be "
+        f"finite and inside [{low[component]:g}, {high[component]:g}]"
+    )

@@ -27,7 +27,7 @@ class GoalFamily(TaskFamily):
 
     The environment must be what HER takes: observations are a dictionary of ``"observation"``,
     ``"achieved_goal"`` and ``"desired_goal"``, and ``compute_reward(achieved_goal, desired_goal,
-    info)`` is its reward, sparse or dense. Then
+    info)`` is its reward, sparse or dense, of many goals ``(n, goal_dim)`` too. Then
 
     - the observation is ``"observation"``, and ``"achieved_goal"`` behind it if asked for;
       ``"desired_goal"`` is left out;
@@ -103,7 +103,7 @@ class GoalFamily(TaskFamily):
         low, high = (np.concatenate(b).astype(np.float64) for b in zip(*boxes, strict=True))
         self.observation_space = spaces.Box(low, high, dtype=np.float64)
         self.action_space = self.env.action_space  # type: ignore[assignment]  # see check_goal_env
-        self._rewards_broadcast = self._check_reward()
+        self._check_reward()
 
     def _make(self) -> gym.Env:
         if "gymnasium_robotics" in (str(self._source).partition(":")[0], *sys.modules):
@@ -145,36 +145,26 @@ class GoalFamily(TaskFamily):
         truncated = self._spec is None and self._elapsed_steps >= (self.max_episode_steps or np.inf)
         return observation, reward, terminated, truncated, info
 
-    def _check_reward(self) -> bool:
-        """Whether ``compute_reward``, which it tries, takes many goals at once."""
+    def _check_reward(self) -> None:
+        """Refuse a ``compute_reward`` that does not take many goals at once."""
         goals = self._goals_of_resets(self.env, range(2))
-        try:
-            one_by_one = [self._own_reward(goals[i : i + 1], goals[:1]) for i in range(2)]
-        except Exception as error:
-            raise ValueError(
-                f"{self.env}: {REWARD} fails for goals of shape (1, {goals.shape[1]}) and an empty "
-                f"info: {type(error).__name__}: {error}. It must be a function of the two goals"
-            ) from error
         self._place_goal(goals[0])
         try:
-            together = self._own_reward(goals, goals[[0, 0]])
-        except Exception:
-            return False
-        return together.shape == (2,) and np.array_equal(together, np.concatenate(one_by_one))
-
-    def _own_reward(self, achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
-        compute_reward: Callable[..., Any] = self.env.compute_reward  # type: ignore[attr-defined]
-        return np.atleast_1d(np.asarray(compute_reward(achieved, desired, {}), dtype=np.float64))
+            together, alone = self._reward(goals[0], goals), self._reward(goals[0], goals[1])
+        except Exception as error:
+            raise ValueError(
+                f"{self.env}: {REWARD} fails for goals of shape (n, {goals.shape[1]}) and an empty "
+                f"info: {type(error).__name__}: {error}. It must be a function of the two goals"
+            ) from error
+        if together[1] != alone:
+            raise ValueError(f"{self.env}: {REWARD} of many goals must give each its own reward")
 
     def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
         tasks, features = np.broadcast_arrays(tasks, features)
         desired = np.ascontiguousarray(tasks).reshape(-1, tasks.shape[-1])
         achieved = np.ascontiguousarray(features).reshape(desired.shape)
-        if self._rewards_broadcast:
-            rewards = self._own_reward(achieved, desired)
-        else:
-            pairs = zip(achieved[:, None], desired[:, None], strict=True)
-            rewards = np.array([self._own_reward(*pair)[0] for pair in pairs])
+        compute_reward: Callable[..., Any] = self.env.compute_reward  # type: ignore[attr-defined]
+        rewards = np.asarray(compute_reward(achieved, desired, {}), dtype=np.float64)
         return rewards.reshape(tasks.shape[:-1])
 
     def _draw_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:

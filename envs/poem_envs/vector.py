@@ -16,7 +16,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from poem_envs.family import TaskFamily, checked_actions, task_option
+from poem_envs.family import TaskFamily, checked, task_option
 from poem_envs.processes import EpisodeStart, ProcessCopies
 
 NO_RENDER_MODE = "without a render_mode; pass one to the constructor, say 'rgb_array'"
@@ -293,9 +293,10 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         """Step every copy by ``(num_envs, action_dim)``; errors as of :meth:`TaskFamily.step`."""
         if self._tasks is None:
             raise ResetNeeded("step() was called before the first reset()")
-        checked = checked_actions(actions, self.single_action_space, self.num_envs)
+        single, shape = self.single_action_space, self.action_space.shape
+        actions = checked(actions, single, shape, "actions")
         self._elapsed_steps += 1
-        features, terminations = self._copies._advance(checked)
+        features, terminations = self._copies._advance(actions)
         rewards = self.family.compute_rewards(self._tasks, features)
         observations = self._copies._observations()
         limit = np.inf if self.max_episode_steps is None else self.max_episode_steps

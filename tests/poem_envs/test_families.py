@@ -166,7 +166,7 @@ def test_wrong_tasks(env_id, wrong):
     env = make(env_id)
     env.reset(seed=0)
     before = env.task
-    with pytest.raises(ValueError, match=r"task=|task has shape"):
+    with pytest.raises(ValueError, match=r"task is|task=|task has shape"):
         env.set_task(wrong)
     if wrong is not None:
         with pytest.raises(ValueError, match="task"):
@@ -221,7 +221,7 @@ def test_wrong_actions(env_id):
     for value in (np.nan, np.inf, 2.0):
         wrong = np.zeros_like(high)
         wrong[1] = value
-        with pytest.raises(ValueError, match=rf"action is {value} at component 1.*inside \[-"):
+        with pytest.raises(ValueError, match=rf"action is {value:g} at component 1.*inside \[-"):
             env.step(wrong)
     with pytest.raises(ValueError, match="action has shape"):
         env.step(np.zeros(len(high) + 1))

@@ -103,15 +103,6 @@ class OneRewardAtATime(Reach):
         )
 
 
-def test_a_reward_function_for_one_goal_at_a_time_is_called_for_one_after_another(rng):
-    family = GoalFamily(OneRewardAtATime)
-    goals, achieved = rng.uniform(-1, 1, (5, 2)), rng.uniform(-1, 1, (4, 2))
-    expected = [[-(abs(a[0] - g[0]) + abs(a[1])) for a in achieved] for g in goals]
-    assert family.compute_rewards(goals[:, None], achieved[None]) == pytest.approx(
-        np.array(expected)
-    )
-
-
 def test_what_the_observation_holds():
     family, without = GoalFamily(Reach), GoalFamily(Reach, observe_achieved_goal=False)
     assert family.observation_space.shape == (4,)
@@ -170,6 +161,7 @@ class RewardOfTheInfo(Reach):
         (Pixels, "the space of 'observation' must be a flat Box"),
         (GoalsOfAnotherWidth, "must have the same shape"),
         (Buttons, "the action space must be a Box"),
+        (OneRewardAtATime, "fails for goals of shape"),
         (RewardOfTheInfo, "and an empty info: KeyError: 'energy'"),
     ],
 )
