@@ -121,9 +121,6 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
     >>> bool(reward == -abs(info["reward_features"][0] - env.task[0]))
     True
 
-    The base class checks actions and tasks, draws and keeps the task, computes the reward and fills
-    in the info.
-
     **The task.** As long as none was chosen, ``reset(seed=...)`` draws one from the family's
     distribution, from a stream of its own that the seed determines, and a reset without a seed
     keeps it. :meth:`set_task` chooses one, from the next reset on, and then no seed draws another;

@@ -196,8 +196,9 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         self._next_tasks = np.full((num_envs, *one.task_space.shape), np.nan)
         self._task_chosen = np.zeros(num_envs, dtype=bool)
         self._tasks_kept = np.zeros(num_envs, dtype=bool)
-        self._rngs: dict[int, np.random.Generator] = {}  # of each copy, as are the seeds
-        self._seeds: dict[int, int] = {}
+        # Of each copy, None before the first reset: what np_random and np_random_seed give.
+        self._np_random: Any = [None] * num_envs
+        self._np_random_seed: Any = [None] * num_envs
         self._elapsed_steps = np.zeros(num_envs, dtype=np.int64)
         self._episodes = np.zeros(num_envs, dtype=np.int64)
         self._succeeded = np.zeros(num_envs, dtype=bool)
@@ -206,7 +207,7 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
             self._copies, one.nthread = one, nthread
             one._allocate(num_envs)
             # no method of this object, which would live as long as the family does
-            facts = self._elapsed_steps, self._episodes, self._seeds
+            facts = self._elapsed_steps, self._episodes, self._np_random_seed
             one._describe = functools.partial(_describe, *facts)  # type: ignore[method-assign]
         else:
             self._copies = ProcessCopies(make, num_envs, nthread, one.observation_space)
@@ -272,8 +273,8 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         if (tasks := task_option(options, "tasks")) is not None:
             self.set_tasks(tasks)
         for copy, own in enumerate(seeds):
-            if own is not None or copy not in self._rngs:
-                self._rngs[copy], self._seeds[copy] = seeding.np_random(own)
+            if own is not None or self._np_random[copy] is None:
+                self._np_random[copy], self._np_random_seed[copy] = seeding.np_random(own)
         self._episodes[seeded] = 0
         undecided = ~self._task_chosen
         if self._tasks is None:
@@ -281,7 +282,7 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         else:
             undecided &= seeded & ~self._tasks_kept
         for copy in np.flatnonzero(undecided).tolist():
-            self._tasks[copy] = self.family._sample_task(self._rngs[copy])
+            self._tasks[copy] = self.family._sample_task(self._np_random[copy])
         self._begin(np.arange(self.num_envs))
         if self.render_mode == "human":
             self.render()
@@ -332,16 +333,6 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         self._copies._release()
         self.family.close()
 
-    @property  # type: ignore[misc]
-    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
-        """Of each copy; empty before the first reset."""
-        return tuple(self._rngs.values())
-
-    @property
-    def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
-        """Of each copy; empty before the first reset."""
-        return tuple(self._seeds.values())
-
     def _begin(self, copies: np.ndarray) -> None:
         assert self._tasks is not None
         chosen = copies[self._task_chosen[copies]]
@@ -350,18 +341,20 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         self._elapsed_steps[copies] = 0
         self._succeeded[copies] = False
         self._episodes[copies] += 1
-        rngs = {copy: self._rngs[copy] for copy in copies.tolist()}
+        rngs, seeds = self._np_random, self._np_random_seed
         if isinstance(self._copies, BatchFamily):
-            self._copies._begin_episodes(copies, list(rngs.values()))
+            self._copies._begin_episodes(copies, [rngs[copy] for copy in copies])
             return
+        tasks, episodes = self._tasks.copy(), self._episodes.tolist()
         starts = {
-            copy: EpisodeStart(rng, self._tasks[copy].copy(), self._seeds[copy], episode)
-            for (copy, rng), episode in zip(rngs.items(), self._episodes[copies], strict=True)
+            copy: EpisodeStart(rngs[copy], tasks[copy], seeds[copy], episodes[copy])
+            for copy in copies.tolist()
         }
-        self._rngs |= self._copies.begin(starts)  # which have drawn, in other processes
+        for copy, drawn in self._copies.begin(starts).items():  # perhaps in other processes
+            rngs[copy] = drawn
 
 
-def _describe(steps: np.ndarray, episodes: np.ndarray, seeds: dict[int, int], copy: int) -> str:
+def _describe(steps: np.ndarray, episodes: np.ndarray, seeds: list[int], copy: int) -> str:
     return (
         f"step {steps[copy]} of episode {episodes[copy]} since reset(seed={seeds[copy]}) in "
         f"environment copy {copy}"

@@ -152,7 +152,7 @@ class RewardOfTheInfo(Reach):
 @pytest.mark.parametrize(
     ("env", "message"),
     [
-        (NoReward, r"has no compute_reward\(achieved_goal, desired_goal, info\)"),
+        (NoReward, r"compute_reward\(achieved_goal, desired_goal, info\) fails"),
         (
             NoGoals,
             r"space must be a Dict of .*'desired_goal', but is a Dict of \['observation'\]",
@@ -160,13 +160,13 @@ class RewardOfTheInfo(Reach):
         (lambda: gym.make("CartPole-v1"), "observation space must be a Dict"),
         (Pixels, "the space of 'observation' must be a flat Box"),
         (GoalsOfAnotherWidth, "must have the same shape"),
-        (Buttons, "the action space must be a Box"),
+        (Buttons, "action_space must be a flat .*Box"),
         (OneRewardAtATime, "fails for goals of shape"),
         (RewardOfTheInfo, "and an empty info: KeyError: 'energy'"),
     ],
 )
 def test_environments_that_are_not_goal_conditioned(env, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((ValueError, TypeError), match=message):
         GoalFamily(env)
 
 

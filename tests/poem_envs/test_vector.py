@@ -116,7 +116,7 @@ def test_interface(env_id):
         envs.step(np.zeros(envs.action_space.shape))
     observations, _ = envs.reset(seed=0)
     assert observations in envs.observation_space
-    assert envs.np_random_seed == (0, 1, 2)
+    assert envs.np_random_seed == [0, 1, 2]
     envs.close()
     envs.close()
 
