@@ -314,11 +314,19 @@ class FilmRenderer(StateRenderer):
         marks, camera = self.look.marks, self._camera
         if not marks:
             return []
-        width = 2 * HALF_HEIGHT * camera.distance * self._viewport.width / self._viewport.height
+        aspect = self._viewport.width / self._viewport.height
+        width = 2 * HALF_HEIGHT * camera.distance * aspect
         apart = next((far for far in MARK_DISTANCES if width / far <= MOST_MARKS), 100)
         add = self._add_metres if marks == "metres" else self._add_circles
-        labels = self._labels(add(start, width, apart))
-        return labels + (list(COMPASS) if marks == "compass" else [])
+        labels = add(start, width, apart)
+        away = np.array([place for _, place in labels]) - self._eye()
+        aside, upwards, beyond = self._axes @ away.T
+        depth = np.maximum(beyond, 1e-6)
+        x = (1 + aside / depth / HALF_HEIGHT / aspect) / 2
+        y = (1 + upwards / depth / HALF_HEIGHT) / 2
+        inside = (depth > 1e-3) & (np.abs(x - 0.5) < 0.4) & (np.abs(y - 0.5) < 0.42)
+        seen = [(labels[i][0], x[i], y[i]) for i in np.flatnonzero(inside)]
+        return seen + (list(COMPASS) if marks == "compass" else [])
 
     def _add_metres(
         self, start: np.ndarray, width: float, apart: int
@@ -355,17 +363,6 @@ class FilmRenderer(StateRenderer):
             self._add_shape(CYLINDER, place, size, BANDS[number % 2])
             labels.append((f"{apart * number} m", place + 0.7 * apart * number * beside))
         return labels
-
-    def _labels(self, labels: list[tuple[str, np.ndarray]]) -> list[tuple[str, float, float]]:
-        """Where in the picture words are whose places are in it."""
-        away = np.array([place for _, place in labels]) - self._eye()
-        aside, upwards, beyond = self._axes @ away.T
-        depth = np.maximum(beyond, 1e-6)
-        aspect = self._viewport.width / self._viewport.height
-        x = (1 + aside / depth / HALF_HEIGHT / aspect) / 2
-        y = (1 + upwards / depth / HALF_HEIGHT) / 2
-        inside = (depth > 1e-3) & (np.abs(x - 0.5) < 0.4) & (np.abs(y - 0.5) < 0.42)
-        return [(labels[i][0], x[i], y[i]) for i in np.flatnonzero(inside)]
 
     def _eye(self) -> np.ndarray:
         """Where the camera is, ``(3,)``."""

@@ -26,10 +26,6 @@ class _HalfCheetah(MujocoFamily):
         velocity = (self._qpos[:, 0] - qpos_before[:, 0]) / self.dt
         return np.stack([velocity, np.square(actions).sum(axis=1)], axis=1)
 
-    def visible_difference(self, left: np.ndarray, right: np.ndarray, spread: np.ndarray) -> float:
-        """See :class:`TaskFamily`: of the velocity; what actions cost is not seen."""
-        return super().visible_difference(left[:, :1], right[:, :1], spread[:1])
-
 
 class HalfCheetahVelEnv(_HalfCheetah):
     r"""

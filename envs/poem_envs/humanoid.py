@@ -92,15 +92,10 @@ class HumanoidDir2DEnv(DirectionFamily):
     healthy_z_range: tuple[float, float] = (1.0, 2.0)
     reset_noise_scale: float = 1e-2
 
-    def _derived_dim(self) -> int:
-        return (10 + 6 + 6) * self.model.nbody + self.model.nv
-
-    def _observation_dim(self) -> int:
-        return super()._observation_dim() + self._derived_dim()
-
     def _allocate(self, n: int) -> None:
         super()._allocate(n)
-        self._derived = np.zeros((n, self._derived_dim()))  # cinert, cvel, qfrc_actuator, cfrc_ext
+        # cinert, cvel, qfrc_actuator, cfrc_ext
+        self._derived = np.zeros((n, (10 + 6 + 6) * self.model.nbody + self.model.nv))
         self._centre_of_mass = np.zeros((n, 2))
         self._forward_data = mujoco.MjData(self.model)
 

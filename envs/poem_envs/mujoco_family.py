@@ -15,8 +15,6 @@ from poem_envs.films import MujocoFilms
 from poem_envs.mujoco_rendering import StateRenderer, arrow, renders_fast
 from poem_envs.vector import BatchFamily
 
-RENDER_MODES = ["human", "rgb_array", "depth_array", "rgbd_tuple"]
-
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class MujocoFamily(MujocoFilms, BatchFamily):
@@ -57,7 +55,7 @@ class MujocoFamily(MujocoFilms, BatchFamily):
     #: The following camera: attributes of ``mujoco.MjvCamera``.
     camera_config: ClassVar[dict[str, Any]] = {"distance": 4.0}
 
-    metadata = {"render_modes": RENDER_MODES}  # noqa: RUF012 (Gymnasium's way)
+    metadata = {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"]}  # noqa: RUF012
 
     xml_file: str
     frame_skip: int = 5
@@ -79,11 +77,11 @@ class MujocoFamily(MujocoFilms, BatchFamily):
         self.init_qpos, self.init_qvel = initial.qpos.copy(), initial.qvel.copy()
         self._renders_fast = renders_fast(self.render_quality, self.render_mode)
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.dt)}
-        low, high = self.model.actuator_ctrlrange.astype(np.float32).T
-        shape = (self._observation_dim(),)
-        self.observation_space = spaces.Box(-np.inf, np.inf, shape, np.float64)
-        self.action_space = spaces.Box(low, high, dtype=np.float32)
         super().__post_init__()
+        shape = self._observations().shape[1:]
+        self.observation_space = spaces.Box(-np.inf, np.inf, shape, np.float64)
+        low, high = self.model.actuator_ctrlrange.astype(np.float32).T
+        self.action_space = spaces.Box(low, high, dtype=np.float32)
 
     @property
     def dt(self) -> float:
@@ -107,9 +105,13 @@ class MujocoFamily(MujocoFilms, BatchFamily):
 
         :param qpos_before: ``(n, nq)``, where ``self._qpos`` are the positions after
         :param actions: ``(n, nu)``
-        :return: ``(n, reward_feature_dim)``, a new array
+        :return: ``(n, reward_feature_dim)``, a new array, the last of which is the cost of actions
         """
         raise NotImplementedError
+
+    def visible_difference(self, left: np.ndarray, right: np.ndarray, spread: np.ndarray) -> float:
+        """See :class:`TaskFamily`: of the velocity or place; what actions cost is not seen."""
+        return super().visible_difference(left[:, :-1], right[:, :-1], spread[:-1])
 
     def _unhealthy(self) -> np.ndarray:
         """Which copies end their episode now, ``(n,)``: none unless overridden."""
@@ -118,9 +120,6 @@ class MujocoFamily(MujocoFilms, BatchFamily):
     def _task_markers(self, task: np.ndarray, position: np.ndarray) -> list[dict[str, Any]]:
         """Shapes that show a task, as ``add_marker`` takes them; ``(3,)``, the robot's root."""
         raise NotImplementedError
-
-    def _observation_dim(self) -> int:
-        return self.model.nq - self.hidden_qpos + self.model.nv
 
     def _allocate(self, n: int) -> None:
         #: Of all copies, MuJoCo's mjSTATE_FULLPHYSICS: time, positions, velocities.
@@ -200,7 +199,7 @@ class MujocoFamily(MujocoFilms, BatchFamily):
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class LeggedFamily(MujocoFamily):
-    """A robot that ends its episode outside a range of heights; the last feature is the cost."""
+    """A robot that ends its episode outside a range of heights."""
 
     hidden_qpos = 2
     reward_feature_dim = 3
@@ -218,10 +217,6 @@ class LeggedFamily(MujocoFamily):
             return super()._unhealthy()
         (lowest, highest), height = self.healthy_z_range, self._qpos[:, 2]
         return ~(self.within(lowest, height) & self.within(height, highest))
-
-    def visible_difference(self, left: np.ndarray, right: np.ndarray, spread: np.ndarray) -> float:
-        """See :class:`TaskFamily`: of the velocity or place; what actions cost is not seen."""
-        return super().visible_difference(left[:, :-1], right[:, :-1], spread[:-1])
 
     def _marker_place(self, position: np.ndarray) -> np.ndarray:
         """Above the robot, ``(3,)``."""

@@ -177,7 +177,8 @@ class ImageWindow:
     def __init__(self, width: int, height: int, title: str) -> None:
         import glfw
 
-        self._glfw, self._window = glfw, None
+        self._glfw: Any = glfw
+        self._window: Any = None
         if glfw.init():
             glfw.window_hint(glfw.RESIZABLE, glfw.FALSE)
             self._window = glfw.create_window(width, height, title, None, None)

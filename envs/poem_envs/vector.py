@@ -294,8 +294,8 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         """Step every copy by ``(num_envs, action_dim)``; errors as of :meth:`TaskFamily.step`."""
         if self._tasks is None:
             raise ResetNeeded("step() was called before the first reset()")
-        single, shape = self.single_action_space, self.action_space.shape
-        actions = checked(actions, single, shape, "actions")
+        space = self.single_action_space
+        actions = checked(actions, space, (self.num_envs, *space.shape), "actions")
         self._elapsed_steps += 1
         features, terminations = self._copies._advance(actions)
         rewards = self.family.compute_rewards(self._tasks, features)
