@@ -9,7 +9,7 @@ import functools
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from gymnasium.envs.registration import register
+from gymnasium.envs.registration import load_env_creator, register, registry
 
 from poem_envs.family import TaskFamily
 from poem_envs.vector import BatchFamily, TaskFamilyVector, set_task
@@ -18,21 +18,19 @@ if TYPE_CHECKING:
     from poem_envs.goal_family import GoalFamily
 
 __all__ = ["BatchFamily", "GoalFamily", "TaskFamily", "TaskFamilyVector", "set_task"]
-#: Where what is loaded on first use is
-_MODULES = {"GoalFamily": "goal_family"}
 
 
 def __getattr__(name: str) -> Any:
-    single = name.replace("VectorEnv", "Env")
-    if single not in _MODULES:
+    if name == "GoalFamily":
+        return import_module("poem_envs.goal_family").GoalFamily
+    spec = registry.get(f"poem/{name.removesuffix('VectorEnv')}-v0")
+    if spec is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    family = getattr(import_module(f"poem_envs.{_MODULES[single]}"), single)
-    return family if single == name else functools.partial(TaskFamilyVector, family)
+    return functools.partial(TaskFamilyVector, load_env_creator(spec.entry_point))
 
 
 def _register(module: str, max_episode_steps: int, *names: str) -> None:
     for name in names:
-        _MODULES[f"{name}Env"] = module
         register(
             id=f"poem/{name}-v0",
             entry_point=f"poem_envs.{module}:{name}Env",

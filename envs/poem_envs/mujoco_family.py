@@ -189,7 +189,8 @@ class MujocoFamily(MujocoFilms, BatchFamily):
     def _film_model(self) -> mujoco.MjModel:
         return self.model
 
-    def _release(self) -> None:
+    def close(self) -> None:
+        """Free what rendering and simulation hold."""
         self._close_films()
         for held in (self._rollout, self._renderer):
             if held is not None:

@@ -125,7 +125,7 @@ class PointGoalEnv(BatchFamily):
             images.append(canvas.image())
         return images
 
-    def _release(self) -> None:
+    def close(self) -> None:
         if self._window is not None:
             self._window.close()
             self._window = None

@@ -218,7 +218,7 @@ class ProcessCopies:
                 except Exception as problem:
                     failures.append(problem)
         except BaseException:  # answers under way would be taken for later ones
-            self._release()
+            self.close()
             raise
         if failures:
             raise failures[0]
@@ -256,7 +256,7 @@ class ProcessCopies:
         group = next(group for group, copies in enumerate(self._copies) if copy in copies)
         return self._call("call", {group: (copy, "render")})[group]
 
-    def _release(self) -> None:
+    def close(self) -> None:
         for group in self._groups:
             group.close()
         self._groups = []

@@ -76,9 +76,6 @@ class BatchFamily(TaskFamily):
         """Render one copy, in one of Gymnasium's modes, with its task unless that is None."""
         raise NotImplementedError
 
-    def _release(self) -> None:
-        """Free threads, windows and the like. Called by ``close``, possibly more than once."""
-
     def _describe(self, copy: int) -> str:
         """Where a copy's episode is, for error messages."""
         return self._describe_episode()
@@ -100,10 +97,6 @@ class BatchFamily(TaskFamily):
             gym.logger.warn(f"render() was called {NO_RENDER_MODE}")
             return None
         return self._render_copy(0, self.render_mode, self._task if self.render_task else None)
-
-    def close(self) -> None:
-        """Free what rendering and simulation hold."""
-        self._release()
 
 
 def available_cores() -> int:
@@ -330,7 +323,7 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         return self._copies._render_copy(copy, self.render_mode, task)
 
     def close_extras(self, **kwargs: Any) -> None:
-        self._copies._release()
+        self._copies.close()
         self.family.close()
 
     def _begin(self, copies: np.ndarray) -> None:
