@@ -282,9 +282,7 @@ class FilmRenderer(StateRenderer):
         growth: float,
         lane: np.ndarray,
     ) -> None:
-        """Tint a robot, the moving shapes from the first on, move it into its lane, and let it
-        grow around its place.
-        """
+        """Tint a robot, the shapes from the first on, and let it grow, in a lane of its own."""
         for shape in self._scene.geoms[first : self._scene.ngeom]:
             if shape.category != mujoco.mjtCatBit.mjCAT_DYNAMIC:
                 continue

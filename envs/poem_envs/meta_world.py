@@ -22,14 +22,7 @@ PUCK_TO_GOAL = 0.15
 
 
 class MetaWorldEnv(MujocoFilms, TaskFamily):
-    """What ML1 and ML10 have in common: observations, actions, simulators and their rendering.
-
-    :param split: one of :attr:`splits`
-    :param width: of rendered images, pixels
-    :param height: of rendered images, pixels
-    :param camera_name: one of Meta-World's cameras
-    :param render_quality: "full", or "fast": without shadows and antialiasing, for RGB images alone
-    """
+    """What ML1 and ML10 have in common: observations, actions, simulators and their rendering."""
 
     #: The names of the sets that tasks can be drawn from, of which the first is for training.
     splits: tuple[str, ...]

@@ -101,11 +101,8 @@ class MujocoFamily(MujocoFilms, BatchFamily):
         return qpos, qvel
 
     def _reward_features(self, qpos_before: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """What the reward of the step just taken depends on.
-
-        :param qpos_before: ``(n, nq)``, where ``self._qpos`` are the positions after
-        :param actions: ``(n, nu)``
-        :return: ``(n, reward_feature_dim)``, a new array, the last of which is the cost of actions
+        """What the reward of the step just taken depends on, the cost of actions last: a new array
+        ``(n, reward_feature_dim)``, of positions before ``(n, nq)`` and of those that are now.
         """
         raise NotImplementedError
 

@@ -20,10 +20,7 @@ LEFT_OUT = [FLAGS.mjRND_SHADOW.value, FLAGS.mjRND_REFLECTION.value, FLAGS.mjRND_
 class StateRenderer:
     """Renders states as Gymnasium's ``MujocoRenderer`` does; its own camera follows the root. The
     model's settings of rendering are changed. A graphics context belongs to the thread that
-    rendered first; render from no other.
-
-    :param fast: without shadows, reflections, haze or details, fast without a graphics card
-    :param view: further arguments of ``MujocoRenderer``
+    rendered first; render from no other. Fast is without shadows, reflections, haze or details.
     """
 
     def __init__(

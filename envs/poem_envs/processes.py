@@ -170,9 +170,8 @@ def _end_worker(connection: Connection, process: subprocess.Popen[bytes]) -> Non
 
 
 class ProcessCopies:
-    """What :class:`~poem_envs.TaskFamilyVector` asks of copies, of ``n`` in ``nthread`` processes.
-
-    :param space: of their observations
+    """What :class:`~poem_envs.TaskFamilyVector` asks of copies, of ``n`` in ``nthread`` processes,
+    whose observations are of a space.
     """
 
     def __init__(

@@ -16,10 +16,7 @@ INSTALL = "pip install 'sb3_poem[metaworld]'"
 
 
 def load_metaworld() -> Any:
-    """Meta-World's table of environments, the module ``metaworld.env_dict``.
-
-    :raises ImportError: if Meta-World is absent, or of a version whose environments differ
-    """
+    """The module ``metaworld.env_dict``, of a version whose environments are known."""
     needed = "the Meta-World families need metaworld >= 3.1, < 4"
     try:
         found = version("metaworld")
@@ -39,11 +36,7 @@ def manipulation_names() -> list[str]:
 
 
 def checked_manipulation(env_name: str) -> str:
-    """The name of a manipulation, without ``-v3``.
-
-    :param env_name: with it or without
-    :raises ValueError: if there is none of that name; the message lists the nearest
-    """
+    """The name of a manipulation, with ``-v3`` or without, as one without."""
     known, name = manipulation_names(), str(env_name).removesuffix("-v3")
     if name in known:
         return name
@@ -58,12 +51,8 @@ class Sawyer:
     Meta-World's own reset leaves some starts depending on the episode before: it computes them from
     data that the simulator has not brought up to date since objects were moved. Here a reset is
     what Meta-World does in an environment that has just been made, bit for bit, however often it
-    was used before.
-
-    :param manipulation: its name, without ``-v3``
-    :param renders_fast: see :class:`~poem_envs.mujoco_rendering.StateRenderer`
-    :param render_arguments: ``render_mode``, ``camera_name``, ``width`` and ``height``, as
-        Meta-World has them
+    was used before. Arguments of rendering are Meta-World's ``render_mode``, ``camera_name``,
+    ``width`` and ``height``.
     """
 
     def __init__(
@@ -80,12 +69,8 @@ class Sawyer:
         self._placement: np.ndarray | None = None
 
     def reset(self, placement: np.ndarray, show_goal: bool = False) -> np.ndarray:
-        """Begin an episode.
-
-        :param placement: Meta-World's ``rand_vec``, ``(placement_dim,)``
-        :param show_goal: whether rendering shows where the goal is
-        :return: the observation, ``(39,)``
-        :raises ValueError: if Meta-World would redraw the placement
+        """Begin an episode of a placement, Meta-World's ``rand_vec``; returns the observation. A
+        ValueError says that Meta-World would redraw the placement.
         """
         env = self.env
         # The first pass moves bodies in the model, from which the second one computes.
@@ -101,11 +86,8 @@ class Sawyer:
         return observation
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool]:
-        """Take a step.
-
-        :param action: ``(4,)`` float64
-        :return: the observation ``(39,)``, Meta-World's reward, and whether the step was a success
-        :raises FloatingPointError: if the simulation diverges
+        """Observation, Meta-World's reward, and whether the step was a success; a
+        FloatingPointError says that the simulation diverged.
         """
         env = self.env
         before = env.data.time
@@ -116,7 +98,6 @@ class Sawyer:
         return observation, float(reward), bool(info["success"])
 
     def render(self) -> Any:
-        """An image ``(height, width, 3)`` uint8, or what else ``render_mode`` says."""
         env = self.env
         if env.render_mode is not None:
             prepared_viewer(env.mujoco_renderer, env.render_mode, self.arguments["renders_fast"])
@@ -177,7 +158,7 @@ class Placements:
         return np.array(env._last_rand_vec, dtype=np.float64)
 
     def check(self, placement: np.ndarray) -> None:
-        """:raises ValueError: if Meta-World would redraw the placement"""
+        """Raise a ValueError if Meta-World would redraw the placement."""
         self._sawyer.env._get_state_rand_vec = self._sawyer._take_placement
         self._sawyer._placement = placement.copy()
         self._sawyer.env.reset_model()

@@ -152,13 +152,10 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
     ) -> None:
         super().__init__()
         self.closed = True  # until there is something to close
-        for name, number, none in (
-            ("num_envs", num_envs, ""),
-            ("nthread", nthread, ", or None for all cores"),
-            ("max_episode_steps", max_episode_steps, ", or None for no limit"),
-        ):
+        numbers = {"num_envs": num_envs, "nthread": nthread, "max_episode_steps": max_episode_steps}
+        for name, number in numbers.items():
             if number is not None and number < 1:
-                raise ValueError(f"{name}={number!r} must be at least 1{none}")
+                raise ValueError(f"{name}={number!r} must be at least 1")
         nthread = nthread or available_cores()
         if render_mode is not None:
             family_kwargs["render_mode"] = render_mode
@@ -308,17 +305,14 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
             self.render()
         return observations, rewards, terminations, truncations, infos
 
-    def render(self) -> tuple[Any, ...] | None:
+    def render(self) -> tuple[Any, ...]:
         """Render every copy as ``render_mode`` says, and return the images."""
-        if self.render_mode is None:
-            gym.logger.warn(f"render() was called {NO_RENDER_MODE}")
-            return None
         return tuple(self.render_copy(copy) for copy in range(self.num_envs))
 
     def render_copy(self, copy: int) -> Any:
         """What :meth:`render` would hold for one copy, by number."""
         if self.render_mode is None:
-            raise ValueError(f"render_copy() was called {NO_RENDER_MODE}")
+            raise ValueError(f"render() was called {NO_RENDER_MODE}")
         task = self._tasks[copy] if self.family.render_task and self._tasks is not None else None
         return self._copies._render_copy(copy, self.render_mode, task)
 

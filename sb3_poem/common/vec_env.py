@@ -148,9 +148,7 @@ class TaskVecEnv(VecEnv):
             what = "but this method assumes it is `rgb_array` to obtain images."
             warnings.warn(f"The render mode is {self.render_mode}, {what}", stacklevel=2)
             return [None] * self.num_envs
-        images = self.vector_env.render()
-        assert images is not None
-        return images
+        return self.vector_env.render()
 
     def __repr__(self) -> str:
         spec = self.vector_env.spec
