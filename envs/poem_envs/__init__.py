@@ -26,7 +26,8 @@ def __getattr__(name: str) -> Any:
     spec = registry.get(f"poem/{name.removesuffix('VectorEnv')}-v0")
     if spec is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return functools.partial(TaskFamilyVector, load_env_creator(spec.entry_point))
+    family: Any = load_env_creator(str(spec.entry_point))
+    return functools.partial(TaskFamilyVector, family)
 
 
 def _register(module: str, max_episode_steps: int, *names: str) -> None:

@@ -128,14 +128,8 @@ class AntFwdBackEnv(_Ant, DirectionFamily):
     features are $(v_x, v_y, \|action\|_2^2)$.
 
     ## Arguments
-    | Parameter               | Type      | Default | Description                       |
-    | ----------------------- | --------- | ------- | --------------------------------- |
-    | `forward_reward_weight` | **float** | `1.0`   | Weight of the speed term          |
-    | `healthy_reward`        | **float** | `1.0`   | Added to the reward of every step |
-    | `ctrl_cost_weight`      | **float** | `0.5`   | Weight of the action cost         |
-
-    The others are those of :class:`AntVelEnv`, but for `forward_reward_offset`.
-    `render_task=True` shows the hidden task: an arrow.
+    Those of :class:`AntVelEnv`, but for `forward_reward_offset`; by default `healthy_reward=1.0`
+    and `ctrl_cost_weight=0.5`. `render_task=True` shows the hidden task: an arrow.
     """
 
     task_space = spaces.Box(0.0, np.pi, (1,), np.float64)
@@ -190,14 +184,9 @@ class AntGoalEnv(_Ant):
     :class:`AntVelEnv`. `gymnasium.make` truncates episodes after 200 steps.
 
     ## Arguments
-    | Parameter                  | Type      | Default | Description                     |
-    | -------------------------- | --------- | ------- | ------------------------------- |
-    | `distance_reward_weight`   | **float** | `1.0`   | Weight of the distance term     |
-    | `ctrl_cost_weight`         | **float** | `0.1`   | Weight of the action cost       |
-    | `terminate_when_unhealthy` | **bool**  | `False` | Whether a fall ends the episode |
-
-    `healthy_z_range`, `reset_noise_scale` and further arguments are those of :class:`AntVelEnv`.
-    `render_task=True` shows the hidden task: a pole at the goal.
+    `distance_reward_weight=1.0` is the weight of the distance term. The others are those of
+    :class:`AntVelEnv`, but for its terms of the reward; by default `ctrl_cost_weight=0.1` and
+    `terminate_when_unhealthy=False`. `render_task=True` shows the hidden task: a pole at the goal.
     """
 
     hidden_qpos = 0
