@@ -40,8 +40,14 @@ class AntVelEnv(_Ant):
 
     ## Action Space
     The action space is a `Box(-1, 1, (8,), float32)`: torques at the hinge joints in N m, scaled by
-    each motor's gear, of hip and ankle of each leg: back right (`hip_4`, `ankle_4`), front left
-    (`hip_1`, `ankle_1`), front right (`hip_2`, `ankle_2`), back left (`hip_3`, `ankle_3`).
+    each motor's gear.
+
+    | Num  | Action                               | Control Min | Control Max | XML name       |
+    | ---- | ------------------------------------ | ----------- | ----------- | -------------- |
+    | 0, 1 | torques on back right hip and ankle  | -1          | 1           | hip_4, ankle_4 |
+    | 2, 3 | torques on front left hip and ankle  | -1          | 1           | hip_1, ankle_1 |
+    | 4, 5 | torques on front right hip and ankle | -1          | 1           | hip_2, ankle_2 |
+    | 6, 7 | torques on back left hip and ankle   | -1          | 1           | hip_3, ankle_3 |
 
     ## Observation Space
     The observation space is a `Box(-Inf, Inf, (27,), float64)`: positions without x and y, then
@@ -77,6 +83,11 @@ class AntVelEnv(_Ant):
     `terminate_when_unhealthy=False`. `gymnasium.make` truncates episodes after 200 steps.
 
     ## Arguments
+    ```python
+    import gymnasium as gym
+    env = gym.make("poem_envs:poem/AntVel-v0", ctrl_cost_weight=0.005)
+    ```
+
     | Parameter                  | Type      | Default      | Description                       |
     | -------------------------- | --------- | ------------ | --------------------------------- |
     | `forward_reward_weight`    | **float** | `1.0`        | Weight of the speed term          |
@@ -128,8 +139,19 @@ class AntFwdBackEnv(_Ant, DirectionFamily):
     features are $(v_x, v_y, \|action\|_2^2)$.
 
     ## Arguments
-    Those of :class:`AntVelEnv`, but for `forward_reward_offset`; by default `healthy_reward=1.0`
-    and `ctrl_cost_weight=0.5`. `render_task=True` shows the hidden task: an arrow.
+    ```python
+    import gymnasium as gym
+    env = gym.make("poem_envs:poem/AntFwdBack-v0", ctrl_cost_weight=0.5)
+    ```
+
+    | Parameter               | Type      | Default | Description                       |
+    | ----------------------- | --------- | ------- | --------------------------------- |
+    | `forward_reward_weight` | **float** | `1.0`   | Weight of the speed term          |
+    | `healthy_reward`        | **float** | `1.0`   | Added to the reward of every step |
+    | `ctrl_cost_weight`      | **float** | `0.5`   | Weight of the action cost         |
+
+    The others are those of :class:`AntVelEnv`, but for `forward_reward_offset`.
+    `render_task=True` shows the hidden task: an arrow.
     """
 
     task_space = spaces.Box(0.0, np.pi, (1,), np.float64)
@@ -184,9 +206,19 @@ class AntGoalEnv(_Ant):
     :class:`AntVelEnv`. `gymnasium.make` truncates episodes after 200 steps.
 
     ## Arguments
-    `distance_reward_weight=1.0` is the weight of the distance term. The others are those of
-    :class:`AntVelEnv`, but for its terms of the reward; by default `ctrl_cost_weight=0.1` and
-    `terminate_when_unhealthy=False`. `render_task=True` shows the hidden task: a pole at the goal.
+    ```python
+    import gymnasium as gym
+    env = gym.make("poem_envs:poem/AntGoal-v0", ctrl_cost_weight=0.1)
+    ```
+
+    | Parameter                  | Type      | Default | Description                     |
+    | -------------------------- | --------- | ------- | ------------------------------- |
+    | `distance_reward_weight`   | **float** | `1.0`   | Weight of the distance term     |
+    | `ctrl_cost_weight`         | **float** | `0.1`   | Weight of the action cost       |
+    | `terminate_when_unhealthy` | **bool**  | `False` | Whether a fall ends the episode |
+
+    `healthy_z_range`, `reset_noise_scale` and further arguments are those of :class:`AntVelEnv`.
+    `render_task=True` shows the hidden task: a pole at the goal.
     """
 
     hidden_qpos = 0

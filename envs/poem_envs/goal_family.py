@@ -27,7 +27,7 @@ class GoalFamily(TaskFamily):
 
     The environment must be what HER takes: observations are a dictionary of ``"observation"``,
     ``"achieved_goal"`` and ``"desired_goal"``, and ``compute_reward(achieved_goal, desired_goal,
-    info)`` is its reward, sparse or dense, of many goals ``(n, goal_dim)`` too. Then
+    info)`` is its reward, sparse or dense. Then
 
     - the observation is ``"observation"``, and ``"achieved_goal"`` behind it if asked for;
       ``"desired_goal"`` is left out;
@@ -39,6 +39,11 @@ class GoalFamily(TaskFamily):
     >>> env = GoalFamily("gymnasium_robotics:FetchSlide-v4")
     >>> env.observation_space.shape, env.task_space.shape, env.max_episode_steps
     ((28,), (3,), 50)
+
+    So that an id makes it::
+
+        slide = {"env": "gymnasium_robotics:FetchSlide-v4"}
+        gym.register("my/FetchSlide-v0", entry_point=GoalFamily, kwargs=slide)
 
     The environment's resets must depend on their seed alone. Its time limit is the family's too
     (:attr:`max_episode_steps`), unless the family is registered with another or ``gym.make`` is
@@ -102,8 +107,8 @@ class GoalFamily(TaskFamily):
         boxes = [(own[key].low, own[key].high) for key in self._observed]
         low, high = (np.concatenate(b).astype(np.float64) for b in zip(*boxes, strict=True))
         self.observation_space = spaces.Box(low, high, dtype=np.float64)
-        self.action_space = self.env.action_space  # type: ignore[assignment]
-        self._check_reward()
+        self.action_space = self.env.action_space  # type: ignore[assignment]  # see check_goal_env
+        self._rewards_broadcast = self._check_reward()
 
     def _make(self) -> gym.Env:
         if "gymnasium_robotics" in (str(self._source).partition(":")[0], *sys.modules):
@@ -145,27 +150,36 @@ class GoalFamily(TaskFamily):
         truncated = self._spec is None and self._elapsed_steps >= (self.max_episode_steps or np.inf)
         return observation, reward, terminated, truncated, info
 
-    def _check_reward(self) -> None:
-        """Refuse a ``compute_reward`` that does not take many goals at once."""
+    def _check_reward(self) -> bool:
+        """Whether ``compute_reward``, which it tries, takes many goals at once."""
         goals = self._goals_of_resets(self.env, range(2))
-        self._place_goal(goals[0])
         try:
-            together, alone = self._reward(goals[0], goals), self._reward(goals[0], goals[1])
+            one_by_one = [self._own_reward(goals[i : i + 1], goals[:1]) for i in range(2)]
         except Exception as error:
             raise ValueError(
-                f"{self.env}: {REWARD} fails for goals of shape (n, {goals.shape[1]}) and an empty "
-                f"info: {type(error).__name__}: {error}. It must be a function of the two goals, "
-                "as that of gymnasium_robotics.core.GoalEnv is"
+                f"{self.env}: {REWARD} fails for goals of shape (1, {goals.shape[1]}) and an empty "
+                f"info: {type(error).__name__}: {error}. It must be a function of the two goals"
             ) from error
-        if together[1] != alone:
-            raise ValueError(f"{self.env}: {REWARD} of many goals must give each its own reward")
+        self._place_goal(goals[0])
+        try:
+            together = self._own_reward(goals, goals[[0, 0]])
+        except Exception:
+            return False
+        return together.shape == (2,) and np.array_equal(together, np.concatenate(one_by_one))
+
+    def _own_reward(self, achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
+        compute_reward: Callable[..., Any] = self.env.compute_reward  # type: ignore[attr-defined]
+        return np.atleast_1d(np.asarray(compute_reward(achieved, desired, {}), dtype=np.float64))
 
     def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
         tasks, features = np.broadcast_arrays(tasks, features)
         desired = np.ascontiguousarray(tasks).reshape(-1, tasks.shape[-1])
         achieved = np.ascontiguousarray(features).reshape(desired.shape)
-        compute_reward: Callable[..., Any] = self.env.compute_reward  # type: ignore[attr-defined]
-        rewards = np.asarray(compute_reward(achieved, desired, {}), dtype=np.float64)
+        if self._rewards_broadcast:
+            rewards = self._own_reward(achieved, desired)
+        else:
+            pairs = zip(achieved[:, None], desired[:, None], strict=True)
+            rewards = np.array([self._own_reward(*pair)[0] for pair in pairs])
         return rewards.reshape(tasks.shape[:-1])
 
     def _draw_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
@@ -332,4 +346,11 @@ def check_goal_env(env: gym.Env) -> None:
         raise ValueError(
             f"{bare}: 'achieved_goal' and 'desired_goal' must have the same shape, but have "
             f"{achieved} and {desired}"
+        )
+    if not isinstance(env.action_space, spaces.Box):
+        raise ValueError(f"{bare}: the action space must be a Box, but is {env.action_space}")
+    if not callable(getattr(bare, "compute_reward", None)):
+        raise ValueError(
+            f"{bare} has no {REWARD}, by which rewards of other goals are computed; define it as "
+            "gymnasium_robotics.core.GoalEnv does"
         )

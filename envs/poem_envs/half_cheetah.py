@@ -40,8 +40,12 @@ class HalfCheetahVelEnv(_HalfCheetah):
 
     ## Action Space
     The action space is a `Box(-1, 1, (6,), float32)`: torques at the hinge joints in N m, scaled by
-    each motor's gear, of back thigh, shin and foot (`bthigh`, `bshin`, `bfoot`), then of front
-    thigh, shin and foot.
+    each motor's gear.
+
+    | Num   | Action                           | Control Min | Control Max | XML name             |
+    | ----- | -------------------------------- | ----------- | ----------- | -------------------- |
+    | 0 - 2 | torques: back thigh, shin, foot  | -1          | 1           | bthigh, bshin, bfoot |
+    | 3 - 5 | torques: front thigh, shin, foot | -1          | 1           | fthigh, fshin, ffoot |
 
     ## Observation Space
     The observation space is a `Box(-Inf, Inf, (17,), float64)`: positions without the x-coordinate,
@@ -72,6 +76,11 @@ class HalfCheetahVelEnv(_HalfCheetah):
     There is no early end. `gymnasium.make` truncates episodes after 200 steps.
 
     ## Arguments
+    ```python
+    import gymnasium as gym
+    env = gym.make("poem_envs:poem/HalfCheetahVel-v0", ctrl_cost_weight=0.05)
+    ```
+
     | Parameter               | Type      | Default | Description                              |
     | ----------------------- | --------- | ------- | ---------------------------------------- |
     | `forward_reward_weight` | **float** | `1.0`   | Weight of the speed term                 |

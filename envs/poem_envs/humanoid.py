@@ -29,8 +29,15 @@ class HumanoidDir2DEnv(DirectionFamily):
 
     ## Action Space
     The action space is a `Box(-0.4, 0.4, (17,), float32)`: torques at the hinge joints in N m,
-    scaled by each motor's gear, of abdomen (y, z, x), right hip (x, z, y) and knee, left hip and
-    knee, right shoulder (1, 2) and elbow, left shoulder and elbow.
+    scaled by each motor's gear.
+
+    | Num     | Action                                         | Control Min | Control Max |
+    | ------- | ---------------------------------------------- | ----------- | ----------- |
+    | 0 - 2   | torques on the abdomen (y, z, x)               | -0.4        | 0.4         |
+    | 3 - 6   | torques on the right hip (x, z, y) and knee    | -0.4        | 0.4         |
+    | 7 - 10  | torques on the left hip (x, z, y) and knee     | -0.4        | 0.4         |
+    | 11 - 13 | torques on the right shoulder (1, 2) and elbow | -0.4        | 0.4         |
+    | 14 - 16 | torques on the left shoulder (1, 2) and elbow  | -0.4        | 0.4         |
 
     ## Observation Space
     The observation space is a `Box(-Inf, Inf, (376,), float64)`, in the layout of Gymnasium's
@@ -65,6 +72,11 @@ class HumanoidDir2DEnv(DirectionFamily):
     unless `terminate_when_unhealthy=False`. `gymnasium.make` truncates episodes after 200 steps.
 
     ## Arguments
+    ```python
+    import gymnasium as gym
+    env = gym.make("poem_envs:poem/HumanoidDir2D-v0", ctrl_cost_weight=0.1)
+    ```
+
     | Parameter                  | Type      | Default      | Description                       |
     | -------------------------- | --------- | ------------ | --------------------------------- |
     | `forward_reward_weight`    | **float** | `1.25`       | Weight of the speed term          |

@@ -22,7 +22,13 @@ PUCK_TO_GOAL = 0.15
 
 
 class MetaWorldEnv(MujocoFilms, TaskFamily):
-    """What ML1 and ML10 have in common: observations, actions, simulators and their rendering."""
+    """What ML1 and ML10 have in common: observations, actions, simulators and their rendering.
+
+    :param width: of rendered images, pixels
+    :param height: of rendered images, pixels
+    :param camera_name: one of Meta-World's cameras
+    :param render_quality: "full", or "fast": without shadows and antialiasing, for RGB images alone
+    """
 
     #: The names of the sets that tasks can be drawn from, of which the first is for training.
     splits: tuple[str, ...]
@@ -180,6 +186,11 @@ class MetaWorldML1Env(MetaWorldEnv):
 
     ## Arguments
     The extra `metaworld` is needed: `pip install 'sb3_poem[metaworld]'`.
+
+    ```python
+    import gymnasium as gym
+    env = gym.make("poem_envs:poem/MetaWorldML1-v0", env_name="push")
+    ```
 
     | Parameter         | Type     | Default     | Description                                  |
     | ----------------- | -------- | ----------- | -------------------------------------------- |

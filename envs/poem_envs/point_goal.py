@@ -48,6 +48,11 @@ class PointGoalEnv(BatchFamily):
     There is no early end. `gymnasium.make` truncates episodes after 25 steps.
 
     ## Arguments
+    ```python
+    import gymnasium as gym
+    env = gym.make("poem_envs:poem/PointGoal-v0", step_length=0.05)
+    ```
+
     | Parameter           | Type      | Default | Description                                  |
     | ------------------- | --------- | ------- | -------------------------------------------- |
     | `step_length`       | **float** | `0.05`  | Distance that an action of 1 moves the point |

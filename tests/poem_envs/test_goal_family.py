@@ -103,6 +103,15 @@ class OneRewardAtATime(Reach):
         )
 
 
+def test_a_reward_function_for_one_goal_at_a_time_is_called_for_one_after_another(rng):
+    family = GoalFamily(OneRewardAtATime)
+    goals, achieved = rng.uniform(-1, 1, (5, 2)), rng.uniform(-1, 1, (4, 2))
+    expected = [[-(abs(a[0] - g[0]) + abs(a[1])) for a in achieved] for g in goals]
+    assert family.compute_rewards(goals[:, None], achieved[None]) == pytest.approx(
+        np.array(expected)
+    )
+
+
 def test_what_the_observation_holds():
     family, without = GoalFamily(Reach), GoalFamily(Reach, observe_achieved_goal=False)
     assert family.observation_space.shape == (4,)
@@ -152,7 +161,7 @@ class RewardOfTheInfo(Reach):
 @pytest.mark.parametrize(
     ("env", "message"),
     [
-        (NoReward, r"compute_reward\(achieved_goal, desired_goal, info\) fails"),
+        (NoReward, r"has no compute_reward\(achieved_goal, desired_goal, info\)"),
         (
             NoGoals,
             r"space must be a Dict of .*'desired_goal', but is a Dict of \['observation'\]",
@@ -160,13 +169,12 @@ class RewardOfTheInfo(Reach):
         (lambda: gym.make("CartPole-v1"), "observation space must be a Dict"),
         (Pixels, "the space of 'observation' must be a flat Box"),
         (GoalsOfAnotherWidth, "must have the same shape"),
-        (Buttons, "action_space must be a flat .*Box"),
-        (OneRewardAtATime, "fails for goals of shape"),
+        (Buttons, "the action space must be a Box"),
         (RewardOfTheInfo, "and an empty info: KeyError: 'energy'"),
     ],
 )
 def test_environments_that_are_not_goal_conditioned(env, message):
-    with pytest.raises((ValueError, TypeError), match=message):
+    with pytest.raises(ValueError, match=message):
         GoalFamily(env)
 
 
