@@ -32,12 +32,31 @@ class BatchFamily(TaskFamily):
     A subclass defines the methods below, and ``_reward``. It sets what :class:`TaskFamily` asks for
     in its class, in the constructor, which hands all that it does not know to ``super().__init__``,
     or, as a dataclass whose fields are its arguments, in ``__post_init__``.
-    ``poem_envs/point_goal.py`` is the smallest example.
 
-    >>> from poem_envs.point_goal import PointGoalEnv
-    >>> envs = TaskFamilyVector(PointGoalEnv, num_envs=3)
+    >>> class Drift(BatchFamily):
+    ...     observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    ...     action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+    ...     task_space = spaces.Box(-1.0, 1.0, (1,), np.float64)
+    ...     reward_feature_dim = 1
+    ...
+    ...     def _allocate(self, n):
+    ...         self.x = np.zeros((n, 1))
+    ...
+    ...     def _begin_episodes(self, copies, rngs):
+    ...         self.x[copies] = 0.0
+    ...
+    ...     def _advance(self, actions):
+    ...         self.x += 0.1 * actions
+    ...         return self.x.copy(), np.zeros(len(actions), dtype=bool)
+    ...
+    ...     def _observations(self):
+    ...         return self.x.copy()
+    ...
+    ...     def _reward(self, tasks, features):
+    ...         return -np.abs(features[..., 0] - tasks[..., 0])
+    >>> envs = TaskFamilyVector(Drift, num_envs=3)
     >>> envs.reset(seed=0)[0].shape
-    (3, 2)
+    (3, 1)
     """
 
     render_mode: str | None = None
@@ -305,14 +324,17 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
             self.render()
         return observations, rewards, terminations, truncations, infos
 
-    def render(self) -> tuple[Any, ...]:
+    def render(self) -> tuple[Any, ...] | None:
         """Render every copy as ``render_mode`` says, and return the images."""
+        if self.render_mode is None:
+            gym.logger.warn(f"render() was called {NO_RENDER_MODE}")
+            return None
         return tuple(self.render_copy(copy) for copy in range(self.num_envs))
 
     def render_copy(self, copy: int) -> Any:
         """What :meth:`render` would hold for one copy, by number."""
         if self.render_mode is None:
-            raise ValueError(f"render() was called {NO_RENDER_MODE}")
+            raise ValueError(f"render_copy() was called {NO_RENDER_MODE}")
         task = self._tasks[copy] if self.family.render_task and self._tasks is not None else None
         return self._copies._render_copy(copy, self.render_mode, task)
 
