@@ -22,11 +22,10 @@ from stable_baselines3.common.vec_env import VecEnv
 from poem_envs.registration import plain_id
 from sb3_poem.common.buffers import ContextStore, Segment, TaskReplayBuffer
 from sb3_poem.common.checks import check_number
-from sb3_poem.common.digest import digest_of
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.files import write_atomically
 from sb3_poem.common.foreign import environment_of
-from sb3_poem.common.networks import RunningNorm
+from sb3_poem.common.networks import RunningNorm, digest_of
 from sb3_poem.common.precision import hidden_dtype
 from sb3_poem.common.random import Generators
 from sb3_poem.common.trajectory import Trajectory

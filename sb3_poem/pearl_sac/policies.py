@@ -14,7 +14,6 @@ from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
 from sb3_poem.common.buffers import Segment
-from sb3_poem.common.decoding import decoded_sums
 from sb3_poem.common.networks import (
     ContextEncoder,
     LatentActor,
@@ -183,7 +182,7 @@ class LatentPolicy(SACPolicy):
             lengths.append(len(steps))
             shares.append(len(trajectory) / len(steps))
         embeddings = self.reward_embedding(self.tensor(np.atleast_2d(latents)))
-        sums = decoded_sums(self.decoder.mlp, th.cat(rows), lengths, embeddings, dtype).double()
+        sums = self.decoder.sums(th.cat(rows), lengths, embeddings, dtype).double()
         norm = self.reward_norm
         sums = sums * norm.std + norm.mean * sums.new_tensor(lengths)
         return (sums * sums.new_tensor(shares)).cpu().numpy()
