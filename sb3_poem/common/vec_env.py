@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
+from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
@@ -22,8 +22,8 @@ from poem_envs.vector import TaskFamilyVector
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.family_view import no_family
 
-# What these do, the vectorised environment or TaskVecEnv does itself.
-ABSORBED_WRAPPERS = (TimeLimit, OrderEnforcing, PassiveEnvChecker, Monitor)
+# What these do, the vectorised environment or TaskVecEnv does itself
+ABSORBED_WRAPPERS = ("TimeLimit", "OrderEnforcing", "PassiveEnvChecker", "Monitor")
 MAKE_VEC_ARGUMENTS = frozenset({"max_episode_steps", "nthread", "num_envs", "vectorization_mode"})
 #: What TaskVecEnv reads of a vectorised environment's infos by itself
 READ_INFOS = {"reward_features", "final_obs", "_final_obs"}
@@ -283,12 +283,6 @@ class _Copy:
         return getattr(self._vector_env.family, name)
 
 
-def _is_absorbed(wrapper: gym.Wrapper) -> bool:
-    # An import of rl_zoo3 replaces Gymnasium's TimeLimit by a subclass.
-    patched = isinstance(wrapper, TimeLimit) and type(wrapper).__module__ == "rl_zoo3.gym_patches"
-    return patched or type(wrapper) in ABSORBED_WRAPPERS
-
-
 def _vectorised(
     bare: gym.Env, wrappers: list[gym.Wrapper], num_envs: int, nthread: int | None
 ) -> TaskFamilyVector:
@@ -296,9 +290,11 @@ def _vectorised(
     instead = "use DummyVecEnv instead of TaskVecEnv"
     if not isinstance(bare, TaskFamily):
         raise ValueError(no_family(str(bare)))
-    foreign = [type(wrapper).__name__ for wrapper in wrappers if not _is_absorbed(wrapper)]
+    names = [type(wrapper).__name__ for wrapper in wrappers]
+    # an import of rl_zoo3 patches Gymnasium's TimeLimit
+    foreign = [name for name in names if name.removeprefix("Patched") not in ABSORBED_WRAPPERS]
     if foreign:
-        allowed = ", ".join(kind.__name__ for kind in ABSORBED_WRAPPERS)
+        allowed = ", ".join(ABSORBED_WRAPPERS)
         raise ValueError(
             f"the environment is wrapped in {', '.join(foreign)}, but only {allowed} can be "
             f"vectorised; {instead}"
