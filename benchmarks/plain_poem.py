@@ -25,9 +25,6 @@ def fields(model: POEMSAC, batch: MetaBatch) -> list[th.Tensor]:
     of: rewards, observations and discounts. Observations are standardised.
     """
     data, ahead, standardise = batch.transitions, batch.bootstraps, model.policy.standardise
-    if ahead is None:
-        discounts = model.gamma * (1.0 - data.terminated)
-        ahead = Bootstraps(data.rewards, data.next_observations, discounts)
     seen = standardise(data.observations), data.actions, standardise(data.next_observations)
     return [*seen, data.rewards, ahead.rewards, standardise(ahead.observations), ahead.discounts]
 

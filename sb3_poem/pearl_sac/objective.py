@@ -40,7 +40,6 @@ class Objective:
     actor_trains_encoder: ClassVar[bool] = False
 
     policy: LatentPolicy
-    gamma: float
     reward_scale: th.Tensor
     reward_variance: th.Tensor
     relabel_fraction: float
@@ -93,13 +92,9 @@ class Objective:
         """Half the squared soft Bellman error of all critics; it trains the encoder too."""
         policy, n = self.policy, transitions.rewards.shape[1]
         z = rows(embeddings.latents, n)
-        if batch.bootstraps is None:
-            rewards, next_obs = transitions.rewards, transitions.next_observations
-            discounts = self.gamma * (1.0 - transitions.terminated)
-        else:
-            rewards, next_obs, discounts = batch.bootstraps
-            next_obs = policy.standardise(next_obs)
+        rewards, next_obs, discounts = batch.bootstraps
         with th.no_grad():
+            next_obs = policy.standardise(next_obs)
             next_embedding, noise = rows(embeddings.policy, n), batch.next_action_noise
             next_actions, next_log_prob = policy.actor(next_obs, next_embedding, noise)
             next_values = policy.critic_target(next_obs, next_actions, z).amin(dim=0)

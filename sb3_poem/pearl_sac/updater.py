@@ -168,5 +168,4 @@ def prepare_optimizers(optimizers: list[th.optim.Optimizer], device: th.device) 
 
 def tensors(batch: tuple[Any, ...]) -> list[th.Tensor]:
     """All tensors of a meta-batch."""
-    parts = (tensors(part) if isinstance(part, tuple) else [part] for part in batch)
-    return [tensor for tensor in chain(*parts) if tensor is not None]
+    return list(chain(*(tensors(part) if isinstance(part, tuple) else [part] for part in batch)))
