@@ -15,7 +15,7 @@ from torch import nn
 from torch.nn.functional import binary_cross_entropy_with_logits, mse_loss, softplus
 
 from sb3_poem import POEMSAC
-from sb3_poem.pearl_sac.sampler import Bootstraps, MetaBatch
+from sb3_poem.pearl_sac.sampler import MetaBatch
 
 TRANSITIONS_PER_TASK = 2_000
 

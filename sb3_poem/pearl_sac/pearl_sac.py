@@ -31,9 +31,8 @@ from sb3_poem.common.random import Generators
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.hub import upload
 from sb3_poem.pearl_sac import saving
-from sb3_poem.pearl_sac.arguments import check_arguments, refuse_unknown
+from sb3_poem.pearl_sac.arguments import GivenEnv, check_arguments, refuse_unknown, vectorise
 from sb3_poem.pearl_sac.collector import CollectionStoppedError, EpochCollector, concatenate
-from sb3_poem.pearl_sac.environments import GivenEnv, vectorise
 from sb3_poem.pearl_sac.objective import Objective, rows
 from sb3_poem.pearl_sac.policies import OBSERVATION_CLIP, LatentPolicy, MlpPolicy
 from sb3_poem.pearl_sac.sampler import MetaBatchSampler
