@@ -26,15 +26,13 @@ TEST_TASK_STREAM = 0x7E57
 COMPARED_STEPS = 10
 
 #: These leave alone what is seen, done and paid; the patched one is rl_zoo3's.
-HARMLESS = frozenset(
-    {
-        *("HumanRendering", "Monitor", "OrderEnforcing", "PassiveEnvChecker", "PatchedTimeLimit"),
-        *("RecordEpisodeStatistics", "RecordVideo", "RenderCollection", "TimeLimit"),
-        *("VecCheckNan", "VecMonitor", "VecVideoRecorder"),
-    }
-)
+HARMLESS = {
+    *("HumanRendering", "Monitor", "OrderEnforcing", "PassiveEnvChecker", "PatchedTimeLimit"),
+    *("RecordEpisodeStatistics", "RecordVideo", "RenderCollection", "TimeLimit"),
+    *("VecCheckNan", "VecMonitor", "VecVideoRecorder"),
+}
 #: All others of Gymnasium and Stable-Baselines3 may change it, as may these kinds.
-CHANGING = frozenset({*gym.wrappers.__all__, *sb3_vec_env.__all__}) - HARMLESS
+CHANGING = {*gym.wrappers.__all__, *sb3_vec_env.__all__} - HARMLESS
 CHANGING_KINDS = (gym.ObservationWrapper, gym.RewardWrapper, gym.ActionWrapper)
 
 
@@ -51,7 +49,7 @@ class WrapperError(ValueError):
 
 
 def no_family(env: str) -> str:
-    """What to say of an environment that is no task family, but describes itself so."""
+    """What to say of an environment that describes itself so."""
     return (
         f"env {env} is no task family: an environment whose reward depends on a hidden task. "
         "Subclass poem_envs.TaskFamily, or make one of a goal-conditioned environment by "
@@ -131,7 +129,14 @@ class FamilyView:
 
     def unknown_wrappers(self) -> list[str]:
         """The names of wrappers that may change the family; refuses those that are known to."""
-        env, names = self.env, self._wrapper_names()
+        env, names = self.env, []  # outermost first
+        while isinstance(env, VecEnvWrapper):
+            names.append(type(env).__name__)
+            env = env.venv
+        for chain in dict.fromkeys(env.env_method("__str__")):  # which SubprocVecEnv gives too
+            words = re.findall(r"<([^<>]+)", chain)
+            names += words[: -1 if words and words[-1].endswith(" instance") else -2]
+        names = list(dict.fromkeys(names))
         changing = [name for name in names if name in CHANGING]
         changing += [kind.__name__ for kind in CHANGING_KINDS if any(env.env_is_wrapped(kind))]
         if changing:
@@ -139,21 +144,10 @@ class FamilyView:
             raise WrapperError(f"env must not be wrapped in {changing[0]} (it is in: {wrappers})")
         return [name for name in names if name not in HARMLESS]
 
-    def _wrapper_names(self) -> list[str]:
-        """Of the wrappers around the environment and around its copies, outermost first."""
-        env, names = self.env, []
-        while isinstance(env, VecEnvWrapper):
-            names.append(type(env).__name__)
-            env = env.venv
-        for chain in dict.fromkeys(env.env_method("__str__")):  # which SubprocVecEnv gives too
-            words = re.findall(r"<([^<>]+)", chain)
-            names += words[: -1 if words and words[-1].endswith(" instance") else -2]
-        return list(dict.fromkeys(names))
-
     def check_experience(self, tasks: np.ndarray, seed: int, segment: Segment) -> None:
         """Refuse rewards that are not :meth:`compute_rewards`'s, and unknown wrappers that change
-        the family, by a segment of these tasks (copies, task_dim) from a reset with this seed. The
-        first call looks, and the others take its word.
+        the family, by a segment of these tasks (copies, task_dim) from a reset with this seed: the
+        first that it is shown.
         """
         if self._experience_is_right:
             return
@@ -256,8 +250,7 @@ class FamilyView:
             env.env_method("set_task", task, indices=[index])
 
     def seed_episodes(self, seeds: Sequence[int]) -> None:
-        """Seed every copy's next episode, one seed a copy, without touching its task, the one that
-        was chosen for the next reset if there is one.
+        """Seed every copy's next episode, one seed a copy, without touching its task.
 
         A family that was never given a task draws one whenever it is reset with a seed. So its
         generators are replaced, and its next reset needs no seed; copies that have none to replace

@@ -26,13 +26,12 @@ def rollout_latents(
     environment has copies; in the order of the latents.
 
     Every rollout resets its copy with a seed of its own: of policies that act by their mode it
-    depends on its latent, task and seed alone, not on the copy or on how many there are, and two
-    with equal seeds start alike (common random numbers). Action noise is drawn for a wave of copies
-    together. A copy's first episode alone is kept; the environment keeps the tasks and the state
-    that it ended in.
+    depends on its latent, task and seed alone, and two with equal seeds start alike (common random
+    numbers). Action noise is drawn for a wave of copies together. A copy's first episode alone is
+    kept; the environment keeps the tasks and the state that it ended in.
 
     :param model: Anything with SB3's ``predict(obs, state=latents, deterministic=...)``.
-    :param latents: (n, latent_dim), any n.
+    :param latents: (n, latent_dim).
     :param tasks: (n, task_dim) to set before each rollout; None keeps the environment's own tasks.
     :param seed: One seed a rollout, or one integer s: then rollout i takes s + i.
     :param deterministic: Whether the policies act by their mode.
@@ -77,7 +76,6 @@ def _episodes(
     frames: int = 0,
     max_steps: int | None = None,
 ) -> Iterator[tuple[Trajectory, bool | None]]:
-    """Of every latent, and whether it was a success."""
     latents = np.asarray(latents, dtype=np.float64)
     n, copies = len(latents), vec_env.num_envs
     if latents.ndim != 2:
@@ -120,7 +118,7 @@ def _wave(
     first: int,
     n: int,
 ) -> Iterator[tuple[Trajectory, bool | None]]:
-    """An episode of each of ``n`` copies, of which the first has this number."""
+    """An episode of each of ``n`` copies, the first of which has this number."""
     copies = len(latents)
     running, lengths = np.arange(copies) < n, np.zeros(copies, dtype=np.int64)
     successes: list[bool | None] = [None] * copies
@@ -138,7 +136,7 @@ def _wave(
             if running[copy] and image is not None:
                 images[copy].append(np.asarray(image))
 
-    observations = finite(_flat(vec_env.reset()), 0, "an observation")
+    observations = finite(np.asarray(vec_env.reset()), 0, "an observation")
     seen, taken, features = [observations.copy()], [], []
     if frames:
         render()
@@ -146,7 +144,7 @@ def _wave(
         actions, _ = model.predict(observations, state=latents, deterministic=deterministic)
         taken.append(np.array(finite(actions, step, "an action")))
         stepped, _, dones, infos = vec_env.step(actions)
-        observations = _flat(stepped)
+        observations = np.asarray(stepped)
         if (given := reward_features(vec_env, infos)) is not None:
             features.append(np.array(given, dtype=np.float64))
         after = observations.copy()
@@ -174,7 +172,3 @@ def _wave(
             frames=images[row] if frames else None,
         )
         yield trajectory, successes[row]
-
-
-def _flat(observations: Any) -> np.ndarray:
-    return observations.reshape(len(observations), -1)

@@ -4,7 +4,6 @@ import copy
 import dataclasses
 import functools
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -91,7 +90,7 @@ class TaskVecEnv(VecEnv):
 
     @property
     def tasks(self) -> np.ndarray | None:
-        """The tasks in effect, ``(num_envs, task_dim)``; None before the first reset."""
+        """The tasks in effect, (num_envs, task_dim); None before the first reset."""
         return self.vector_env.tasks
 
     def set_tasks(self, tasks: npt.ArrayLike) -> None:
@@ -144,13 +143,8 @@ class TaskVecEnv(VecEnv):
             self._monitor.results_writer.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        if self.render_mode != "rgb_array":
-            what = "but this method assumes it is `rgb_array` to obtain images."
-            warnings.warn(f"The render mode is {self.render_mode}, {what}", stacklevel=2)
-            return [None] * self.num_envs
-        images = self.vector_env.render()
-        assert images is not None
-        return images
+        images = self.vector_env.render() if self.render_mode == "rgb_array" else None
+        return [None] * self.num_envs if images is None else images
 
     def __repr__(self) -> str:
         spec = self.vector_env.spec
@@ -168,8 +162,7 @@ class TaskVecEnv(VecEnv):
             )
         if attr_name in ("task", "tasks"):
             raise AttributeError(
-                f"{attr_name!r} cannot be set; use set_tasks(tasks), which takes effect at the "
-                "next reset"
+                f"{attr_name!r} cannot be set; set_tasks takes those of next resets"
             )
         self.vector_env.set_attribute(attr_name, value)
 
