@@ -136,7 +136,7 @@ def _wave(
             if running[copy] and image is not None:
                 images[copy].append(np.asarray(image))
 
-    observations = finite(np.asarray(vec_env.reset()), 0, "an observation")
+    observations = finite(np.asarray(vec_env.reset()).reshape(copies, -1), 0, "an observation")
     seen, taken, features = [observations.copy()], [], []
     if frames:
         render()
@@ -144,7 +144,7 @@ def _wave(
         actions, _ = model.predict(observations, state=latents, deterministic=deterministic)
         taken.append(np.array(finite(actions, step, "an action")))
         stepped, _, dones, infos = vec_env.step(actions)
-        observations = np.asarray(stepped)
+        observations = np.asarray(stepped).reshape(copies, -1)
         if (given := reward_features(vec_env, infos)) is not None:
             features.append(np.array(given, dtype=np.float64))
         after = observations.copy()

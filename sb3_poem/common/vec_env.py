@@ -161,9 +161,7 @@ class TaskVecEnv(VecEnv):
                 "set for all of them"
             )
         if attr_name in ("task", "tasks"):
-            raise AttributeError(
-                f"{attr_name!r} cannot be set; set_tasks takes those of next resets"
-            )
+            raise AttributeError(f"{attr_name!r} cannot be set; use set_tasks(tasks)")
         self.vector_env.set_attribute(attr_name, value)
 
     def env_method(
