@@ -37,10 +37,8 @@ def hidden_dtype(precision: str, device_type: str) -> th.dtype:
 
 class MixedPrecision:
     """Runs the hidden layers of all rectified perceptrons of a module in another arithmetic, on
-    weights that stay float32.
-
-    Within the context, copies of the layers compute; :meth:`refresh` brings them up to date. Their
-    gradients are added to those of the weights. Float32 changes nothing.
+    weights that stay float32: within the context, copies of the layers compute, and give the
+    weights their gradients. Float32 changes nothing.
     """
 
     def __init__(self, module: nn.Module, dtype: th.dtype) -> None:
@@ -139,8 +137,8 @@ class LowPrecisionMLP:
         trained: bool,
         wanted: bool,
     ) -> th.Tensor | None:
-        """From an output's gradient the input's, if ``wanted``, and where ``trained`` those of the
-        float32 parameters: the first since they changed replaces what was there.
+        """From an output's gradient the input's, if ``wanted``; where ``trained``, parameters get
+        theirs.
         """
         g, last, weight = grad.to(self.dtype), values[-1], self.out_weight
         if self.layer_norm:

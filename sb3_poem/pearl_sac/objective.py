@@ -13,7 +13,7 @@ Metrics = dict[str, th.Tensor]
 
 
 class TaskEmbeddings(NamedTuple):
-    """Latents of a meta-batch, and what actor and decoder see of them; each (tasks, latent_dim)."""
+    """Latents, and what actor and decoder see of them; each (tasks, latent_dim)."""
 
     latents: th.Tensor
     policy: th.Tensor
@@ -76,7 +76,6 @@ class Objective:
         return latents, kl_to_prior(mean, variance).mean()
 
     def embed(self, latents: th.Tensor) -> TaskEmbeddings:
-        """What actor and decoder see of latents (tasks, latent_dim)."""
         policy, seen = self.policy, latents if self.actor_trains_encoder else latents.detach()
         embeddings = policy.policy_embedding(seen), policy.reward_embedding(latents)
         return TaskEmbeddings(latents, *embeddings)

@@ -7,7 +7,7 @@ import time
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 import torch as th
@@ -40,7 +40,6 @@ from sb3_poem.pearl_sac.train_tasks import TrainTasks
 from sb3_poem.pearl_sac.updater import EntropyCoefficient, Updater
 from sb3_poem.resources import config_file, zoo_entry
 
-SelfPEARLSAC = TypeVar("SelfPEARLSAC", bound="PEARLSAC")
 Part = TypeVar("Part")
 
 #: Transitions of each task on which the decoder is measured
@@ -93,22 +92,19 @@ class PEARLSAC(SAC):
     :param relabel_fraction: Share of each task's batch that comes from other tasks' buffers, with
         rewards relabelled. Needs a family with shared dynamics; None: 0.5 of those, else 0
     :param context_relabel_fraction: Share of the contexts in a gradient step that hold other tasks'
-        transitions, with rewards relabelled. Without any, the encoder may read a task from what its
-        policy does rather than from the rewards, and is then at a loss when it sees a new task's
-        first rollouts. Needs a family with shared dynamics; None: 0.5 of those, else 0
+        transitions, with rewards relabelled: without any, the encoder may read a task from what its
+        policy does. Needs a family with shared dynamics; None: 0.5 of those, else 0
     :param reward_scale: Factor on the rewards that the critics learn; "auto" divides by the
         deviation of the first epoch's, or leaves them as they are where these do not differ;
         "per-task" divides each task's by their root mean square in its replay buffer, so that tasks
         whose rewards are small are learned beside those whose rewards are large
     :param n_steps: Steps of rewards in the critics' targets before the value takes over; more carry
-        rewards back faster, and rely more on what older policies, and with ``relabel_fraction``
-        other tasks', did
+        rewards back faster, and rely more on what other policies did
     :param shaping_coef: From 0 to 1, how far the critics learn what is gained beyond staying where
         one is: their rewards are shaped (Ng, Harada & Russell, ICML 1999) with this share of the
-        family's potential over 1 - ``gamma``. Which policies are best stays as it is; where an
-        action changes values by a small part of their spread, as on the way to a place, they are
-        learned sooner. Action values, those in POEM's contexts too, are then without that share.
-        Needs a family with a potential
+        family's potential over 1 - ``gamma``. Which policies are best stays as it is; on the way to
+        a place they are learned sooner. Action values, those in POEM's contexts too, are then
+        without that share. Needs a family with a potential
     :param policy_delay: Gradient steps of critics and encoder for each of everything else, that is
         the actor, the decoder, the embeddings and the entropy coefficient (as in TD3)
     :param horizon: Steps of an episode; None takes the environment's time limit
@@ -233,7 +229,6 @@ class PEARLSAC(SAC):
         super().__init__(**inherited)
 
     def _check_arguments(self, given: Mapping[str, Any]) -> None:
-        """Refuse the first that is outside its range."""
         check_arguments(given, type(self))
 
     def __repr__(self) -> str:
@@ -261,7 +256,6 @@ class PEARLSAC(SAC):
         self.generators = generators  # a model that is loaded goes on with its own
 
     def _complete_policy_kwargs(self) -> None:
-        """Give the policy what follows from the model's own arguments."""
         self.policy_kwargs.pop("use_sde", None)
         self.policy_kwargs["latent_dim"] = self.latent_dim
 
@@ -280,7 +274,7 @@ class PEARLSAC(SAC):
         return ours
 
     @classmethod
-    def from_zoo(cls: type[SelfPEARLSAC], env_id: str, **arguments: Any) -> SelfPEARLSAC:
+    def from_zoo(cls, env_id: str, **arguments: Any) -> Self:
         """A new model with the hyperparameters that ship for an environment (``zoo_configs/``), as
         ``sb3-poem train`` makes it. :meth:`learn` then knows for how many steps.
 
@@ -309,14 +303,14 @@ class PEARLSAC(SAC):
     # ------------------------------------------------------------------ learning: Algorithm 1
 
     def learn(
-        self: SelfPEARLSAC,
+        self,
         total_timesteps: int | None = None,
         callback: MaybeCallback = None,
         log_interval: int | None = 1,
         tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
-    ) -> SelfPEARLSAC:
+    ) -> Self:
         """Train, in whole epochs, until at least ``total_timesteps`` environment steps are done.
 
         :param total_timesteps: None takes those of the entry that :meth:`from_zoo` read
@@ -349,7 +343,6 @@ class PEARLSAC(SAC):
         return self
 
     def _checked_steps(self, total_timesteps: int | None, callback: MaybeCallback) -> int:
-        """How many steps to train for, said aloud where ``verbose``."""
         total = self.n_timesteps if total_timesteps is None else total_timesteps
         if total is None:
             raise ValueError(
@@ -477,11 +470,11 @@ class PEARLSAC(SAC):
         self.logger.record("train/decoder_error", self.predicted_rewards_error)
 
     def resume(
-        self: SelfPEARLSAC,
+        self,
         callback: MaybeCallback = None,
         log_interval: int | None = 1,
         progress_bar: bool = False,
-    ) -> SelfPEARLSAC:
+    ) -> Self:
         """Finish the ``learn`` that a checkpoint interrupted, up to its own ``total_timesteps``."""
         remaining = self._total_timesteps - self.num_timesteps
         if remaining <= 0:
@@ -506,7 +499,6 @@ class PEARLSAC(SAC):
         return kind(**{name: getattr(self, name) for name in names}, **others)
 
     def make_collector(self, callback: BaseCallback) -> EpochCollector:
-        """What collects an epoch, and tells a callback of every step."""
         num_envs = self.family.num_envs
 
         def on_step(step_locals: dict[str, Any]) -> bool:
@@ -529,11 +521,9 @@ class PEARLSAC(SAC):
         )
 
     def make_sampler(self) -> MetaBatchSampler:
-        """What draws meta-batches."""
         return self._part(self.sampler_class, epoch_context=self._known_context)
 
     def make_objective(self) -> Objective:
-        """What gradient steps minimise."""
         rewards = self._known_context.rewards
         if self.reward_scale == "per-task":
             sizes = self.replay_buffer.reward_magnitudes()
@@ -548,7 +538,6 @@ class PEARLSAC(SAC):
         return self._part(self.objective_class, reward_scale=scale, reward_variance=variance)
 
     def make_updater(self) -> Updater:
-        """What takes gradient steps."""
         return self._part(Updater, objective=self.make_objective(), n_updates=self._n_updates)
 
     @property
@@ -697,9 +686,8 @@ class PEARLSAC(SAC):
         """
         own = self.replay_buffer
         super().load_replay_buffer(path, truncate_last_traj)
-        loaded = self.replay_buffer
-        same_rows = getattr(loaded, "widths", None) == own.widths
-        if not (same_rows and np.array_equal(loaded.tasks, own.tasks)):
+        tasks, widths = getattr(self.replay_buffer, "tasks", ()), own.widths
+        if not np.array_equal(tasks, own.tasks) or self.replay_buffer.widths != widths:
             self.replay_buffer = own
             raise ValueError(
                 f"{path} is the experience of other tasks than this model's training tasks, which "
@@ -708,7 +696,7 @@ class PEARLSAC(SAC):
 
     @classmethod
     def load(
-        cls: type[SelfPEARLSAC],
+        cls,
         path: str | pathlib.Path | io.BufferedIOBase,
         env: GivenEnv | None = None,
         device: th.device | str = "auto",
@@ -716,7 +704,7 @@ class PEARLSAC(SAC):
         print_system_info: bool = False,
         force_reset: bool = True,
         **kwargs: Any,
-    ) -> SelfPEARLSAC:
+    ) -> Self:
         """As SB3's. ``env`` may be a registered id too, see :meth:`set_env`. Further arguments are
         the constructor's; a ``seed`` begins new random streams.
 
@@ -745,16 +733,15 @@ class PEARLSAC(SAC):
 
     @classmethod
     def load_checkpoint(
-        cls: type[SelfPEARLSAC],
+        cls,
         path: str | pathlib.Path,
         env: GivenEnv | None = None,
         device: th.device | str = "auto",
-    ) -> SelfPEARLSAC:
+    ) -> Self:
         """Read what :meth:`save_checkpoint` or :class:`TrainingCheckpointCallback` wrote;
         :meth:`resume` then continues the run, in an environment with as many copies.
 
-        :raises ValueError: if the file is truncated or of another algorithm, or env of another
-            family
+        :raises ValueError: if the file is truncated or foreign, or env of another family
         """
         if not saving.is_checkpoint(path):
             raise ValueError(f"{path} is truncated, or no checkpoint of sb3_poem")
@@ -796,11 +783,11 @@ class PEARLSAC(SAC):
 
     @classmethod
     def from_pretrained(
-        cls: type[SelfPEARLSAC],
+        cls,
         folder: str | pathlib.Path,
         env: GivenEnv | None = None,
         device: th.device | str = "auto",
-    ) -> SelfPEARLSAC:
+    ) -> Self:
         """Read what :meth:`save_pretrained` or :meth:`push_to_hub` wrote.
 
         :param folder: The folder, the name of a shipped model, or ``"user/name"`` on the Hugging

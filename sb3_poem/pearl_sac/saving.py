@@ -183,12 +183,20 @@ def model_contents(
         tensors[name] = th.as_tensor(getattr(model.train_tasks, field))
     for name, box in boxes.items():
         tensors[f"{name}.low"], tensors[f"{name}.high"] = map(th.as_tensor, (box.low, box.high))
+    # those with which training goes on; a schedule's place takes its default
+    names = [*kept_arguments(type(model)), "target_entropy", "ent_coef"]
+    arguments = {name: getattr(model, name) for name in names}
+    coefficient = model.entropy_coefficient
+    if coefficient.optimizer is not None:
+        arguments["ent_coef"] = f"auto_{coefficient.value.item():.9g}"
+    if not callable(model.learning_rate):
+        arguments["learning_rate"] = model.learning_rate
     config: dict[str, Any] = {
         "format": FORMAT,
         "algorithm": model.algorithm,
         **{name: getattr(model, name) for name in FACTS},
         "n_updates": model._n_updates,
-        "arguments": _arguments(model),
+        "arguments": arguments,
         **{name: getattr(policy, name) for name in POLICY_FACTS},
         **{name: getattr(policy, name).__name__ for name in CLASSES},
         "predicted_rewards_error": None if np.isnan(error) else error,  # NaN is no JSON
@@ -197,18 +205,6 @@ def model_contents(
         **{name: {"dtype": str(box.dtype)} for name, box in boxes.items()},
     }
     return config, {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-
-
-def _arguments(model: Any) -> dict[str, Any]:
-    """Arguments with which training goes on; a schedule's place takes its default."""
-    names = [*kept_arguments(type(model)), "target_entropy", "ent_coef"]
-    arguments = {name: getattr(model, name) for name in names}
-    coefficient = model.entropy_coefficient
-    if coefficient.optimizer is not None:
-        arguments["ent_coef"] = f"auto_{coefficient.value.item():.9g}"
-    if isinstance(model.learning_rate, (int, float)):
-        arguments["learning_rate"] = model.learning_rate
-    return arguments
 
 
 def config_text(config: dict[str, Any]) -> str:
