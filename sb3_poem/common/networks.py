@@ -37,11 +37,7 @@ class Normalised(nn.Module):
 
 
 class RunningNorm(nn.Module):
-    """Standardises by the mean and deviation of all rows that it was shown.
-
-    :param width: Entries of a row
-    :param clip: Bound on standardised values; None for none
-    """
+    """Standardises rows by the mean and deviation of all that it was shown, to within ``clip``."""
 
     #: Deviations below it count as this
     MIN_STD = 1e-3
@@ -78,11 +74,7 @@ class RunningNorm(nn.Module):
 
 
 class MLP(nn.Module):
-    """Multi-layer perceptron.
-
-    :param net_arch: Widths of the hidden layers
-    :param layer_norm: Whether hidden layers are normalised before the activation
-    """
+    """Multi-layer perceptron; ``layer_norm`` normalises hidden layers before the activation."""
 
     def __init__(
         self,
