@@ -32,11 +32,10 @@ def rollout_latents(
 
     :param model: Anything with SB3's ``predict(obs, state=latents, deterministic=...)``.
     :param latents: (n, latent_dim).
-    :param tasks: (n, task_dim) to set before each rollout; None keeps the environment's own tasks.
+    :param tasks: (n, task_dim) to set before each rollout; None keeps the environment's own.
     :param seed: One seed a rollout, or one integer s: then rollout i takes s + i.
     :param deterministic: Whether the policies act by their mode.
-    :param frames: Whether to render every step, or n to render every n-th; the environment needs
-        ``render_mode="rgb_array"``.
+    :param frames: Whether to render every step, or n to render every n-th.
     :param max_steps: Where an episode is cut; None takes ``model.horizon``.
     :raises ValueError: If a latent, an observation or an action is not finite.
     """

@@ -161,9 +161,8 @@ def vectorise(
     trajectories_per_task: int = 1,
     **env_kwargs: Any,
 ) -> GymEnv | None:
-    """An environment as SB3 takes it. A registered id becomes ``n_copies`` with these arguments:
-    unless given, :func:`default_copies`; of a family without a vectorised version, as many as
-    :func:`make_task_vec_env` steps in turn.
+    """An environment as SB3 takes it. A registered id becomes ``n_copies`` with these arguments;
+    None: as many as are worth while.
     """
     if isinstance(env, gym.vector.VectorEnv):
         return as_task_vec_env(env)

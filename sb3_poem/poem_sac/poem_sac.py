@@ -111,11 +111,8 @@ class POEMSAC(PEARLSAC):
     trains them (eqs. 6, 7); contexts of the current policies with their action values (eq. 8); an
     encoder that learns from the actor as well.
 
-    Differences from the paper: twin target critics and a learned entropy coefficient, as SB3's SAC
-    has them, instead of a value network; a replay buffer that outlives the epoch for the critics
-    and the actor, while contexts and preference labels are the last epoch's only; the critics' loss
-    trains the encoder too, as in PEARL.
-
+    Differences from the paper are those of SAC and PEARL: twin target critics, a learned entropy
+    coefficient, a replay buffer that outlives the epoch, a critics' loss that trains the encoder.
     Of the arguments of :class:`PEARLSAC` it lacks ``context_relabel_fraction`` (contexts are of the
     task's own policy, eq. 8), and defaults of the losses' weights are others.
 
@@ -209,7 +206,7 @@ class POEMSAC(PEARLSAC):
 
     @property
     def relabels(self) -> bool:
-        """Whether J[i, j] comes from relabelling, rather than from rollouts."""
+        """Whether J[i, j] comes from relabelling."""
         if self.preference_source == "auto":
             return self.family.shared_dynamics
         return self.preference_source == "relabel"
