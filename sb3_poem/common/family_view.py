@@ -1,5 +1,6 @@
 """What an algorithm needs to know of a task family, asked of any SB3 ``VecEnv`` of it."""
 
+import copy
 import re
 from collections.abc import Sequence
 from functools import cached_property
@@ -161,10 +162,10 @@ class FamilyView:
             )
         wrong = np.argwhere(~np.isclose(segment.rewards, expected, rtol=1e-5, atol=1e-6))
         if len(wrong):
-            copy, step = wrong[0]
+            row, step = wrong[0]
             what = (
-                f"env paid {segment.rewards[copy, step]:.6g} at step {step} of copy {copy}, but "
-                f'compute_rewards(task, info["reward_features"]) is {expected[copy, step]:.6g}'
+                f"env paid {segment.rewards[row, step]:.6g} at step {step} of copy {row}, but "
+                f'compute_rewards(task, info["reward_features"]) is {expected[row, step]:.6g}'
             )
             if wrappers:
                 raise WrapperError(f"{what}, by one of its wrappers {wrappers}")
@@ -176,9 +177,9 @@ class FamilyView:
     def _lives_through(self, task: np.ndarray, seed: int, segment: Segment) -> bool:
         """Whether the family without its wrappers repeats the first copy's experience."""
         if self.env_id is None:
-            wrappers = self._unknown_wrappers
-            raise WrapperError(f"register env, so that a copy tells whether {wrappers} change it")
-        twin: Any = gym.make(self.env_id, disable_env_checker=True, **self.env_kwargs).unwrapped
+            twin: Any = copy.deepcopy(self._get("unwrapped"))
+        else:
+            twin = gym.make(self.env_id, disable_env_checker=True, **self.env_kwargs).unwrapped
         low, high = twin.action_space.low, twin.action_space.high
         twin.set_task(task)
         seen = [twin.reset(seed=seed)[0]]
@@ -260,8 +261,8 @@ class FamilyView:
         if any(seed is not None for seed in env.unwrapped._seeds):
             env.reset()  # as make_vec_env seeds, to choose tasks, not these episodes
         if not hasattr(env, "keep_tasks"):
-            for copy, seed in enumerate(seeds):
-                env.set_attr("np_random", np.random.default_rng(seed), indices=[copy])
+            for index, seed in enumerate(seeds):
+                env.set_attr("np_random", np.random.default_rng(seed), indices=[index])
             return
         if env.tasks is None:  # nobody has chosen yet, so that the first seeds do
             seed_copies(env, seeds)

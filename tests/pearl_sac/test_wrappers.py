@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium import wrappers
+from gymnasium import spaces, wrappers
 from meta_toys import EPOCH, POINT_GOAL, Walk, assert_same_model, small
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
@@ -37,21 +37,31 @@ class Wet(gym.ActionWrapper):
         return 0.5 * action
 
 
+class EvenWalk(Walk):
+    """The opposite of an action is one too."""
+
+    action_space = spaces.Box(-3.0, 3.0, (1,), np.float32)
+
+
 class Own(gym.Wrapper):
     """A wrapper of nobody's knowledge, which changes one thing."""
 
     def __init__(self, env: gym.Env, what: str = "nothing") -> None:
         super().__init__(env)
         self.what = what
+        if what == "shape":
+            self.observation_space = spaces.Box(-np.inf, np.inf, (4,), np.float64)
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(**kwargs)
-        return observation + (self.what == "start"), info
+        shown = {"start": observation + 1, "shape": np.tile(observation, 2)}
+        return shown.get(self.what, observation), info
 
     def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         observation, reward, *rest = self.env.step(-action if self.what == "action" else action)
         reward += 0.01 * (self.what == "reward")
-        return 2 * observation if self.what == "observation" else observation, reward, *rest
+        shown = {"observation": 2 * observation, "shape": np.tile(observation, 2)}
+        return shown.get(self.what, observation), reward, *rest
 
 
 class OwnVec(VecEnvWrapper):
@@ -153,9 +163,13 @@ def test_in_subprocesses(wrap: Wrap, message: str) -> None:
         ),
     ],
 )
-def test_unknown_wrappers_are_refused_by_the_first_experience(what: str, message: str) -> None:
+@pytest.mark.parametrize("registered", [True, False])
+def test_unknown_wrappers_are_refused_by_the_first_experience(
+    what: str, message: str, registered: bool
+) -> None:
     """Before a gradient step: there is no such experience among what is learned from."""
-    model = small(POEMSAC, Own(gym.make(POINT_GOAL), what))
+    family = gym.make(POINT_GOAL) if registered else gym.wrappers.TimeLimit(EvenWalk(edge=0.5), 25)
+    model = small(POEMSAC, Own(family, what), horizon=25)
     with pytest.raises(ValueError, match=message):
         model.learn(EPOCH)
     assert model._n_updates == 0
@@ -168,9 +182,9 @@ def test_unknown_wrappers_around_the_vectorised_environment() -> None:
             small(POEMSAC, OwnVec(env)).learn(EPOCH)
 
 
-def test_of_an_unregistered_family_nobody_knows_what_a_wrapper_changes() -> None:
-    with pytest.raises(ValueError, match="register env, so that a copy tells whether Own"):
-        small(POEMSAC, Own(Walk()), horizon=5).learn(EPOCH)
+def test_another_space_is_refused_by_its_observations() -> None:
+    with pytest.raises(ValueError, match="env's wrappers Own change what is seen or done"):
+        small(POEMSAC, Own(gym.make(POINT_GOAL), "shape")).learn(EPOCH)
 
 
 def test_a_family_that_does_not_pay_what_it_computes() -> None:
