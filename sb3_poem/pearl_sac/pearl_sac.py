@@ -232,8 +232,7 @@ class PEARLSAC(SAC):
         check_arguments(given, type(self))
 
     def __repr__(self) -> str:
-        env_id, steps = getattr(self, "env_id", None), self.num_timesteps
-        return f"{type(self).__name__}({env_id}, {steps:,} steps trained)"
+        return f"{type(self).__name__}({self.env_id}, {self.num_timesteps:,} steps trained)"
 
     def _setup_model(self) -> None:
         generators = self.generators.to(self.device)
@@ -486,11 +485,6 @@ class PEARLSAC(SAC):
             self.dump_logs()
             self._logs_pending = False
 
-    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
-        """The last epoch may overshoot the total; a schedule must not turn negative there."""
-        steps = min(num_timesteps, total_timesteps)
-        super()._update_current_progress_remaining(steps, total_timesteps)
-
     # ------------------------------------------------------------------ the parts
 
     def _part(self, kind: type[Part], **others: Any) -> Part:
@@ -509,7 +503,8 @@ class PEARLSAC(SAC):
             dones = step_locals["dones"]
             if dones.any():  # what it looks for comes with an episode's end
                 self._update_info_buffer(step_locals["infos"], dones)
-            self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+            total = self._total_timesteps  # which the last epoch may overshoot
+            self._update_current_progress_remaining(min(self.num_timesteps, total), total)
             self._episode_num += int(dones.sum())
             return True
 
