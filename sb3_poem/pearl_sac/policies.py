@@ -10,7 +10,7 @@ import numpy.typing as npt
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
@@ -256,10 +256,19 @@ class LatentPolicy(SACPolicy):
         if not np.all(np.isfinite(latents)):
             raise ValueError(f"state holds NaN or infinity: {latents}")
         latents = np.array(np.broadcast_to(latents, (n, d)))
-        noise = None if deterministic else th.randn(n, *self.action_space.shape, device=self.device)
-        actions = self.unscale_action(self.acting_on(latents)(obs, noise))
+        actions = self.unscale_action(self.acting_on(latents)(obs, self._noise(n, deterministic)))
         actions = np.clip(actions, self.action_space.low, self.action_space.high)
         return (actions[0] if single else actions), latents
+
+    def _noise(self, n: int, deterministic: bool) -> th.Tensor | None:
+        shape = (n, *self.action_space.shape)
+        return None if deterministic else th.randn(shape, device=self.device)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        assert isinstance(observation, th.Tensor)
+        act = self.acting_on(np.zeros((len(observation), self.latent_dim)))
+        noise = self._noise(len(observation), deterministic)
+        return self.tensor(act(observation.cpu().numpy(), noise))
 
     def set_training_mode(self, mode: bool) -> None:
         self.train(mode)

@@ -133,6 +133,13 @@ def test_predict_refuses(
         trained.predict(obs, state=state)
 
 
+def test_policy_forward_is_predict_at_the_priors_mean(trained: PEARLSAC) -> None:
+    scaled = trained.policy._predict(th.as_tensor(OBS), deterministic=True)
+    np.testing.assert_allclose(
+        scaled.numpy(), trained.predict(OBS, deterministic=True)[0], atol=1e-6
+    )
+
+
 def test_evaluate_policy(trained: PEARLSAC) -> None:
     env = make_vec_env(POINT_GOAL, 3, seed=0)
     mean, std = evaluate_policy(trained, env, n_eval_episodes=6)
