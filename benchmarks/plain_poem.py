@@ -15,7 +15,7 @@ from torch import nn
 from torch.nn.functional import binary_cross_entropy_with_logits, mse_loss, softplus
 
 from sb3_poem import POEMSAC
-from sb3_poem.pearl_sac.sampler import Bootstraps, MetaBatch
+from sb3_poem.pearl_sac.sampler import MetaBatch
 
 TRANSITIONS_PER_TASK = 2_000
 
@@ -25,9 +25,6 @@ def fields(model: POEMSAC, batch: MetaBatch) -> list[th.Tensor]:
     of: rewards, observations and discounts. Observations are standardised.
     """
     data, ahead, standardise = batch.transitions, batch.bootstraps, model.policy.standardise
-    if ahead is None:
-        discounts = model.gamma * (1.0 - data.terminated)
-        ahead = Bootstraps(data.rewards, data.next_observations, discounts)
     seen = standardise(data.observations), data.actions, standardise(data.next_observations)
     return [*seen, data.rewards, ahead.rewards, standardise(ahead.observations), ahead.discounts]
 

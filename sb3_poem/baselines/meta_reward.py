@@ -26,9 +26,8 @@ from sb3_poem.baselines.fragments import (
     transition_rows,
 )
 from sb3_poem.common.checks import check_whole
-from sb3_poem.common.digest import digest_of
 from sb3_poem.common.files import write_atomically
-from sb3_poem.common.networks import MLP
+from sb3_poem.common.networks import MLP, digest_of
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.pearl_sac import PEARLSAC
 from sb3_poem.pearl_sac.policies import LatentPolicy

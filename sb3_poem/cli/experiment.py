@@ -27,8 +27,8 @@ from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.vec_env import TaskVecEnv
 from sb3_poem.loading import ALGORITHMS
 from sb3_poem.pearl_sac import PEARLSAC
+from sb3_poem.pearl_sac.arguments import default_copies
 from sb3_poem.pearl_sac.callbacks import TrainingCheckpointCallback
-from sb3_poem.pearl_sac.environments import default_copies
 from sb3_poem.pearl_sac.saving import is_checkpoint
 from sb3_poem.resources import config_file
 

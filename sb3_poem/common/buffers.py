@@ -123,7 +123,7 @@ class TaskReplayBuffer(ReplayBuffer):
         return (uniform * self._counts_on_device[source_tasks]).long()
 
     def sample_rows(self, source_tasks: th.Tensor, generator: th.Generator) -> TaskBatch:
-        """The transitions in :meth:`draw_slots`, with its arguments."""
+        """The transitions in slots that are drawn so."""
         return self.at(source_tasks, self.draw_slots(source_tasks, generator))
 
     def at(self, tasks: th.Tensor, slots: th.Tensor) -> TaskBatch:
@@ -142,7 +142,7 @@ class TaskReplayBuffer(ReplayBuffer):
         return th.stack([each[:count].square().mean().sqrt() for each, count in kept])
 
     def state(self) -> dict[str, th.Tensor]:
-        """Everything needed to continue, without unused room."""
+        """What :meth:`load_state` continues from, without unused room."""
         used = int(self.counts.max()) if self.n_tasks else 0
         rows = self.rows[:, :used].clone()
         for task_rows, count in zip(rows, self.counts.tolist(), strict=True):
@@ -156,7 +156,6 @@ class TaskReplayBuffer(ReplayBuffer):
         }
 
     def load_state(self, state: dict[str, th.Tensor]) -> None:
-        """Continue from what :meth:`state` returned."""
         self.reset()
         used = state["rows"].shape[1]
         if used:

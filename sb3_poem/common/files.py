@@ -13,24 +13,21 @@ def write_atomically(path: str | Path, content: bytes | Callable[[BufferedWriter
     leaves the previous file whole. ``content`` may be a function that writes to an open file.
     """
     path = Path(path)
-    temporary: str | None = None
+    temporary = path.parent / f".{path.name}.{uuid.uuid4().hex}"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = str(path.parent / f".{path.name}.{uuid.uuid4().hex}")
         with open(temporary, "xb") as file:  # with the permissions that the user's umask leaves
             content(file) if callable(content) else file.write(content)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
-        temporary = None
     except OSError as error:
         before = "what was there before, if anything, is untouched"
         message = f"could not write {path} ({error.strerror}); {before}"
         raise OSError(error.errno, message) from error
     finally:  # an interrupt from the keyboard leaves nothing behind either
-        if temporary is not None:
-            with contextlib.suppress(OSError):
-                os.unlink(temporary)
+        with contextlib.suppress(OSError):
+            os.unlink(temporary)
     with contextlib.suppress(OSError):  # not every file system lets a folder be synchronised
         folder = os.open(path.parent, os.O_RDONLY)
         try:

@@ -4,9 +4,10 @@ Hidden layers may run in bfloat16 (see :mod:`sb3_poem.common.precision`); every 
 float32, because values in the hundreds lose their differences in eight bits of mantissa.
 """
 
+import hashlib
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,8 @@ LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
 MIN_FACTOR_VARIANCE = 1e-7
 #: Of a standard normal and of tanh's slope, for each dimension of an action
 LOG_DENSITY_CONSTANT = 0.5 * math.log(2.0 * math.pi) + 2.0 * math.log(2.0)
+#: Rows of hidden values at once: enough to pay for a call, few enough for a core's cache
+BLOCK_ROWS = 2000
 
 
 class Normalised(nn.Module):
@@ -30,16 +33,11 @@ class Normalised(nn.Module):
         self.activation = activation
 
     def forward(self, x: th.Tensor) -> th.Tensor:
-        """Map (..., width) to (..., width)."""
         return self.activation(nn.functional.layer_norm(x, x.shape[-1:]))
 
 
 class RunningNorm(nn.Module):
-    """Standardises by the mean and deviation of all rows that it was shown.
-
-    :param width: Entries of a row
-    :param clip: Bound on standardised values; None for none
-    """
+    """Standardises rows by the mean and deviation of all that it was shown, to within ``clip``."""
 
     #: Deviations below it count as this
     MIN_STD = 1e-3
@@ -67,7 +65,6 @@ class RunningNorm(nn.Module):
             self.count += len(rows)
 
     def forward(self, rows: th.Tensor) -> th.Tensor:
-        """Map (..., width) to the same, standardised."""
         standardised = (rows - self.mean) / self.std
         return standardised if self.clip is None else standardised.clamp(-self.clip, self.clip)
 
@@ -77,11 +74,7 @@ class RunningNorm(nn.Module):
 
 
 class MLP(nn.Module):
-    """Multi-layer perceptron.
-
-    :param net_arch: Widths of the hidden layers
-    :param layer_norm: Whether hidden layers are normalised before the activation
-    """
+    """Multi-layer perceptron; ``layer_norm`` normalises hidden layers before the activation."""
 
     def __init__(
         self,
@@ -245,3 +238,67 @@ class RewardDecoder(nn.Module):
     ) -> th.Tensor:
         """Predicted standardised rewards (...) of transitions (..., dim)."""
         return self.mlp(obs, actions, next_obs, embedding).squeeze(-1)
+
+    @th.no_grad()
+    def sums(
+        self,
+        transitions: th.Tensor,
+        lengths: Sequence[int],
+        embeddings: th.Tensor,
+        dtype: th.dtype,
+    ) -> th.Tensor:
+        """Predictions, summed over each trajectory, under each embedding (m, latent_dim): (m,
+        trajectories). The first layer sees the transitions once.
+
+        :param transitions: (steps of all trajectories, transition_dim), in order
+        :param lengths: Steps of each trajectory
+        :param dtype: Arithmetic of the hidden layers
+        """
+        groups: list[list[int]] = [[]]
+        for length in lengths:
+            if groups[-1] and sum(groups[-1]) + length > BLOCK_ROWS:
+                groups.append([])
+            groups[-1].append(length)
+        parts = zip(transitions.split([sum(group) for group in groups]), groups, strict=True)
+        return th.cat([self._sums(*part, embeddings, dtype) for part in parts], dim=1)
+
+    def _sums(
+        self, transitions: th.Tensor, lengths: list[int], embeddings: th.Tensor, dtype: th.dtype
+    ) -> th.Tensor:
+        mlp = self.mlp
+        layers: list[Any] = [*mlp.hidden, mlp.output]
+        first, *others = layers
+        widths = [transitions.shape[-1], embeddings.shape[-1]]
+        of_transitions, of_embeddings = first.weight.split(widths, dim=1)
+        base = (transitions @ of_transitions.T + first.bias).to(dtype)  # (rows, width)
+        shifts = (embeddings @ of_embeddings.T).to(dtype)  # (m, width)
+        middle = [(layer.weight.T.to(dtype), layer.bias.to(dtype)) for layer in others[:-1]]
+        last = mlp.output.weight[0].to(dtype)
+        block = max(1, BLOCK_ROWS // len(base))
+        # the same memory for every block: new pages from the system take longer than to fill them
+        rows = min(block, len(shifts)) * len(base)
+        biases = [first.bias, *(bias for _, bias in middle)]
+        buffers = [base.new_empty(rows, len(bias)) for bias in biases]
+        sums = []
+        for some in shifts.split(block):
+            rows = len(some) * len(base)
+            x = buffers[0][:rows]
+            th.add(base, some[:, None], out=x.view(len(some), *base.shape))
+            for (weight, bias), buffer in zip(middle, buffers[1:], strict=True):
+                x = th.addmm(bias, mlp.activation(x), weight, out=buffer[:rows])
+            if others:
+                x = mlp.activation(x) @ last
+            parts = x.view(len(some), -1).float().split(lengths, dim=1)
+            sums.append(th.stack([part.sum(dim=1) for part in parts], dim=1))
+        result = th.cat(sums)
+        return result + mlp.output.bias * result.new_tensor(lengths) if others else result
+
+
+def digest_of(tensors: Mapping[str, th.Tensor]) -> str:
+    """Hexadecimal; the same for equal numbers under equal names, of whatever device and type."""
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        value = tensors[name].detach().cpu().double()  # holds other types' numbers exactly
+        digest.update(f"{name} {tuple(value.shape)}".encode())
+        digest.update(value.contiguous().numpy().tobytes())
+    return digest.hexdigest()

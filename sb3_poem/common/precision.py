@@ -23,56 +23,49 @@ ALIGNMENT = 16
 LAYER_NORM_EPS = 1e-5  # of torch's layer_norm
 
 
-def cpu_has_bfloat16() -> bool:
-    """Whether the processor multiplies bfloat16 matrices in hardware."""
-    return bool(th.cpu._is_avx512_bf16_supported())
-
-
 def hidden_dtype(precision: str, device_type: str) -> th.dtype:
     """Type of the hidden layers' arithmetic on a device, "cpu" or "cuda"."""
     if precision not in PRECISIONS:
         known = ", ".join(map(repr, PRECISIONS))
         raise ValueError(f"precision must be one of {known}, got {precision!r}")
     if precision == "auto":
-        supported = th.cuda.is_bf16_supported() if device_type == "cuda" else cpu_has_bfloat16()
-        return th.bfloat16 if supported else th.float32
+        on_gpu = device_type == "cuda"
+        has = th.cuda.is_bf16_supported if on_gpu else th.cpu._is_avx512_bf16_supported
+        return th.bfloat16 if has() else th.float32
     return th.bfloat16 if precision == "bf16" else th.float32
 
 
 class MixedPrecision:
     """Runs the hidden layers of all rectified perceptrons of a module in another arithmetic, on
-    weights that stay float32.
-
-    Within the context, copies of the layers compute; :meth:`refresh` brings them up to date. Their
-    gradients are added to those of the weights. Float32 changes nothing.
+    weights that stay float32: within the context, copies of the layers compute, and give the
+    weights their gradients. Float32 changes nothing.
     """
 
     def __init__(self, module: nn.Module, dtype: th.dtype) -> None:
-        self._networks: list[tuple[MLP, LowPrecisionMLP]] = []
+        self._networks: list[LowPrecisionMLP] = []
         for part in module.modules() if dtype != th.float32 else ():
             if not isinstance(part, MLP) or not len(part.hidden):
                 continue
             if isinstance(getattr(part.activation, "activation", part.activation), nn.ReLU):
-                self._networks.append((part, LowPrecisionMLP(part, dtype)))
-        pairs = [pair for _, network in self._networks for pair in network.pairs]
-        self._originals = [original for original, _ in pairs]
-        self._copies = [copy for _, copy in pairs]
+                self._networks.append(LowPrecisionMLP(part, dtype))
+        self._originals = [each for network in self._networks for each in network.originals]
+        self._copies = [each for network in self._networks for each in network.copies]
 
     def __enter__(self) -> "MixedPrecision":
-        for part, network in self._networks:
-            part.low_precision = network
+        for network in self._networks:
+            network.mlp.low_precision = network
         return self
 
     def __exit__(self, *exception: Any) -> None:
-        for part, _ in self._networks:
-            part.low_precision = None
+        for network in self._networks:
+            network.mlp.low_precision = None
 
     def refresh(self) -> None:
         """Bring the copies up to date with the float32 weights."""
         if self._copies:
             with th.no_grad():
                 th._foreach_copy_(self._copies, self._originals)
-        for _, network in self._networks:
+        for network in self._networks:
             network.collected = False
 
 
@@ -81,7 +74,7 @@ class LowPrecisionMLP:
 
     def __init__(self, mlp: MLP, dtype: th.dtype) -> None:
         hidden: list[nn.Linear] = list(mlp.hidden)  # type: ignore[arg-type]
-        self.hidden, self.output, self.dtype = hidden, mlp.output, dtype
+        self.mlp, self.hidden, self.output, self.dtype = mlp, hidden, mlp.output, dtype
         self.layer_norm = isinstance(mlp.activation, Normalised)
         output, alignment = mlp.output, 1 if self.layer_norm else ALIGNMENT
         widths = [*(layer.in_features for layer in hidden), output.in_features]
@@ -95,15 +88,11 @@ class LowPrecisionMLP:
         for bias, spare in zip(self.biases, self.ones[1:], strict=True):
             if spare is not None:
                 bias[spare] = 1.0
-        originals = [layer.weight for layer in [*hidden, output]]
-        originals += [layer.bias for layer in hidden]
+        weights = [layer.weight.detach() for layer in [*hidden, output]]
         #: The float32 parameters, and the parts of the copies that follow them
-        self.pairs: list[tuple[th.Tensor, th.Tensor]] = [
-            (original.detach(), copy[tuple(map(slice, original.shape))])
-            for original, copy in zip(
-                originals, [*self.weights, self.out_weight, *self.biases], strict=True
-            )
-        ]
+        self.originals = weights + [layer.bias.detach() for layer in hidden]
+        followers = zip(self.originals, [*self.weights, self.out_weight, *self.biases], strict=True)
+        self.copies = [copy[tuple(map(slice, original.shape))] for original, copy in followers]
         #: Whether the float32 parameters have a gradient already
         self.collected = False
         self._constant = th.zeros(padded[0] - widths[0], device=output.weight.device)
@@ -148,8 +137,8 @@ class LowPrecisionMLP:
         trained: bool,
         wanted: bool,
     ) -> th.Tensor | None:
-        """From an output's gradient the input's, if ``wanted``, and where ``trained`` those of the
-        float32 parameters: the first since they changed replaces what was there.
+        """From an output's gradient the input's, if ``wanted``; where ``trained``, parameters get
+        theirs.
         """
         g, last, weight = grad.to(self.dtype), values[-1], self.out_weight
         if self.layer_norm:
@@ -204,15 +193,7 @@ class _Perceptron(th.autograd.Function):
         return ctx.network.gradient(grad, values, norms, trained, wanted), None, None
 
 
-def _fused_linear_is_available() -> bool:
-    operations = th.ops.mkldnn
-    names = ("_linear_pointwise", "_is_mkldnn_bf16_supported")
-    if not (th.backends.mkldnn.is_available() and all(hasattr(operations, name) for name in names)):
-        return False
-    return bool(operations._is_mkldnn_bf16_supported())
-
-
-_FUSED_LINEAR = _fused_linear_is_available()
+_FUSED_LINEAR = th.backends.mkldnn.is_available() and th.ops.mkldnn._is_mkldnn_bf16_supported()
 
 
 def _linear_relu(x: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:

@@ -87,10 +87,7 @@ class Trajectory:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> "Trajectory":
-        """Read what :meth:`to_dict` wrote.
-
-        :raises ValueError: If the data is incomplete or broken.
-        """
+        """Read what :meth:`to_dict` wrote; ValueError if it is incomplete or broken."""
         try:
             names = STORED if data["reward_features"] is not None else STORED[:-1]
             arrays: dict[str, Any] = {name: decode_array(data[name]) for name in names}

@@ -1,18 +1,27 @@
-"""Arguments: their ranges, and why SAC's others are not taken, with what to do instead."""
+"""Arguments: their ranges, what an environment may be, and why SAC's others are not taken."""
 
+import contextlib
 import difflib
 import inspect
 import re
 import warnings
 from collections.abc import Callable, Iterable, Mapping
-from itertools import takewhile
 from typing import Any, TypeVar
 
+import gymnasium as gym
 import numpy as np
 import torch as th
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import VecEnv
 
+from poem_envs.registration import plain_id
 from sb3_poem.common.checks import check_number, check_number_or_auto, check_whole
 from sb3_poem.common.precision import hidden_dtype
+from sb3_poem.common.vec_env import as_task_vec_env, make_task_vec_env
+from sb3_poem.pearl_sac.train_tasks import DEFAULT_TRAIN_TASKS, default_train_tasks
+
+#: What a model may be given as its environment
+GivenEnv = GymEnv | gym.vector.VectorEnv | str
 
 T = TypeVar("T")
 BY_NAME = inspect.Parameter.KEYWORD_ONLY
@@ -22,10 +31,10 @@ LEAST = {
     **dict.fromkeys(("batch_size", "meta_batch_size", "context_size", "trajectories_per_task"), 1),
     **dict.fromkeys(("latent_dim", "buffer_size", "target_update_interval", "n_steps"), 1),
     **{"policy_delay": 1, "learning_starts": 0, "gradient_steps": -1},
-    **{"n_train_tasks": 1, "seed": 0},
+    **{"n_train_tasks": 1, "horizon": 1, "seed": 0},
 }
 #: Those of them that may be None
-OPTIONAL = ("n_train_tasks", "seed", "relabel_fraction", "context_relabel_fraction")
+OPTIONAL = ("n_train_tasks", "horizon", "seed", "relabel_fraction", "context_relabel_fraction")
 #: The most of arguments that are numbers from 0 on
 MOST = {
     **dict.fromkeys(("kl_coef", "reward_coef", "policy_coef"), np.inf),
@@ -127,16 +136,15 @@ def with_arguments_of(base: type, without: str) -> Callable[[type[T]], type[T]]:
 
     def decorate(cls: type[T]) -> type[T]:
         constructor: Any = vars(cls)["__init__"]
-        theirs = inspect.signature(vars(base)["__init__"]).parameters
-        ours = inspect.signature(constructor).parameters
-        own = {name: one for name, one in ours.items() if one.kind is one.KEYWORD_ONLY}
-        by_place = {"self", *takewhile(lambda name: name not in own, theirs)}
-        merged = [
-            one if name in by_place or one.kind is one.VAR_KEYWORD else one.replace(kind=BY_NAME)
-            for name, one in {"self": ours["self"], **theirs, **own}.items()
-            if name != without
+        signatures = [inspect.signature(vars(each)["__init__"]) for each in (base, cls)]
+        merged = {**signatures[0].parameters, **signatures[1].parameters}
+        for name in (without, "args", "kwargs"):
+            del merged[name]
+        by_place = ("self", "policy", "env", "unsupported")
+        kinds = [
+            one if name in by_place else one.replace(kind=BY_NAME) for name, one in merged.items()
         ]
-        constructor.__signature__ = inspect.Signature(sorted(merged, key=lambda one: one.kind))
+        constructor.__signature__ = inspect.Signature(sorted(kinds, key=lambda one: one.kind))
         text, documented = cls.__doc__ or "", {*described(cls), without}
         inherited = [words for name, words in described(base).items() if name not in documented]
         start = text.index("    :param ")
@@ -144,3 +152,39 @@ def with_arguments_of(base: type, without: str) -> Callable[[type[T]], type[T]]:
         return cls
 
     return decorate
+
+
+def vectorise(
+    env: GivenEnv | None,
+    n_copies: int | None = None,
+    n_train_tasks: int | None = None,
+    trajectories_per_task: int = 1,
+    **env_kwargs: Any,
+) -> GymEnv | None:
+    """An environment as SB3 takes it. A registered id becomes ``n_copies`` with these arguments;
+    None: as many as are worth while.
+    """
+    if isinstance(env, gym.vector.VectorEnv):
+        return as_task_vec_env(env)
+    if env is None or isinstance(env, gym.Env | VecEnv):
+        return env
+    if not isinstance(env, str):
+        what = f"the class {env.__name__}" if isinstance(env, type) else f"a {type(env).__name__}"
+        raise TypeError(
+            f"env is {what}, but must be an environment, a vectorised one (DummyVecEnv, "
+            "SubprocVecEnv, TaskVecEnv), or a registered id"
+        )
+    env = plain_id(env)
+    if n_copies is not None:
+        return make_task_vec_env(env, n_copies, max_sequential=n_copies, **env_kwargs)
+    return make_task_vec_env(env, default_copies(env, n_train_tasks, trajectories_per_task))
+
+
+def default_copies(env_id: str, n_train_tasks: int | None, trajectories_per_task: int) -> int:
+    """How many copies of an environment to step unless told: one for each trajectory of an epoch,
+    up to one per task or :data:`DEFAULT_TRAIN_TASKS`, whichever is more.
+    """
+    if n_train_tasks is None:
+        with contextlib.closing(gym.make(env_id)) as probe:
+            n_train_tasks = default_train_tasks(getattr(probe.unwrapped, "all_tasks", None))
+    return min(n_train_tasks * trajectories_per_task, max(n_train_tasks, DEFAULT_TRAIN_TASKS))

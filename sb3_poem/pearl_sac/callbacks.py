@@ -57,14 +57,8 @@ class TrainingCheckpointCallback(EpochCallback):
     """Writes a checkpoint from which ``load_checkpoint`` and ``resume`` continue bit for bit,
     always to the same file.
 
-    A handler of Ctrl-C may call :meth:`stop`, so that nothing of what was learned is lost::
-
-        callback = TrainingCheckpointCallback("checkpoint.zip")
-        signal.signal(signal.SIGINT, lambda *_: callback.stop())
-        model.learn(500_000, callback)  # raises KeyboardInterrupt once the checkpoint is written
-        POEMSAC.load_checkpoint("checkpoint.zip", env).resume()  # later
-
-    Otherwise it is a callback like any other:
+    A handler of Ctrl-C may call :meth:`stop`, as ``signal.signal(signal.SIGINT, lambda *_:
+    callback.stop())``: then nothing of what was learned is lost.
 
     >>> from sb3_poem import POEMSAC
     >>> small = dict(n_train_tasks=4, gradient_steps=2, seed=0)

@@ -1,7 +1,7 @@
 """The collection of an epoch: every training task is rolled out under its own latest latent."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -69,10 +69,12 @@ class EpochCollector:
                     f"{step}: {values[copy]}. Training stops here, before the networks see them."
                 )
 
-        act, obs = self._acting_on(latents), family.reset(tasks, seed)
+        act, obs = self.policy.acting_on(latents), family.reset(tasks, seed)
+        space = self.policy.action_space
         check("observations", obs, 0)
         for step in range(family.horizon):
-            actions, scaled_actions = act(obs)
+            scaled_actions = self._act(act, obs)
+            actions = np.clip(self.policy.unscale_action(scaled_actions), space.low, space.high)
             check("actions (of the policy)", actions, step)
             new_obs, rewards, dones, infos = family.env.step(actions)
             assert isinstance(new_obs, np.ndarray)
@@ -101,23 +103,15 @@ class EpochCollector:
         self.replay_buffer.extend(segment)
         return segment
 
-    def _acting_on(
-        self, latents: np.ndarray
-    ) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
-        """How to act: from observations to actions in the environment's units, and in [-1, 1]."""
-        space = self.policy.action_space
-        shape = (len(latents), *space.shape)
-        policy_action, device = self.policy.acting_on(latents), self.policy.device
-
-        def act(obs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            if self.explores():
-                scaled = self.generators.numpy.uniform(-1.0, 1.0, shape).astype(np.float32)
-            else:
-                noise = th.randn(shape, generator=self.generators.torch, device=device)
-                scaled = policy_action(obs, noise)
-            return np.clip(self.policy.unscale_action(scaled), space.low, space.high), scaled
-
-        return act
+    def _act(
+        self, act: Callable[[np.ndarray, th.Tensor | None], np.ndarray], obs: np.ndarray
+    ) -> np.ndarray:
+        """Actions in [-1, 1], (copies, action_dim), at random or by the policy with its noise."""
+        shape = (len(obs), *self.policy.action_space.shape)
+        if self.explores():
+            return self.generators.numpy.uniform(-1.0, 1.0, shape).astype(np.float32)
+        noise = th.randn(shape, generator=self.generators.torch, device=self.policy.device)
+        return act(obs, noise)
 
 
 def in_waves(rows: np.ndarray, n_envs: int) -> np.ndarray:
@@ -128,9 +122,8 @@ def in_waves(rows: np.ndarray, n_envs: int) -> np.ndarray:
 
 def concatenate(segments: list[Segment], n: int) -> Segment:
     """The first ``n`` copies of all waves as one segment."""
-    names = [field.name for field in fields(Segment)]
-    parts = {name: [getattr(segment, name) for segment in segments] for name in names}
-    return Segment(**{name: np.concatenate(values)[:n] for name, values in parts.items()})
+    parts = zip(*(vars(segment).values() for segment in segments), strict=True)
+    return Segment(*(np.concatenate(values)[:n] for values in parts))
 
 
 def relabelled_returns(
@@ -139,8 +132,8 @@ def relabelled_returns(
     features: np.ndarray,
     mask: np.ndarray,
 ) -> np.ndarray:
-    """Returns under tasks (tasks, task_dim) of trajectories' features (trajectories, steps,
-    feat_dim), over the steps of a mask (trajectories, steps): (tasks, trajectories).
+    """Returns (tasks, trajectories) of features (trajectories, steps, feat_dim), over the steps of
+    a mask (trajectories, steps).
     """
     # one row at a time bounds the memory at trajectories x steps
     return np.array([(compute_rewards(task, features) * mask).sum(axis=1) for task in tasks])

@@ -13,7 +13,7 @@ Metrics = dict[str, th.Tensor]
 
 
 class TaskEmbeddings(NamedTuple):
-    """Latents of a meta-batch, and what actor and decoder see of them; each (tasks, latent_dim)."""
+    """Latents, and what actor and decoder see of them; each (tasks, latent_dim)."""
 
     latents: th.Tensor
     policy: th.Tensor
@@ -40,7 +40,6 @@ class Objective:
     actor_trains_encoder: ClassVar[bool] = False
 
     policy: LatentPolicy
-    gamma: float
     reward_scale: th.Tensor
     reward_variance: th.Tensor
     relabel_fraction: float
@@ -77,7 +76,6 @@ class Objective:
         return latents, kl_to_prior(mean, variance).mean()
 
     def embed(self, latents: th.Tensor) -> TaskEmbeddings:
-        """What actor and decoder see of latents (tasks, latent_dim)."""
         policy, seen = self.policy, latents if self.actor_trains_encoder else latents.detach()
         embeddings = policy.policy_embedding(seen), policy.reward_embedding(latents)
         return TaskEmbeddings(latents, *embeddings)
@@ -93,13 +91,9 @@ class Objective:
         """Half the squared soft Bellman error of all critics; it trains the encoder too."""
         policy, n = self.policy, transitions.rewards.shape[1]
         z = rows(embeddings.latents, n)
-        if batch.bootstraps is None:
-            rewards, next_obs = transitions.rewards, transitions.next_observations
-            discounts = self.gamma * (1.0 - transitions.terminated)
-        else:
-            rewards, next_obs, discounts = batch.bootstraps
-            next_obs = policy.standardise(next_obs)
+        rewards, next_obs, discounts = batch.bootstraps
         with th.no_grad():
+            next_obs = policy.standardise(next_obs)
             next_embedding, noise = rows(embeddings.policy, n), batch.next_action_noise
             next_actions, next_log_prob = policy.actor(next_obs, next_embedding, noise)
             next_values = policy.critic_target(next_obs, next_actions, z).amin(dim=0)

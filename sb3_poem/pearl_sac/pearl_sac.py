@@ -7,7 +7,7 @@ import time
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 import torch as th
@@ -22,19 +22,17 @@ from stable_baselines3.common.vec_env import VecEnv
 from poem_envs.registration import plain_id
 from sb3_poem.common.buffers import ContextStore, Segment, TaskReplayBuffer
 from sb3_poem.common.checks import check_number
-from sb3_poem.common.digest import digest_of
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.files import write_atomically
 from sb3_poem.common.foreign import environment_of
-from sb3_poem.common.networks import RunningNorm
+from sb3_poem.common.networks import RunningNorm, digest_of
 from sb3_poem.common.precision import hidden_dtype
 from sb3_poem.common.random import Generators
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.hub import upload
 from sb3_poem.pearl_sac import saving
-from sb3_poem.pearl_sac.arguments import check_arguments, refuse_unknown
+from sb3_poem.pearl_sac.arguments import GivenEnv, check_arguments, refuse_unknown, vectorise
 from sb3_poem.pearl_sac.collector import CollectionStoppedError, EpochCollector, concatenate
-from sb3_poem.pearl_sac.environments import GivenEnv, vectorise
 from sb3_poem.pearl_sac.objective import Objective, rows
 from sb3_poem.pearl_sac.policies import OBSERVATION_CLIP, LatentPolicy, MlpPolicy
 from sb3_poem.pearl_sac.sampler import MetaBatchSampler
@@ -42,7 +40,6 @@ from sb3_poem.pearl_sac.train_tasks import TrainTasks
 from sb3_poem.pearl_sac.updater import EntropyCoefficient, Updater
 from sb3_poem.resources import config_file, zoo_entry
 
-SelfPEARLSAC = TypeVar("SelfPEARLSAC", bound="PEARLSAC")
 Part = TypeVar("Part")
 
 #: Transitions of each task on which the decoder is measured
@@ -95,22 +92,19 @@ class PEARLSAC(SAC):
     :param relabel_fraction: Share of each task's batch that comes from other tasks' buffers, with
         rewards relabelled. Needs a family with shared dynamics; None: 0.5 of those, else 0
     :param context_relabel_fraction: Share of the contexts in a gradient step that hold other tasks'
-        transitions, with rewards relabelled. Without any, the encoder may read a task from what its
-        policy does rather than from the rewards, and is then at a loss when it sees a new task's
-        first rollouts. Needs a family with shared dynamics; None: 0.5 of those, else 0
+        transitions, with rewards relabelled: without any, the encoder may read a task from what its
+        policy does. Needs a family with shared dynamics; None: 0.5 of those, else 0
     :param reward_scale: Factor on the rewards that the critics learn; "auto" divides by the
         deviation of the first epoch's, or leaves them as they are where these do not differ;
         "per-task" divides each task's by their root mean square in its replay buffer, so that tasks
         whose rewards are small are learned beside those whose rewards are large
     :param n_steps: Steps of rewards in the critics' targets before the value takes over; more carry
-        rewards back faster, and rely more on what older policies, and with ``relabel_fraction``
-        other tasks', did
+        rewards back faster, and rely more on what other policies did
     :param shaping_coef: From 0 to 1, how far the critics learn what is gained beyond staying where
         one is: their rewards are shaped (Ng, Harada & Russell, ICML 1999) with this share of the
-        family's potential over 1 - ``gamma``. Which policies are best stays as it is; where an
-        action changes values by a small part of their spread, as on the way to a place, they are
-        learned sooner. Action values, those in POEM's contexts too, are then without that share.
-        Needs a family with a potential
+        family's potential over 1 - ``gamma``. Which policies are best stays as it is; on the way to
+        a place they are learned sooner. Action values, those in POEM's contexts too, are then
+        without that share. Needs a family with a potential
     :param policy_delay: Gradient steps of critics and encoder for each of everything else, that is
         the actor, the decoder, the embeddings and the entropy coefficient (as in TD3)
     :param horizon: Steps of an episode; None takes the environment's time limit
@@ -235,12 +229,10 @@ class PEARLSAC(SAC):
         super().__init__(**inherited)
 
     def _check_arguments(self, given: Mapping[str, Any]) -> None:
-        """Refuse the first that is outside its range."""
         check_arguments(given, type(self))
 
     def __repr__(self) -> str:
-        env_id, steps = getattr(self, "env_id", None), self.num_timesteps
-        return f"{type(self).__name__}({env_id}, {steps:,} steps trained)"
+        return f"{type(self).__name__}({self.env_id}, {self.num_timesteps:,} steps trained)"
 
     def _setup_model(self) -> None:
         generators = self.generators.to(self.device)
@@ -263,7 +255,6 @@ class PEARLSAC(SAC):
         self.generators = generators  # a model that is loaded goes on with its own
 
     def _complete_policy_kwargs(self) -> None:
-        """Give the policy what follows from the model's own arguments."""
         self.policy_kwargs.pop("use_sde", None)
         self.policy_kwargs["latent_dim"] = self.latent_dim
 
@@ -282,7 +273,7 @@ class PEARLSAC(SAC):
         return ours
 
     @classmethod
-    def from_zoo(cls: type[SelfPEARLSAC], env_id: str, **arguments: Any) -> SelfPEARLSAC:
+    def from_zoo(cls, env_id: str, **arguments: Any) -> Self:
         """A new model with the hyperparameters that ship for an environment (``zoo_configs/``), as
         ``sb3-poem train`` makes it. :meth:`learn` then knows for how many steps.
 
@@ -311,14 +302,14 @@ class PEARLSAC(SAC):
     # ------------------------------------------------------------------ learning: Algorithm 1
 
     def learn(
-        self: SelfPEARLSAC,
+        self,
         total_timesteps: int | None = None,
         callback: MaybeCallback = None,
         log_interval: int | None = 1,
         tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
-    ) -> SelfPEARLSAC:
+    ) -> Self:
         """Train, in whole epochs, until at least ``total_timesteps`` environment steps are done.
 
         :param total_timesteps: None takes those of the entry that :meth:`from_zoo` read
@@ -351,7 +342,6 @@ class PEARLSAC(SAC):
         return self
 
     def _checked_steps(self, total_timesteps: int | None, callback: MaybeCallback) -> int:
-        """How many steps to train for, said aloud where ``verbose``."""
         total = self.n_timesteps if total_timesteps is None else total_timesteps
         if total is None:
             raise ValueError(
@@ -479,11 +469,11 @@ class PEARLSAC(SAC):
         self.logger.record("train/decoder_error", self.predicted_rewards_error)
 
     def resume(
-        self: SelfPEARLSAC,
+        self,
         callback: MaybeCallback = None,
         log_interval: int | None = 1,
         progress_bar: bool = False,
-    ) -> SelfPEARLSAC:
+    ) -> Self:
         """Finish the ``learn`` that a checkpoint interrupted, up to its own ``total_timesteps``."""
         remaining = self._total_timesteps - self.num_timesteps
         if remaining <= 0:
@@ -495,11 +485,6 @@ class PEARLSAC(SAC):
             self.dump_logs()
             self._logs_pending = False
 
-    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
-        """The last epoch may overshoot the total; a schedule must not turn negative there."""
-        steps = min(num_timesteps, total_timesteps)
-        super()._update_current_progress_remaining(steps, total_timesteps)
-
     # ------------------------------------------------------------------ the parts
 
     def _part(self, kind: type[Part], **others: Any) -> Part:
@@ -508,7 +493,6 @@ class PEARLSAC(SAC):
         return kind(**{name: getattr(self, name) for name in names}, **others)
 
     def make_collector(self, callback: BaseCallback) -> EpochCollector:
-        """What collects an epoch, and tells a callback of every step."""
         num_envs = self.family.num_envs
 
         def on_step(step_locals: dict[str, Any]) -> bool:
@@ -519,7 +503,8 @@ class PEARLSAC(SAC):
             dones = step_locals["dones"]
             if dones.any():  # what it looks for comes with an episode's end
                 self._update_info_buffer(step_locals["infos"], dones)
-            self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+            total = self._total_timesteps  # which the last epoch may overshoot
+            self._update_current_progress_remaining(min(self.num_timesteps, total), total)
             self._episode_num += int(dones.sum())
             return True
 
@@ -531,11 +516,9 @@ class PEARLSAC(SAC):
         )
 
     def make_sampler(self) -> MetaBatchSampler:
-        """What draws meta-batches."""
         return self._part(self.sampler_class, epoch_context=self._known_context)
 
     def make_objective(self) -> Objective:
-        """What gradient steps minimise."""
         rewards = self._known_context.rewards
         if self.reward_scale == "per-task":
             sizes = self.replay_buffer.reward_magnitudes()
@@ -550,7 +533,6 @@ class PEARLSAC(SAC):
         return self._part(self.objective_class, reward_scale=scale, reward_variance=variance)
 
     def make_updater(self) -> Updater:
-        """What takes gradient steps."""
         return self._part(Updater, objective=self.make_objective(), n_updates=self._n_updates)
 
     @property
@@ -699,9 +681,8 @@ class PEARLSAC(SAC):
         """
         own = self.replay_buffer
         super().load_replay_buffer(path, truncate_last_traj)
-        loaded = self.replay_buffer
-        same_rows = getattr(loaded, "widths", None) == own.widths
-        if not (same_rows and np.array_equal(loaded.tasks, own.tasks)):
+        tasks, widths = getattr(self.replay_buffer, "tasks", ()), own.widths
+        if not np.array_equal(tasks, own.tasks) or self.replay_buffer.widths != widths:
             self.replay_buffer = own
             raise ValueError(
                 f"{path} is the experience of other tasks than this model's training tasks, which "
@@ -710,7 +691,7 @@ class PEARLSAC(SAC):
 
     @classmethod
     def load(
-        cls: type[SelfPEARLSAC],
+        cls,
         path: str | pathlib.Path | io.BufferedIOBase,
         env: GivenEnv | None = None,
         device: th.device | str = "auto",
@@ -718,7 +699,7 @@ class PEARLSAC(SAC):
         print_system_info: bool = False,
         force_reset: bool = True,
         **kwargs: Any,
-    ) -> SelfPEARLSAC:
+    ) -> Self:
         """As SB3's. ``env`` may be a registered id too, see :meth:`set_env`. Further arguments are
         the constructor's; a ``seed`` begins new random streams.
 
@@ -747,16 +728,15 @@ class PEARLSAC(SAC):
 
     @classmethod
     def load_checkpoint(
-        cls: type[SelfPEARLSAC],
+        cls,
         path: str | pathlib.Path,
         env: GivenEnv | None = None,
         device: th.device | str = "auto",
-    ) -> SelfPEARLSAC:
+    ) -> Self:
         """Read what :meth:`save_checkpoint` or :class:`TrainingCheckpointCallback` wrote;
         :meth:`resume` then continues the run, in an environment with as many copies.
 
-        :raises ValueError: if the file is truncated or of another algorithm, or env of another
-            family
+        :raises ValueError: if the file is truncated or foreign, or env of another family
         """
         if not saving.is_checkpoint(path):
             raise ValueError(f"{path} is truncated, or no checkpoint of sb3_poem")
@@ -798,11 +778,11 @@ class PEARLSAC(SAC):
 
     @classmethod
     def from_pretrained(
-        cls: type[SelfPEARLSAC],
+        cls,
         folder: str | pathlib.Path,
         env: GivenEnv | None = None,
         device: th.device | str = "auto",
-    ) -> SelfPEARLSAC:
+    ) -> Self:
         """Read what :meth:`save_pretrained` or :meth:`push_to_hub` wrote.
 
         :param folder: The folder, the name of a shipped model, or ``"user/name"`` on the Hugging

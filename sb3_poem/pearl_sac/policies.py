@@ -1,5 +1,6 @@
 """Policy of PEARLSAC: an actor, critics, a context encoder and a reward decoder of one latent."""
 
+import inspect
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
@@ -14,7 +15,6 @@ from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
 from sb3_poem.common.buffers import Segment
-from sb3_poem.common.decoding import decoded_sums
 from sb3_poem.common.networks import (
     ContextEncoder,
     LatentActor,
@@ -146,7 +146,7 @@ class LatentPolicy(SACPolicy):
 
     def update_statistics(self, segments: Sequence[Segment]) -> None:
         """Standardise observations by all so far: a robot that has learned to run is far from what
-        the first epoch showed. Rewards keep the first epoch's, in whose units the critics learn.
+        the first epoch showed. Rewards keep the first epoch's statistics.
         """
         obs = np.concatenate([segment.observations for segment in segments])
         self.obs_norm.update(obs.reshape(-1, obs.shape[-1]))
@@ -173,7 +173,7 @@ class LatentPolicy(SACPolicy):
         dtype: th.dtype,
     ) -> np.ndarray:
         """See :meth:`PEARLSAC.predicted_returns`; ``dtype`` is the hidden layers' arithmetic."""
-        rows, lengths, shares = [], [], []  # shares: one over those of a trajectory's steps
+        rows, lengths, factors = [], [], []
         for trajectory in trajectories:
             steps = _evenly_spaced(len(trajectory), max_steps)
             seen = (trajectory.observations[at] for at in (steps, steps + 1))
@@ -181,12 +181,12 @@ class LatentPolicy(SACPolicy):
             actions = self.tensor(self.scale_action(trajectory.actions[steps]))
             rows.append(th.cat([obs, actions, next_obs], dim=1))
             lengths.append(len(steps))
-            shares.append(len(trajectory) / len(steps))
+            factors.append(len(trajectory) / len(steps))
         embeddings = self.reward_embedding(self.tensor(np.atleast_2d(latents)))
-        sums = decoded_sums(self.decoder.mlp, th.cat(rows), lengths, embeddings, dtype).double()
+        sums = self.decoder.sums(th.cat(rows), lengths, embeddings, dtype).double()
         norm = self.reward_norm
         sums = sums * norm.std + norm.mean * sums.new_tensor(lengths)
-        return (sums * sums.new_tensor(shares)).cpu().numpy()
+        return (sums * sums.new_tensor(factors)).cpu().numpy()
 
     def decode_rewards(
         self, obs: th.Tensor, actions: th.Tensor, next_obs: th.Tensor, reward_embedding: th.Tensor
@@ -274,11 +274,8 @@ class LatentPolicy(SACPolicy):
         self.train(mode)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        names = [
-            *("observation_space", "action_space", "net_arch", "activation_fn", "layer_norm"),
-            *("latent_dim", "context_has_value", "n_critics"),
-            *("optimizer_class", "optimizer_kwargs"),
-        ]
+        names = list(inspect.signature(LatentPolicy).parameters)
+        names.remove("lr_schedule")
         return {"lr_schedule": self._dummy_schedule} | {name: getattr(self, name) for name in names}
 
 

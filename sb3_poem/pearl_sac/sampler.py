@@ -38,14 +38,14 @@ class MetaBatch(NamedTuple):
     latent_noise: th.Tensor  # (tasks, latent_dim)
     action_noise: th.Tensor  # (tasks, batch, action_dim)
     next_action_noise: th.Tensor
-    bootstraps: Bootstraps | None = None  # None where targets look one step ahead
+    bootstraps: Bootstraps
 
 
 def mapped(function: Callable[[th.Tensor], th.Tensor], batch: Any) -> Any:
     """A meta-batch with what a function makes of each of its tensors."""
     if isinstance(batch, tuple):
         return type(batch)(*(mapped(function, part) for part in batch))
-    return None if batch is None else function(batch)
+    return function(batch)
 
 
 @dataclass
@@ -107,7 +107,7 @@ class MetaBatchSampler:
 
     def _transitions(
         self, task_ids: th.Tensor, chosen: np.ndarray, batch_size: int
-    ) -> tuple[TaskBatch, Bootstraps | None]:
+    ) -> tuple[TaskBatch, Bootstraps]:
         """Transitions, ``relabel_fraction`` of them relabelled; what targets need beyond."""
         generator, buffer = self.generators.torch, self.replay_buffer
         sources = task_ids[:, None].expand(-1, batch_size)
@@ -126,10 +126,8 @@ class MetaBatchSampler:
             rewards[:, -n_foreign:] = self._rewards(chosen, batch.features[:, -n_foreign:])
             return batch._replace(rewards=rewards)
 
-        transitions = seen(slots)
-        if self.n_steps == 1 and self.shaping_coef == 0:
-            return transitions, None
-        last, rewards, going_on = transitions, transitions.rewards.clone(), ~transitions.ended
+        transitions = last = seen(slots)
+        rewards, going_on = transitions.rewards.clone(), ~transitions.ended
         discounts = th.full_like(rewards, self.gamma)
         for _ in range(self.n_steps - 1):
             slots = th.where(going_on, (slots + 1) % buffer.capacity, slots)
@@ -145,16 +143,21 @@ class MetaBatchSampler:
 
     def _potential(self, observations: th.Tensor, chosen: np.ndarray) -> th.Tensor:
         """What staying at observations (tasks, batch, obs_dim) would be worth, (tasks, batch)."""
-        tasks = self.train_tasks.tasks[chosen][:, None, :]
-        potential = self.family.compute_potential(tasks, observations.cpu().numpy())
-        values = th.as_tensor(potential, dtype=th.float32, device=self.device)
-        return values * (self.shaping_coef / (1.0 - self.gamma))
+        potential = self._of_tasks(self.family.compute_potential, chosen, observations)
+        return potential * (self.shaping_coef / (1.0 - self.gamma))
 
     def _rewards(self, chosen: np.ndarray, features: th.Tensor) -> th.Tensor:
-        """Rewards (tasks, batch) of features (tasks, batch, feat_dim)."""
-        tasks = self.train_tasks.tasks[chosen][:, None, :]
-        rewards = self.family.compute_rewards(tasks, features.cpu().numpy())
-        return th.as_tensor(rewards, dtype=th.float32, device=self.device)
+        return self._of_tasks(self.family.compute_rewards, chosen, features)
+
+    def _of_tasks(
+        self,
+        compute: Callable[[np.ndarray, np.ndarray], np.ndarray],
+        chosen: np.ndarray,
+        of: th.Tensor,
+    ) -> th.Tensor:
+        """What the family computes for chosen tasks of (tasks, batch, ...): (tasks, batch)."""
+        computed = compute(self.train_tasks.tasks[chosen][:, None, :], of.cpu().numpy())
+        return th.as_tensor(computed, dtype=th.float32, device=self.device)
 
     def contexts(self, task_ids: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """``context_size`` transitions of the last epoch for each task, and their rewards."""

@@ -1,9 +1,5 @@
-"""How models and training runs are written and read: SB3's zip, checkpoints, and pretrained
-folders.
-
-A checkpoint is such a zip that holds the experience too, so that training continues bit for bit. A
-pretrained folder holds safetensors, JSON and a model card: nothing in it can run code. A model is a
-PEARLSAC here, or of a subclass.
+"""How models are written and read: SB3's zip; checkpoints, which are such zips with the experience;
+and pretrained folders, in which nothing can run code.
 """
 
 import inspect
@@ -83,12 +79,7 @@ def kept_arguments(algorithm: type) -> list[str]:
 def check_archive(
     path: str | Path | io.BufferedIOBase, algorithm: type, changes: Mapping[str, Any]
 ) -> None:
-    """Refuse a zip of which ``load`` cannot make the model.
-
-    :param changes: Arguments of the constructor that shall differ
-    :raises ValueError: if it is a folder, the file is truncated or holds another algorithm's model,
-        or a change is of what the networks are
-    """
+    """Refuse a zip of which ``load`` cannot make the model with these changes of arguments."""
     if not isinstance(path, io.BufferedIOBase):
         _check_is_file(Path(path), algorithm.__name__)
     try:
@@ -106,16 +97,20 @@ def check_archive(
     for name, value in changes.items():
         fixed, why = name in FIXED or (name == "n_train_tasks" and value is not None), ""
         if name == "ent_coef":
-            learned = [str(coef).startswith("auto") for coef in (value, found[name])]
-            fixed = learned[0] != learned[1]
+            fixed = str(value).startswith("auto") != str(found[name]).startswith("auto")
             why = ": a coefficient that is learned stays one, as does a fixed one"
         if fixed and value != (kept := found.get(name)):
             raise ValueError(f"{name} is {kept!r} in {path}, and cannot become {value!r}{why}")
 
 
 def algorithm_of(path: str | Path) -> str:
-    """Name of the class whose model a zip holds; empty where that cannot be told."""
+    """Name of the class whose model a zip holds; empty where it says none."""
     return str(_facts(path).get("algorithm", ""))
+
+
+def is_checkpoint(path: str | Path) -> bool:
+    """Whether a file is a checkpoint of a training run, rather than a model that ``save`` wrote."""
+    return bool(_facts(path).get("keeps_experience"))
 
 
 def _facts(path: str | Path) -> dict[str, Any]:
@@ -128,7 +123,7 @@ def _facts(path: str | Path) -> dict[str, Any]:
 
 
 def _check_is_file(path: Path, algorithm: str) -> None:
-    """:raises ValueError: if it is what another method reads: a checkpoint, a folder"""
+    """Refuse what another method reads."""
     what, method = "the name of a model that ships", "from_pretrained"
     if path.is_file() and is_checkpoint(path):
         what, method = "a checkpoint", "load_checkpoint"
@@ -160,21 +155,14 @@ class Experience:
             self.model.epoch_context = ContextStore(**state["context"])
 
 
-def is_checkpoint(path: str | Path) -> bool:
-    """Whether a file is a checkpoint of a training run, rather than a model that ``save`` wrote."""
-    return bool(_facts(path).get("keeps_experience"))
-
-
 # ---------------------------------------------------------------------- pretrained folders
 
 
 def pretrained_files(
     model: Any, card: dict[str, Any] | None, name: str | None = None
 ) -> dict[str, bytes]:
-    """What :func:`from_pretrained` reads, by the names of its files; see
-    :meth:`PEARLSAC.save_pretrained`.
-
-    :param name: By which the card says to load the model; None is its family's
+    """What :func:`from_pretrained` reads, by the names of its files; the card says to load the
+    model by ``name``, None is its family's.
     """
     config, tensors = model_contents(model, card)
     text = config_text(config)
@@ -188,64 +176,58 @@ def pretrained_files(
 def model_contents(
     model: Any, card: dict[str, Any] | None = None
 ) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
-    """What a model is made of, from which :func:`build_model` makes it again: its configuration,
-    which :func:`config_text` writes, and its tensors by name; raises as
-    :meth:`PEARLSAC.save_pretrained`.
+    """What :func:`build_model` makes a model of again: its configuration, which
+    :func:`config_text` writes, and its tensors by name; raises as :meth:`PEARLSAC.save_pretrained`.
     """
     policy, error = model.policy, model.predicted_rewards_error
     for argument, (module, _) in CLASSES.items():
         value = getattr(policy, argument)
         if getattr(module, value.__name__, None) is not value:
             raise ValueError(f"{argument} must be in {module.__name__} to be saved, but is {value}")
-    state, found = policy.state_dict(), [(name, getattr(model, name)) for name in SPACES]
+    state, boxes = policy.state_dict(), {name: getattr(model, name) for name in SPACES}
     tensors = {f"policy.{name}": state[name] for name in state if not name.startswith(DERIVED)}
-    arrays = {name: getattr(model.train_tasks, field) for name, field in ARRAYS.items()}
-    arrays |= {f"{name}.low": space.low for name, space in found}
-    arrays |= {f"{name}.high": space.high for name, space in found}
-    tensors |= {name: th.as_tensor(value) for name, value in arrays.items()}
-    config: dict[str, Any] = {
-        "format": FORMAT,
-        "algorithm": model.algorithm,
-        **{name: getattr(model, name) for name in FACTS},
-        "n_updates": model._n_updates,
-        "arguments": _arguments(model),
-        **{name: getattr(policy, name) for name in POLICY_FACTS},
-        **{name: getattr(policy, name).__name__ for name in CLASSES},
-        "predicted_rewards_error": None if np.isnan(error) else error,  # NaN is no JSON
-        "context_reward_statistics": model.context_reward_statistics,
-        "card": card or {},
-        **{name: {"dtype": str(space.dtype)} for name, space in found},
-    }
-    return config, {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-
-
-def config_text(config: dict[str, Any]) -> str:
-    return json.dumps(config, indent=2, default=_to_json)
-
-
-def _arguments(model: Any) -> dict[str, Any]:
-    """Arguments with which training goes on; a schedule's place takes its default."""
+    for name, field in ARRAYS.items():
+        tensors[name] = th.as_tensor(getattr(model.train_tasks, field))
+    for name, box in boxes.items():
+        tensors[f"{name}.low"], tensors[f"{name}.high"] = map(th.as_tensor, (box.low, box.high))
+    # those with which training goes on; a schedule's place takes its default
     names = [*kept_arguments(type(model)), "target_entropy", "ent_coef"]
     arguments = {name: getattr(model, name) for name in names}
     coefficient = model.entropy_coefficient
     if coefficient.optimizer is not None:
         arguments["ent_coef"] = f"auto_{coefficient.value.item():.9g}"
-    if isinstance(model.learning_rate, (int, float)):
+    if not callable(model.learning_rate):
         arguments["learning_rate"] = model.learning_rate
-    return arguments
+    config: dict[str, Any] = {
+        "format": FORMAT,
+        "algorithm": model.algorithm,
+        **{name: getattr(model, name) for name in FACTS},
+        "n_updates": model._n_updates,
+        "arguments": arguments,
+        **{name: getattr(policy, name) for name in POLICY_FACTS},
+        **{name: getattr(policy, name).__name__ for name in CLASSES},
+        "predicted_rewards_error": None if np.isnan(error) else error,  # NaN is no JSON
+        "context_reward_statistics": model.context_reward_statistics,
+        "card": card or {},
+        **{name: {"dtype": str(box.dtype)} for name, box in boxes.items()},
+    }
+    return config, {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
 
 
-def _to_json(value: Any) -> Any:
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    raise TypeError(f"{value!r} of type {type(value).__name__} cannot be written as JSON")
+def config_text(config: dict[str, Any]) -> str:
+    """A configuration as JSON; refuses what cannot be written so."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, np.ndarray | np.generic):
+            return value.tolist()
+        raise TypeError(f"{value!r} of type {type(value).__name__} cannot be written as JSON")
+
+    return json.dumps(config, indent=2, default=plain)
 
 
 def read_config(folder: str | Path) -> dict[str, Any]:
-    """The ``config.json`` of a pretrained folder.
-
-    :raises FileNotFoundError: if the folder or its configuration does not exist
-    :raises ValueError: if it is truncated or of another program
+    """The ``config.json`` of a pretrained folder; raises FileNotFoundError if there is none, and as
+    :func:`parse_config`.
     """
     path = Path(folder) / CONFIG
     if not path.is_file():
@@ -254,18 +236,16 @@ def read_config(folder: str | Path) -> dict[str, Any]:
 
 
 def parse_config(text: str | bytes, source: str) -> dict[str, Any]:
-    """The configuration of a model.
+    """What :func:`config_text` wrote; ``source`` is where it comes from, for the message.
 
-    :param text: What :func:`config_text` wrote
-    :param source: Where it comes from, for the message
     :raises ValueError: if it is truncated, of another program or version, or its ``env_id`` would
         import a module
     """
     try:
         config = json.loads(text)
     except (ValueError, RecursionError) as error:  # of thousands of brackets
-        what = f"truncated, or no configuration of sb3_poem: {error}"
-        raise ValueError(f"{source} is {what}") from error
+        what = "is truncated, or no configuration of sb3_poem"
+        raise ValueError(f"{source} {what}: {error}") from error
     found = config.get("format") if isinstance(config, dict) else None
     if found != FORMAT:
         what = f"its format is {found!r}, expected {FORMAT!r}"
@@ -281,12 +261,7 @@ def parse_config(text: str | bytes, source: str) -> dict[str, Any]:
 
 
 def from_pretrained(algorithm: type[Model], folder: str | Path, device: th.device | str) -> Model:
-    """Read a model of :func:`pretrained_files`.
-
-    :param folder: What :func:`sb3_poem.resources.find_folder` takes
-    :raises FileNotFoundError: if the folder does not hold a model
-    :raises ValueError: if a file is truncated or foreign, or the model is of another algorithm
-    """
+    """See :meth:`PEARLSAC.from_pretrained`."""
     folder = find_folder(folder)
     config, weights = read_config(folder), folder / WEIGHTS
     found = config["algorithm"]
@@ -306,24 +281,20 @@ def build_model(
     source: str,
     device: th.device | str = "auto",
 ) -> Model:
-    """Make a model from what :func:`model_contents` took it apart into.
+    """Make a model from what :func:`model_contents` took it apart into. No memory is taken for
+    networks before the configuration has been found to agree with the tensors.
 
-    No memory is taken for networks before the configuration has been found to agree with the
-    tensors.
-
-    :param source: Where they come from, for the message
-    :raises ValueError: if something is missing, does not fit, or is out of all proportion
+    :raises ValueError: if something is missing or does not fit; the message names ``source``
     """
     try:
         _check_numbers(algorithm, config, tensors)
-        make: Any = algorithm  # without an environment
         arguments = {**config["arguments"], "device": device, "_init_setup_model": False}
+        make: Any = algorithm  # without an environment
         model = make("MlpPolicy", None, **arguments)
         for name in SPACES:
             low, high = tensors[f"{name}.low"].numpy(), tensors[f"{name}.high"].numpy()
             setattr(model, name, spaces.Box(low, high, dtype=np.dtype(config[name]["dtype"]).type))
-        arrays = {field: tensors[name].numpy() for name, field in ARRAYS.items()}
-        model.train_tasks = TrainTasks(**arrays)
+        model.train_tasks = TrainTasks(*(tensors[name].numpy() for name in ARRAYS))
         for name in FACTS:
             setattr(model, name, config[name])
         model._n_updates = config["n_updates"]
@@ -338,10 +309,12 @@ def build_model(
             model.policy_kwargs[name] = kind
         _check_shapes(model, tensors)
         model._setup_model()
-        of_policy = [name for name in tensors if name.startswith("policy.")]
-        state = {name.removeprefix("policy."): tensors[name] for name in of_policy}
-        critics = [name for name in state if name.startswith("critic.")]
-        state |= {DERIVED + name.removeprefix("critic."): state[name] for name in critics}
+        state = {}
+        for name, value in tensors.items():
+            if name.startswith("policy."):
+                state[name.removeprefix("policy.")] = value
+            if name.startswith("policy.critic."):
+                state[DERIVED + name.removeprefix("policy.critic.")] = value
         model.policy.load_state_dict(state)
     except Exception as error:  # what foreign data may raise is no closed list
         what = f"does not hold a complete {algorithm.__name__}: {error}"

@@ -55,9 +55,9 @@ class Updater:
         policy, on_gpu = self.policy, self.policy.device.type == "cuda"
         optimizers = policy.optimizer, self.entropy_coefficient.optimizer
         self.optimizers = [optimizer for optimizer in optimizers if optimizer is not None]
-        prepare_optimizers(self.optimizers, policy.device)
-        learning = [policy.encoder, policy.decoder, policy.actor]
-        learning += [policy.critic, policy.critic_target]
+        for optimizer in self.optimizers:
+            prepare_for_graphs(optimizer, on_gpu)
+        learning = policy.encoder, policy.decoder, policy.actor, policy.critic, policy.critic_target
         self.precision = MixedPrecision(nn.ModuleList(learning), self.hidden_dtype)
         #: By whether everything learns
         self._steps: dict[bool, Callable[[MetaBatch], Metrics]]
@@ -115,9 +115,8 @@ class GraphedStep:
     """Runs a step, which maps a meta-batch to scalar metrics without waiting for the device, and
     from the fourth on replays it: thousands of small kernels then cost one launch.
 
-    Everything that the step reads and does not change must stay where it is between calls, but for
-    the meta-batch, which is copied to where the graph reads it. Its optimisers must be
-    :func:`prepared <prepare_optimizers>`.
+    Everything that the step reads must stay where it is between calls, but for the meta-batch,
+    which is copied to where the graph reads it.
     """
 
     def __init__(self, step: Callable[[MetaBatch], Metrics]) -> None:
@@ -154,19 +153,17 @@ class GraphedStep:
         return dict(zip(self._names, self._values.clone().unbind(), strict=True))
 
 
-def prepare_optimizers(optimizers: list[th.optim.Optimizer], device: th.device) -> None:
-    """Keep optimisers' state where parameters are; only on a GPU may a graph capture them."""
-    for optimizer in optimizers:
-        for group in optimizer.param_groups:
-            if "capturable" in group:
-                group["capturable"] = device.type == "cuda"
-        for parameter, state in optimizer.state.items():
-            if "step" in state:
-                steps, place = state["step"], parameter.device
-                state["step"] = th.as_tensor(steps, dtype=th.float32, device=place)
+def prepare_for_graphs(optimizer: th.optim.Optimizer, on_gpu: bool) -> None:
+    """Keep an optimiser's state where parameters are; only on a GPU may a graph capture it."""
+    for group in optimizer.param_groups:
+        if "capturable" in group:
+            group["capturable"] = on_gpu
+    for parameter, state in optimizer.state.items():
+        if "step" in state:
+            steps = th.as_tensor(state["step"], dtype=th.float32, device=parameter.device)
+            state["step"] = steps
 
 
 def tensors(batch: tuple[Any, ...]) -> list[th.Tensor]:
     """All tensors of a meta-batch."""
-    parts = (tensors(part) if isinstance(part, tuple) else [part] for part in batch)
-    return [tensor for tensor in chain(*parts) if tensor is not None]
+    return list(chain(*(tensors(part) if isinstance(part, tuple) else [part] for part in batch)))

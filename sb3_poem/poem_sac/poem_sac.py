@@ -7,17 +7,17 @@ from typing import Any, ClassVar
 import numpy as np
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
+from torch.autograd.function import once_differentiable
+from torch.nn.functional import softplus
 
 from sb3_poem.common.buffers import Segment
 from sb3_poem.common.checks import check_number, check_whole
 from sb3_poem.common.family_view import FamilyView
-from sb3_poem.pearl_sac.arguments import refuse_unknown, with_arguments_of
+from sb3_poem.pearl_sac.arguments import GivenEnv, refuse_unknown, with_arguments_of
 from sb3_poem.pearl_sac.collector import EpochCollector, in_waves, relabelled_returns
-from sb3_poem.pearl_sac.environments import GivenEnv
-from sb3_poem.pearl_sac.objective import Objective
+from sb3_poem.pearl_sac.objective import Metrics, Objective, TaskEmbeddings
 from sb3_poem.pearl_sac.pearl_sac import PEARLSAC
-from sb3_poem.pearl_sac.sampler import MetaBatchSampler
-from sb3_poem.poem_sac.objective import POEMObjective
+from sb3_poem.pearl_sac.sampler import MetaBatch, MetaBatchSampler
 from sb3_poem.poem_sac.policies import MlpPolicy, POEMPolicy
 
 #: Arguments that are words, and which
@@ -44,6 +44,63 @@ class GroupSampler(MetaBatchSampler):
         return np.concatenate([self.groups[index] for index in chosen])
 
 
+@dataclass
+class POEMObjective(Objective):
+    """PEARL's losses and, weighted with ``preference_coef``, the preference loss."""
+
+    actor_trains_encoder: ClassVar[bool] = True  # L_policy trains both (section 5.3)
+
+    policy: POEMPolicy
+    preference_coef: float
+
+    def embedding_loss(
+        self, batch: MetaBatch, embeddings: TaskEmbeddings
+    ) -> tuple[th.Tensor, Metrics]:
+        """The preference loss (eqs. 6, 7), weighted."""
+        similarities = self.policy.compare(embeddings.reward, embeddings.policy)  # eq. 3
+        loss, accuracy = preference_loss(similarities, batch.returns)
+        metrics = {"preference_loss": loss, "preference_accuracy": accuracy}
+        return self.preference_coef * loss, metrics
+
+
+def preference_loss(similarity: th.Tensor, returns: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """Bradley-Terry cross-entropy over all triples (i, j, k) of a meta-batch (eqs. 6 and 7 of Xu &
+    Zhu 2025).
+
+    Task i predicts that policy j is preferred over policy k with probability sigmoid(S[i, j] - S[i,
+    k]); the truth is whether J[i, j] > J[i, k]. Pairs of equal or unknown return carry no order and
+    are left out; without any pair the loss is 0.
+
+    :param similarity: (tasks, tasks), S[i, j] = S(z_i, z_j)
+    :param returns: (tasks, tasks), J[i, j], NaN where unknown
+    :return: loss, and the share of pairs in the right order (NaN without pairs)
+    """
+    return _PreferenceLoss.apply(similarity, returns)
+
+
+class _PreferenceLoss(th.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, similarity: th.Tensor, returns: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        # (tasks i, policies j, policies k)
+        margin, difference = (x[:, :, None] - x[:, None, :] for x in (similarity, returns))
+        # every pair counts twice, as (j, k) and as (k, j), which changes neither of the means
+        sign = difference.nan_to_num_(nan=0.0, posinf=0.0, neginf=0.0).sign_()
+        agreement = margin.mul_(sign)
+        ordered = sign.abs()
+        n_pairs = ordered.sum()
+        counted = n_pairs.clamp(min=1.0)
+        # of j's similarity, over all k: (j, k) and (k, j) give the same
+        ctx.gradient = (sign * th.sigmoid(-agreement)).sum(dim=2).mul_(-2.0 / counted)
+        accuracy = (agreement > 0).sum() / n_pairs
+        ctx.mark_non_differentiable(accuracy)
+        return ordered.mul_(softplus(-agreement)).sum() / counted, accuracy
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, of_loss: th.Tensor, _: th.Tensor) -> tuple[th.Tensor, None]:  # type: ignore[override]
+        return ctx.gradient * of_loss, None
+
+
 @with_arguments_of(PEARLSAC, without="context_relabel_fraction")
 class POEMSAC(PEARLSAC):
     """Preference-order-preserving embedding on soft actor-critic (POEM, Xu & Zhu, ICML 2025),
@@ -54,11 +111,8 @@ class POEMSAC(PEARLSAC):
     trains them (eqs. 6, 7); contexts of the current policies with their action values (eq. 8); an
     encoder that learns from the actor as well.
 
-    Differences from the paper: twin target critics and a learned entropy coefficient, as SB3's SAC
-    has them, instead of a value network; a replay buffer that outlives the epoch for the critics
-    and the actor, while contexts and preference labels are the last epoch's only; the critics' loss
-    trains the encoder too, as in PEARL.
-
+    Differences from the paper are those of SAC and PEARL: twin target critics, a learned entropy
+    coefficient, a replay buffer that outlives the epoch, a critics' loss that trains the encoder.
     Of the arguments of :class:`PEARLSAC` it lacks ``context_relabel_fraction`` (contexts are of the
     task's own policy, eq. 8), and defaults of the losses' weights are others.
 
@@ -152,7 +206,7 @@ class POEMSAC(PEARLSAC):
 
     @property
     def relabels(self) -> bool:
-        """Whether J[i, j] comes from relabelling, rather than from rollouts."""
+        """Whether J[i, j] comes from relabelling."""
         if self.preference_source == "auto":
             return self.family.shared_dynamics
         return self.preference_source == "relabel"

@@ -39,7 +39,7 @@ from sb3_poem.adaptation import (
     named_rule,
 )
 from sb3_poem.adaptation.rule import Answer
-from sb3_poem.common.digest import digest_of
+from sb3_poem.common.networks import digest_of
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.resources import pretrained_folder

@@ -6,7 +6,6 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_poem.common import precision
 from sb3_poem.common.networks import MLP, LatentCritic, Normalised
 from sb3_poem.common.precision import MixedPrecision, hidden_dtype
 
@@ -21,14 +20,10 @@ def test_named_precisions(device: str) -> None:
 def test_auto_asks_the_processor(
     supported: bool, expected: th.dtype, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(precision, "cpu_has_bfloat16", lambda: supported)
+    monkeypatch.setattr(th.cpu, "_is_avx512_bf16_supported", lambda: supported)
     monkeypatch.setattr(th.cuda, "is_bf16_supported", lambda: not supported)
     assert hidden_dtype("auto", "cpu") is expected
     assert hidden_dtype("auto", "cuda") is (th.float32 if supported else th.bfloat16)
-
-
-def test_the_processor_is_known() -> None:
-    assert precision.cpu_has_bfloat16() in (True, False)
 
 
 @pytest.mark.parametrize("name", ["fp16", "float32", "", None])

@@ -10,7 +10,7 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
-from sb3_poem.poem_sac.objective import preference_loss
+from sb3_poem.poem_sac.poem_sac import preference_loss
 from sb3_poem.poem_sac.policies import POEMPolicy
 
 

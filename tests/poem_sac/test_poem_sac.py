@@ -29,7 +29,7 @@ from sb3_poem.common.buffers import Segment, TaskBatch
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.pearl_sac.collector import EpochCollector
 from sb3_poem.pearl_sac.objective import TaskEmbeddings, kl_to_prior
-from sb3_poem.poem_sac.objective import POEMObjective
+from sb3_poem.poem_sac.poem_sac import POEMObjective
 
 
 def transitions_of(model: PEARLSAC, start: int, stop: int) -> TaskBatch:
