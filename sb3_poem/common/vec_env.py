@@ -246,11 +246,13 @@ class _Copy:
 
     @property
     def np_random(self) -> np.random.Generator:
-        return self._vector_env.np_random[self._index]
+        rngs: Any = self._vector_env.np_random  # one a copy
+        return rngs[self._index]
 
     @property
     def np_random_seed(self) -> int:
-        return self._vector_env.np_random_seed[self._index]
+        seeds: Any = self._vector_env.np_random_seed
+        return seeds[self._index]
 
     def set_task(self, task: npt.ArrayLike) -> None:
         self._vector_env.set_tasks([np.asarray(task)], copies=[self._index])
