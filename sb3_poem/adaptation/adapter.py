@@ -21,7 +21,6 @@ from sb3_poem.adaptation.rule import (
     Rule,
     Setting,
     Shown,
-    Snapshot,
     as_rule,
     inference_rng,
     latent_of,
@@ -32,7 +31,7 @@ from sb3_poem.adaptation.state import parse_json, read_json, write_json_atomical
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.rollouts import rollout_latents
-from sb3_poem.common.trajectory import Trajectory
+from sb3_poem.common.trajectory import Trajectory, decode_array, encode_array
 from sb3_poem.loading import as_model
 
 FORMAT, FORMAT_VERSION = "sb3_poem.PreferenceAdapter", 3
@@ -126,7 +125,7 @@ class PreferenceAdapter:
         # What was rolled out to choose a question, by the question's number and latent
         self._seen: dict[tuple[int, bytes], Trajectory] = {}
         self.pending = None
-        self._previous: tuple[Snapshot, Query] | None = None
+        self._previous: tuple[dict[str, Any], Query] | None = None
 
     def _start(self) -> None:
         self.rule.check(self.model, self._setting)
@@ -346,6 +345,8 @@ class PreferenceAdapter:
         environment, oracle and library too.
         """
         model, pending, kind = self.model, self.pending, self.rule.question
+        state = self.inference.snapshot()
+        arrays = {name: encode_array(array) for name, array in state["arrays"].items()}
         return {
             "format": FORMAT,
             "version": FORMAT_VERSION,
@@ -364,7 +365,7 @@ class PreferenceAdapter:
                 for answer in self.inference.answers
             ],
             "pending": None if pending is None else shown_to_dict(kind, pending.shown),
-            "inference": self.inference.snapshot().to_dict(),
+            "inference": {**state, "arrays": arrays},
         }
 
     @classmethod
@@ -421,7 +422,9 @@ class PreferenceAdapter:
             ]
             waits = data["pending"]
             pending = None if waits is None else Query(shown_from_dict(kind, waits), kind)
-            self.inference.restore(Snapshot.from_dict(data["inference"]), answers)
+            state = data["inference"]
+            arrays = {name: decode_array(array) for name, array in state["arrays"].items()}
+            self.inference.restore({**state, "arrays": arrays}, answers)
         self.pending, self._previous = pending, None
         self._seen.clear()
 

@@ -13,10 +13,12 @@ from sb3_poem.adaptation import queries
 from sb3_poem.adaptation.decisions import DECISIONS, decide
 from sb3_poem.adaptation.meta_model import HasRewardDecoder, HasSimilarity, MetaModel
 from sb3_poem.adaptation.noise import (
+    INFER,
     PROBIT_SLOPE,
     BoltzmannNoise,
     ExactNoise,
     NoiseModel,
+    People,
     Values,
     noise_model_from_dict,
 )
@@ -28,7 +30,6 @@ from sb3_poem.adaptation.particles import (
     kernel_neighbours,
     systematic_resample,
 )
-from sb3_poem.adaptation.people import INFER, People
 from sb3_poem.adaptation.preference import (
     ANSWERS,
     BEST_OF_FOUR,
@@ -43,12 +44,10 @@ from sb3_poem.adaptation.rule import (
     Rule,
     Setting,
     Shown,
-    Snapshot,
-    check_choice,
     latent_of,
     trajectories_of,
 )
-from sb3_poem.common.checks import check_whole
+from sb3_poem.common.checks import check_choice, check_whole
 from sb3_poem.common.trajectory import Trajectory
 
 LIKELIHOODS = ("decoder", "similarity")
@@ -149,7 +148,7 @@ class Bayes(Rule):
 
     *Who answers*: how an oracle errs can be told (``noise_model``) or inferred with the task: the
     posterior is then one of latent and person together, of whom there is a grid in the place of
-    each particle (:class:`~sb3_poem.adaptation.people.People` states the prior), and both answers
+    each particle (:class:`~sb3_poem.adaptation.noise.People` states the prior), and both answers
     and questions are averaged over it. What a person calls equal and much better, which graded
     answers depend on, is always inferred.
 
@@ -617,7 +616,7 @@ class BayesInference(Inference):
             told = self._log_likelihoods(particles, self.answers) + self.people.log_prior
             self.people_log_shares[moved] = log_softmax(told, axis=1)
 
-    def restore(self, snapshot: Snapshot, answers: list[Answer]) -> None:
+    def restore(self, snapshot: dict[str, Any], answers: list[Answer]) -> None:
         super().restore(snapshot, answers)
         self._library_returns = None
 

@@ -16,8 +16,7 @@ from sb3_poem.adaptation.evaluation import (
 from sb3_poem.adaptation.limits import AnswerLimits
 from sb3_poem.adaptation.meta_model import HasSimilarity, MetaModel
 from sb3_poem.adaptation.noise import NoiseModel
-from sb3_poem.adaptation.rule import check_choice
-from sb3_poem.common.checks import check_whole
+from sb3_poem.common.checks import check_choice, check_whole
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.rollouts import rollout_outcomes
 

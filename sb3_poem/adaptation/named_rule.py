@@ -5,7 +5,8 @@ from typing import Any
 from sb3_poem.adaptation.bayes import Bayes
 from sb3_poem.adaptation.noise import MistakeNoise
 from sb3_poem.adaptation.paper import Paper
-from sb3_poem.adaptation.rule import Rule, check_choice
+from sb3_poem.adaptation.rule import Rule
+from sb3_poem.common.checks import check_choice
 
 
 def named_rule(

@@ -17,10 +17,9 @@ from sb3_poem.adaptation.rule import (
     Rule,
     Setting,
     Shown,
-    check_choice,
     latent_of,
 )
-from sb3_poem.common.checks import check_whole
+from sb3_poem.common.checks import check_choice, check_whole
 
 # Bound on the draws for a question.
 MAX_DRAWS = 16384

@@ -67,7 +67,7 @@ class Query:
     def __post_init__(self) -> None:
         if self.kind not in ANSWERS:
             raise ValueError(f"`kind` must be one of {tuple(ANSWERS)}, but is {self.kind!r}")
-        check_number(self.kind, self.shown)
+        check_shown(self.kind, self.shown)
 
     @property
     def left(self) -> Trajectory:
@@ -95,7 +95,7 @@ class Query:
         return write_video(in_rows(clips, captions), path, fps)
 
 
-def check_number(kind: str, shown: Sequence[Any]) -> None:
+def check_shown(kind: str, shown: Sequence[Any]) -> None:
     """Refuse another number of trajectories than this kind of question shows."""
     if len(shown) != len(PLACES[kind]):
         raise ValueError(

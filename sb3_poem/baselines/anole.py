@@ -13,13 +13,13 @@ from sb3_poem.adaptation.meta_model import HasRewardDecoder, MetaModel
 from sb3_poem.adaptation.preference import SIGNS, Preference
 from sb3_poem.adaptation.priors import SOURCES, make_prior
 from sb3_poem.adaptation.queries import random_set
-from sb3_poem.adaptation.rule import Shown, Snapshot, check_choice, trajectories_of
+from sb3_poem.adaptation.rule import Shown, trajectories_of
 from sb3_poem.baselines.fragments import (
     check_shared_dynamics,
     default_fragment_length,
     replay_fragments,
 )
-from sb3_poem.common.checks import check_whole
+from sb3_poem.common.checks import check_choice, check_whole
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.pearl_sac import PEARLSAC
 
@@ -193,7 +193,7 @@ class ANOLEInference(Inference):
         worse = ~self.alive if self.rule.strategy == "greedy" else self.contradictions
         return self.candidates[np.lexsort((self.priority, worse))[0]].copy()
 
-    def restore(self, snapshot: Snapshot, answers: list[Answer]) -> None:
+    def restore(self, snapshot: dict[str, Any], answers: list[Answer]) -> None:
         super().restore(snapshot, answers)
         self._library_returns = None
 

@@ -16,7 +16,7 @@ from stable_baselines3.common.utils import set_random_seed
 from sb3_poem.adaptation import Answer, Inference, Rule, Setting
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.preference import Preference
-from sb3_poem.adaptation.rule import Shown, Snapshot, trajectories_of
+from sb3_poem.adaptation.rule import Shown, trajectories_of
 from sb3_poem.baselines.fragments import check_shared_dynamics, standardised
 from sb3_poem.baselines.meta_reward import MetaReward
 from sb3_poem.common.checks import check_whole
@@ -191,7 +191,7 @@ class MAMLRewardInference(Inference):
     def estimate(self) -> np.ndarray:
         return self.latent.copy()
 
-    def restore(self, snapshot: Snapshot, answers: list[Answer]) -> None:
+    def restore(self, snapshot: dict[str, Any], answers: list[Answer]) -> None:
         """See :class:`Inference`: the answers are told again."""
         super().restore(snapshot, [])
         self._restart()

@@ -19,10 +19,10 @@ from sb3_poem.adaptation.rule import (
     Rule,
     Setting,
     Shown,
-    check_choice,
     trajectories_of,
 )
 from sb3_poem.baselines.fragments import transition_rows
+from sb3_poem.common.checks import check_choice
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.pearl_sac import PEARLSAC

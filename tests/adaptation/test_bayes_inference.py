@@ -31,7 +31,7 @@ from sb3_poem.adaptation.particles import (
 from sb3_poem.adaptation.preference import ANSWERS as ANSWERS_OF
 from sb3_poem.adaptation.preference import Preference, preference_log_likelihood
 from sb3_poem.adaptation.priors import AggregatePrior, GaussianPrior
-from sb3_poem.adaptation.rule import Answer, Setting, Snapshot
+from sb3_poem.adaptation.rule import Answer, Setting
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.common.vec_env import make_task_vec_env
@@ -643,11 +643,11 @@ def test_a_snapshot_continues_exactly():
             at_speed(model, model.speed(left), left),
             at_speed(model, model.speed(right), right),
         )
-    second.restore(Snapshot.from_dict(first.snapshot().to_dict()), first.answers)
+    second.restore(first.snapshot(), first.answers)
     np.testing.assert_array_equal(first.estimate(), second.estimate())
     np.testing.assert_array_equal(first.ask(), second.ask())
     with pytest.raises(ValueError, match="snapshot of BayesInference"):
-        first.restore(Snapshot(first.snapshot().random_state, {}), [])
+        first.restore({**first.snapshot(), "arrays": {}}, [])
 
 
 class NoDecoder(SpeedModel):

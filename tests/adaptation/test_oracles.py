@@ -20,7 +20,7 @@ from sb3_poem.adaptation import (
     PreferenceAdapter,
     ReturnOracle,
 )
-from sb3_poem.adaptation.human import PROMPTS
+from sb3_poem.adaptation.oracles import PROMPTS
 from sb3_poem.adaptation.rule import inference_rng
 from sb3_poem.common.trajectory import Trajectory
 
