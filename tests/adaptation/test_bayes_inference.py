@@ -432,13 +432,11 @@ def test_kernel_neighbours_keep_mean_and_covariance_and_stay_where_the_prior_is(
     ]
     weights = np.full(len(particles), 1 / len(particles))
     fitted = fit_gaussian(particles, weights)
-    neighbours = kernel_neighbours(particles, fitted, 0.3, None, rng)
+    neighbours = kernel_neighbours(particles, fitted, None, rng)
     assert np.all(np.any(neighbours != particles, axis=1))
     np.testing.assert_allclose(neighbours.mean(axis=0), particles.mean(axis=0), atol=0.02)
     np.testing.assert_allclose(np.cov(neighbours.T), np.cov(particles.T), atol=0.03)
-    upper = kernel_neighbours(
-        particles, fitted, 0.3, lambda z: np.where(z[:, 0] > 1, 0.0, -1e9), rng
-    )
+    upper = kernel_neighbours(particles, fitted, lambda z: np.where(z[:, 0] > 1, 0.0, -1e9), rng)
     inside = particles[:, 0] > 1
     assert np.all(upper[inside, 0] > 1)
 
