@@ -62,10 +62,8 @@ def evaluate_episodes(
     seed: int = 0,
     deterministic: bool = True,
 ) -> EpisodeOutcomes:
-    """True returns of latents (n, latent_dim) on tasks (n, task_dim), row by row: an episode's
-    rewards up to its end, early or not, not discounted; and successes.
-
-    Episode e of row i always starts from the same seed, so the same rows with other latents are
+    """True undiscounted returns of latents (n, latent_dim) on tasks (n, task_dim), row by row; and
+    successes. Episode e of row i always starts from the same seed, so that other latents are
     compared on equal starts. For ``model`` and ``env`` see :func:`adapt_tasks`.
 
     :param seed: Where the episodes' reset seeds start.
@@ -80,17 +78,15 @@ def evaluate_episodes(
             f"but have shapes {latents.shape} and {tasks.shape}"
         )
     check_whole("n_episodes", n_episodes, 1)
-    shape = n_episodes, len(latents)
-    rows = np.tile(np.arange(len(latents)), n_episodes)
-    outcomes = rollout_outcomes(model, vec_env, latents[rows], tasks[rows], seed, deterministic)
-    family, successes = FamilyView(vec_env), None
+    shape, family = (n_episodes, len(latents)), FamilyView(vec_env)
+    every, of = np.tile(latents, (n_episodes, 1)), np.tile(tasks, (n_episodes, 1))
+    outcomes = rollout_outcomes(model, vec_env, every, of, seed, deterministic)
     returns = [
-        float(np.sum(family.compute_rewards(tasks[row], outcome.reward_features)))
-        for row, outcome in zip(rows, outcomes, strict=True)
+        float(np.sum(family.compute_rewards(task, outcome.reward_features)))
+        for task, outcome in zip(of, outcomes, strict=True)
     ]
-    if all(outcome.success is not None for outcome in outcomes):
-        flags = np.array([outcome.success for outcome in outcomes], dtype=bool)
-        successes = flags.reshape(shape).T
+    flags = np.array([outcome.success for outcome in outcomes]).reshape(shape).T
+    successes = None if None in flags else flags.astype(bool)
     return EpisodeOutcomes(np.array(returns).reshape(shape).T, successes)
 
 
@@ -103,9 +99,8 @@ class AdaptationEvaluation(TaskAdaptations):
     >>> result.task_returns.shape
     (3, 2)
 
-    :param returns: (n_tasks, len(record_at), n_episodes).
-    :param successes: (n_tasks, len(record_at), n_episodes), whether an episode was a success; None
-        for a family that does not say.
+    :param returns: (n_tasks, len(record_at), n_episodes), and ``successes``, whether an episode was
+        one; None for a family that does not say.
     """
 
     returns: np.ndarray
@@ -134,12 +129,13 @@ class AdaptationEvaluation(TaskAdaptations):
     def after(self, n_answers: int) -> float:
         """Mean return after so many answers, which must be one of ``record_at``."""
         if n_answers not in self.record_at:
-            recorded = f"returns were recorded after {self.record_at} answers"
-            raise ValueError(f"{recorded}, not after {n_answers}")
+            raise ValueError(
+                f"returns were recorded after {self.record_at} answers, not after {n_answers}"
+            )
         return float(self.mean_returns[self.record_at.index(n_answers)])
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-ready: means, and every task's, after every recorded number of answers."""
+        """JSON-ready: means, and those of every task, after the recorded numbers of answers."""
         data: dict[str, Any] = {
             "queries": list(self.record_at),
             "mean_return": self.mean_returns.tolist(),
@@ -188,26 +184,25 @@ def evaluate_adaptation(
     own, vec_env = model_and_env(model, env)
     tasks, start = choose_test_tasks(own, vec_env, tasks, seed), evaluation_seed(seed)
     outcomes: list[EpisodeOutcomes] = []
+    found: AdaptationEvaluation | None = None
 
     def measure(adapted: TaskAdaptations) -> None:
+        nonlocal found
         latents = adapted.latents[:, -1], adapted.tasks
         outcomes.append(evaluate_episodes(own, vec_env, *latents, n_episodes, start, deterministic))
+        returns = np.stack([each.returns for each in outcomes], axis=1)
+        known = [each.successes for each in outcomes if each.successes is not None]
+        successes = np.stack(known, axis=1) if len(known) == len(outcomes) else None
+        found = AdaptationEvaluation(**vars(adapted), returns=returns, successes=successes)
         if on_record is not None:
-            on_record(_evaluation(adapted, outcomes))
+            on_record(found)
 
     how: dict[str, Any] = {"rule": rule, "n_queries": max(1, *record_at), "record_at": record_at}
     how |= {"seed": seed, "deterministic": deterministic, "library": library}
     how |= {"progress_bar": progress_bar, "on_record": measure}
-    return _evaluation(adapt_tasks(own, vec_env, tasks, oracle_factory, **how), outcomes)
-
-
-def _evaluation(
-    adapted: TaskAdaptations, outcomes: Sequence[EpisodeOutcomes]
-) -> AdaptationEvaluation:
-    returns = np.stack([outcome.returns for outcome in outcomes], axis=1)
-    known = [outcome.successes for outcome in outcomes if outcome.successes is not None]
-    successes = np.stack(known, axis=1) if len(known) == len(outcomes) else None
-    return AdaptationEvaluation(**vars(adapted), returns=returns, successes=successes)
+    adapt_tasks(own, vec_env, tasks, oracle_factory, **how)
+    assert found is not None
+    return found
 
 
 def choose_test_tasks(

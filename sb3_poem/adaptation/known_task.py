@@ -81,17 +81,13 @@ def known_task_return(
 ) -> KnownTaskReturn:
     """The return if the task were known: for each task the best of many latents, refined by two
     rounds of draws around it. Winners are rolled out anew, so that the luck of having been chosen
-    does not count.
-
-    Beside the adapted return it tells which to work on: the repertoire of policies, or the
-    inference among them. Where tasks share their dynamics every latent is rolled out once, and its
+    does not count. Where tasks share their dynamics every latent is rolled out once, and its
     trajectory relabelled for every task.
 
     The *limit* is what the best 2^k of the latents that were tried at first earn on these tasks
     (:class:`AnswerLimits`). They are chosen on other tasks, for which the same rollouts are
-    relabelled, and scored by fresh episodes: so it does not profit from luck, nor from knowing the
-    test tasks. Where tasks do not share dynamics they are chosen on the test tasks themselves, and
-    only the episodes are others. It is the best codebook of these policies, not of any method.
+    relabelled (where tasks do not share their dynamics, on the test tasks themselves), and scored
+    by fresh episodes.
 
     >>> best = known_task_return("PointGoal", "poem/PointGoal-v0", 5, n_latents=50)
     >>> best.latents.shape  # a policy for each of five tasks
@@ -99,8 +95,7 @@ def known_task_return(
 
     :param model: And ``env``: see :func:`adapt_tasks`.
     :param tasks: See :func:`evaluate_adaptation`.
-    :param n_latents: How many to try at first; None for 300, or for 30 where every latent must be
-        rolled out in every task.
+    :param n_latents: How many to try at first; None for 300, or 30 where dynamics differ.
     :param n_episodes: Fresh episodes per winner.
     :param source: Where latents come from: "prior", "aggregate", or "both" in equal parts.
     :param selection_episodes: Episodes per latent (and task, where dynamics differ) for choosing.
@@ -113,9 +108,9 @@ def known_task_return(
     shared = family.shared_dynamics
     if n_latents is None:
         n_latents = LATENTS_WITH_SHARED_DYNAMICS if shared else LATENTS_WITH_OWN_DYNAMICS
-    check_whole("n_latents", n_latents, 1)
-    check_whole("n_episodes", n_episodes, 1)
-    check_whole("selection_episodes", selection_episodes, 1)
+    numbers = {"n_latents": n_latents, "n_episodes": n_episodes}
+    for name, number in {**numbers, "selection_episodes": selection_episodes}.items():
+        check_whole(name, number, 1)
     rng = np.random.default_rng([seed, 2])
     candidates = _draw_latents(model, n_latents, source, rng)
     others = tasks[:0]
@@ -163,9 +158,7 @@ def known_task_return(
 
 def return_spread(model: MetaModel | str | Path, env: Env, seed: int = 0) -> float:
     """The family's spread of returns: the root mean square difference of the returns of two random
-    policies of a model on a random task, which thresholds of graded answers are shares of.
-
-    :param model: And ``env``: see :func:`adapt_tasks`.
+    policies of a model on a random task. For ``model`` and ``env`` see :func:`adapt_tasks`.
     """
     model, vec_env = model_and_env(model, env)
     tasks = choose_test_tasks(model, vec_env, SPREAD_TASKS, seed)
@@ -189,9 +182,8 @@ def return_matrix(
     seed: int = 0,
     deterministic: bool = True,
 ) -> np.ndarray:
-    """J[i, j], (n_tasks, n_latents), the mean true return on task i (n_tasks, task_dim) of the
-    policy of latent j (n_latents, latent_dim) over so many episodes, whose reset seeds start at
-    ``seed``. Where tasks share their dynamics each latent is rolled out once for all of them.
+    """J[i, j], (n_tasks, n_latents), the mean true return of latent j (n_latents, latent_dim) on
+    task i (n_tasks, task_dim), over episodes whose reset seeds start at ``seed``.
     """
     tasks, latents = np.asarray(tasks, dtype=np.float64), np.asarray(latents, dtype=np.float64)
     family, shape = FamilyView(vec_env), (len(tasks), len(latents))
@@ -218,12 +210,11 @@ def property_one(similarities: np.ndarray, returns: np.ndarray) -> tuple[float, 
     >>> round(accuracy, 2), round(tau, 2)
     (0.67, 0.33)
 
-    :return: Preference accuracy, the share of pairs of policies with different returns that S puts
-        in the right order (a tie of S counts one half); and Kendall's tau-b, averaged over tasks.
-        NaN if no task tells any two policies apart.
+    :return: The share of pairs of policies with different returns that S puts in the right order (a
+        tie of S counts one half); and Kendall's tau-b, averaged over tasks. NaN if no task tells
+        any two policies apart.
     """
-    similarities = np.asarray(similarities, dtype=np.float64)
-    returns = np.asarray(returns, dtype=np.float64)
+    similarities, returns = (np.asarray(x, dtype=np.float64) for x in (similarities, returns))
     if similarities.shape != returns.shape or similarities.ndim != 2:
         raise ValueError(
             "`similarities` and `returns` must have the same shape (n_tasks, n_policies), but have "
@@ -244,13 +235,9 @@ def property_one(similarities: np.ndarray, returns: np.ndarray) -> tuple[float, 
 
 
 def preference_order(model: HasSimilarity, known: KnownTaskReturn) -> tuple[float, float]:
-    """:func:`property_one` on held-out tasks. A held-out task's latent is the best of the
-    candidates for it; S between those latents is compared with the returns of their policies on
-    those tasks.
-    """
-    best = np.argmax(known.candidate_returns, axis=1)
+    """:func:`property_one` on held-out tasks, whose latents are the best of the candidates."""
+    best, latents = np.argmax(known.candidate_returns, axis=1), known.candidate_latents
     policies = np.unique(best)
-    latents = known.candidate_latents
     similarities = model.similarities(latents[best], latents[policies])
     return property_one(similarities, known.candidate_returns[:, policies])
 

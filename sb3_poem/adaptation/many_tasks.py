@@ -24,9 +24,9 @@ Library = Sequence[Trajectory] | Callable[[np.ndarray], Sequence[Trajectory]]
 
 @dataclass(frozen=True, eq=False)
 class TaskAdaptations:
-    """Many tasks, adapted: ``tasks`` (n_tasks, task_dim), the numbers of answers at which estimates
-    were kept, ascending, those ``latents`` (n_tasks, len(record_at), latent_dim), and each task's
-    answers in order. :func:`adapt_tasks` gives them.
+    """From :func:`adapt_tasks`: ``tasks`` (n_tasks, task_dim), the numbers of answers at which
+    estimates were kept, ascending, those ``latents`` (n_tasks, len(record_at), latent_dim), and
+    each task's answers in order.
 
     >>> from sb3_poem import ReturnOracle
     >>> tasks = np.array([[0.5], [1.5]])
@@ -63,10 +63,9 @@ def adapt_tasks(
     once.
 
     Task i is adapted as ``PreferenceAdapter(model, env, seed=seed + i, ...)`` would alone: with the
-    same candidates, questions and reset seeds. (Matrix products may round otherwise in a batch than
-    alone, in the last bits; and with ``deterministic=False`` the actions' noise is drawn for all
-    rollouts of a question together.) The tasks are set in ``env`` for the rollouts, and known to
-    the oracles; a rule that infers from answers never sees them.
+    same candidates, questions and reset seeds. (Products may round otherwise in a batch; and with
+    ``deterministic=False`` the actions' noise is drawn for all rollouts together.) The tasks are
+    set in ``env``, and known to the oracles; a rule that infers from answers never sees them.
 
     Arguments that are not explained here are those of :class:`PreferenceAdapter`.
 
@@ -92,10 +91,8 @@ def adapt_tasks(
     _check_factory(oracle_factory)
     tasks = np.asarray(tasks, dtype=np.float64)
     if tasks.ndim != 2 or len(tasks) < 1:
-        raise ValueError(
-            "`tasks` must have shape (n_tasks, task_dim) with at least one task, but has shape "
-            f"{tasks.shape}"
-        )
+        expected = "shape (n_tasks, task_dim) with at least one task"
+        raise ValueError(f"`tasks` must have {expected}, but has shape {tasks.shape}")
     check_whole("seed", seed, 0)
     check_whole("n_queries", n_queries, 1)
     record_at = range(n_queries + 1) if record_at is None else record_at
@@ -127,11 +124,10 @@ def adapt_tasks(
             asked = [item for inference in inferences for item in inference.ask()]
             shown = [item for item in asked if isinstance(item, Trajectory)]
             if not shown:
-                seeds = [
-                    rollout_seed(number, query) for number, _ in numbered for _ in range(n_shown)
-                ]
-                policies = np.stack([latent_of(item) for item in asked])
+                own_seeds = [rollout_seed(number, query) for number, _ in numbered]
+                seeds = np.repeat(own_seeds, n_shown).tolist()
                 where = np.repeat(tasks, n_shown, axis=0)
+                policies = np.stack([latent_of(item) for item in asked])
                 shown = rollout_latents(model, vec_env, policies, where, seeds, by_mode)
             for i, (inference, oracle) in enumerate(zip(inferences, oracles, strict=True)):
                 own = shown[n_shown * i : n_shown * (i + 1)]
