@@ -62,9 +62,9 @@ class TaskOracle(ABC):
         ``env`` (in its first copy) whenever a question is asked.
     :param seed: Of the oracle's own noise.
     :param thresholds: Answers are graded: EQUAL up to the first difference of returns, MUCH_LEFT or
-        MUCH_RIGHT beyond the second; None compares, and nothing but a difference of 0 is EQUAL. See
-        :func:`~sb3_poem.adaptation.known_task.return_spread` for what is much in a family. Of four
-        the best one is told from the second best by the first of them.
+        MUCH_RIGHT beyond the second (see :func:`~sb3_poem.adaptation.return_spread`); None
+        compares, and only a difference of 0 is EQUAL. Of four the best one is told from the second
+        best by the first of them.
     :param question: The kind of questions that it answers, see :class:`Query`: "best-of-four", or
         None, which is "graded" with ``thresholds`` and else "pair".
     """
@@ -84,10 +84,8 @@ class TaskOracle(ABC):
         if thresholds is not None:
             equal, much = thresholds if len(thresholds) == 2 else (np.nan, np.nan)
             if not 0.0 <= equal <= much < np.inf:
-                raise ValueError(
-                    "`thresholds` must be two finite differences of returns, the first not the "
-                    f"larger, but is {thresholds!r}"
-                )
+                two = "two finite differences of returns, the first not the larger"
+                raise ValueError(f"`thresholds` must be {two}, but is {thresholds!r}")
             self.thresholds = (float(equal), float(much))
         usual = "pair" if thresholds is None else "graded"
         if question not in (None, usual, BEST_OF_FOUR):
@@ -163,13 +161,11 @@ class ReturnOracle(TaskOracle):
 
 
 class BoltzmannOracle(TaskOracle):
-    """Left wins with probability 1 / (1 + exp(-beta (R_left - R_right))) (C.6 of Xu & Zhu 2025): it
-    perceives the difference with a logistic error of scale 1 / beta.
+    """Left wins with probability 1 / (1 + exp(-beta (R_left - R_right))) (C.6 of Xu & Zhu 2025).
 
     With the paper's beta (None), ``1 / (|R_left| + |R_right|)``, an answer is right at most 73 % of
-    the time, and ten answers carry less than two bits. Of four each wins with a probability
-    proportional to exp(beta R), where the paper's beta becomes ``1 / (2 mean |R|)``. For the other
-    arguments see :class:`TaskOracle`.
+    the time. Of four each wins with a probability proportional to exp(beta R), where the paper's
+    beta becomes ``1 / (2 mean |R|)``. For the other arguments see :class:`TaskOracle`.
 
     >>> BoltzmannOracle(beta=0.5).noise_model
     BoltzmannNoise(beta=0.5)
@@ -190,9 +186,8 @@ class BoltzmannOracle(TaskOracle):
 
 
 class MistakeOracle(TaskOracle):
-    """The right answer, flipped with a probability in [0, 1], of which the noise model knows those
-    up to 0.5; of four another one, whichever. Equal returns stay EQUAL. For the other arguments see
-    :class:`TaskOracle`.
+    """The right answer, flipped with a probability in [0, 1]; of four another one, whichever. Equal
+    returns stay EQUAL. For the other arguments see :class:`TaskOracle`.
 
     >>> MistakeOracle(0.1).noise_model
     MistakeNoise(rate=0.1)
@@ -242,9 +237,8 @@ class HumanOracle:
     """Shows a question's trajectories beside each other in a video file, and asks at the terminal.
 
     The n-th question's file is ``query-001.gif`` and so on (or ``.mp4``) within the folder. The
-    prompt takes l or left, r or right, and e, equal, = or ?, in upper or lower case; or a number,
-    1 (left) and 2 (right) of a pair, 1 (left is much better) to 5 (right is much better) of a
-    graded question, and 1 to 4, or 0, of a best of four; anything else is asked again.
+    prompt takes l or left, r or right, and e, equal, = or ?, or a number: 1 or 2 of a pair, 1 (left
+    is much better) to 5 of a graded question, and 1 to 4, or 0, of a best of four.
 
     >>> from sb3_poem import PreferenceAdapter
     >>> import gymnasium as gym
@@ -254,15 +248,13 @@ class HumanOracle:
     >>> policy = adapter.adapt()
     Query 1: preference_queries/query-001.gif
 
-    :param folder: Where the videos go; it is made if missing.
     :param video_format: "gif" (any viewer plays it) or "mp4" (smaller).
     :param mistake_rate: How often a person is taken to err, for the Bayesian rule; None lets it
         infer how they do.
     :param question: "pair", "graded" or "best-of-four", as the rule's.
-    :param read: Reads a line after showing a prompt; ``input`` by default.
-    :param write: Shows a line; ``print`` by default.
-    :param record: Called with each :class:`HumanAnswer` as soon as it is understood;
-        ``sb3_poem.label`` has one that keeps them in the store of the web page.
+    :param read: Reads a line after showing a prompt; ``write`` shows one.
+    :param record: Called with each :class:`HumanAnswer`; ``sb3_poem.label.StoreRecorder`` keeps
+        them in the store of the web page.
     """
 
     needs_frames = True
@@ -292,8 +284,8 @@ class HumanOracle:
         return f"HumanOracle({self.n_asked} asked, videos in {self.folder})"
 
     def __call__(self, *shown: Trajectory) -> Preference:
-        """Write the video of trajectories with frames, as many as a question of its kind shows, and
-        ask until an answer is understood; an ``EOFError`` if standard input has ended.
+        """Write the video of trajectories with frames, and ask until an answer is understood; an
+        ``EOFError`` if standard input has ended.
         """
         asked, query = time.time(), Query(shown, self.question)
         name = f"query-{self.n_asked + 1:03d}.{self.video_format}"

@@ -1,6 +1,4 @@
-"""ANOLE and its two variants: candidates told apart by the reward decoder (Ren et al. 2022), in as
-many ways as the answers still to come may lie (Berlekamp 1968).
-"""
+"""ANOLE and its two variants: twenty questions with a liar (Ren et al. 2022; Berlekamp 1968)."""
 
 from dataclasses import dataclass
 from math import comb, floor
@@ -30,16 +28,14 @@ MAX_CANDIDATES = 2**14  # each has a predicted return for every fragment
 @dataclass(frozen=True, repr=False)
 class ANOLE(Rule):
     """ANOLE (Ren et al. 2022) asks about fragments of what the training tasks' policies did, and
-    never rolls out on the new task. Candidates are latents; each predicts an answer by the reward
-    decoder's returns of the two fragments, and what counts is how many answers it contradicts;
-    equal returns, and answers of EQUAL, contradict nothing.
+    never rolls out on the new task. Each candidate, a latent, predicts an answer by the reward
+    decoder's returns of the two fragments, and what counts is how many answers it contradicts.
 
-    It takes a ``PEARLSAC`` with its reward decoder and, unless the adapter has a ``library``, its
-    replay buffer.
+    It takes a ``PEARLSAC`` with its replay buffer, unless the adapter has a ``library``.
 
     - "berlekamp" (ANOLE): of random pairs the one whose worse answer leaves the smallest Berlekamp
       volume.
-    - "greedy" (greedy binary search): 2^K candidates, the pair that splits them most evenly; what
+    - "greedy" (binary search): 2^K candidates, the pair that splits them most evenly; what
       disagrees is dropped, unless nothing would be left.
     - "random": one random pair, else as ANOLE.
 
@@ -54,10 +50,9 @@ class ANOLE(Rule):
     :param strategy: "berlekamp", "greedy" or "random".
     :param n_candidates: Candidates at least; "greedy" takes 2^K.
     :param mistake_rate: The share of answers that may be mistakes: E = floor(rate K).
-    :param n_pairs: Random pairs to choose from for each question; they are drawn from twice as many
-        fragments.
+    :param n_pairs: Random pairs to choose from for each question, of twice as many fragments.
     :param fragment_length: Steps of a fragment from the replay buffer; None takes 50, or an episode
-        that is shorter (the paper gives none).
+        that is shorter.
     :param candidates: Where candidates come from: "prior" or "aggregate".
     """
 
@@ -89,12 +84,12 @@ class ANOLE(Rule):
     def check(self, model: MetaModel, setting: Setting) -> None:
         """See :class:`Rule`: it needs a decoder, experience, and tasks that share dynamics."""
         super().check(model, setting)
-        most = max(MAX_CANDIDATES, self.n_candidates)
-        allowed = [k for k in range(1, setting.n_queries + 1) if self.total_candidates(k) <= most]
-        if setting.n_queries not in allowed:
+        n, most = setting.n_queries, max(MAX_CANDIDATES, self.n_candidates)
+        if self.total_candidates(n) > most:
+            allowed = max(k for k in range(n) if self.total_candidates(k) <= most)
             raise ValueError(
-                f"`n_queries` must be at most {max(allowed)} with {self}, which keeps no more than "
-                f"{most:,} candidates, but is {setting.n_queries}"
+                f"`n_queries` must be at most {allowed} with {self}, which keeps no more than "
+                f"{most:,} candidates, but is {n}"
             )
         untrained = isinstance(model, PEARLSAC) and model.reward_coef == 0
         if untrained or not isinstance(model, HasRewardDecoder):
@@ -106,10 +101,9 @@ class ANOLE(Rule):
             return
         if not has_experience(model):
             raise ValueError(
-                "`model` has no experience to ask about, because its replay buffer is empty (a "
-                "loaded model has none): call load_replay_buffer, or pass library="
-                "sb3_poem.baselines.training_rollouts(model, env, 200), of another copy of the "
-                "environment"
+                "`model` has no experience to ask about, as its replay buffer is empty (a loaded "
+                "model has none): call load_replay_buffer, or pass library="
+                "sb3_poem.baselines.training_rollouts(model, env, 200)"
             )
         check_shared_dynamics(
             setting,
@@ -143,8 +137,7 @@ class ANOLEInference(Inference):
         self.rule, self.model, self.n_queries, self.library = rule, model, n_queries, library
         n = rule.total_candidates(n_queries)
         self.candidates = make_prior(model, rule.candidates, rng).sample(n, rng)
-        # Ties are broken at random, but always alike: looking at the estimate must not change what
-        # comes after.
+        # Ties are broken at random, but always alike.
         self.priority = rng.permutation(n)
         self.contradictions = np.zeros(n, dtype=np.int64)
         self.alive = np.ones(n, dtype=bool)
@@ -156,22 +149,22 @@ class ANOLEInference(Inference):
         return max(self.rule.budget(self.n_queries), int(self.contradictions.min()))
 
     def ask(self) -> tuple[Shown, Shown]:
-        """See :class:`Inference`: the best of random pairs, or one random pair."""
-        n = len(self.library)
-        if self.rule.strategy == "random":
-            first, second = random_set(n, 2, self.rng)
-            return self.library[first], self.library[second]
-        pairs = np.array([random_set(n, 2, self.rng) for _ in range(self.rule.n_pairs)])
-        if self._library_returns is None:
-            self._library_returns = self.model.predicted_returns(self.candidates, self.library)
-        returns = self._library_returns
-        scores = self._scores(returns[:, pairs[:, 0]] - returns[:, pairs[:, 1]])
-        first, second = pairs[np.argmin(scores)]
+        """The best of random pairs, or one random pair."""
+        n_pairs = 1 if self.rule.strategy == "random" else self.rule.n_pairs
+        pairs = np.array([random_set(len(self.library), 2, self.rng) for _ in range(n_pairs)])
+        best = 0
+        if n_pairs > 1:
+            if self._library_returns is None:
+                self._library_returns = self.model.predicted_returns(self.candidates, self.library)
+            returns = self._library_returns
+            scores = self._scores(returns[:, pairs[:, 0]] - returns[:, pairs[:, 1]])
+            best = int(np.argmin(scores))
+        first, second = pairs[best]
         return self.library[first], self.library[second]
 
     def _scores(self, differences: np.ndarray) -> np.ndarray:
-        """(n_pairs,) how much of the candidates the worse answer leaves: Berlekamp volumes, or for
-        "greedy" their number. ``differences`` (n_candidates, n_pairs) are of predicted returns.
+        """(n_pairs,) Berlekamp volumes that the worse answer leaves, or for "greedy" the number of
+        candidates; ``differences`` (n_candidates, n_pairs) are of predicted returns.
         """
         if self.rule.strategy == "greedy":
             # Without a budget for mistakes the volume of a candidate is 1 until it is contradicted.
@@ -189,7 +182,7 @@ class ANOLEInference(Inference):
         self.answers.append(Answer(preference, shown))
 
     def estimate(self) -> np.ndarray:
-        """See :class:`Inference`: a candidate of fewest contradictions; for "greedy" one left."""
+        """A candidate of fewest contradictions; for "greedy" one that is left."""
         worse = ~self.alive if self.rule.strategy == "greedy" else self.contradictions
         return self.candidates[np.lexsort((self.priority, worse))[0]].copy()
 
@@ -205,9 +198,8 @@ def has_experience(model: MetaModel) -> bool:
 
 
 def berlekamp_volumes(contradictions: np.ndarray, n_left: int, budget: int) -> np.ndarray:
-    """In how many ways the ``n_left`` answers to come (K - k) may lie without exceeding the budget
-    (E), if a candidate is the truth that contradicts so many answers (m): sum over e = 0, ..., E -
-    m of C(n_left, e); 0 where m exceeds E.
+    """In how many ways the ``n_left`` answers to come may lie within the budget E, if a candidate
+    is the truth that contradicts m answers: sum over e = 0, ..., E - m of C(n_left, e).
     """
     by_lies_left = np.cumsum([float(comb(n_left, lies)) for lies in range(budget + 1)])
     lies_left = budget - np.asarray(contradictions)
@@ -217,11 +209,8 @@ def berlekamp_volumes(contradictions: np.ndarray, n_left: int, budget: int) -> n
 def worst_case_volumes(
     differences: np.ndarray, contradictions: np.ndarray, n_left: int, budget: int
 ) -> np.ndarray:
-    """(n_pairs,) the volume that the worse of two answers leaves, over all candidates, with
-    ``n_left`` questions to come after it.
-
-    :param differences: (n_candidates, n_pairs) predicted return of the left fragment minus that of
-        the right one.
+    """(n_pairs,) the volume that the worse of two answers leaves, with ``n_left`` questions to come
+    after it; ``differences`` (n_candidates, n_pairs) are of predicted returns, left minus right.
     """
     kept = berlekamp_volumes(contradictions, n_left, budget)
     lost = kept - berlekamp_volumes(contradictions + 1, n_left, budget)
@@ -231,7 +220,5 @@ def worst_case_volumes(
 
 
 def n_distinguishable(n_queries: int, budget: int) -> int:
-    """How many candidates so many answers with so many lies can tell apart at most (the
-    sphere-packing bound): 2^K over the number of ways to lie, rounded down.
-    """
+    """Candidates that so many answers with so many lies can tell apart (sphere-packing bound)."""
     return 2**n_queries // sum(comb(n_queries, lies) for lies in range(budget + 1))

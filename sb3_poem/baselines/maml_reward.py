@@ -26,8 +26,8 @@ from sb3_poem.pearl_sac import PEARLSAC
 
 class MAMLRewardModel(MetaModel):
     """A meta-trained reward with the face of a model. Its policies are SAC's after so many answers
-    to some task; a "latent" names one by its number, and says with its second entry, 1 or -1, with
-    which sign exploration noise is added: so two rollouts of one policy from equal seeds differ.
+    to some task; a "latent" holds the number of one, and the sign, 1 or -1, with which exploration
+    noise is added: so two rollouts of one policy from equal seeds differ.
 
     >>> from sb3_poem import PEARLSAC
     >>> from sb3_poem.baselines import meta_train_reward
@@ -36,8 +36,7 @@ class MAMLRewardModel(MetaModel):
     >>> MAMLRewardModel(meta_train_reward(pearl, n_iterations=1), pearl)
     MAMLRewardModel(poem/PointGoal-v0)
 
-    :param reward: The meta-trained reward.
-    :param model: The :class:`PEARLSAC` that it was meta-trained with, for spaces and horizon.
+    :param model: The :class:`PEARLSAC` that the reward was meta-trained with.
     """
 
     latent_dim = 2
@@ -97,14 +96,13 @@ class MAMLRewardModel(MetaModel):
 @dataclass(frozen=True, repr=False)
 class MAMLReward(Rule):
     """MAML-reward (Hejna & Sadigh 2023): a meta-trained reward is adapted to the answers, and SB3's
-    SAC learns the policy on it from the trajectories that were shown, at most 2 K. The model is a
-    :class:`MAMLRewardModel`.
+    SAC learns the policy on it from the trajectories that were shown. The model is a
+    :class:`MAMLRewardModel`, the options are SAC's.
 
     After each answer the reward is adapted anew from the meta-trained start to all answers,
-    everything that was shown is relabelled with it, and SAC goes on learning from that
-    (``gradient_steps``; the other options are SAC's too). What is learnt follows from the seed and
-    the answers alone, so a saved adaptation keeps no networks: they are learnt again. Questions
-    show exploring policies: nothing else brings SAC its experience.
+    everything that was shown is relabelled with it, and SAC goes on learning from that. It follows
+    from the seed and the answers alone, so a saved adaptation keeps no networks. Questions show
+    exploring policies: nothing else brings SAC its experience.
 
     >>> from sb3_poem import PEARLSAC, PreferenceAdapter, ReturnOracle
     >>> from sb3_poem.baselines import meta_train_reward
@@ -140,10 +138,8 @@ class MAMLReward(Rule):
                 "one by MAMLRewardModel(meta_train_reward(model), model)"
             )
         super().check(model, setting)
-        check_shared_dynamics(
-            setting,
-            "MAML-reward's network was trained on what tasks say of each other's fragments",
-        )
+        why = "MAML-reward's network was trained on what tasks say of each other's fragments"
+        check_shared_dynamics(setting, why)
 
     def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> Inference:
         return MAMLRewardInference(self, model, rng, setting.n_queries)
@@ -163,17 +159,17 @@ class MAMLRewardInference(Inference):
         self._restart()
 
     def _restart(self) -> None:
-        self.answers: list[Answer] = []
+        self.answers = []
         with _seeded(int(self.seed[0])):
             self.sac = _make_sac(self.model, self.rule, self.n_queries)
         self.latent = self.model.add(self.sac.actor)
 
     def ask(self) -> tuple[Shown, Shown]:
-        """See :class:`Inference`: the current policy twice, with opposite exploration noise."""
+        """The current policy twice, with opposite exploration noise."""
         return self.latent.copy(), self.latent * np.array([1.0, -1.0])
 
     def same_latents(self, *latents: np.ndarray) -> tuple[Shown, ...]:
-        """See :class:`Inference`: the current policy, whose number in the file was another."""
+        """The current policy, whose number in the file was another."""
         return self.ask()
 
     def tell(self, preference: Preference, *shown: Shown) -> None:
@@ -192,7 +188,7 @@ class MAMLRewardInference(Inference):
         return self.latent.copy()
 
     def restore(self, snapshot: dict[str, Any], answers: list[Answer]) -> None:
-        """See :class:`Inference`: the answers are told again."""
+        """Tells the answers again."""
         super().restore(snapshot, [])
         self._restart()
         for answer in answers:
@@ -206,10 +202,10 @@ class MAMLRewardInference(Inference):
             obs = standardised(policy, trajectory).cpu().numpy()
             actions = policy.scale_action(trajectory.actions)
             # Nothing ends but by the time limit, unless an episode is shorter than that.
-            ended = len(trajectory) < self.model.horizon
-            for t in range(len(trajectory)):
-                done = ended and t == len(trajectory) - 1
-                buffer.add(obs[t], obs[t + 1], actions[t], row[t], np.array([done]), [{}])
+            done = np.zeros(len(row), dtype=bool)
+            done[-1] = len(row) < self.model.horizon
+            for t in range(len(row)):
+                buffer.add(obs[t], obs[t + 1], actions[t], row[t], done[t : t + 1], [{}])
 
 
 def _make_sac(model: MAMLRewardModel, rule: MAMLReward, n_queries: int) -> SAC:

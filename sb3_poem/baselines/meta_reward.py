@@ -1,6 +1,4 @@
-"""A reward, meta-trained by MAML (Finn et al. 2017), which a few answers adapt to a task (Hejna &
-Sadigh 2023).
-"""
+"""A reward that a few answers adapt to a task (MAML, Finn et al. 2017; Hejna & Sadigh 2023)."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,8 +8,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from safetensors import SafetensorError
-from safetensors.torch import load as load_tensors
-from safetensors.torch import save as tensors_to_bytes
+from safetensors.torch import load, save
 from torch import nn
 from torch.func import functional_call, grad, vmap
 from torch.nn.functional import softplus
@@ -42,8 +39,7 @@ Parameters = dict[str, th.Tensor]
 
 class PreferencePairs(NamedTuple):
     """Pairs of fragments, (..., pairs, steps, in_dim + 1) transitions as :class:`RewardNetwork`
-    takes them, and ``label`` (..., pairs): 1 where the left one is better, 0 where the right one
-    is, 0.5 where neither is.
+    takes them, and ``label`` (..., pairs): 1 where the left one is better, 0 or 0.5.
     """
 
     left: th.Tensor
@@ -53,9 +49,7 @@ class PreferencePairs(NamedTuple):
 
 class RewardNetwork(nn.Module):
     """Reward of a transition (s, a, s') of width ``in_dim``, unknown up to scale; and what MAML
-    does with its parameters, in functions of them.
-
-    :param learning_rate: Step size of MAML's inner loop, which has so many ``steps``.
+    does with its parameters, whose inner loop has so many ``steps``.
     """
 
     def __init__(
@@ -73,17 +67,13 @@ class RewardNetwork(nn.Module):
         return self.mlp(transitions[..., :-1]).squeeze(-1) * transitions[..., -1]
 
     def preference_loss(self, parameters: Parameters, pairs: PreferencePairs) -> th.Tensor:
-        """Bradley-Terry cross-entropy of the sums of predicted rewards; the mean over one task's
-        pairs.
-        """
+        """Bradley-Terry cross-entropy of the sums of predicted rewards of one task's pairs."""
         both = th.stack([pairs.left, pairs.right])
         left, right = functional_call(self, parameters, (both,)).sum(dim=-1)
         return (softplus(left - right) - pairs.label * (left - right)).mean()
 
     def adapted(self, parameters: Parameters, pairs: PreferencePairs) -> Parameters:
-        """MAML's inner loop: gradient steps on one task's preferences. It can be differentiated,
-        and mapped over tasks.
-        """
+        """MAML's inner loop: gradient steps on one task's preferences."""
         for _ in range(self.steps):
             slope = grad(self.preference_loss)(parameters, pairs)
             parameters = {k: v - self.learning_rate * slope[k] for k, v in parameters.items()}
@@ -93,8 +83,7 @@ class RewardNetwork(nn.Module):
         self, parameters: Parameters, support: PreferencePairs, query: PreferencePairs
     ) -> th.Tensor:
         """MAML's outer objective: how well what ``support`` (tasks, pairs, ...) adapts predicts
-        ``query``, other preferences of the same tasks; the mean over them. Its gradient passes
-        through the inner loop.
+        ``query``, other preferences of the same tasks.
         """
 
         def task_loss(some: PreferencePairs, others: PreferencePairs) -> th.Tensor:
@@ -129,8 +118,9 @@ class MetaReward:
         seed: int = 0,
     ) -> None:
         if not inner_learning_rate > 0:
-            rate = inner_learning_rate
-            raise ValueError(f"`inner_learning_rate` must be positive, but is {rate}")
+            raise ValueError(
+                f"`inner_learning_rate` must be positive, but is {inner_learning_rate}"
+            )
         check_whole("inner_steps", inner_steps, 1)
         self.policy = policy
         self.inner_learning_rate, self.inner_steps = inner_learning_rate, inner_steps
@@ -150,13 +140,11 @@ class MetaReward:
         return digest_of({**self.parameters, **_standardisation(self.policy)})
 
     def save(self, folder: str | Path) -> None:
-        """Write the parameters as safetensors and the settings as JSON; the folder is made if
-        missing.
-        """
+        """Write the parameters as safetensors and the settings as JSON."""
         tensors = {f"network.{name}": value for name, value in self.parameters.items()}
         tensors |= _standardisation(self.policy)
         content = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-        write_atomically(Path(folder) / WEIGHTS, tensors_to_bytes(content))
+        write_atomically(Path(folder) / WEIGHTS, save(content))
         settings = {name: getattr(self, name) for name in SETTINGS}
         write_json_atomically(Path(folder) / CONFIG, {"format": FORMAT, **settings})
 
@@ -168,23 +156,18 @@ class MetaReward:
             raise FileNotFoundError(f"{folder} holds no meta-trained reward: it has no {CONFIG}")
         config = read_json(settings, "the settings of a meta-trained reward")
         if config.get("format") != FORMAT:
-            expected = f"expected format {FORMAT!r}"
-            raise ValueError(f"{settings} is not of this version of sb3_poem ({expected})")
+            raise ValueError(f"{settings} is not of this version of sb3_poem, {FORMAT!r}")
         try:
-            tensors = load_tensors(weights.read_bytes())
+            tensors = load(weights.read_bytes())
         except SafetensorError as error:
             raise ValueError(f"{weights} is truncated, or no safetensors file: {error}") from error
         for name, value in _standardisation(policy).items():
-            kept = tensors.get(name)
-            if kept is None or kept.shape != value.shape or not th.equal(kept, value.cpu()):
+            if not th.equal(tensors[name], value.cpu()):
                 raise ValueError(
-                    "`policy` is not the one with which the reward in "
-                    f"{folder} was meta-trained: its {name} differs; load the same model again"
+                    f"`policy` is not the one with which the reward in {folder} was meta-trained: "
+                    f"its {name} differs; load the same model again"
                 )
         meta = cls(policy, **{name: config[name] for name in SETTINGS})
-        shapes = {f"network.{name}": value.shape for name, value in meta.parameters.items()}
-        if shapes != {name: t.shape for name, t in tensors.items() if name.startswith("network.")}:
-            raise ValueError(f"{weights} does not hold the network that {CONFIG} describes")
         for name in meta.parameters:
             meta.parameters[name] = tensors[f"network.{name}"].to(policy.device)
         return meta
@@ -194,13 +177,11 @@ class MetaReward:
         return transition_rows(self.policy, trajectory, 1.0)
 
     def adapted(self, answers: Sequence[Answer]) -> Parameters:
-        """The network's parameters after some answers, about trajectories of any length. The inner
-        loop's steps suit sums over the fragments of the meta-training, so longer trajectories count
-        with their mean over as many steps.
+        """The network's parameters after some answers. The inner loop's steps suit sums over the
+        fragments of the meta-training: longer trajectories count with their mean over as many.
         """
-        parameters = self.parameters
         if not answers:
-            return parameters
+            return self.parameters
         shown = [one for item in answers for one in trajectories_of("MAML-reward", *item.shown)]
         # (2 answers, longest, in_dim + 1)
         rows = pad_sequence([self.transitions(trajectory) for trajectory in shown], True)
@@ -208,7 +189,7 @@ class MetaReward:
         rows[..., -1] *= min(1.0, (self.fragment_length or longest) / longest)
         labels = [0.5 + 0.5 * SIGNS[answer.preference] for answer in answers]
         pairs = PreferencePairs(rows[::2], rows[1::2], th.tensor(labels, device=rows.device))
-        adapted = self.network.adapted(parameters, pairs)
+        adapted = self.network.adapted(self.parameters, pairs)
         return {name: value.detach() for name, value in adapted.items()}
 
     def rewards(self, parameters: Parameters, trajectory: Trajectory) -> np.ndarray:
@@ -232,27 +213,24 @@ def meta_train_reward(
     **arguments: Any,
 ) -> MetaReward:
     """Meta-train a reward on the preferences of a model's training tasks about fragments from its
-    replay buffer. Every training task judges fragments of all of them, so the family must share
-    dynamics.
+    replay buffer. Every task judges fragments of all of them, so the family must share dynamics.
 
-    :param n_iterations: Steps of the outer loop.
+    :param n_iterations: Steps of the outer loop, by Adam with ``learning_rate``.
     :param n_fragments: Fragments that pairs are drawn from.
-    :param fragment_length: Steps of a fragment; None takes 50, or an episode that is shorter.
+    :param fragment_length: Their steps; None takes 50, or an episode that is shorter.
     :param tasks_per_batch: Tasks in an outer step (all, if there are fewer).
-    :param n_support: Pairs that a task adapts to.
-    :param n_query: Pairs that it is judged by.
-    :param learning_rate: Of Adam in the outer loop.
+    :param n_support: Pairs that a task adapts to, and ``n_query``, that it is judged by.
     :param arguments: Of :class:`MetaReward`.
     """
     if not model.family.shared_dynamics:
         raise ValueError(
             "`model` must be of a family whose tasks share their dynamics, but those of "
-            f"{model.family.env_id} do not: MAML-reward lets every training task judge all tasks' "
-            "fragments"
+            f"{model.family.env_id} do not: every task judges all tasks' fragments"
         )
     if not model.replay_buffer.counts.any():
-        empty = "has an empty replay buffer (a loaded model has none)"
-        raise ValueError(f"`model` {empty}: call load_replay_buffer")
+        raise ValueError(
+            "`model` has an empty replay buffer (a loaded model has none): call load_replay_buffer"
+        )
     sizes = {"n_iterations": n_iterations, "n_support": n_support, "n_query": n_query}
     sizes |= {"n_fragments": n_fragments, "tasks_per_batch": tasks_per_batch}
     for name, size in sizes.items():
@@ -290,5 +268,5 @@ def _judged(
 
 
 def _standardisation(policy: LatentPolicy) -> dict[str, th.Tensor]:
-    """How observations are standardised, without which the parameters mean nothing."""
+    """Without which the parameters mean nothing."""
     return {"obs_mean": policy.obs_norm.mean, "obs_std": policy.obs_norm.std}
