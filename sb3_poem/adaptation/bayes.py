@@ -271,7 +271,6 @@ class BayesInference(Inference):
         # Sums over answers that tie S to the decoder's returns: S dS, S dR, |R| and their number.
         self.calibration = np.zeros(4)
         self.thinning = np.zeros((0, 3))  # a Thinning of each answer
-        self._library_returns: np.ndarray | None = None
         self._library_spread: float | None = None
 
     @property
@@ -583,10 +582,6 @@ class BayesInference(Inference):
         if self.people is not None:
             told = self._log_likelihoods(particles, self.answers) + self.people.log_prior
             self.people_log_shares[moved] = log_softmax(told, axis=1)
-
-    def restore(self, snapshot: dict[str, Any], answers: list[Answer]) -> None:
-        super().restore(snapshot, answers)
-        self._library_returns = None
 
 
 def first_to_others(values: np.ndarray) -> np.ndarray:

@@ -9,10 +9,9 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.adaptation.environments import Env, model_and_env
-from sb3_poem.adaptation.many_tasks import Library, OracleFactory, TaskAdaptations, adapt_tasks
+from sb3_poem.adaptation.many_tasks import OracleFactory, TaskAdaptations, adapt_tasks
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.oracles import ReturnOracle
-from sb3_poem.adaptation.rule import Rule
 from sb3_poem.common.checks import check_whole, check_whole_numbers
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.rollouts import rollout_outcomes
@@ -155,18 +154,17 @@ def evaluate_adaptation(
     tasks: np.ndarray | int | None = None,
     oracle_factory: OracleFactory = ReturnOracle,
     *,
-    rule: Rule | None = None,
     record_at: Sequence[int] = (0, 1, 2, 5, 10),
     n_episodes: int = 10,
     seed: int = 0,
     deterministic: bool = True,
-    library: Library | None = None,
-    progress_bar: bool = False,
     on_record: Callable[[AdaptationEvaluation], None] | None = None,
+    **options: Any,
 ) -> AdaptationEvaluation:
     """Adapt to each task, and measure the true return of the policy after some numbers of answers.
 
-    Arguments that are not explained here are those of :func:`adapt_tasks`.
+    Arguments that are not explained here, and ``options``, are those of :func:`adapt_tasks`:
+    ``rule``, ``library`` and ``progress_bar``.
 
     >>> found = evaluate_adaptation("PointGoal", "poem/PointGoal-v0", 5, record_at=(0, 5))
     >>> found.returns.shape  # (n_tasks, len(record_at), n_episodes)
@@ -197,10 +195,9 @@ def evaluate_adaptation(
         if on_record is not None:
             on_record(found)
 
-    how: dict[str, Any] = {"rule": rule, "n_queries": max(1, *record_at), "record_at": record_at}
-    how |= {"seed": seed, "deterministic": deterministic, "library": library}
-    how |= {"progress_bar": progress_bar, "on_record": measure}
-    adapt_tasks(own, vec_env, tasks, oracle_factory, **how)
+    options |= {"n_queries": max(1, *record_at), "record_at": record_at, "on_record": measure}
+    options |= {"seed": seed, "deterministic": deterministic}
+    adapt_tasks(own, vec_env, tasks, oracle_factory, **options)
     assert found is not None
     return found
 

@@ -16,7 +16,7 @@ from sb3_poem.adaptation.evaluation import (
 from sb3_poem.adaptation.limits import AnswerLimits
 from sb3_poem.adaptation.meta_model import HasSimilarity, MetaModel
 from sb3_poem.adaptation.noise import NoiseModel
-from sb3_poem.common.checks import check_choice, check_whole
+from sb3_poem.common.checks import check_whole
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.rollouts import rollout_outcomes
 
@@ -74,15 +74,12 @@ def known_task_return(
     n_episodes: int = 10,
     seed: int = 0,
     *,
-    source: str = "both",
     selection_episodes: int = 1,
-    deterministic: bool = True,
     limits: bool = True,
 ) -> KnownTaskReturn:
-    """The return if the task were known: for each task the best of many latents, refined by two
-    rounds of draws around it. Winners are rolled out anew, so that the luck of having been chosen
-    does not count. Where tasks share their dynamics every latent is rolled out once, and its
-    trajectory relabelled for every task.
+    """The return if the task were known: for each task the best of many latents, half of N(0, I)
+    and half of the training tasks', refined by two rounds of draws around it. Winners are rolled
+    out anew, so that the luck of having been chosen does not count.
 
     The *limit* is what the best 2^k of the latents that were tried at first earn on these tasks
     (:class:`AnswerLimits`). They are chosen on other tasks, for which the same rollouts are
@@ -97,9 +94,7 @@ def known_task_return(
     :param tasks: See :func:`evaluate_adaptation`.
     :param n_latents: How many to try at first; None for 300, or 30 where dynamics differ.
     :param n_episodes: Fresh episodes per winner.
-    :param source: Where latents come from: "prior", "aggregate", or "both" in equal parts.
     :param selection_episodes: Episodes per latent (and task, where dynamics differ) for choosing.
-    :param deterministic: Whether policies act by their mode.
     :param limits: Whether to measure limits, which takes one more rollout of all latents.
     """
     model, vec_env = model_and_env(model, env)
@@ -112,7 +107,7 @@ def known_task_return(
     for name, number in {**numbers, "selection_episodes": selection_episodes}.items():
         check_whole(name, number, 1)
     rng = np.random.default_rng([seed, 2])
-    candidates = _draw_latents(model, n_latents, source, rng)
+    candidates = _draw_latents(model, n_latents, rng)
     others = tasks[:0]
     if limits and shared:
         n = OTHER_TASKS if family.all_tasks is None else len(family.all_tasks)
@@ -123,8 +118,8 @@ def known_task_return(
     def returns_of(
         tasks: np.ndarray, latents: np.ndarray, stream: int, episodes: int = selection_episodes
     ) -> np.ndarray:
-        how = episodes, evaluation_seed(seed, stream), deterministic
-        return return_matrix(model, vec_env, tasks, latents, *how)
+        start = evaluation_seed(seed, stream)
+        return return_matrix(model, vec_env, tasks, latents, episodes, start)
 
     returns, on_others = np.split(returns_of(every, candidates, 1), [len(tasks)])
     best = candidates[np.argmax(returns, axis=1)]
@@ -138,7 +133,7 @@ def known_task_return(
             best = flat[np.argmax(returns_of(tasks, flat, stream), axis=1)]
             continue
         rows = np.repeat(tasks, draws.shape[1], axis=0)
-        how = selection_episodes, evaluation_seed(seed, stream), deterministic
+        how = selection_episodes, evaluation_seed(seed, stream)
         found = evaluate_episodes(model, vec_env, draws.reshape(len(rows), -1), rows, *how)
         picks = np.argmax(found.returns.mean(axis=1).reshape(draws.shape[:2]), axis=1)
         best = draws[np.arange(len(tasks)), picks]
@@ -150,8 +145,7 @@ def known_task_return(
         if ordered:
             chosen_on = chosen_on[np.argsort(along[:, 0])]
         measured = AnswerLimits.measure(chosen_on, returns, fresh, ordered=ordered)
-    how = n_episodes, evaluation_seed(seed), deterministic
-    outcomes = evaluate_episodes(model, vec_env, best, tasks, *how)
+    outcomes = evaluate_episodes(model, vec_env, best, tasks, n_episodes, evaluation_seed(seed))
     own = {"tasks": tasks, "latents": best, "candidate_latents": candidates}
     return KnownTaskReturn(**vars(outcomes), **own, candidate_returns=returns, limits=measured)
 
@@ -164,10 +158,10 @@ def return_spread(model: MetaModel | str | Path, env: Env, seed: int = 0) -> flo
     tasks = choose_test_tasks(model, vec_env, SPREAD_TASKS, seed)
     rng, start = np.random.default_rng([seed, 4]), evaluation_seed(seed, 2)
     if FamilyView(vec_env).shared_dynamics:
-        latents = _draw_latents(model, SPREAD_TASKS, "both", rng)
+        latents = _draw_latents(model, SPREAD_TASKS, rng)
         returns = return_matrix(model, vec_env, tasks, latents, seed=start)
     else:
-        latents = _draw_latents(model, 2 * SPREAD_TASKS, "both", rng)
+        latents = _draw_latents(model, 2 * SPREAD_TASKS, rng)
         outcomes = evaluate_episodes(model, vec_env, latents, np.tile(tasks, (2, 1)), 1, start)
         returns = outcomes.returns.reshape(2, SPREAD_TASKS).T
     return float(np.sqrt(2.0 * returns.var(axis=1, ddof=1).mean()))
@@ -180,7 +174,6 @@ def return_matrix(
     latents: np.ndarray,
     n_episodes: int = 1,
     seed: int = 0,
-    deterministic: bool = True,
 ) -> np.ndarray:
     """J[i, j], (n_tasks, n_latents), the mean true return of latent j (n_latents, latent_dim) on
     task i (n_tasks, task_dim), over episodes whose reset seeds start at ``seed``.
@@ -189,13 +182,12 @@ def return_matrix(
     family, shape = FamilyView(vec_env), (len(tasks), len(latents))
     if not family.shared_dynamics:
         every, rows = np.tile(latents, (shape[0], 1)), np.repeat(tasks, shape[1], axis=0)
-        how = n_episodes, seed, deterministic
-        found = evaluate_episodes(model, vec_env, every, rows, *how)
+        found = evaluate_episodes(model, vec_env, every, rows, n_episodes, seed)
         return found.returns.mean(axis=1).reshape(shape)
     # The task in effect does not matter, and it must be one that every copy accepts.
     some_task = np.repeat(tasks[:1], n_episodes * shape[1], axis=0)
     every = np.tile(latents, (n_episodes, 1))
-    outcomes = rollout_outcomes(model, vec_env, every, some_task, seed, deterministic)
+    outcomes = rollout_outcomes(model, vec_env, every, some_task, seed)
     features = [outcome.reward_features[None] for outcome in outcomes]
     totals = [family.compute_rewards(tasks[:, None], each).sum(axis=1) for each in features]
     return np.stack(totals, axis=1).reshape(shape[0], n_episodes, shape[1]).mean(axis=1)
@@ -242,9 +234,7 @@ def preference_order(model: HasSimilarity, known: KnownTaskReturn) -> tuple[floa
     return property_one(similarities, known.candidate_returns[:, policies])
 
 
-def _draw_latents(model: MetaModel, n: int, source: str, rng: np.random.Generator) -> np.ndarray:
-    of_aggregate = {"prior": 0, "both": n // 2, "aggregate": n}
-    check_choice("source", source, tuple(of_aggregate))
-    numbers = {"prior": n - of_aggregate[source], "aggregate": of_aggregate[source]}
-    drawn = [model.sample_latents(k, rng, source=name) for name, k in numbers.items() if k]
+def _draw_latents(model: MetaModel, n: int, rng: np.random.Generator) -> np.ndarray:
+    numbers = {"prior": n - n // 2, "aggregate": n // 2}
+    drawn = [model.sample_latents(k, rng, source=source) for source, k in numbers.items() if k]
     return np.concatenate(drawn)

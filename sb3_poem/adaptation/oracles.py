@@ -112,11 +112,9 @@ class TaskOracle(ABC):
     def _perceive(self, returns: np.ndarray) -> np.ndarray:
         """The returns by which to answer, from true ones; both (n,)."""
 
-    def bind(self, env: gym.Env | VecEnv, task: np.ndarray | None = None) -> Self:
-        """Give the oracle its environment, and its task unless that is None; returns itself."""
+    def bind(self, env: gym.Env | VecEnv) -> Self:
+        """Give the oracle its environment; returns itself."""
         self.env = env
-        if task is not None:
-            self.task = np.asarray(task, dtype=np.float64)
         return self
 
     def __call__(self, *shown: Trajectory) -> Preference:

@@ -41,15 +41,14 @@ def worst_case_sizes(
     """
     first, second = _pairs(similarities.shape[1])
     rows, slack = _policy_rows(similarities), tolerance(epsilon)
-    sizes = np.empty(len(first), dtype=np.int64 if weights is None else np.float64)
+    sizes = np.empty(len(first))
+    if weights is None:
+        weights = np.ones(len(similarities))
     block = max(1, BLOCK_ENTRIES // len(similarities))
     for start in range(0, len(first), block):
         some = slice(start, start + block)
         difference = rows[first[some]] - rows[second[some]]
-        survivors = difference >= -slack, difference <= slack
-        sizes[some] = np.maximum(
-            *(np.count_nonzero(s, axis=1) if weights is None else s @ weights for s in survivors)
-        )
+        sizes[some] = np.maximum((difference >= -slack) @ weights, (difference <= slack) @ weights)
     return sizes
 
 

@@ -49,6 +49,7 @@ class Inference(ABC):
     state: tuple[str, ...] = ()
     #: Trajectories to ask about; None where questions are new rollouts.
     library: list[Trajectory] | None = None
+    _library_returns: np.ndarray | None = None  # as far as they have been predicted
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.rng = rng
@@ -92,7 +93,7 @@ class Inference(ABC):
             raise ValueError(f"not the state of a PCG64 generator: {error}") from error
         for name in self.state:
             setattr(self, name, arrays[name].copy())
-        self.rng, self.answers = rng, list(answers)
+        self.rng, self.answers, self._library_returns = rng, list(answers), None
 
 
 @dataclass(frozen=True, eq=False)

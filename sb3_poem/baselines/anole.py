@@ -141,7 +141,6 @@ class ANOLEInference(Inference):
         self.priority = rng.permutation(n)
         self.contradictions = np.zeros(n, dtype=np.int64)
         self.alive = np.ones(n, dtype=bool)
-        self._library_returns: np.ndarray | None = None
 
     @property
     def budget(self) -> int:
@@ -185,10 +184,6 @@ class ANOLEInference(Inference):
         """A candidate of fewest contradictions; for "greedy" one that is left."""
         worse = ~self.alive if self.rule.strategy == "greedy" else self.contradictions
         return self.candidates[np.lexsort((self.priority, worse))[0]].copy()
-
-    def restore(self, snapshot: dict[str, Any], answers: list[Answer]) -> None:
-        super().restore(snapshot, answers)
-        self._library_returns = None
 
 
 def has_experience(model: MetaModel) -> bool:

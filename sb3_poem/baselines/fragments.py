@@ -53,7 +53,7 @@ def replay_fragments(
 
 
 def training_rollouts(
-    model: PEARLSAC | str | Path, env: Env, n: int, seed: int = 0, deterministic: bool = False
+    model: PEARLSAC | str | Path, env: Env, n: int, seed: int = 0
 ) -> list[Trajectory]:
     """n episodes of training tasks, drawn by ``seed``, under their own policies: a ``library`` for
     a loaded model. For ``model`` and ``env``, in which tasks are set, see
@@ -68,7 +68,7 @@ def training_rollouts(
         raise TypeError(f"`model` must be a PEARLSAC, but is of type {type(trained).__name__}")
     chosen = np.random.default_rng([seed, 4]).integers(len(trained.train_tasks), size=n)
     latents, tasks = trained.task_latents[chosen], trained.train_tasks.tasks[chosen]
-    return rollout_latents(trained, vec_env, latents, tasks, seed, deterministic)
+    return rollout_latents(trained, vec_env, latents, tasks, seed, False)
 
 
 def rollout_fragments(

@@ -33,6 +33,8 @@ from sb3_poem.pearl_sac.policies import LatentPolicy
 FORMAT = "sb3_poem meta reward 2"
 WEIGHTS, CONFIG = "reward.safetensors", "reward.json"
 SETTINGS = ("net_arch", "inner_learning_rate", "inner_steps", "fragment_length")
+#: Of an outer step of the meta-training: tasks, and pairs that each adapts to and is judged by.
+TASKS_PER_BATCH, PAIRS = 16, 10
 
 Parameters = dict[str, th.Tensor]
 
@@ -205,9 +207,6 @@ def meta_train_reward(
     n_iterations: int = 500,
     n_fragments: int = 500,
     fragment_length: int | None = None,
-    tasks_per_batch: int = 16,
-    n_support: int = 10,
-    n_query: int = 10,
     learning_rate: float = 1e-3,
     seed: int = 0,
     **arguments: Any,
@@ -218,8 +217,6 @@ def meta_train_reward(
     :param n_iterations: Steps of the outer loop, by Adam with ``learning_rate``.
     :param n_fragments: Fragments that pairs are drawn from.
     :param fragment_length: Their steps; None takes 50, or an episode that is shorter.
-    :param tasks_per_batch: Tasks in an outer step (all, if there are fewer).
-    :param n_support: Pairs that a task adapts to, and ``n_query``, that it is judged by.
     :param arguments: Of :class:`MetaReward`.
     """
     if not model.family.shared_dynamics:
@@ -231,10 +228,8 @@ def meta_train_reward(
         raise ValueError(
             "`model` has an empty replay buffer (a loaded model has none): call load_replay_buffer"
         )
-    sizes = {"n_iterations": n_iterations, "n_support": n_support, "n_query": n_query}
-    sizes |= {"n_fragments": n_fragments, "tasks_per_batch": tasks_per_batch}
-    for name, size in sizes.items():
-        check_whole(name, size, 1)
+    check_whole("n_iterations", n_iterations, 1)
+    check_whole("n_fragments", n_fragments, 1)
     rng = np.random.default_rng([seed, 5])
     length = default_fragment_length(model.horizon) if fragment_length is None else fragment_length
     meta = MetaReward(model.policy, fragment_length=length, seed=seed, **arguments)
@@ -245,10 +240,10 @@ def meta_train_reward(
     returns = model.family.compute_rewards(tasks, features[None]).sum(axis=2)
     parameters = {name: value.requires_grad_() for name, value in meta.parameters.items()}
     optimizer = th.optim.Adam(parameters.values(), lr=learning_rate)
-    n_tasks = min(tasks_per_batch, len(returns))
+    n_tasks = min(TASKS_PER_BATCH, len(returns))
     for _ in range(n_iterations):
         judges = rng.choice(len(returns), size=n_tasks, replace=False)
-        support, query = (_judged(inputs, returns, judges, n, rng) for n in (n_support, n_query))
+        support, query = (_judged(inputs, returns, judges, rng) for _ in range(2))
         optimizer.zero_grad()
         meta.network.maml_loss(parameters, support, query).backward()
         optimizer.step()
@@ -257,10 +252,10 @@ def meta_train_reward(
 
 
 def _judged(
-    inputs: th.Tensor, returns: np.ndarray, tasks: np.ndarray, n: int, rng: np.random.Generator
+    inputs: th.Tensor, returns: np.ndarray, tasks: np.ndarray, rng: np.random.Generator
 ) -> PreferencePairs:
-    """n pairs for each of some tasks, by their returns (all tasks, fragments)."""
-    left, right = rng.integers(len(inputs), size=(2, len(tasks), n))
+    """Pairs for each of some tasks, by their returns (all tasks, fragments)."""
+    left, right = rng.integers(len(inputs), size=(2, len(tasks), PAIRS))
     rows = tasks[:, None]
     label = 0.5 + 0.5 * np.sign(returns[rows, left] - returns[rows, right])
     labels = th.as_tensor(label, dtype=inputs.dtype, device=inputs.device)
