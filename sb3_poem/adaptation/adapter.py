@@ -25,7 +25,6 @@ from sb3_poem.adaptation.rule import (
     inference_rng,
     latent_of,
     rollout_seed,
-    trajectories_of,
 )
 from sb3_poem.adaptation.state import parse_json, read_json, write_json_atomically
 from sb3_poem.common.checks import check_whole
@@ -59,9 +58,7 @@ class PreferenceAdapter:
     ...     adapter.tell(oracle(query.left, query.right))
     >>> policy = adapter.policy()
 
-    The new task is the one in effect in :attr:`env`, or the one that its first reset draws. Measure
-    the policy there: ``evaluate_policy(policy, adapter.env)``. ``env.reset(seed=...)`` draws
-    another, unless one was chosen by ``sb3_poem.set_task(env, task)``.
+    The new task is the one in effect in :attr:`env`, or the one that its first reset draws.
 
     :param model: A trained ``POEMSAC`` (or, within limits, ``PEARLSAC``), a file or folder of one,
         or the name of one that ships.
@@ -184,8 +181,7 @@ class PreferenceAdapter:
         if number not in range(self.n_answers):
             known = f"that of an answer, from 0 to {self.n_answers - 1}"
             raise ValueError(f"`number` must be {known}, but is {number!r}")
-        shown = trajectories_of("ask_again()", *self.inference.answers[number].shown)
-        self.pending = Query(shown, self.rule.question)
+        self.pending = Query(self.answers[number].shown, self.rule.question)
         return self.ask()
 
     def tell(self, preference: Preference | str) -> None:
@@ -280,7 +276,7 @@ class PreferenceAdapter:
     def _number_of(self, query: Query) -> int:
         """Of the answer about the very trajectories of a question; else the next one's."""
         for number, answer in enumerate(self.answers):
-            pairs = zip(trajectories_of("ask()", *answer.shown), query.shown, strict=True)
+            pairs = zip(answer.shown, query.shown, strict=True)
             if all(np.array_equal(old.observations, new.observations) for old, new in pairs):
                 return number
         return self.n_answers

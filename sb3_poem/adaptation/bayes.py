@@ -4,7 +4,7 @@ they thin out.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 from scipy.special import log_softmax, logsumexp
@@ -19,7 +19,6 @@ from sb3_poem.adaptation.noise import (
     ExactNoise,
     NoiseModel,
     People,
-    Values,
     noise_model_from_dict,
 )
 from sb3_poem.adaptation.particles import (
@@ -38,15 +37,7 @@ from sb3_poem.adaptation.preference import (
     preference_log_likelihood,
 )
 from sb3_poem.adaptation.priors import SOURCES, make_prior
-from sb3_poem.adaptation.rule import (
-    Answer,
-    Inference,
-    Rule,
-    Setting,
-    Shown,
-    latent_of,
-    trajectories_of,
-)
+from sb3_poem.adaptation.rule import Answer, Inference, Rule, Setting, Shown, latent_of
 from sb3_poem.common.checks import check_choice, check_whole
 from sb3_poem.common.trajectory import Trajectory
 
@@ -92,50 +83,16 @@ SPREAD_LATENTS = 32
 CONTRADICTED, BELIEVED = 0.2, 0.5
 
 
-class Thinning(NamedTuple):
-    """What decoding all steps adds to a difference x of returns that was decoded from some:
-    intercept + slope x, give or take ``error``, a standard deviation.
-    """
-
-    intercept: float = 0.0
-    slope: float = 0.0
-    error: float = 0.0
-
-    @classmethod
-    def fit(cls, thin: np.ndarray, full: np.ndarray) -> Self:
-        """Fit differences (n,) decoded from some steps and from all, by ridge regression."""
-        added = full - thin
-        covariance = np.mean((thin - thin.mean()) * added)
-        slope = covariance / max(thin.var() + np.square(added).mean(), 1e-12)
-        intercept = added.mean() - slope * thin.mean()
-        error = np.sqrt(np.square(added - intercept - slope * thin).mean())
-        return cls(float(intercept), float(slope), float(error))
-
-
 @dataclass(frozen=True, repr=False)
 class Bayes(Rule):
     """Posterior weights proportional to the prior times the likelihood of the answers under the
-    oracle's own noise model; questions by expected information gain; the latent of highest expected
-    fitness.
+    oracle's own noise model, by the returns that the reward decoder predicts of what was shown, or
+    by S; questions by expected information gain; the latent of highest expected fitness.
 
-    *Likelihood*: the reward decoder predicts, for every particle, the returns of what was shown;
-    the noise model turns the difference into the probability of the answer. It is trusted as far as
-    the decoder's own residual allows. Without a decoder S(z, z_left) - S(z, z_right) takes its
-    place: in training S is the log-odds of being right about error-free labels, so one logistic
-    unit of it is the model's doubt; but as S may be scaled up without end once nearly all pairs are
-    separated, the unit is at least a fixed share of the spread of S.
-
-    *Where a person answers*, what a question tells is multiplied by how much of the difference can
-    be seen (:meth:`poem_envs.TaskFamily.visible_difference`), with ``"information-gain"``.
-
-    *Thinning*: when half of the particles carry no weight they are resampled and moved by
-    elliptical slice sampling. A move by the decoder evaluates all trajectories that were ever
-    shown, so only as many particles move as a budget allows; the copies that are left over are
-    replaced by neighbours from a kernel that keeps mean and covariance (Liu & West 2001).
-
-    *Who answers*: with ``noise_model="infer"``, and where answers are more than left or right, the
-    posterior is one of latent and person together, of whom there is a grid in the place of each
-    particle (:class:`~sb3_poem.adaptation.noise.People`).
+    Particles are moved when half of them carry no weight. With ``noise_model="infer"``, and where
+    answers are more than left or right, a grid of people stands in the place of each particle.
+    Where a person answers, what a question tells is multiplied by how much of the difference can be
+    seen (:meth:`poem_envs.TaskFamily.visible_difference`), with ``"information-gain"``.
 
     >>> from sb3_poem import PreferenceAdapter
     >>> rule = Bayes(n_particles=100)
@@ -253,8 +210,8 @@ class BayesInference(Inference):
         noise: Any = rule.noise_model or ExactNoise()
         #: How the oracle errs, if that is told
         self.noise_model: NoiseModel | None = None if noise == INFER else noise
-        grid = noise == INFER or rule.question != "pair"
-        self.people = People(rule.question, self.noise_model) if grid else None
+        told = self.noise_model is not None and rule.question == "pair"
+        self.people = None if told else People(rule.question, self.noise_model)
         self.library = None if setting.library is None else list(setting.library)
         far = model.aggregate_to_prior_kl > PRIOR_COVERS
         self.prior = make_prior(model, rule.candidates or ("aggregate" if far else "prior"), rng)
@@ -270,7 +227,7 @@ class BayesInference(Inference):
         self.scale = self._similarity_scale()
         # Sums over answers that tie S to the decoder's returns: S dS, S dR, |R| and their number.
         self.calibration = np.zeros(4)
-        self.thinning = np.zeros((0, 3))  # a Thinning of each answer
+        self.thinning = np.zeros((0, 3))  # see fit_thinning, of each answer
         self._library_spread: float | None = None
 
     @property
@@ -358,9 +315,7 @@ class BayesInference(Inference):
             return pair
         return queries.most_telling_set(pair, self.n_shown, values, weights, said)
 
-    def tell(self, preference: Preference, *shown: Shown) -> None:
-        if self.likelihood == "decoder":
-            trajectories_of('likelihood="decoder"', *shown)
+    def tell(self, preference: Preference, *shown: Any) -> None:
         answer = Answer(preference, shown)
         told = self._log_likelihoods(self.particles, [answer], new=True)
         if self.people is not None:
@@ -426,7 +381,10 @@ class BayesInference(Inference):
         return int(np.argmin(found)) if np.any(found < CONTRADICTED) else None
 
     def _similarity_scale(self) -> np.ndarray:
-        """The spread of S's differences, and the one that is a logistic unit of doubt."""
+        """The spread of S's differences, and the one that is a logistic unit of doubt: 1, as S is
+        the log-odds of being right about labels without errors; but once nearly all pairs are
+        separated training scales S up without end, so it is at least a share of the spread.
+        """
         if not self.has_similarity:
             return np.ones(2)
         similarities = self.model.similarities(self.particles, self.particles)
@@ -467,7 +425,7 @@ class BayesInference(Inference):
         fixed = isinstance(self.noise_model, BoltzmannNoise) and self.noise_model.beta is not None
         return 1.0, 2.0 * self._spread, ExactNoise() if fixed else self.noise_model
 
-    def _decoder_error(self, steps: Values) -> Any:
+    def _decoder_error(self, steps: Any) -> Any:
         return self.model.predicted_rewards_error * np.sqrt(steps * ERROR_CORRELATION)
 
     def _differences(
@@ -483,8 +441,7 @@ class BayesInference(Inference):
             values = self.model.predicted_returns(latents, shown, DECODED_STEPS)  # (m, k n)
             steps = np.array([len(item) for item in shown], dtype=np.float64).reshape(grouped[1:])
             if new:
-                measured = self._measure_thinning(shown, values)
-                self.thinning = np.concatenate([self.thinning, measured])
+                self.thinning = np.vstack([self.thinning, self._measure_thinning(shown, values)])
             fits = self.thinning[-len(answers) * (self.n_shown - 1) :]
             intercepts, slopes, errors = fits.T.reshape(3, len(answers), self.n_shown - 1)
             error = np.hypot(self._decoder_error(steps[:, :1] + steps[:, 1:]), errors).mean(axis=1)
@@ -523,15 +480,15 @@ class BayesInference(Inference):
         told = self._log_likelihoods(latents, self.answers)
         return told if self.people is None else logsumexp(told + self.people.log_prior, axis=1)
 
-    def _measure_thinning(self, shown: Sequence[Shown], thin: np.ndarray) -> list[Thinning]:
-        """Of the first one's difference to each other."""
+    def _measure_thinning(self, shown: Sequence[Shown], thin: np.ndarray) -> np.ndarray:
+        """(n - 1, 3) of the first one's difference to each other."""
         if max(map(len, shown)) <= DECODED_STEPS:
-            return [Thinning()] * (len(shown) - 1)
+            return np.zeros((len(shown) - 1, 3))
         quantiles = (np.arange(FULLY_DECODED) + 0.5) / FULLY_DECODED
         some = np.searchsorted(np.cumsum(self.weights), quantiles).clip(max=len(self.particles) - 1)
         full = self.model.predicted_returns(self.particles[some], shown)
         pairs = zip(first_to_others(thin[some]).T, first_to_others(full).T, strict=True)
-        return [Thinning.fit(*pair) for pair in pairs]
+        return np.array([fit_thinning(*pair) for pair in pairs])
 
     def _calibrate(self, latents: np.ndarray, shown: Sequence[Shown], returns: np.ndarray) -> None:
         shown_latents = np.stack([latent_of(item) for item in shown])
@@ -582,6 +539,18 @@ class BayesInference(Inference):
         if self.people is not None:
             told = self._log_likelihoods(particles, self.answers) + self.people.log_prior
             self.people_log_shares[moved] = log_softmax(told, axis=1)
+
+
+def fit_thinning(thin: np.ndarray, full: np.ndarray) -> tuple[float, float, float]:
+    """What decoding all steps adds to a difference x of returns that was decoded from some:
+    intercept + slope x, give or take an error, a standard deviation; by ridge regression on (n,).
+    """
+    added = full - thin
+    covariance = np.mean((thin - thin.mean()) * added)
+    slope = covariance / max(thin.var() + np.square(added).mean(), 1e-12)
+    intercept = added.mean() - slope * thin.mean()
+    error = np.sqrt(np.square(added - intercept - slope * thin).mean())
+    return float(intercept), float(slope), float(error)
 
 
 def first_to_others(values: np.ndarray) -> np.ndarray:

@@ -191,14 +191,12 @@ def best_intervals(returns: np.ndarray, size: int) -> np.ndarray:
 def answer_capacity(noise: NoiseModel | None, spread: float, n_answers: int = 2) -> float:
     """The most that one answer can tell, whatever is asked: bits, in [0, log2(n_answers)].
 
-    Of the probabilities that questions can bring about only the extremes matter, since the
-    information is convex in them; asking in the light of earlier answers adds nothing (Cover &
-    Thomas, Elements of Information Theory, 7.12). Left or right are a binary symmetric channel; of
-    more answers a mistake exchanges each with its opposite, which is a sum of such channels (ibid.,
-    problem 7.28). A Boltzmann oracle's grades tell no more than the difference that it perceives.
-    Where one of four is best, a mistake is any other one, and a Boltzmann oracle's probabilities
-    are at most a factor apart: r probable answers and 4 - r others, and as each can be any of the
-    four, the channel is symmetric (ibid., 7.2.1).
+    Left or right are a binary symmetric channel at the smallest probability of a mistake: of the
+    probabilities that questions bring about only the extremes matter, and asking in the light of
+    earlier answers adds nothing (Cover & Thomas, Elements of Information Theory, 7.12). Of more
+    answers a mistake exchanges each with its opposite, a sum of such channels (problem 7.28); a
+    Boltzmann oracle's grades tell no more than the difference that it perceives. Where one of four
+    is best the channel is symmetric (7.2.1): r answers are probable, and 4 - r are not.
 
     >>> from sb3_poem.adaptation import MistakeNoise
     >>> round(answer_capacity(MistakeNoise(0.1), spread=1.0), 2)  # a tenth is wrong

@@ -62,12 +62,10 @@ def adapt_tasks(
     """Adapt a model to each of many tasks (n_tasks, task_dim), with all rollouts of a question at
     once.
 
-    Task i is adapted as ``PreferenceAdapter(model, env, seed=seed + i, ...)`` would alone: with the
-    same candidates, questions and reset seeds. (Products may round otherwise in a batch; and with
-    ``deterministic=False`` the actions' noise is drawn for all rollouts together.) The tasks are
-    set in ``env``, and known to the oracles; a rule that infers from answers never sees them.
-
-    Arguments that are not explained here are those of :class:`PreferenceAdapter`.
+    Task i is adapted as ``PreferenceAdapter(model, env, seed=seed + i, ...)`` would alone, but for
+    rounding, and for action noise with ``deterministic=False``. The tasks are set in ``env``, and
+    known to the oracles; a rule that infers from answers never sees them. Arguments that are not
+    explained here are those of :class:`PreferenceAdapter`.
 
     >>> from sb3_poem import ReturnOracle
     >>> tasks = np.array([[0.5], [2.5]])  # angles of the goal
@@ -84,8 +82,7 @@ def adapt_tasks(
         those of a task (task_dim,).
     :param record_at: Numbers of answers at which to keep the estimate; None keeps 0, 1, ...,
         n_queries.
-    :param on_record: Called with all that there is so far, each time that estimates are kept. It
-        may use ``vec_env``.
+    :param on_record: Called with all that there is so far, each time that estimates are kept.
     """
     model, vec_env = model_and_env(model, env)
     _check_factory(oracle_factory)

@@ -146,13 +146,9 @@ class People:
 
     Somebody perceives the difference of the two returns with a doubt of their own, says EQUAL if it
     is smaller than their width of indifference, MUCH_LEFT or MUCH_RIGHT if it exceeds what they
-    call much, and LEFT or RIGHT else; that is turned round with their rate of mistakes. This is an
-    ordered logistic regression (McCullagh 1980) on the predicted difference, whose error is folded
-    into the doubt. Of four the best one is chosen by Luce's rule (1959), which of two is the same;
-    EQUAL is that none leads all others by the width of indifference (Rao & Kupper 1967), and a
-    mistake is any other one. One answer in a hundred is a slip, which may be any.
-
-    The prior is a product of ``MISTAKES``, ``DOUBTS``, ``INDIFFERENCES`` and ``MUCH``.
+    call much, and LEFT or RIGHT else (McCullagh 1980); that is turned round with their rate of
+    mistakes. Of four the best one is chosen by Luce's rule (1959); EQUAL is that none leads all
+    others by the width of indifference (Rao & Kupper 1967), and a mistake is any other one.
 
     :param kind: Of the questions, see :class:`~sb3_poem.adaptation.preference.Query`.
     :param noise: How they err, if that is known: then only their widths are not.

@@ -11,13 +11,7 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_poem.adaptation.noise import (
-    INFER,
-    BoltzmannNoise,
-    ExactNoise,
-    MistakeNoise,
-    NoiseModel,
-)
+from sb3_poem.adaptation.noise import INFER, BoltzmannNoise, ExactNoise, MistakeNoise, NoiseModel
 from sb3_poem.adaptation.preference import ANSWERS, BEST_OF_FOUR, Preference, Query, check_shown
 from sb3_poem.common.checks import check_choice, check_number
 from sb3_poem.common.family_view import FamilyView, vectorised

@@ -10,14 +10,7 @@ from sb3_poem.adaptation import queries
 from sb3_poem.adaptation.meta_model import HasSimilarity, MetaModel
 from sb3_poem.adaptation.preference import SIGNS, Preference, preference_log_likelihood
 from sb3_poem.adaptation.priors import SOURCES, make_prior
-from sb3_poem.adaptation.rule import (
-    Answer,
-    Inference,
-    Rule,
-    Setting,
-    Shown,
-    latent_of,
-)
+from sb3_poem.adaptation.rule import Answer, Inference, Rule, Setting, Shown, latent_of
 from sb3_poem.common.checks import check_choice, check_whole
 
 # Bound on the draws for a question.
@@ -29,9 +22,8 @@ class Paper(Rule):
     """Algorithm 2 of Xu & Zhu (2025): candidates that satisfy every answer within the tolerance of
     eq. 9, the pair of eq. 10, and the candidate of highest Bradley-Terry likelihood (line 17).
 
-    The paper's loop draws until N_z candidates are found, which need not happen. Here the draws are
-    bounded; what is missing is filled up by those that satisfy most answers, and among these by the
-    likeliest. EQUAL excludes nobody.
+    Draws are bounded; what is missing of N_z candidates is filled up by those that satisfy most
+    answers, among these by the likeliest. EQUAL excludes nobody.
 
     >>> from sb3_poem import PreferenceAdapter
     >>> rule = Paper(n_candidates=50, epsilon=0.2)
@@ -101,7 +93,7 @@ class PaperInference(Inference):
                 first, second = queries.best_pair(gains, n)
         return self.candidates[first].copy(), self.candidates[second].copy()
 
-    def tell(self, preference: Preference, *shown: Shown) -> None:
+    def tell(self, preference: Preference, *shown: Any) -> None:
         self.answers.append(Answer(preference, shown))
         self.fresh = np.array([False])
 

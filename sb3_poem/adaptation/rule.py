@@ -19,7 +19,8 @@ Shown: TypeAlias = Trajectory | np.ndarray
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """One answered question: the answer, and what was shown, left and right or in order.
+    """One answered question: the answer, and the trajectories that were shown, in order (or their
+    latents, to a rule that needs no more).
 
     >>> from sb3_poem import PreferenceAdapter
     >>> adapter = PreferenceAdapter("PointGoal", "poem/PointGoal-v0", seed=0)
@@ -30,7 +31,7 @@ class Answer:
     """
 
     preference: Preference
-    shown: tuple[Shown, ...]
+    shown: tuple[Any, ...]
 
 
 class Inference(ABC):
@@ -64,8 +65,8 @@ class Inference(ABC):
         return latents
 
     @abstractmethod
-    def tell(self, preference: Preference, *shown: Shown) -> None:
-        """Take an answer about trajectories, or their latents where the rule needs no more."""
+    def tell(self, preference: Preference, *shown: Any) -> None:
+        """Take an answer, see :class:`Answer`."""
 
     @abstractmethod
     def estimate(self) -> np.ndarray:
@@ -218,13 +219,6 @@ def as_rule(rule: Any) -> Rule:
 def latent_of(shown: Shown) -> np.ndarray:
     """(d,) the latent behind what was shown."""
     return shown.latent if isinstance(shown, Trajectory) else np.asarray(shown, dtype=np.float64)
-
-
-def trajectories_of(name: str, *shown: Shown) -> tuple[Trajectory, ...]:
-    """What was shown, as trajectories, which a rule of that name needs."""
-    if not all(isinstance(item, Trajectory) for item in shown):
-        raise ValueError(f"{name} needs the trajectories that were shown, not their latents alone")
-    return shown  # type: ignore[return-value]
 
 
 def inference_rng(seed: int) -> np.random.Generator:

@@ -11,7 +11,7 @@ from sb3_poem.adaptation.meta_model import HasRewardDecoder, MetaModel
 from sb3_poem.adaptation.preference import SIGNS, Preference
 from sb3_poem.adaptation.priors import SOURCES, make_prior
 from sb3_poem.adaptation.queries import random_set
-from sb3_poem.adaptation.rule import Shown, trajectories_of
+from sb3_poem.adaptation.rule import Shown
 from sb3_poem.baselines.fragments import (
     check_shared_dynamics,
     default_fragment_length,
@@ -33,12 +33,6 @@ class ANOLE(Rule):
 
     It takes a ``PEARLSAC`` with its replay buffer, unless the adapter has a ``library``.
 
-    - "berlekamp" (ANOLE): of random pairs the one whose worse answer leaves the smallest Berlekamp
-      volume.
-    - "greedy" (binary search): 2^K candidates, the pair that splits them most evenly; what
-      disagrees is dropped, unless nothing would be left.
-    - "random": one random pair, else as ANOLE.
-
     >>> from sb3_poem import PreferenceAdapter
     >>> from sb3_poem.baselines import rollout_fragments
     >>> name, env = "PointGoal", "poem/PointGoal-v0"  # the model, which ships without its buffer
@@ -47,8 +41,10 @@ class ANOLE(Rule):
     >>> adapter.ask().left.actions.shape
     (10, 2)
 
-    :param strategy: "berlekamp", "greedy" or "random".
-    :param n_candidates: Candidates at least; "greedy" takes 2^K.
+    :param strategy: "berlekamp" (ANOLE) asks the pair whose worse answer leaves the smallest
+        Berlekamp volume, "random" a random one; "greedy" (binary search) the pair that splits 2^K
+        candidates most evenly, and drops what disagrees.
+    :param n_candidates: Candidates at least.
     :param mistake_rate: The share of answers that may be mistakes: E = floor(rate K).
     :param n_pairs: Random pairs to choose from for each question, of twice as many fragments.
     :param fragment_length: Steps of a fragment from the replay buffer; None takes 50, or an episode
@@ -171,9 +167,8 @@ class ANOLEInference(Inference):
         left = max(0, self.n_queries - len(self.answers) - 1)
         return worst_case_volumes(differences, self.contradictions, left, self.budget)
 
-    def tell(self, preference: Preference, *shown: Shown) -> None:
-        trajectories = trajectories_of("ANOLE", *shown)
-        returns = self.model.predicted_returns(self.candidates, trajectories)
+    def tell(self, preference: Preference, *shown: Any) -> None:
+        returns = self.model.predicted_returns(self.candidates, shown)
         contradicted = SIGNS[preference] * (returns[:, 0] - returns[:, 1]) < 0
         self.contradictions = self.contradictions + contradicted
         if np.any(self.alive & ~contradicted):

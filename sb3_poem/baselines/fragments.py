@@ -97,6 +97,7 @@ def check_shared_dynamics(setting: Setting, why: str) -> None:
 
 
 def standardised(policy: LatentPolicy, trajectory: Trajectory) -> th.Tensor:
+    """(T + 1, obs_dim) observations as the networks take them."""
     with th.no_grad():
         return policy.standardise(_tensor(policy, trajectory.observations))
 

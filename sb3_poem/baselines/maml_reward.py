@@ -16,7 +16,7 @@ from stable_baselines3.common.utils import set_random_seed
 from sb3_poem.adaptation import Answer, Inference, Rule, Setting
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.preference import Preference
-from sb3_poem.adaptation.rule import Shown, trajectories_of
+from sb3_poem.adaptation.rule import Shown
 from sb3_poem.baselines.fragments import check_shared_dynamics, standardised
 from sb3_poem.baselines.meta_reward import MetaReward
 from sb3_poem.common.checks import check_whole
@@ -99,10 +99,8 @@ class MAMLReward(Rule):
     SAC learns the policy on it from the trajectories that were shown. The model is a
     :class:`MAMLRewardModel`, the options are SAC's.
 
-    After each answer the reward is adapted anew from the meta-trained start to all answers,
-    everything that was shown is relabelled with it, and SAC goes on learning from that. It follows
-    from the seed and the answers alone, so a saved adaptation keeps no networks. Questions show
-    exploring policies: nothing else brings SAC its experience.
+    After each answer the reward is adapted anew to all answers, everything that was shown is
+    relabelled with it, and SAC goes on learning from that; a saved adaptation keeps no networks.
 
     >>> from sb3_poem import PEARLSAC, PreferenceAdapter, ReturnOracle
     >>> from sb3_poem.baselines import meta_train_reward
@@ -172,10 +170,10 @@ class MAMLRewardInference(Inference):
         """The current policy, whose number in the file was another."""
         return self.ask()
 
-    def tell(self, preference: Preference, *shown: Shown) -> None:
-        answers = [*self.answers, Answer(preference, shown)]
-        seen = [one for each in answers for one in trajectories_of("MAML-reward", *each.shown)]
-        self.answers, parameters = answers, self.model.reward.adapted(answers)
+    def tell(self, preference: Preference, *shown: Any) -> None:
+        self.answers.append(Answer(preference, shown))
+        seen = [one for each in self.answers for one in each.shown]
+        parameters = self.model.reward.adapted(self.answers)
         rewards = [self.model.reward.rewards(parameters, trajectory) for trajectory in seen]
         # Preferences fix no unit; SAC's entropy needs one.
         scale = max(float(np.concatenate(rewards).std()), 1e-6)

@@ -15,13 +15,9 @@ from torch.nn.functional import softplus
 from torch.nn.utils.rnn import pad_sequence
 
 from sb3_poem.adaptation.preference import SIGNS
-from sb3_poem.adaptation.rule import Answer, trajectories_of
+from sb3_poem.adaptation.rule import Answer
 from sb3_poem.adaptation.state import read_json, write_json_atomically
-from sb3_poem.baselines.fragments import (
-    default_fragment_length,
-    replay_fragments,
-    transition_rows,
-)
+from sb3_poem.baselines.fragments import default_fragment_length, replay_fragments, transition_rows
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.digest import digest_of
 from sb3_poem.common.files import write_atomically
@@ -184,7 +180,7 @@ class MetaReward:
         """
         if not answers:
             return self.parameters
-        shown = [one for item in answers for one in trajectories_of("MAML-reward", *item.shown)]
+        shown = [one for answer in answers for one in answer.shown]
         # (2 answers, longest, in_dim + 1)
         rows = pad_sequence([self.transitions(trajectory) for trajectory in shown], True)
         longest = rows.shape[1]

@@ -10,14 +10,7 @@ from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.oracles import step_rewards
 from sb3_poem.adaptation.preference import Preference
 from sb3_poem.adaptation.priors import N_CENTRES, SOURCES
-from sb3_poem.adaptation.rule import (
-    Answer,
-    Inference,
-    Rule,
-    Setting,
-    Shown,
-    trajectories_of,
-)
+from sb3_poem.adaptation.rule import Answer, Inference, Rule, Setting, Shown
 from sb3_poem.baselines.fragments import transition_rows
 from sb3_poem.common.checks import check_choice
 from sb3_poem.common.family_view import FamilyView
@@ -28,15 +21,12 @@ from sb3_poem.pearl_sac import PEARLSAC
 @dataclass(frozen=True, repr=False)
 class RewardOracle(Rule):
     """The reference that sees the new task's rewards: as many rollouts as the others, two for each
-    question, by posterior sampling (Rakelly et al. 2019). Answers are not looked at.
+    question, by posterior sampling (Rakelly et al. 2019). Answers are not looked at. The model is a
+    ``PEARLSAC``, or a ``POEMSAC`` with ``context="pearl"``.
 
-    Latents are drawn from the posterior, rolled out, and the encoder gives the next posterior from
-    what was collected. A context has no more transitions than in training, for the posterior, a
-    product over them, would be too sure of more: what was collected is dealt out to as many
-    contexts as it fills, and their posteriors' means and variances are averaged.
-
-    It is as good as the encoder, whose contexts in training are of the tasks' own policies. The
-    model is a ``PEARLSAC``, or a ``POEMSAC`` with ``context="pearl"``.
+    A context has no more transitions than in training, for the posterior, a product over them,
+    would be too sure of more: what was collected is dealt out to as many contexts as it fills, and
+    their posteriors' means and variances are averaged.
 
     >>> from sb3_poem import PEARLSAC, PreferenceAdapter, ReturnOracle
     >>> small = dict(n_train_tasks=4, gradient_steps=2, seed=0)
@@ -103,10 +93,9 @@ class RewardInference(Inference):
         left, right = self.mean + np.sqrt(self.variance) * noise
         return left, right
 
-    def tell(self, preference: Preference, *shown: Shown) -> None:
+    def tell(self, preference: Preference, *shown: Any) -> None:
         """Looks at the rewards of both trajectories, not at the answer."""
-        trajectories = trajectories_of("the reward oracle", *shown)
-        rows = np.concatenate([self._context_rows(item) for item in trajectories])
+        rows = np.concatenate([self._context_rows(item) for item in shown])
         self.answers.append(Answer(preference, shown))
         before = [self.transitions] if len(self.transitions) else []
         self.transitions = np.concatenate([*before, rows])
