@@ -195,9 +195,9 @@ def evaluate_adaptation(
         if on_record is not None:
             on_record(found)
 
-    options |= {"n_queries": max(1, *record_at), "record_at": record_at, "on_record": measure}
-    options |= {"seed": seed, "deterministic": deterministic}
-    adapt_tasks(own, vec_env, tasks, oracle_factory, **options)
+    how: dict[str, Any] = {"n_queries": max(1, *record_at), "record_at": record_at}
+    how |= {"seed": seed, "deterministic": deterministic, "on_record": measure}
+    adapt_tasks(own, vec_env, tasks, oracle_factory, **how, **options)
     assert found is not None
     return found
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any, Self
 
@@ -115,7 +116,11 @@ class AdaptedPolicy:
         latent = tensors.pop(LATENT, th.zeros(0)).double().numpy()
         parts = {name.removeprefix(MODEL_PREFIX): value for name, value in tensors.items()}
         model = build_model(algorithm, config, parts, source, device)
+        n_answers = facts.get("n_answers", "")
+        if not re.fullmatch("[0-9]{1,9}", n_answers):
+            wrong = f"n_answers must be a whole number, but is {n_answers[:20]!r}"
+            raise ValueError(f"{source} is broken: {wrong}")
         try:
-            return cls(model, latent, int(facts.get("n_answers", "")))
+            return cls(model, latent, int(n_answers))
         except ValueError as error:
             raise ValueError(f"{source} is broken: {error}") from error

@@ -108,11 +108,7 @@ class ANOLE(Rule):
         )
 
     def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> Inference:
-        library = setting.library
-        if library is None:
-            length = self.fragment_length or default_fragment_length(model.horizon)
-            library = replay_fragments(model, 2 * self.n_pairs, length, rng)
-        return ANOLEInference(self, model, rng, setting.n_queries, list(library))
+        return ANOLEInference(self, model, rng, setting)
 
 
 class ANOLEInference(Inference):
@@ -121,17 +117,15 @@ class ANOLEInference(Inference):
     state = ("candidates", "priority", "contradictions", "alive")
     library: list[Trajectory]
 
-    def __init__(
-        self,
-        rule: ANOLE,
-        model: Any,
-        rng: np.random.Generator,
-        n_queries: int,
-        library: list[Trajectory],
-    ) -> None:
+    def __init__(self, rule: ANOLE, model: Any, rng: np.random.Generator, setting: Setting) -> None:
         super().__init__(rng)
-        self.rule, self.model, self.n_queries, self.library = rule, model, n_queries, library
-        n = rule.total_candidates(n_queries)
+        self.rule, self.model, self.n_queries = rule, model, setting.n_queries
+        if setting.library is None:
+            length = rule.fragment_length or default_fragment_length(model.horizon)
+            self.library = replay_fragments(model, 2 * rule.n_pairs, length, rng)
+        else:
+            self.library = list(setting.library)
+        n = rule.total_candidates(self.n_queries)
         self.candidates = make_prior(model, rule.candidates, rng).sample(n, rng)
         # Ties are broken at random, but always alike.
         self.priority = rng.permutation(n)
