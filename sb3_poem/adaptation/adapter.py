@@ -155,11 +155,7 @@ class PreferenceAdapter:
         if self.pending is None:
             self._check_unfinished()
             self.pending = self._make_query(self.inference.ask())
-        elif (
-            self._needs_frames
-            and self.pending.shown[0].frames is None
-            and self.inference.library is None
-        ):
+        elif self._needs_frames and not (self.pending.shown[0].frames or self.inference.library):
             # It comes from a file, which holds no frames; the same seed gives the same rollouts.
             latents = self.inference.same_latents(*(item.latent for item in self.pending.shown))
             self.pending = self._make_query(latents, self._number_of(self.pending))
@@ -309,9 +305,8 @@ class PreferenceAdapter:
             return 1.0
         # The first pair is nearly always the one that is asked about, so that it is filmed at once.
         frames = 0 if self._seen else self._needs_frames
-        number = self.n_answers
-        left, right = rolled = [self._rolled_out(item, number, frames) for item in pair]
-        self._seen.update(((number, clip.latent.tobytes()), clip) for clip in rolled)
+        left, right = rolled = [self._rolled_out(item, self.n_answers, frames) for item in pair]
+        self._seen |= {(self.n_answers, clip.latent.tobytes()): clip for clip in rolled}
         if left.reward_features is None or right.reward_features is None:
             return 1.0
         answered = [item for answer in self.answers for item in answer.shown]
@@ -325,14 +320,13 @@ class PreferenceAdapter:
         oracle and library.
         """
         model, pending, kind = self.model, self.pending, self.rule.question
-        facts = {"latent_dim": int(model.latent_dim), "env_id": model.env_id}
-        facts["digest"] = model.digest
+        facts = {"env_id": model.env_id, "digest": model.digest}
         state = self.inference.snapshot()
         arrays = {name: encode_array(array) for name, array in state["arrays"].items()}
         return {
             "format": FORMAT,
             "version": FORMAT_VERSION,
-            "model": facts,
+            "model": {"latent_dim": int(model.latent_dim), **facts},
             "rule": self.rule.to_dict(),
             "n_queries": self.n_queries,
             "seed": self.seed,

@@ -448,10 +448,12 @@ class BayesInference(Inference):
             difference = first_to_others(values.reshape(grouped))
             difference = difference + intercepts + slopes * difference
             if new and self.has_similarity:
-                self._calibrate(latents, shown, values)
+                s = first_to_others(self._similarities(latents, shown)).ravel()
+                typical = 2.0 * np.abs(values).mean(axis=1).mean()
+                self.calibration += [s @ first_to_others(values).ravel(), s @ s, typical, 1.0]
             magnitude = 2.0 * np.abs(values).reshape(grouped).mean(axis=2)
             return difference, np.broadcast_to(error, shape), magnitude, self._return_spread(shown)
-        values = self.model.similarities(latents, np.stack([latent_of(item) for item in shown]))
+        values = self._similarities(latents, shown)
         error = np.full(shape, self.scale[1] * PROBIT_SLOPE)
         magnitude = np.full(shape, 2.0 * self._spread)
         return first_to_others(values.reshape(grouped)), error, magnitude, self._spread
@@ -490,11 +492,8 @@ class BayesInference(Inference):
         pairs = zip(first_to_others(thin[some]).T, first_to_others(full).T, strict=True)
         return np.array([fit_thinning(*pair) for pair in pairs])
 
-    def _calibrate(self, latents: np.ndarray, shown: Sequence[Shown], returns: np.ndarray) -> None:
-        shown_latents = np.stack([latent_of(item) for item in shown])
-        s = first_to_others(self.model.similarities(latents, shown_latents)).ravel()
-        magnitude = 2.0 * np.abs(returns).mean(axis=1).mean()
-        self.calibration += [s @ first_to_others(returns).ravel(), s @ s, magnitude, 1.0]
+    def _similarities(self, latents: np.ndarray, shown: Sequence[Shown]) -> np.ndarray:
+        return self.model.similarities(latents, np.stack([latent_of(item) for item in shown]))
 
     def _query_policies(self) -> np.ndarray:
         """(n, d): half of them draws of the posterior, half of the prior."""

@@ -166,11 +166,6 @@ def evaluate_adaptation(
     Arguments that are not explained here, and ``options``, are those of :func:`adapt_tasks`:
     ``rule``, ``library`` and ``progress_bar``.
 
-    >>> found = evaluate_adaptation("PointGoal", "poem/PointGoal-v0", 5, record_at=(0, 5))
-    >>> found.returns.shape  # (n_tasks, len(record_at), n_episodes)
-    (5, 2, 10)
-    >>> before, after = found.mean_returns
-
     :param tasks: (n_tasks, task_dim), or a number (None is 30) of tasks that no model was trained
         on, which ``seed`` draws, the same as in :func:`known_task_return`.
     :param record_at: After how many answers to measure; the largest is the number of questions.

@@ -86,10 +86,6 @@ def known_task_return(
     relabelled (where tasks do not share their dynamics, on the test tasks themselves), and scored
     by fresh episodes.
 
-    >>> best = known_task_return("PointGoal", "poem/PointGoal-v0", 5, n_latents=50)
-    >>> best.latents.shape  # a policy for each of five tasks
-    (5, 5)
-
     :param model: And ``env``: see :func:`adapt_tasks`.
     :param tasks: See :func:`evaluate_adaptation`.
     :param n_latents: How many to try at first; None for 300, or 30 where dynamics differ.
@@ -115,11 +111,9 @@ def known_task_return(
         others = np.unique(drawn, axis=0)
     every = np.concatenate([tasks, others])
 
-    def returns_of(
-        tasks: np.ndarray, latents: np.ndarray, stream: int, episodes: int = selection_episodes
-    ) -> np.ndarray:
+    def returns_of(tasks: np.ndarray, latents: np.ndarray, stream: int) -> np.ndarray:
         start = evaluation_seed(seed, stream)
-        return return_matrix(model, vec_env, tasks, latents, episodes, start)
+        return return_matrix(model, vec_env, tasks, latents, selection_episodes, start)
 
     returns, on_others = np.split(returns_of(every, candidates, 1), [len(tasks)])
     best = candidates[np.argmax(returns, axis=1)]
@@ -139,7 +133,7 @@ def known_task_return(
         best = draws[np.arange(len(tasks)), picks]
     measured = None
     if limits:
-        fresh = returns_of(tasks, candidates, 4, 1)
+        fresh = return_matrix(model, vec_env, tasks, candidates, 1, evaluation_seed(seed, 4))
         chosen_on, along = (on_others, others) if shared else (returns, tasks)
         ordered = along.shape[1] == 1
         if ordered:

@@ -278,25 +278,16 @@ def _greedy(returns: np.ndarray, size: int, first: Sequence[int] | np.ndarray = 
 
 def _swap(returns: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     """Replace one policy at a time by the best other one, as long as that helps."""
-    chosen = chosen.copy()
-    value = _value(returns, chosen)
-    every, replaced = np.arange(len(returns)), True
+    chosen, value = chosen.copy(), _value(returns, chosen)
     for _ in range(MAX_SWAP_ROUNDS):
-        improved = False
+        before = value
         for position in range(len(chosen)):
-            if replaced:
-                taken = returns[:, chosen]
-                best = np.argmax(taken, axis=1)
-                first = taken[every, best]
-                taken[every, best] = -np.inf
-                second = taken.max(axis=1)
-            rest = np.where(best == position, second, first)
+            rest = returns[:, np.delete(chosen, position)].max(axis=1, initial=-np.inf)
             values = np.maximum(returns, rest[:, None]).mean(axis=0)
             candidate = int(np.argmax(values))
-            replaced = values[candidate] > value + 1e-12 * max(1.0, abs(value))
-            if replaced:
-                chosen[position], value, improved = candidate, values[candidate], True
-        if not improved:
+            if values[candidate] > value + 1e-12 * max(1.0, abs(value)):
+                chosen[position], value = candidate, float(values[candidate])
+        if value == before:
             break
     return chosen
 

@@ -67,12 +67,6 @@ def adapt_tasks(
     known to the oracles; a rule that infers from answers never sees them. Arguments that are not
     explained here are those of :class:`PreferenceAdapter`.
 
-    >>> from sb3_poem import ReturnOracle
-    >>> tasks = np.array([[0.5], [2.5]])  # angles of the goal
-    >>> found = adapt_tasks("PointGoal", "poem/PointGoal-v0", tasks, ReturnOracle, n_queries=3)
-    >>> found.latents.shape  # (n_tasks, answers, latent_dim)
-    (2, 4, 5)
-
     :param env: A task family. Any number of copies will do; twice the number of tasks is best, and
         an id makes 60.
     :param oracle_factory: Called as ``oracle_factory(env=vec_env, task=task, seed=seed + i)``,

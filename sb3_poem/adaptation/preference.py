@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_poem.common.checks import check_choice
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.common.video import in_rows, write_video
 
@@ -65,8 +66,7 @@ class Query:
     kind: str = "pair"
 
     def __post_init__(self) -> None:
-        if self.kind not in ANSWERS:
-            raise ValueError(f"`kind` must be one of {tuple(ANSWERS)}, but is {self.kind!r}")
+        check_choice("kind", self.kind, tuple(ANSWERS))
         check_shown(self.kind, self.shown)
 
     @property
@@ -86,8 +86,7 @@ class Query:
         if not all(each.frames for each in self.shown):
             raise ValueError(
                 "the question has no frames to show: ask for them by PreferenceAdapter(..., "
-                "render=True) or oracle=HumanOracle(), with an environment's id, or an environment "
-                'made with render_mode="rgb_array"'
+                'render=True), with an environment\'s id, or one made with render_mode="rgb_array"'
             )
         clips = [each.frames or () for each in self.shown]
         captions = ("LEFT", "RIGHT") if len(clips) == 2 else tuple("1234")
@@ -117,10 +116,8 @@ def as_preference(answer: Any, kind: str = "pair") -> Preference:
         others = [each for each in ANSWERS if answer in ANSWERS[each]]
         given = f"{answer.value!r}, which only {' and '.join(others)} questions have"
     elif not isinstance(answer, str):
-        raise TypeError(
-            "an answer must be Preference.LEFT, Preference.RIGHT or Preference.EQUAL (or the "
-            f"word), but is {answer!r} of type {type(answer).__name__}"
-        )
+        given = f"{given} of type {type(answer).__name__}"
+        raise TypeError(f"an answer must be Preference.LEFT (or its word) say, but is {given}")
     words = ", ".join(f'"{each.value}"' for each in reversed(ANSWERS[kind]))
     raise ValueError(f"an answer to a {kind} question must be one of {words}, but is {given}")
 

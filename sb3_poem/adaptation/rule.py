@@ -175,9 +175,8 @@ class Rule(ABC):
         if kind != self.question:
             raise ValueError(
                 f'the oracle answers "{kind}" questions, but the rule asks "{self.question}" ones: '
-                'Bayes(question="graded") goes with ReturnOracle(thresholds=(20, 100)) or '
-                'HumanOracle(question="graded"), say, and Bayes(question="best-of-four") with '
-                f'ReturnOracle(question="best-of-four"); the oracle is {oracle!r}'
+                'Bayes(question="graded") goes with ReturnOracle(thresholds=(20, 100)), and '
+                f'"best-of-four" with ReturnOracle(question="best-of-four"); it is {oracle!r}'
             )
         return self
 
@@ -196,10 +195,8 @@ class Rule(ABC):
         """Read what :meth:`to_dict` of any imported rule wrote."""
         name, module = data["name"], data["module"]
         if name not in cls._known:
-            raise ValueError(
-                f"the rule is {name!r}, which this program does not know: import it first, by "
-                f"`from {module} import {name}`"
-            )
+            first = f"import it first, by `from {module} import {name}`"
+            raise ValueError(f"the rule is {name!r}, which this program does not know: {first}")
         return cls._known[name](**data["options"])
 
 
