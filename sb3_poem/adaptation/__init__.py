@@ -6,6 +6,8 @@ from sb3_poem.adaptation.bayes import Bayes
 from sb3_poem.adaptation.evaluation import (
     AdaptationEvaluation,
     EpisodeOutcomes,
+    TaskAdaptations,
+    adapt_tasks,
     evaluate_adaptation,
     evaluate_episodes,
 )
@@ -22,7 +24,6 @@ from sb3_poem.adaptation.limits import (
     information_limit,
     rate_distortion_limit,
 )
-from sb3_poem.adaptation.many_tasks import TaskAdaptations, adapt_tasks
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.named_rule import named_rule
 from sb3_poem.adaptation.noise import BoltzmannNoise, ExactNoise, MistakeNoise, NoiseModel

@@ -1,27 +1,283 @@
-"""MAML-reward: the answers adapt the reward, and SAC learns from what was shown."""
+"""MAML-reward: the answers adapt a meta-trained reward, and SAC learns from what was shown (Finn et
+al. 2017; Hejna & Sadigh 2023).
+"""
 
 import contextlib
 import copy
 import random
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
+from safetensors import SafetensorError
+from safetensors.torch import load, save
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import set_random_seed
+from torch import nn
+from torch.func import functional_call, grad, vmap
+from torch.nn.functional import softplus
+from torch.nn.utils.rnn import pad_sequence
 
 from sb3_poem.adaptation import Answer, Inference, Rule, Setting
 from sb3_poem.adaptation.meta_model import MetaModel
-from sb3_poem.adaptation.preference import Preference
+from sb3_poem.adaptation.preference import SIGNS, Preference
 from sb3_poem.adaptation.rule import Shown
-from sb3_poem.baselines.fragments import check_shared_dynamics, standardised
-from sb3_poem.baselines.meta_reward import MetaReward
+from sb3_poem.adaptation.state import read_json, write_json_atomically
+from sb3_poem.baselines.fragments import (
+    check_shared_dynamics,
+    default_fragment_length,
+    replay_fragments,
+    standardised,
+    transition_rows,
+)
 from sb3_poem.common.checks import check_whole
+from sb3_poem.common.digest import digest_of
+from sb3_poem.common.files import write_atomically
+from sb3_poem.common.networks import MLP
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.pearl_sac import PEARLSAC
+from sb3_poem.pearl_sac.policies import LatentPolicy
+
+FORMAT = "sb3_poem meta reward 2"
+WEIGHTS, CONFIG = "reward.safetensors", "reward.json"
+SETTINGS = ("net_arch", "inner_learning_rate", "inner_steps", "fragment_length")
+#: Of an outer step of the meta-training: tasks, and pairs that each adapts to and is judged by.
+TASKS_PER_BATCH, PAIRS = 16, 10
+
+Parameters = dict[str, th.Tensor]
+
+
+class PreferencePairs(NamedTuple):
+    """Pairs of fragments, (..., pairs, steps, in_dim + 1) transitions as :class:`RewardNetwork`
+    takes them, and ``label`` (..., pairs): 1 where the left one is better, 0 or 0.5.
+    """
+
+    left: th.Tensor
+    right: th.Tensor
+    label: th.Tensor
+
+
+class RewardNetwork(nn.Module):
+    """Reward of a transition (s, a, s') of width ``in_dim``, unknown up to scale; and what MAML
+    does with its parameters, whose inner loop has so many ``steps``.
+    """
+
+    def __init__(
+        self, in_dim: int, net_arch: Sequence[int], learning_rate: float, steps: int
+    ) -> None:
+        super().__init__()
+        # A smooth activation: MAML differentiates the gradient.
+        self.mlp = MLP(in_dim, 1, net_arch, nn.Tanh)
+        self.learning_rate, self.steps = learning_rate, steps
+
+    def forward(self, transitions: th.Tensor) -> th.Tensor:
+        """(..., in_dim + 1), the last entry 1, or 0 for what only fills up an episode that ended
+        early -> (...).
+        """
+        return self.mlp(transitions[..., :-1]).squeeze(-1) * transitions[..., -1]
+
+    def preference_loss(self, parameters: Parameters, pairs: PreferencePairs) -> th.Tensor:
+        """Bradley-Terry cross-entropy of the sums of predicted rewards of one task's pairs."""
+        both = th.stack([pairs.left, pairs.right])
+        left, right = functional_call(self, parameters, (both,)).sum(dim=-1)
+        return (softplus(left - right) - pairs.label * (left - right)).mean()
+
+    def adapted(self, parameters: Parameters, pairs: PreferencePairs) -> Parameters:
+        """MAML's inner loop: gradient steps on one task's preferences."""
+        for _ in range(self.steps):
+            slope = grad(self.preference_loss)(parameters, pairs)
+            parameters = {k: v - self.learning_rate * slope[k] for k, v in parameters.items()}
+        return parameters
+
+    def maml_loss(
+        self, parameters: Parameters, support: PreferencePairs, query: PreferencePairs
+    ) -> th.Tensor:
+        """MAML's outer objective: how well what ``support`` (tasks, pairs, ...) adapts predicts
+        ``query``, other preferences of the same tasks.
+        """
+
+        def task_loss(some: PreferencePairs, others: PreferencePairs) -> th.Tensor:
+            return self.preference_loss(self.adapted(parameters, some), others)
+
+        return vmap(task_loss)(support, query).mean()
+
+
+class MetaReward:
+    """A reward network from which a few preferences lead to a task's reward.
+
+    >>> from sb3_poem import PEARLSAC
+    >>> small = dict(n_train_tasks=4, gradient_steps=2, seed=0)
+    >>> pearl = PEARLSAC("MlpPolicy", "poem/PointGoal-v0", **small).learn(200)
+    >>> meta_train_reward(pearl, n_iterations=1).save("reward")
+    >>> MetaReward.load("reward", pearl.policy).inner_steps
+    5
+
+    :param policy: Whose standardisation of observations is used.
+    :param inner_learning_rate: Step size of MAML's inner loop, which has ``inner_steps``.
+    :param fragment_length: Steps of the fragments of the meta-training; None: any.
+    :param seed: Of the initial parameters.
+    """
+
+    def __init__(
+        self,
+        policy: LatentPolicy,
+        net_arch: Sequence[int] = (64, 64),
+        inner_learning_rate: float = 0.1,
+        inner_steps: int = 5,
+        fragment_length: int | None = None,
+        seed: int = 0,
+    ) -> None:
+        if not inner_learning_rate > 0:
+            raise ValueError(
+                f"`inner_learning_rate` must be positive, but is {inner_learning_rate}"
+            )
+        check_whole("inner_steps", inner_steps, 1)
+        self.policy = policy
+        self.inner_learning_rate, self.inner_steps = inner_learning_rate, inner_steps
+        self.fragment_length = fragment_length
+        self.net_arch = tuple(int(width) for width in net_arch)
+        in_dim = 2 * spaces.flatdim(policy.observation_space) + spaces.flatdim(policy.action_space)
+        with th.random.fork_rng():
+            th.manual_seed(seed)
+            network = RewardNetwork(in_dim, net_arch, inner_learning_rate, inner_steps)
+        self.network = network.to(policy.device)
+        self.parameters: Parameters = {
+            name: value.detach().clone() for name, value in self.network.named_parameters()
+        }
+
+    @property
+    def digest(self) -> str:
+        return digest_of({**self.parameters, **_standardisation(self.policy)})
+
+    def save(self, folder: str | Path) -> None:
+        """Write the parameters as safetensors and the settings as JSON."""
+        tensors = {f"network.{name}": value for name, value in self.parameters.items()}
+        tensors |= _standardisation(self.policy)
+        content = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+        write_atomically(Path(folder) / WEIGHTS, save(content))
+        settings = {name: getattr(self, name) for name in SETTINGS}
+        write_json_atomically(Path(folder) / CONFIG, {"format": FORMAT, **settings})
+
+    @classmethod
+    def load(cls, folder: str | Path, policy: LatentPolicy) -> Self:
+        """Read what :meth:`save` wrote; the policy must be that of the meta-training."""
+        weights, settings = Path(folder) / WEIGHTS, Path(folder) / CONFIG
+        if not settings.is_file():
+            raise FileNotFoundError(f"{folder} holds no meta-trained reward: it has no {CONFIG}")
+        config = read_json(settings, "the settings of a meta-trained reward")
+        if config.get("format") != FORMAT:
+            raise ValueError(f"{settings} is not of this version of sb3_poem, {FORMAT!r}")
+        try:
+            tensors = load(weights.read_bytes())
+        except SafetensorError as error:
+            raise ValueError(f"{weights} is truncated, or no safetensors file: {error}") from error
+        for name, value in _standardisation(policy).items():
+            if not th.equal(tensors[name], value.cpu()):
+                raise ValueError(
+                    f"`policy` is not the one with which the reward in {folder} was meta-trained: "
+                    f"its {name} differs; load the same model again"
+                )
+        meta = cls(policy, **{name: config[name] for name in SETTINGS})
+        for name in meta.parameters:
+            meta.parameters[name] = tensors[f"network.{name}"].to(policy.device)
+        return meta
+
+    def transitions(self, trajectory: Trajectory) -> th.Tensor:
+        """(T, in_dim + 1) standardised (s, a, s') of a trajectory, and 1."""
+        return transition_rows(self.policy, trajectory, 1.0)
+
+    def adapted(self, answers: Sequence[Answer]) -> Parameters:
+        """The network's parameters after some answers. The inner loop's steps suit sums over the
+        fragments of the meta-training: longer trajectories count with their mean over as many.
+        """
+        if not answers:
+            return self.parameters
+        shown = [one for answer in answers for one in answer.shown]
+        # (2 answers, longest, in_dim + 1)
+        rows = pad_sequence([self.transitions(trajectory) for trajectory in shown], True)
+        longest = rows.shape[1]
+        rows[..., -1] *= min(1.0, (self.fragment_length or longest) / longest)
+        labels = [0.5 + 0.5 * SIGNS[answer.preference] for answer in answers]
+        pairs = PreferencePairs(rows[::2], rows[1::2], th.tensor(labels, device=rows.device))
+        adapted = self.network.adapted(self.parameters, pairs)
+        return {name: value.detach() for name, value in adapted.items()}
+
+    def rewards(self, parameters: Parameters, trajectory: Trajectory) -> np.ndarray:
+        """(T,) predicted rewards with what :meth:`adapted` gave, in the network's own unit."""
+        inputs = (self.transitions(trajectory),)
+        with th.no_grad():
+            predicted = th.func.functional_call(self.network, parameters, inputs)
+        return predicted.double().cpu().numpy()
+
+
+def meta_train_reward(
+    model: PEARLSAC,
+    n_iterations: int = 500,
+    n_fragments: int = 500,
+    fragment_length: int | None = None,
+    learning_rate: float = 1e-3,
+    seed: int = 0,
+    **arguments: Any,
+) -> MetaReward:
+    """Meta-train a reward on the preferences of a model's training tasks about fragments from its
+    replay buffer. Every task judges fragments of all of them, so the family must share dynamics.
+
+    :param n_iterations: Steps of the outer loop, by Adam with ``learning_rate``.
+    :param n_fragments: Fragments that pairs are drawn from.
+    :param fragment_length: Their steps; None takes 50, or an episode that is shorter.
+    :param arguments: Of :class:`MetaReward`.
+    """
+    if not model.family.shared_dynamics:
+        raise ValueError(
+            "`model` must be of a family whose tasks share their dynamics, but those of "
+            f"{model.family.env_id} do not: every task judges all tasks' fragments"
+        )
+    if not model.replay_buffer.counts.any():
+        raise ValueError(
+            "`model` has an empty replay buffer (a loaded model has none): call load_replay_buffer"
+        )
+    check_whole("n_iterations", n_iterations, 1)
+    check_whole("n_fragments", n_fragments, 1)
+    rng = np.random.default_rng([seed, 5])
+    length = default_fragment_length(model.horizon) if fragment_length is None else fragment_length
+    meta = MetaReward(model.policy, fragment_length=length, seed=seed, **arguments)
+    fragments = replay_fragments(model, n_fragments, length, rng)
+    inputs = th.stack([meta.transitions(fragment) for fragment in fragments])
+    features = np.stack([np.asarray(fragment.reward_features) for fragment in fragments])
+    tasks = model.train_tasks.tasks[:, None, None, :]
+    returns = model.family.compute_rewards(tasks, features[None]).sum(axis=2)
+    parameters = {name: value.requires_grad_() for name, value in meta.parameters.items()}
+    optimizer = th.optim.Adam(parameters.values(), lr=learning_rate)
+    n_tasks = min(TASKS_PER_BATCH, len(returns))
+    for _ in range(n_iterations):
+        judges = rng.choice(len(returns), size=n_tasks, replace=False)
+        support, query = (_judged(inputs, returns, judges, rng) for _ in range(2))
+        optimizer.zero_grad()
+        meta.network.maml_loss(parameters, support, query).backward()
+        optimizer.step()
+    meta.parameters = {name: value.detach() for name, value in parameters.items()}
+    return meta
+
+
+def _judged(
+    inputs: th.Tensor, returns: np.ndarray, tasks: np.ndarray, rng: np.random.Generator
+) -> PreferencePairs:
+    """Pairs for each of some tasks, by their returns (all tasks, fragments)."""
+    left, right = rng.integers(len(inputs), size=(2, len(tasks), PAIRS))
+    rows = tasks[:, None]
+    label = 0.5 + 0.5 * np.sign(returns[rows, left] - returns[rows, right])
+    labels = th.as_tensor(label, dtype=inputs.dtype, device=inputs.device)
+    return PreferencePairs(inputs[left], inputs[right], labels)
+
+
+def _standardisation(policy: LatentPolicy) -> dict[str, th.Tensor]:
+    """Without which the parameters mean nothing."""
+    return {"obs_mean": policy.obs_norm.mean, "obs_std": policy.obs_norm.std}
 
 
 class MAMLRewardModel(MetaModel):

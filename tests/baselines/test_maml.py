@@ -10,7 +10,7 @@ from sb3_poem import PEARLSAC
 from sb3_poem.adaptation import Preference
 from sb3_poem.adaptation.rule import Answer
 from sb3_poem.baselines import replay_fragments
-from sb3_poem.baselines.meta_reward import (
+from sb3_poem.baselines.maml_reward import (
     MetaReward,
     PreferencePairs,
     RewardNetwork,
