@@ -373,8 +373,7 @@ class BayesInference(Inference):
         than 0.2, and less than 0.5 given all. What was asked about twice is left alone.
         """
         # by what was seen: fragments of one policy differ, and have one latent
-        seen = [[getattr(item, "observations", item) for item in a.shown] for a in self.answers]
-        asked = [[np.asarray(item).tobytes() for item in shown] for shown in seen]
+        asked = [[item.observations.tobytes() for item in answer.shown] for answer in self.answers]
         asked_twice = np.array([asked.count(shown) > 1 for shown in asked], dtype=bool)
         others, everything = self.agreements().T
         found = np.where(asked_twice | (everything >= BELIEVED), 1.0, others)

@@ -93,8 +93,8 @@ class AdaptationEvalCallback(EpochCallback):
             spec = self.model.family.spec
             if spec is None:
                 raise ValueError(
-                    "AdaptationEvalCallback makes copies of the environment: register it with "
-                    "Gymnasium, or call evaluate_adaptation with a vector environment of your own"
+                    "AdaptationEvalCallback makes copies of the environment, which must be "
+                    "registered with Gymnasium; or call evaluate_adaptation yourself"
                 )
             kwargs = {"max_episode_steps": spec.max_episode_steps, **spec.kwargs, **self.env_kwargs}
             self._env = make_task_vec_env(spec.id, 2 * self.n_tasks, **kwargs)

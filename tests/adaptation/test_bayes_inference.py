@@ -691,11 +691,6 @@ def test_bad_options(model, arguments, message):
         make(model, **arguments)
 
 
-def test_the_decoder_needs_trajectories():
-    with pytest.raises(ValueError, match="needs the trajectories"):
-        make().tell(LEFT, np.zeros(5), np.ones(5))
-
-
 class Misled(SpeedModel):
     """From some steps alone it takes the left trajectories for better than they are, by as much for
     every latent.
