@@ -6,10 +6,11 @@ from sb3_poem.adaptation.bayes import Bayes
 from sb3_poem.adaptation.evaluation import (
     AdaptationEvaluation,
     EpisodeOutcomes,
+    TaskAdaptations,
+    adapt_tasks,
     evaluate_adaptation,
     evaluate_episodes,
 )
-from sb3_poem.adaptation.human import HumanOracle
 from sb3_poem.adaptation.known_task import (
     KnownTaskReturn,
     known_task_return,
@@ -23,11 +24,16 @@ from sb3_poem.adaptation.limits import (
     information_limit,
     rate_distortion_limit,
 )
-from sb3_poem.adaptation.many_tasks import TaskAdaptations, adapt_tasks
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.named_rule import named_rule
 from sb3_poem.adaptation.noise import BoltzmannNoise, ExactNoise, MistakeNoise, NoiseModel
-from sb3_poem.adaptation.oracles import BoltzmannOracle, MistakeOracle, ReturnOracle, TaskOracle
+from sb3_poem.adaptation.oracles import (
+    BoltzmannOracle,
+    HumanOracle,
+    MistakeOracle,
+    ReturnOracle,
+    TaskOracle,
+)
 from sb3_poem.adaptation.paper import Paper
 from sb3_poem.adaptation.policy import AdaptedPolicy
 from sb3_poem.adaptation.preference import Preference, Query

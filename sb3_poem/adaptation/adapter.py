@@ -21,18 +21,16 @@ from sb3_poem.adaptation.rule import (
     Rule,
     Setting,
     Shown,
-    Snapshot,
     as_rule,
     inference_rng,
     latent_of,
     rollout_seed,
-    trajectories_of,
 )
 from sb3_poem.adaptation.state import parse_json, read_json, write_json_atomically
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.rollouts import rollout_latents
-from sb3_poem.common.trajectory import Trajectory
+from sb3_poem.common.trajectory import Trajectory, decode_array, encode_array
 from sb3_poem.loading import as_model
 
 FORMAT, FORMAT_VERSION = "sb3_poem.PreferenceAdapter", 3
@@ -60,22 +58,18 @@ class PreferenceAdapter:
     ...     adapter.tell(oracle(query.left, query.right))
     >>> policy = adapter.policy()
 
-    The new task is the one in effect in :attr:`env`, or the one that its first reset draws. Measure
-    the policy there: ``evaluate_policy(policy, adapter.env)``. Another environment has another
-    task; ``env.reset(seed=...)`` draws another, too, unless one was chosen, by
-    ``sb3_poem.set_task(env, task)`` or ``reset(options={"task": task})``.
+    The new task is the one in effect in :attr:`env`, or the one that its first reset draws.
 
     :param model: A trained ``POEMSAC`` (or, within limits, ``PEARLSAC``), a file or folder of one,
         or the name of one that ships.
     :param env: The environment with the new task: a ``gym.Env``, its id, or a vector environment of
         Gymnasium's or SB3's, of which the first copy is watched.
     :param rule: How to ask and to infer: :class:`Bayes`, :class:`Paper` (Algorithm 2 of Xu & Zhu
-        2025), or a baseline's, each with its own options; None is ``Bayes()``.
+        2025), or a baseline; None is ``Bayes()``.
     :param n_queries: How many answers are asked for at most (K).
-    :param oracle: Who answers in :meth:`adapt`; a callable (left, right) -> Preference, or of as
-        many trajectories as the rule's questions show. If it has ``needs_frames``, trajectories
-        carry frames. If it has ``bind`` and no environment of its own, it is bound to ``env`` until
-        another adapter takes it.
+    :param oracle: Who answers in :meth:`adapt`; a callable of the trajectories that a question
+        shows -> Preference. If it has ``needs_frames``, these carry frames. If it has ``bind`` and
+        no environment of its own, it is bound to ``env`` until another adapter takes it.
     :param seed: Makes everything reproducible; None draws one, kept in ``seed``.
     :param deterministic: Whether policies act by their mode.
     :param library: Trajectories to ask about instead of rolling out new ones, for a rule that can.
@@ -126,7 +120,7 @@ class PreferenceAdapter:
         # What was rolled out to choose a question, by the question's number and latent
         self._seen: dict[tuple[int, bytes], Trajectory] = {}
         self.pending = None
-        self._previous: tuple[Snapshot, Query] | None = None
+        self._previous: tuple[dict[str, Any], Query] | None = None
 
     def _start(self) -> None:
         self.rule.check(self.model, self._setting)
@@ -161,11 +155,7 @@ class PreferenceAdapter:
         if self.pending is None:
             self._check_unfinished()
             self.pending = self._make_query(self.inference.ask())
-        elif (
-            self._needs_frames
-            and self.pending.shown[0].frames is None
-            and self.inference.library is None
-        ):
+        elif self._needs_frames and not (self.pending.shown[0].frames or self.inference.library):
             # It comes from a file, which holds no frames; the same seed gives the same rollouts.
             latents = self.inference.same_latents(*(item.latent for item in self.pending.shown))
             self.pending = self._make_query(latents, self._number_of(self.pending))
@@ -173,34 +163,27 @@ class PreferenceAdapter:
 
     @property
     def contradicted(self) -> int | None:
-        """The number, from 0, of the answer that the others contradict most, see :class:`Bayes`;
-        None if they agree, or the rule does not tell.
+        """The number, from 0, of the answer that the others contradict most; None if they agree,
+        or the rule does not tell.
         """
         return self.inference.contradicted()
 
     def ask_again(self, number: int) -> Query:
-        """Ask about the same trajectories as question ``number``, from 0, instead of the one
-        that waits, if any. Its answer is one more, beside the first.
-
-        :raises RuntimeError: If all questions have been answered.
-        :raises ValueError: If question ``number`` has no answer.
+        """Ask about the same trajectories as question ``number``, from 0, instead of the one that
+        waits, if any; the answer is one more, beside the first. A ``ValueError`` if that question
+        has none, and a ``RuntimeError`` if all questions have been answered.
         """
         self._check_unfinished()
         if number not in range(self.n_answers):
-            raise ValueError(
-                f"`number` must be that of an answer, from 0 to {self.n_answers - 1}, but is "
-                f"{number!r}"
-            )
-        shown = trajectories_of("ask_again()", *self.inference.answers[number].shown)
-        self.pending = Query(shown, self.rule.question)
+            known = f"that of an answer, from 0 to {self.n_answers - 1}"
+            raise ValueError(f"`number` must be {known}, but is {number!r}")
+        self.pending = Query(self.answers[number].shown, self.rule.question)
         return self.ask()
 
     def tell(self, preference: Preference | str) -> None:
         """Answer the pending question.
 
-        :param preference: A :class:`Preference`, or "left", "right" or "equal"; to a graded
-            question "much left" and "much right", too; of four "first", "second", "third", "fourth"
-            or "equal".
+        :param preference: A :class:`Preference`, or its word, "left" say.
         :raises RuntimeError: If no question waits for an answer.
         :raises TypeError, ValueError: If it is no answer to such a question, which goes on waiting.
         """
@@ -220,10 +203,8 @@ class PreferenceAdapter:
         next question is asked for: else a ``RuntimeError``.
         """
         if self._previous is None or self.pending is not None:
-            raise RuntimeError(
-                "nothing to undo: undo() takes back the last answer, before the next question is "
-                "asked for"
-            )
+            only = "undo() takes back the last answer, before the next question is asked for"
+            raise RuntimeError(f"nothing to undo: {only}")
         snapshot, query = self._previous
         self.inference.restore(snapshot, self.inference.answers[:-1])
         self.pending, self._previous = query, None
@@ -238,8 +219,8 @@ class PreferenceAdapter:
         return f"PreferenceAdapter({describe_model(self.model)}, {self.rule}, {answers})"
 
     def adapt(self, oracle: Oracle | None = None, progress_bar: bool = False) -> AdaptedPolicy:
-        """Ask the oracle (None takes the one given at construction) until done. A ``ValueError`` if
-        another one errs in a way that the questions asked so far did not count on.
+        """Ask the oracle (None takes the one given at construction) until done; a ``ValueError`` if
+        another one errs otherwise than the questions asked so far took for granted.
         """
         oracle = self.oracle if oracle is None else oracle
         if oracle is None:
@@ -258,11 +239,10 @@ class PreferenceAdapter:
             self.rule = rule
             self._start()
         self._take_oracle(oracle)
-        n, shows = self.n_queries, not progress_bar
-        with tqdm(total=n, initial=self.n_answers, unit="query", disable=shows) as bar:
+        n, hidden = self.n_queries, not progress_bar
+        with tqdm(total=n, initial=self.n_answers, unit="query", disable=hidden) as bar:
             while not self.done:
-                query = self.ask()
-                self.tell(oracle(*query.shown))
+                self.tell(oracle(*self.ask().shown))
                 bar.update()
         return self.policy()
 
@@ -292,21 +272,18 @@ class PreferenceAdapter:
     def _number_of(self, query: Query) -> int:
         """Of the answer about the very trajectories of a question; else the next one's."""
         for number, answer in enumerate(self.answers):
-            pairs = zip(trajectories_of("ask()", *answer.shown), query.shown, strict=True)
+            pairs = zip(answer.shown, query.shown, strict=True)
             if all(np.array_equal(old.observations, new.observations) for old, new in pairs):
                 return number
         return self.n_answers
 
     def _make_query(self, shown: Sequence[Shown], number: int | None = None) -> Query:
-        """The rollouts start alike, one after the other in the first copy: other copies may hold
-        other tasks.
-        """
         number, frames = self.n_answers if number is None else number, self._needs_frames
         rolled = tuple(self._rolled_out(item, number, frames) for item in shown)
         return Query(rolled, self.rule.question)
 
     def _rolled_out(self, shown: Shown, number: int, frames: int) -> Trajectory:
-        """What is shown of question ``number``."""
+        """What is shown of question ``number``: all its rollouts start alike."""
         if isinstance(shown, Trajectory):
             return shown
         latent = latent_of(shown)
@@ -315,23 +292,21 @@ class PreferenceAdapter:
             return known
         seed = rollout_seed(self.seed, number)
         by_mode = self.deterministic and not self.rule.explores
-        # It fills a wave of its own; copies beyond the first repeat it and are not read.
+        # One by one: copies beyond the first may hold other tasks. They repeat it, and are unread.
         about = (self.model, self.env, latent[None], None, [seed], by_mode)
         return rollout_latents(*about, frames=frames)[0]
 
     def _visibility(self, *pair: Shown) -> float:
-        """The share of what a question about these tells that is left when a person has to see
-        their difference: their family's :meth:`~poem_envs.TaskFamily.visible_difference`, up to 1.
-        It is 1 for a simulated oracle.
+        """See :class:`Setting`: the family's :meth:`~poem_envs.TaskFamily.visible_difference`, up
+        to 1; for a simulated oracle 1.
         """
         family = FamilyView.of(self.env) if self._watched else None
         if family is None:
             return 1.0
         # The first pair is nearly always the one that is asked about, so that it is filmed at once.
         frames = 0 if self._seen else self._needs_frames
-        number = self.n_answers
-        left, right = rolled = [self._rolled_out(item, number, frames) for item in pair]
-        self._seen.update(((number, clip.latent.tobytes()), clip) for clip in rolled)
+        left, right = rolled = [self._rolled_out(item, self.n_answers, frames) for item in pair]
+        self._seen |= {(self.n_answers, clip.latent.tobytes()): clip for clip in rolled}
         if left.reward_features is None or right.reward_features is None:
             return 1.0
         answered = [item for answer in self.answers for item in answer.shown]
@@ -341,19 +316,17 @@ class PreferenceAdapter:
         return min(1.0, visible)
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything as JSON-ready data, for :meth:`from_dict`: rule, answers with their
-        trajectories, posterior, random state, and the pending question. Frames stay out; model,
-        environment, oracle and library too.
+        """Everything as JSON-ready data, for :meth:`from_dict`, but frames, model, environment,
+        oracle and library.
         """
         model, pending, kind = self.model, self.pending, self.rule.question
+        facts = {"env_id": model.env_id, "digest": model.digest}
+        state = self.inference.snapshot()
+        arrays = {name: encode_array(array) for name, array in state["arrays"].items()}
         return {
             "format": FORMAT,
             "version": FORMAT_VERSION,
-            "model": {
-                "latent_dim": int(model.latent_dim),
-                "env_id": model.env_id,
-                "digest": model.digest,
-            },
+            "model": {"latent_dim": int(model.latent_dim), **facts},
             "rule": self.rule.to_dict(),
             "n_queries": self.n_queries,
             "seed": self.seed,
@@ -364,7 +337,7 @@ class PreferenceAdapter:
                 for answer in self.inference.answers
             ],
             "pending": None if pending is None else shown_to_dict(kind, pending.shown),
-            "inference": self.inference.snapshot().to_dict(),
+            "inference": {**state, "arrays": arrays},
         }
 
     @classmethod
@@ -379,28 +352,25 @@ class PreferenceAdapter:
         render: bool = False,
     ) -> Self:
         """Continue where :meth:`to_dict` stood: the same answers lead to the same policy as without
-        the interruption. Model, task and library must be the same (an id's task is drawn again); a
-        stochastic oracle's own generator is its own affair. For the arguments see
-        :class:`PreferenceAdapter`.
+        the interruption. Model, task and library must be the same (an id's task is drawn again);
+        for the arguments see :class:`PreferenceAdapter`.
 
-        :raises OtherModelError: If the model has other weights, another family or another latent's
-            dimension.
-        :raises ValueError: If the data is broken, of another version, or its rule is not imported.
+        :raises ValueError: If the data is broken, of another version or model
+            (``OtherModelError``), or its rule is not imported.
         """
         form, version = data.get("format"), data.get("version")
         if form != FORMAT:
             raise ValueError(f"not a saved adaptation: `format` is {form!r}, not {FORMAT!r}")
         if version != FORMAT_VERSION:
-            reads = f"this program reads {FORMAT_VERSION}"
-            raise ValueError(f"a saved adaptation of version {version!r}; {reads}")
+            raise ValueError(
+                f"a saved adaptation of version {version!r}; this program reads {FORMAT_VERSION}"
+            )
         own: MetaModel = as_model(model)
         with _complete():
             _check_same_model(data["model"], own)
             if data["uses_library"] and library is None:
-                raise ValueError(
-                    "this adaptation asks about a library of trajectories; pass the same `library` "
-                    "again"
-                )
+                asks = "this adaptation asks about a library of trajectories"
+                raise ValueError(f"{asks}; pass the same `library` again")
             kept = {name: data[name] for name in ("n_queries", "seed", "deterministic")}
             kept["rule"] = Rule.from_dict(data["rule"])
             adapter = cls(own, env, oracle=oracle, library=library, render=render, **kept)
@@ -421,7 +391,9 @@ class PreferenceAdapter:
             ]
             waits = data["pending"]
             pending = None if waits is None else Query(shown_from_dict(kind, waits), kind)
-            self.inference.restore(Snapshot.from_dict(data["inference"]), answers)
+            state = data["inference"]
+            arrays = {name: decode_array(array) for name, array in state["arrays"].items()}
+            self.inference.restore({**state, "arrays": arrays}, answers)
         self.pending, self._previous = pending, None
         self._seen.clear()
 

@@ -2,9 +2,9 @@
 they thin out.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Self, TypeAlias
+from typing import Any, Self
 
 import numpy as np
 from scipy.special import log_softmax, logsumexp
@@ -13,11 +13,12 @@ from sb3_poem.adaptation import queries
 from sb3_poem.adaptation.decisions import DECISIONS, decide
 from sb3_poem.adaptation.meta_model import HasRewardDecoder, HasSimilarity, MetaModel
 from sb3_poem.adaptation.noise import (
+    INFER,
     PROBIT_SLOPE,
     BoltzmannNoise,
     ExactNoise,
     NoiseModel,
-    Values,
+    People,
     noise_model_from_dict,
 )
 from sb3_poem.adaptation.particles import (
@@ -28,7 +29,6 @@ from sb3_poem.adaptation.particles import (
     kernel_neighbours,
     systematic_resample,
 )
-from sb3_poem.adaptation.people import INFER, People
 from sb3_poem.adaptation.preference import (
     ANSWERS,
     BEST_OF_FOUR,
@@ -37,33 +37,18 @@ from sb3_poem.adaptation.preference import (
     preference_log_likelihood,
 )
 from sb3_poem.adaptation.priors import SOURCES, make_prior
-from sb3_poem.adaptation.rule import (
-    Answer,
-    Inference,
-    Rule,
-    Setting,
-    Shown,
-    Snapshot,
-    check_choice,
-    latent_of,
-    trajectories_of,
-)
-from sb3_poem.common.checks import check_whole
+from sb3_poem.adaptation.rule import Answer, Inference, Rule, Setting, Shown, latent_of
+from sb3_poem.common.checks import check_choice, check_whole
 from sb3_poem.common.trajectory import Trajectory
 
 LIKELIHOODS = ("decoder", "similarity")
-#: A predicted difference's error, the typical sum of both returns' absolute values, and the
-#: family's spread of returns
-Unit: TypeAlias = tuple[float, float, float]
 
-# Nats between the aggregate posterior and N(0, I) up to which draws of the latter are as good as
-# trained latents.
+# Nats from the aggregate posterior to N(0, I) up to which draws of the latter do as well.
 PRIOR_COVERS = 0.3
 
 # Policies that a question may compare: the posterior's own, and as many from the prior. The pair
 # that splits a narrow posterior best usually lies outside it (to tell 1.0 from 1.1 show 0.8 and
-# 1.3), where the two can also be told apart. Four of which each is best for some of a narrow
-# posterior are rarer.
+# 1.3). Four of which each is best for some of a narrow posterior are rarer.
 QUERY_POLICIES = {"pair": 64, "graded": 64, BEST_OF_FOUR: 128}
 # Differences at which the answers' probabilities are tabulated for choosing a question.
 TABLE_POINTS = 1025
@@ -74,8 +59,8 @@ REFERENCE_POLICIES = 128
 # Smallest resolvable difference of S, as a share of the spread of its differences over random
 # triples. A Gaussian error of that size turns over 3 % of random preferences.
 SIMILARITY_RESOLUTION = 0.1
-# The same for choosing a question. It only has to keep apart policies that do the same; a coarser
-# one would not tell a pair that halves a narrow posterior from one that lies beside it.
+# The same for choosing a question: a coarser one would not tell a pair that halves a narrow
+# posterior from one that lies beside it.
 QUERY_RESOLUTION = 0.02
 # Steps over which the decoder's residuals stay correlated: a return's error grows with their
 # number, not with that of the steps.
@@ -87,71 +72,27 @@ MOVE_TRIES = 6
 # steps) that one answer may spend on them.
 DECODER_TRIES = 2
 DECODER_MOVE_STEPS = 2_500
-# Steps of a trajectory that the decoder sees. What is lost by leaving out the others depends on the
-# robot, so it is measured for each answer, by particles whose returns are predicted from all steps.
+# Steps of a trajectory that the decoder sees; what is lost by leaving out the others is measured
+# for each answer, by so many particles whose returns are predicted from all steps.
 DECODED_STEPS = 25
 FULLY_DECODED = 8
 # The prior's latents by which the spread of returns is told where S does not tell it.
 SPREAD_LATENTS = 32
-# Width of the kernel that replaces a copy of a particle by a neighbour, as a share of the
-# particles' own spread.
-KERNEL_WIDTH = 0.3
 # An answer whose side is less probable than this, given all others, contradicts them, unless it is
 # believed all the same.
 CONTRADICTED, BELIEVED = 0.2, 0.5
 
 
-class Thinning(NamedTuple):
-    """What decoding all steps adds to a difference x of returns that was decoded from some:
-    intercept + slope x, give or take ``error``, a standard deviation.
-    """
-
-    intercept: float = 0.0
-    slope: float = 0.0
-    error: float = 0.0
-
-    @classmethod
-    def fit(cls, thin: np.ndarray, full: np.ndarray) -> Self:
-        """Fit differences (n,) decoded from some steps and from all, by ridge regression."""
-        added = full - thin
-        covariance = np.mean((thin - thin.mean()) * added)
-        slope = covariance / max(thin.var() + np.square(added).mean(), 1e-12)
-        intercept = added.mean() - slope * thin.mean()
-        error = np.sqrt(np.square(added - intercept - slope * thin).mean())
-        return cls(float(intercept), float(slope), float(error))
-
-
 @dataclass(frozen=True, repr=False)
 class Bayes(Rule):
     """Posterior weights proportional to the prior times the likelihood of the answers under the
-    oracle's own noise model; questions by expected information gain; the latent of highest expected
-    fitness.
+    oracle's own noise model, by the returns that the reward decoder predicts of what was shown, or
+    by S; questions by expected information gain; the latent of highest expected fitness.
 
-    *Likelihood from the decoder*: the reward decoder predicts, for every particle, the returns of
-    the trajectories that were shown; the noise model turns the difference into the probability of
-    the answer. The predicted difference is trusted only as far as the decoder's own residual
-    allows.
-
-    *Likelihood from S*: S(z, z_left) - S(z, z_right) takes the place of the returns' difference. In
-    training S is the log-odds of being right about error-free labels, so the model's doubt is one
-    logistic unit of it. Once nearly all pairs are separated, however, the cross-entropy is lowered
-    by scaling S up without end: so the unit is at least a fixed share of the spread of S.
-
-    *Where a person answers*, what a question tells is multiplied by how much of the difference can
-    be seen (:func:`~sb3_poem.adaptation.queries.best_pair`), which the family says
-    (:meth:`poem_envs.TaskFamily.visible_difference`). That holds for ``"information-gain"``.
-
-    *Thinning*: when half of the particles carry no weight they are resampled and moved by
-    elliptical slice sampling around the posterior's own mean and covariance. A move by the decoder
-    evaluates all trajectories that were ever shown, so only as many particles move as a budget
-    allows; the copies that are left over are replaced by neighbours, drawn from a kernel that keeps
-    the particles' mean and covariance (Liu & West 2001).
-
-    *Who answers*: how an oracle errs can be told (``noise_model``) or inferred with the task: the
-    posterior is then one of latent and person together, of whom there is a grid in the place of
-    each particle (:class:`~sb3_poem.adaptation.people.People` states the prior), and both answers
-    and questions are averaged over it. What a person calls equal and much better, which graded
-    answers depend on, is always inferred.
+    Particles are moved when half of them carry no weight. With ``noise_model="infer"``, and where
+    answers are more than left or right, a grid of people stands in the place of each particle.
+    Where a person answers, what a question tells is multiplied by how much of the difference can be
+    seen (:meth:`poem_envs.TaskFamily.visible_difference`), with ``"information-gain"``.
 
     >>> from sb3_poem import PreferenceAdapter
     >>> rule = Bayes(n_particles=100)
@@ -164,15 +105,13 @@ class Bayes(Rule):
     :param candidates: Where particles come from: "prior" (N(0, I)) or "aggregate" (the training
         tasks' posteriors and what lies between neighbours); None takes the prior, unless the
         aggregate is far from it.
-    :param likelihood: "decoder" or "similarity"; None takes the decoder where the model has one and
-        knows its error, which takes tasks that share their dynamics.
+    :param likelihood: "decoder" or "similarity"; None takes the decoder where the model knows its
+        error, which takes tasks that share their dynamics.
     :param decision: "expected-fitness", "posterior-mean" or "most-likely", see
         :func:`sb3_poem.adaptation.decisions.decide`.
-    :param noise_model: How the oracle errs, or "infer"; None takes ``oracle.noise_model`` where
-        there is one, else no error.
+    :param noise_model: How the oracle errs, or "infer"; None takes the oracle's own, else no error.
     :param epsilon: Tolerated error of eq. 9, in [0, 0.5), for ``query_rule="worst-case"``.
-    :param question: "pair" (left, right or equal), "graded" (much better, too) or "best-of-four":
-        the pair that tells most, and two more that add most to it.
+    :param question: "pair" (left, right or equal), "graded" (much better, too) or "best-of-four".
     :raises ValueError: If an option is out of its range.
     """
 
@@ -200,8 +139,7 @@ class Bayes(Rule):
             )
         if isinstance(self.noise_model, dict):  # of a file
             object.__setattr__(self, "noise_model", noise_model_from_dict(self.noise_model))
-        needed = "probability_left" if self.question == "pair" else "probability_above"
-        if self.noise_model not in (None, INFER) and not hasattr(self.noise_model, needed):
+        if self.noise_model not in (None, INFER) and not isinstance(self.noise_model, NoiseModel):
             raise ValueError(
                 '`noise_model` must be None, "infer" or an object as MistakeNoise(0.2), '
                 f"but is {self.noise_model!r}"
@@ -217,8 +155,7 @@ class Bayes(Rule):
         """See :class:`Rule`: the likelihood and the questions need what not all models have."""
         super().check(model, setting)
         name, noise = type(model).__name__, self.noise_model
-        compares = isinstance(model, HasSimilarity)
-        likelihood = self.likelihood_with(model)
+        compares, likelihood = isinstance(model, HasSimilarity), self.likelihood_with(model)
         if likelihood == "decoder" and not _knows_its_decoder(model):
             error = getattr(model, "predicted_rewards_error", np.nan)
             raise ValueError(
@@ -227,8 +164,10 @@ class Bayes(Rule):
                 "model has been trained on tasks that share their dynamics"
             )
         if likelihood == "similarity" and not compares:
-            needs = "needs a model with `similarities` (POEMSAC)"
-            raise ValueError(f'likelihood="similarity" {needs}; {name} has none')
+            raise ValueError(
+                f'likelihood="similarity" needs a model with `similarities` (POEMSAC); {name} has '
+                "none"
+            )
         if likelihood == "similarity" and isinstance(noise, BoltzmannNoise) and noise.beta:
             raise ValueError(
                 f"a Boltzmann oracle of fixed beta ({noise.beta}) needs returns, which S does not "
@@ -244,8 +183,10 @@ class Bayes(Rule):
         elif not isinstance(model, HasRewardDecoder):
             raise ValueError("`library` needs a model with a reward decoder (predicted_returns)")
         elif self.query_rule == "worst-case":
-            instead = 'with a library use "information-gain"'
-            raise ValueError(f'query_rule="worst-case" compares candidates by S; {instead}')
+            raise ValueError(
+                'query_rule="worst-case" compares candidates by S; with a library use '
+                '"information-gain"'
+            )
 
     def likelihood_with(self, model: MetaModel) -> str:
         """Which one is used with a model."""
@@ -269,8 +210,8 @@ class BayesInference(Inference):
         noise: Any = rule.noise_model or ExactNoise()
         #: How the oracle errs, if that is told
         self.noise_model: NoiseModel | None = None if noise == INFER else noise
-        grid = noise == INFER or rule.question != "pair"
-        self.people = People(rule.question, self.noise_model) if grid else None
+        told = self.noise_model is not None and rule.question == "pair"
+        self.people = None if told else People(rule.question, self.noise_model)
         self.library = None if setting.library is None else list(setting.library)
         far = model.aggregate_to_prior_kl > PRIOR_COVERS
         self.prior = make_prior(model, rule.candidates or ("aggregate" if far else "prior"), rng)
@@ -281,13 +222,12 @@ class BayesInference(Inference):
             shares = np.tile(self.people.log_prior, (rule.n_particles, 1))
             self.people_log_shares = shares.astype(np.float16)
             self.state = (*self.state, "people_log_shares")
-        # Of a generator of its own, which does not move the particles' and begins alike every time.
+        # Of a generator of its own, which leaves the particles' alone.
         self._reference = self.prior.balanced_sample(REFERENCE_POLICIES, np.random.default_rng(0))
         self.scale = self._similarity_scale()
         # Sums over answers that tie S to the decoder's returns: S dS, S dR, |R| and their number.
         self.calibration = np.zeros(4)
-        self.thinning = np.zeros((0, 3))  # a Thinning of each answer
-        self._library_returns: np.ndarray | None = None
+        self.thinning = np.zeros((0, 3))  # see fit_thinning, of each answer
         self._library_spread: float | None = None
 
     @property
@@ -317,7 +257,10 @@ class BayesInference(Inference):
 
     def _compare(self, policies: np.ndarray) -> tuple[int, ...]:
         """Which of these (n, d) to roll out, by S."""
-        particles, weights = self._query_particles()
+        particles, weights = self.particles, self.weights
+        if len(particles) > QUERY_PARTICLES:
+            particles = particles[systematic_resample(weights, QUERY_PARTICLES, self.rng)]
+            weights = np.full(QUERY_PARTICLES, 1.0 / QUERY_PARTICLES)
         similarities = self.model.similarities(particles, policies)
         if self.rule.query_rule == "worst-case":
             return queries.worst_case_pair(similarities, self.rule.epsilon, weights)
@@ -340,10 +283,12 @@ class BayesInference(Inference):
         values: np.ndarray,
         weights: np.ndarray,
         noise: Any,
-        unit: Unit,
+        unit: tuple[float, float, float],
     ) -> tuple[int, ...]:
-        """Of what is shown, by its predicted fitness ``values`` (m, n) under m latents of these
-        weights, which sum to one.
+        """Of what is shown, by its predicted fitness (m, n) under m latents of these weights.
+
+        :param unit: A predicted difference's error, the typical sum of both returns' absolute
+            values, and the family's spread of returns.
         """
         see = self.visibility
         visibility: queries.Visibility | None = (
@@ -370,9 +315,7 @@ class BayesInference(Inference):
             return pair
         return queries.most_telling_set(pair, self.n_shown, values, weights, said)
 
-    def tell(self, preference: Preference, *shown: Shown) -> None:
-        if self.likelihood == "decoder":
-            trajectories_of('likelihood="decoder"', *shown)
+    def tell(self, preference: Preference, *shown: Any) -> None:
         answer = Answer(preference, shown)
         told = self._log_likelihoods(self.particles, [answer], new=True)
         if self.people is not None:
@@ -392,9 +335,9 @@ class BayesInference(Inference):
 
     def agreements(self) -> np.ndarray:
         """(k, 2) how well each answer agrees with the others: P(better on its side, or EQUAL),
-        given all others and given all; 1 for EQUAL. The posterior without an answer is that of all,
-        each latent and person divided by their probability of it (Gelfand, Dey & Chang 1992). Of
-        four it is P(better than another one), on average.
+        given all others and given all; 1 for EQUAL. Of four it is P(better than another one), on
+        average. The posterior without an answer is that of all, each latent and person divided by
+        their probability of it (Gelfand, Dey & Chang 1992).
         """
         found = np.ones((len(self.answers), 2))
         if not self.answers:
@@ -404,15 +347,16 @@ class BayesInference(Inference):
             joint = joint * np.exp(self.people_log_shares.astype(np.float64))
         kinds = ANSWERS[self.rule.question]
         middle = kinds.index(Preference.EQUAL)
-        for i, d, e, m, spread in self._each_difference(self.particles, self.answers):
-            place = kinds.index(self.answers[i].preference)
+        difference, error, magnitude, spread = self._differences(self.particles, self.answers)
+        for i, answer in enumerate(self.answers):
+            place, about = kinds.index(answer.preference), (error[:, i], magnitude[:, i])
             if place == middle:
                 continue
             if self.people is not None:
-                said = self.people.probabilities(d, e, m, spread)  # (answers, m, G)
+                said = self.people.probabilities(difference[:, i], *about, spread)
             else:
                 assert self.noise_model is not None
-                left = self.noise_model.probability_left(d[:, 0], e, m)[:, None]
+                left = self.noise_model.probability_left(difference[:, i, 0], *about)[:, None]
                 said = np.stack([1.0 - left, np.zeros_like(left), left])
             if self.n_shown > 2:
                 side, other = said[place], (said[1:].sum(axis=0) - said[place]) / (len(said) - 2)
@@ -425,21 +369,20 @@ class BayesInference(Inference):
         return found
 
     def contradicted(self) -> int | None:
-        """See :class:`Inference`: the answer that agrees least with all others, see
-        :meth:`agreements`, if that is less than 0.2, and less than 0.5 given all. What was asked
-        about twice is left alone.
+        """The answer that agrees least with all others, see :meth:`agreements`, if that is less
+        than 0.2, and less than 0.5 given all. What was asked about twice is left alone.
         """
         # by what was seen: fragments of one policy differ, and have one latent
-        seen = [[getattr(item, "observations", item) for item in a.shown] for a in self.answers]
-        asked = [[np.asarray(item).tobytes() for item in shown] for shown in seen]
+        asked = [[item.observations.tobytes() for item in answer.shown] for answer in self.answers]
         asked_twice = np.array([asked.count(shown) > 1 for shown in asked], dtype=bool)
         others, everything = self.agreements().T
         found = np.where(asked_twice | (everything >= BELIEVED), 1.0, others)
         return int(np.argmin(found)) if np.any(found < CONTRADICTED) else None
 
     def _similarity_scale(self) -> np.ndarray:
-        """The spread of S's differences, and the unit in which a difference counts as one logistic
-        unit of doubt.
+        """The spread of S's differences, and the one that is a logistic unit of doubt: 1, as S is
+        the log-odds of being right about labels without errors; but once nearly all pairs are
+        separated training scales S up without end, so it is at least a share of the spread.
         """
         if not self.has_similarity:
             return np.ones(2)
@@ -454,8 +397,8 @@ class BayesInference(Inference):
         return float(self.scale[0])
 
     def _return_spread(self, shown: Sequence[Shown]) -> float:
-        """The family's spread of returns (see :class:`People`), by the decoder: from S, once it is
-        tied to returns, else from what was shown. 1, of no effect, without people.
+        """The family's spread of returns, for people, by the decoder: from S, once it is tied to
+        returns, else from what was shown.
         """
         if self.people is None:
             return 1.0
@@ -471,58 +414,48 @@ class BayesInference(Inference):
         return self._library_spread
 
     def _return_unit(self) -> tuple[float, float, NoiseModel | None]:
-        """Slope from S to returns, the returns' typical magnitude, and the noise model that fits
-        this unit.
-        """
+        """Slope from S to returns, their typical magnitude, and a noise model for this unit."""
         cross, square, magnitude, count = self.calibration
         if count and cross > 0:
             return float(cross / square), float(magnitude / count), self.noise_model
-        # No trajectory has tied S to returns yet (or none can). Noise models that only ask for the
-        # sign need no unit, and the paper's temperature is relative: it is told that returns are as
-        # large as their spread. A fixed one has to wait.
+        # Nothing has tied S to returns yet. Noise models that only ask for the sign need no unit,
+        # and the paper's temperature is relative: it is told that returns are as large as their
+        # spread. A fixed one has to wait.
         fixed = isinstance(self.noise_model, BoltzmannNoise) and self.noise_model.beta is not None
         return 1.0, 2.0 * self._spread, ExactNoise() if fixed else self.noise_model
 
-    def _decoder_error(self, steps: Values) -> Any:
+    def _decoder_error(self, steps: Any) -> Any:
         return self.model.predicted_rewards_error * np.sqrt(steps * ERROR_CORRELATION)
 
     def _differences(
         self, latents: np.ndarray, answers: Sequence[Answer], new: bool = False
-    ) -> tuple[np.ndarray, Values, Values, float]:
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
         """What each of (m, d) latents predicts of k answers about n: (m, k, n - 1) differences of
-        the first one's to the others' returns, their error and magnitude, as
-        :meth:`NoiseModel.probability_left` takes them, and the family's spread.
+        the first one's to the others' returns, their error and magnitude (m, k), and the family's
+        spread.
         """
         shown = [item for answer in answers for item in answer.shown]
-        grouped = (-1, len(answers), self.n_shown)
+        grouped, shape = (-1, len(answers), self.n_shown), (len(latents), len(answers))
         if self.likelihood == "decoder":
             values = self.model.predicted_returns(latents, shown, DECODED_STEPS)  # (m, k n)
             steps = np.array([len(item) for item in shown], dtype=np.float64).reshape(grouped[1:])
             if new:
-                measured = self._measure_thinning(shown, values)
-                self.thinning = np.concatenate([self.thinning, measured])
+                self.thinning = np.vstack([self.thinning, self._measure_thinning(shown, values)])
             fits = self.thinning[-len(answers) * (self.n_shown - 1) :]
             intercepts, slopes, errors = fits.T.reshape(3, len(answers), self.n_shown - 1)
             error = np.hypot(self._decoder_error(steps[:, :1] + steps[:, 1:]), errors).mean(axis=1)
             difference = first_to_others(values.reshape(grouped))
             difference = difference + intercepts + slopes * difference
             if new and self.has_similarity:
-                self._calibrate(latents, shown, values)
+                s = first_to_others(self._similarities(latents, shown)).ravel()
+                typical = 2.0 * np.abs(values).mean(axis=1).mean()
+                self.calibration += [s @ first_to_others(values).ravel(), s @ s, typical, 1.0]
             magnitude = 2.0 * np.abs(values).reshape(grouped).mean(axis=2)
-            return difference, error, magnitude, self._return_spread(shown)
-        values = self.model.similarities(latents, np.stack([latent_of(item) for item in shown]))
-        error = float(self.scale[1]) * PROBIT_SLOPE
-        return first_to_others(values.reshape(grouped)), error, 2.0 * self._spread, self._spread
-
-    def _each_difference(
-        self, latents: np.ndarray, answers: Sequence[Answer], new: bool = False
-    ) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray, float]]:
-        """The number of each answer, and :meth:`_differences` of it, (m, n - 1), (m,) and (m,)."""
-        difference, error, magnitude, spread = self._differences(latents, answers, new)
-        shape = difference.shape[:2]
-        error, magnitude = np.broadcast_to(error, shape), np.broadcast_to(magnitude, shape)
-        for i in range(len(answers)):
-            yield i, difference[:, i], error[:, i], magnitude[:, i], spread
+            return difference, np.broadcast_to(error, shape), magnitude, self._return_spread(shown)
+        values = self._similarities(latents, shown)
+        error = np.full(shape, self.scale[1] * PROBIT_SLOPE)
+        magnitude = np.full(shape, 2.0 * self._spread)
+        return first_to_others(values.reshape(grouped)), error, magnitude, self._spread
 
     def _log_likelihoods(
         self, latents: np.ndarray, answers: Sequence[Answer], new: bool = False
@@ -530,50 +463,42 @@ class BayesInference(Inference):
         """(m,) log P(answers | latent) of (m, d), or (m, G) for each of the people; what else a new
         answer tells is noted.
         """
+        difference, error, magnitude, spread = self._differences(latents, answers, new)
         if self.people is None:
             assert self.noise_model is not None
-            difference, *unit, _ = self._differences(latents, answers, new)
-            probability = self.noise_model.probability_left(difference[..., 0], *unit)
+            probability = self.noise_model.probability_left(difference[..., 0], error, magnitude)
             told = [answer.preference for answer in answers]
             return preference_log_likelihood(np.log(probability), np.log1p(-probability), told)
         sums = np.zeros((len(latents), len(self.people)))
-        for i, d, e, m, spread in self._each_difference(latents, answers, new):
-            place = self.people.answers.index(answers[i].preference)
-            sums += np.log(self.people.probabilities(d, e, m, spread)[place])
+        for i, answer in enumerate(answers):
+            about = difference[:, i], error[:, i], magnitude[:, i], spread
+            place = self.people.answers.index(answer.preference)
+            sums += np.log(self.people.probabilities(*about)[place])
         return sums
 
     def _answer_log_likelihoods(self, latents: np.ndarray) -> np.ndarray:
-        """(m,) log P(all answers | latent) of (m, d), whoever answers."""
+        """(m,) log P(all answers | latent), whoever answers."""
         told = self._log_likelihoods(latents, self.answers)
         return told if self.people is None else logsumexp(told + self.people.log_prior, axis=1)
 
-    def _measure_thinning(self, shown: Sequence[Shown], thin: np.ndarray) -> list[Thinning]:
-        """Of the first one's difference to each other."""
+    def _measure_thinning(self, shown: Sequence[Shown], thin: np.ndarray) -> np.ndarray:
+        """(n - 1, 3) of the first one's difference to each other."""
         if max(map(len, shown)) <= DECODED_STEPS:
-            return [Thinning()] * (len(shown) - 1)
+            return np.zeros((len(shown) - 1, 3))
         quantiles = (np.arange(FULLY_DECODED) + 0.5) / FULLY_DECODED
         some = np.searchsorted(np.cumsum(self.weights), quantiles).clip(max=len(self.particles) - 1)
         full = self.model.predicted_returns(self.particles[some], shown)
         pairs = zip(first_to_others(thin[some]).T, first_to_others(full).T, strict=True)
-        return [Thinning.fit(*pair) for pair in pairs]
+        return np.array([fit_thinning(*pair) for pair in pairs])
 
-    def _calibrate(self, latents: np.ndarray, shown: Sequence[Shown], returns: np.ndarray) -> None:
-        shown_latents = np.stack([latent_of(item) for item in shown])
-        s = first_to_others(self.model.similarities(latents, shown_latents)).ravel()
-        magnitude = 2.0 * np.abs(returns).mean(axis=1).mean()
-        self.calibration += [s @ first_to_others(returns).ravel(), s @ s, magnitude, 1.0]
+    def _similarities(self, latents: np.ndarray, shown: Sequence[Shown]) -> np.ndarray:
+        return self.model.similarities(latents, np.stack([latent_of(item) for item in shown]))
 
     def _query_policies(self) -> np.ndarray:
         """(n, d): half of them draws of the posterior, half of the prior."""
         half = QUERY_POLICIES[self.rule.question] // 2
         posterior = self.particles[systematic_resample(self.weights, half, self.rng)]
         return np.concatenate([posterior, self.prior.sample(half, self.rng)])
-
-    def _query_particles(self) -> tuple[np.ndarray, np.ndarray]:
-        if len(self.particles) <= QUERY_PARTICLES:
-            return self.particles, self.weights
-        chosen = systematic_resample(self.weights, QUERY_PARTICLES, self.rng)
-        return self.particles[chosen], np.full(QUERY_PARTICLES, 1.0 / QUERY_PARTICLES)
 
     def _rejuvenate(self) -> None:
         """Resample, and replace what is now double, at bounded cost."""
@@ -588,38 +513,42 @@ class BayesInference(Inference):
         if self.likelihood == "similarity":
             self._move(np.arange(len(self.particles)), MOVE_SWEEPS, MOVE_TRIES, fitted)
             return
-        # One evaluation more than tries: where a particle stands now has to be weighed, too; and
-        # another for who answers.
+        # One more than tries: where a particle stands is weighed, too; and another for who answers.
         evaluations = DECODER_TRIES + (1 if self.people is None else 2)
         shown = [item for answer in self.answers for item in answer.shown]
         steps = sum(min(len(item), DECODED_STEPS) for item in shown)
         affordable = DECODER_MOVE_STEPS // (steps * evaluations)
         order = self.rng.permutation(len(copies))
         self._move(copies[order[:affordable]], 1, DECODER_TRIES, fitted)
-        left_over = copies[order[affordable:]]
-        log_prior = self.prior.log_density if self.prior.has_holes else None
-        replaced = self.particles[left_over], fitted, KERNEL_WIDTH, log_prior, self.rng
-        self.particles[left_over] = kernel_neighbours(*replaced)
+        rest = copies[order[affordable:]]
+        prior = self.prior.log_density if self.prior.has_holes else None
+        self.particles[rest] = kernel_neighbours(self.particles[rest], fitted, prior, self.rng)
 
     def _move(self, moved: np.ndarray, sweeps: int, tries: int, fitted: Gaussian) -> None:
         if not len(moved):
             return
         particles = self.particles[moved]
-        log_likelihoods = self._answer_log_likelihoods(particles)
+        told = self._answer_log_likelihoods(particles)
         reference = Gaussian(fitted.mean, WIDENING * fitted.factor)
-        target = self._answer_log_likelihoods, self.prior.log_density, reference
+        target = self._answer_log_likelihoods, self.prior.log_density, reference, tries, self.rng
         for _ in range(sweeps):
-            particles, log_likelihoods = elliptical_slice_moves(
-                particles, log_likelihoods, *target, tries, self.rng
-            )
+            particles, told = elliptical_slice_moves(particles, told, *target)
         self.particles[moved] = particles
         if self.people is not None:
             told = self._log_likelihoods(particles, self.answers) + self.people.log_prior
             self.people_log_shares[moved] = log_softmax(told, axis=1)
 
-    def restore(self, snapshot: Snapshot, answers: list[Answer]) -> None:
-        super().restore(snapshot, answers)
-        self._library_returns = None
+
+def fit_thinning(thin: np.ndarray, full: np.ndarray) -> tuple[float, float, float]:
+    """What decoding all steps adds to a difference x of returns that was decoded from some:
+    intercept + slope x, give or take an error, a standard deviation; by ridge regression on (n,).
+    """
+    added = full - thin
+    covariance = np.mean((thin - thin.mean()) * added)
+    slope = covariance / max(thin.var() + np.square(added).mean(), 1e-12)
+    intercept = added.mean() - slope * thin.mean()
+    error = np.sqrt(np.square(added - intercept - slope * thin).mean())
+    return float(intercept), float(slope), float(error)
 
 
 def first_to_others(values: np.ndarray) -> np.ndarray:

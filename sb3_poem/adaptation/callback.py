@@ -24,15 +24,13 @@ ADAPTATION_KWARGS = ("rule", "oracle_factory", "deterministic", "library", "prog
 
 class AdaptationEvalCallback(EpochCallback):
     """Adapts the model to held-out tasks from preferences while it trains, logs how well that goes,
-    and keeps the best model.
+    and keeps the best model. Training is the same with it and without it.
 
     Logs ``eval/return_after_<k>_queries`` for each k, ``eval/known_task_return`` (the best of many
     latents for each task), ``eval/preference_accuracy`` and ``eval/kendall_tau`` of Property 1,
     ``eval/coverage_loss`` (the return that is lost by replacing each training task's latent by the
-    nearest of 1,000 prior draws). It has its own generators: training is the same with it and
-    without it. Evaluation steps do not count as training steps. For a family whose infos say
-    whether a step was a success, ``eval/success_rate_after_<k>_queries`` and
-    ``eval/known_task_success_rate`` too.
+    nearest of 1,000 prior draws), and for a family that says what a success is
+    ``eval/success_rate_after_<k>_queries`` and ``eval/known_task_success_rate``.
 
     >>> from sb3_poem import POEMSAC
     >>> model = POEMSAC("MlpPolicy", "poem/PointGoal-v0", n_train_tasks=4, gradient_steps=1)
@@ -40,18 +38,15 @@ class AdaptationEvalCallback(EpochCallback):
     >>> model = model.learn(400, callback=evaluation)  # four epochs: none is evaluated yet
 
     :param every: Epochs between two evaluations
-    :param n_tasks: Held-out tasks; a finite family of no more than that is evaluated on all its
-        tasks
+    :param n_tasks: Held-out tasks; all of a finite family that has no more
     :param record_at: Numbers of answers after which the adapted policy is measured
     :param n_episodes: Episodes of each task and measurement
     :param best_model_save_path: Folder for ``best_model.zip``, the model of the highest return
         after the most answers. A run that is resumed with the same folder goes on comparing with it
-    :param seed: Seed of the held-out tasks and of everything else here
+    :param seed: Of the held-out tasks and of everything else here
     :param adaptation_kwargs: Arguments of :func:`sb3_poem.adaptation.evaluate_adaptation`, for
-        instance ``rule``. A model without a similarity is asked random queries unless they say
-        otherwise
-    :param env_kwargs: Arguments of the environment that differ from training's, for instance a
-        ``split`` of its tasks
+        instance ``rule``, without which a model without a similarity is asked random queries
+    :param env_kwargs: Arguments of the environment that differ from training's, ``split`` say
     """
 
     def __init__(
@@ -72,7 +67,6 @@ class AdaptationEvalCallback(EpochCallback):
         self.n_tasks, self.n_episodes, self.seed = n_tasks, n_episodes, seed
         self.record_at = check_whole_numbers("record_at", record_at, 0)
         folder = best_model_save_path
-        self.best_model_save_path = None if folder is None else Path(folder)
         self._best_model = None if folder is None else Path(folder) / "best_model.zip"
         self.adaptation_kwargs = dict(adaptation_kwargs or {})
         self.env_kwargs = dict(env_kwargs or {})
@@ -86,7 +80,7 @@ class AdaptationEvalCallback(EpochCallback):
         self._env: VecEnv | None = None
 
     def _init_callback(self) -> None:
-        """Refuse before training what could not be evaluated or saved after some epochs of it."""
+        """Refuse before training what could not be evaluated or saved afterwards."""
         super()._init_callback()
         self._make_env()
         if self._best_model is not None:
@@ -100,8 +94,7 @@ class AdaptationEvalCallback(EpochCallback):
             if spec is None:
                 raise ValueError(
                     "AdaptationEvalCallback makes copies of the environment, which must be "
-                    "registered with Gymnasium; register it, or call evaluate_adaptation with a "
-                    "vector environment of your own"
+                    "registered with Gymnasium; or call evaluate_adaptation yourself"
                 )
             kwargs = {"max_episode_steps": spec.max_episode_steps, **spec.kwargs, **self.env_kwargs}
             self._env = make_task_vec_env(spec.id, 2 * self.n_tasks, **kwargs)
@@ -124,7 +117,7 @@ class AdaptationEvalCallback(EpochCallback):
         metrics["known_task_return"] = known.mean_return
         if result.success_rates is not None and known.success_rate is not None:
             rates = zip(result.record_at, result.success_rates.tolist(), strict=True)
-            metrics.update({f"success_rate_after_{k}_queries": rate for k, rate in rates})
+            metrics |= {f"success_rate_after_{k}_queries": rate for k, rate in rates}
             metrics["known_task_success_rate"] = known.success_rate
         metrics["coverage_loss"] = self._coverage_loss(env)
         if isinstance(self.model, HasSimilarity):

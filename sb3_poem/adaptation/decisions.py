@@ -6,13 +6,11 @@ from sb3_poem.adaptation.meta_model import HasSimilarity
 
 DECISIONS = ("expected-fitness", "posterior-mean", "most-likely")
 
-# How much fitter than the posterior mean's policy another one must look to be taken instead of it,
-# in standard deviations of S over the prior's policies. S is an estimate, and the best-looking of
-# hundreds of options is partly luck; the mean is not chosen by it.
+# How much fitter than the posterior mean's policy another one must look to be taken instead, in
+# standard deviations of S over the prior's policies: the best-looking of hundreds is partly luck.
 MEAN_ADVANTAGE = 0.1
-# Options that look as fit as the best one to within this, for every task that is plausible (root
-# mean square over the posterior, in the same unit), are not told apart: at the far side of a
-# cluster of latents S went on rising where returns fell.
+# Options that look as fit as the best one to within this (root mean square over the posterior, same
+# unit) are not told apart: at the far side of a cluster S may go on rising where returns fall.
 ALIKE = 0.5
 
 
@@ -30,16 +28,15 @@ def decide(
     - "expected-fitness": the posterior mean if its policy is nearly as fit as any, else the middle
       of those options that S does not tell from the fittest. Fitness is S(z, option), averaged over
       the posterior of z; options are the particles, the posterior mean and the training tasks'
-      latents. Highest likelihood, or fitness alone, would run to extreme latents; and the mean of
-      two separate modes fits neither.
+      latents. (Fitness alone would run to extreme latents; the mean of two modes fits neither.)
     - "posterior-mean": the weighted mean of the particles.
     - "most-likely": the particle of the largest weight.
 
     :param model: None has "expected-fitness" mean the particle nearest to the posterior mean.
     :param training_latents: (N, d) or None.
     :param reference: (m, d) draws of the prior, whose policies give S its unit.
-    :param has_holes: Whether the prior is a mixture, with latents between its parts that no
-        training has seen: S may think much of their policies, so the posterior mean is no option.
+    :param has_holes: Whether no training has seen latents between parts of the prior: then the
+        posterior mean is no option.
     """
     if decision == "most-likely":
         return particles[np.argmax(weights)].copy()
@@ -70,9 +67,8 @@ def decide(
 
 
 def standard_scores(similarities: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """S(z_i, option), (n, options), in units that are the same for all tasks, as those of large
-    norm would outvote the others: S(z_i, policy) of the prior's policies, (n, m), has mean 0 and
-    standard deviation 1.
+    """S(z_i, option), (n, options), in units in which that of the prior's policies, (n, m), has
+    mean 0 and standard deviation 1 for all tasks: those of large norm would outvote others.
     """
     scale = reference.std(axis=1, keepdims=True)
     return (similarities - reference.mean(axis=1, keepdims=True)) / np.maximum(scale, 1e-12)

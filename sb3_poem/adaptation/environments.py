@@ -23,14 +23,10 @@ COPIES = 60
 def model_and_env(
     model: MetaModel | str | Path, env: Env, n_copies: int = COPIES, render: bool = False
 ) -> tuple[MetaModel, VecEnv]:
-    """A model, and a vector environment, of what adaptation accepts as such.
+    """A model, and a vector environment, of what adaptation accepts as such; an id makes
+    ``n_copies``, that on which the model was trained with the same arguments.
 
-    :param model: A model, a file or folder of one, or the name of one that ships.
-    :param env: A ``gym.Env``, its id, a Gymnasium ``VectorEnv`` or an SB3 ``VecEnv``; the latter
-        stays as it is. The id on which the model was trained makes ``n_copies`` with the same
-        arguments.
-    :raises TypeError: If one of them is something else.
-    :raises FileNotFoundError: If there is no such model.
+    :raises TypeError, FileNotFoundError: If one of them is something else, or there is none.
     :raises ValueError: If the model's file asks for what :func:`environment_of` refuses.
     """
     found: MetaModel = as_model(model)

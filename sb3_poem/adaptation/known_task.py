@@ -16,7 +16,6 @@ from sb3_poem.adaptation.evaluation import (
 from sb3_poem.adaptation.limits import AnswerLimits
 from sb3_poem.adaptation.meta_model import HasSimilarity, MetaModel
 from sb3_poem.adaptation.noise import NoiseModel
-from sb3_poem.adaptation.rule import check_choice
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.rollouts import rollout_outcomes
@@ -75,37 +74,23 @@ def known_task_return(
     n_episodes: int = 10,
     seed: int = 0,
     *,
-    source: str = "both",
     selection_episodes: int = 1,
-    deterministic: bool = True,
     limits: bool = True,
 ) -> KnownTaskReturn:
-    """The return if the task were known: for each task the best of many latents, refined by two
-    rounds of draws around it. Winners are rolled out anew, so that the luck of having been chosen
-    does not count.
-
-    Beside the adapted return it tells which to work on: the repertoire of policies, or the
-    inference among them. Where tasks share their dynamics every latent is rolled out once, and its
-    trajectory relabelled for every task.
+    """The return if the task were known: for each task the best of many latents, half of N(0, I)
+    and half of the training tasks', refined by two rounds of draws around it. Winners are rolled
+    out anew, so that the luck of having been chosen does not count.
 
     The *limit* is what the best 2^k of the latents that were tried at first earn on these tasks
     (:class:`AnswerLimits`). They are chosen on other tasks, for which the same rollouts are
-    relabelled, and scored by fresh episodes: so it does not profit from luck, nor from knowing the
-    test tasks. Where tasks do not share dynamics they are chosen on the test tasks themselves, and
-    only the episodes are others. It is the best codebook of these policies, not of any method.
-
-    >>> best = known_task_return("PointGoal", "poem/PointGoal-v0", 5, n_latents=50)
-    >>> best.latents.shape  # a policy for each of five tasks
-    (5, 5)
+    relabelled (where tasks do not share their dynamics, on the test tasks themselves), and scored
+    by fresh episodes.
 
     :param model: And ``env``: see :func:`adapt_tasks`.
     :param tasks: See :func:`evaluate_adaptation`.
-    :param n_latents: How many to try at first; None for 300, or for 30 where every latent must be
-        rolled out in every task.
+    :param n_latents: How many to try at first; None for 300, or 30 where dynamics differ.
     :param n_episodes: Fresh episodes per winner.
-    :param source: Where latents come from: "prior", "aggregate", or "both" in equal parts.
     :param selection_episodes: Episodes per latent (and task, where dynamics differ) for choosing.
-    :param deterministic: Whether policies act by their mode.
     :param limits: Whether to measure limits, which takes one more rollout of all latents.
     """
     model, vec_env = model_and_env(model, env)
@@ -114,11 +99,11 @@ def known_task_return(
     shared = family.shared_dynamics
     if n_latents is None:
         n_latents = LATENTS_WITH_SHARED_DYNAMICS if shared else LATENTS_WITH_OWN_DYNAMICS
-    check_whole("n_latents", n_latents, 1)
-    check_whole("n_episodes", n_episodes, 1)
-    check_whole("selection_episodes", selection_episodes, 1)
+    numbers = {"n_latents": n_latents, "n_episodes": n_episodes}
+    for name, number in {**numbers, "selection_episodes": selection_episodes}.items():
+        check_whole(name, number, 1)
     rng = np.random.default_rng([seed, 2])
-    candidates = _draw_latents(model, n_latents, source, rng)
+    candidates = _draw_latents(model, n_latents, rng)
     others = tasks[:0]
     if limits and shared:
         n = OTHER_TASKS if family.all_tasks is None else len(family.all_tasks)
@@ -126,11 +111,9 @@ def known_task_return(
         others = np.unique(drawn, axis=0)
     every = np.concatenate([tasks, others])
 
-    def returns_of(
-        tasks: np.ndarray, latents: np.ndarray, stream: int, episodes: int = selection_episodes
-    ) -> np.ndarray:
-        how = episodes, evaluation_seed(seed, stream), deterministic
-        return return_matrix(model, vec_env, tasks, latents, *how)
+    def returns_of(tasks: np.ndarray, latents: np.ndarray, stream: int) -> np.ndarray:
+        start = evaluation_seed(seed, stream)
+        return return_matrix(model, vec_env, tasks, latents, selection_episodes, start)
 
     returns, on_others = np.split(returns_of(every, candidates, 1), [len(tasks)])
     best = candidates[np.argmax(returns, axis=1)]
@@ -144,38 +127,35 @@ def known_task_return(
             best = flat[np.argmax(returns_of(tasks, flat, stream), axis=1)]
             continue
         rows = np.repeat(tasks, draws.shape[1], axis=0)
-        how = selection_episodes, evaluation_seed(seed, stream), deterministic
+        how = selection_episodes, evaluation_seed(seed, stream)
         found = evaluate_episodes(model, vec_env, draws.reshape(len(rows), -1), rows, *how)
         picks = np.argmax(found.returns.mean(axis=1).reshape(draws.shape[:2]), axis=1)
         best = draws[np.arange(len(tasks)), picks]
     measured = None
     if limits:
-        fresh = returns_of(tasks, candidates, 4, 1)
+        fresh = return_matrix(model, vec_env, tasks, candidates, 1, evaluation_seed(seed, 4))
         chosen_on, along = (on_others, others) if shared else (returns, tasks)
         ordered = along.shape[1] == 1
         if ordered:
             chosen_on = chosen_on[np.argsort(along[:, 0])]
         measured = AnswerLimits.measure(chosen_on, returns, fresh, ordered=ordered)
-    how = n_episodes, evaluation_seed(seed), deterministic
-    outcomes = evaluate_episodes(model, vec_env, best, tasks, *how)
+    outcomes = evaluate_episodes(model, vec_env, best, tasks, n_episodes, evaluation_seed(seed))
     own = {"tasks": tasks, "latents": best, "candidate_latents": candidates}
     return KnownTaskReturn(**vars(outcomes), **own, candidate_returns=returns, limits=measured)
 
 
 def return_spread(model: MetaModel | str | Path, env: Env, seed: int = 0) -> float:
     """The family's spread of returns: the root mean square difference of the returns of two random
-    policies of a model on a random task, which thresholds of graded answers are shares of.
-
-    :param model: And ``env``: see :func:`adapt_tasks`.
+    policies of a model on a random task. For ``model`` and ``env`` see :func:`adapt_tasks`.
     """
     model, vec_env = model_and_env(model, env)
     tasks = choose_test_tasks(model, vec_env, SPREAD_TASKS, seed)
     rng, start = np.random.default_rng([seed, 4]), evaluation_seed(seed, 2)
     if FamilyView(vec_env).shared_dynamics:
-        latents = _draw_latents(model, SPREAD_TASKS, "both", rng)
+        latents = _draw_latents(model, SPREAD_TASKS, rng)
         returns = return_matrix(model, vec_env, tasks, latents, seed=start)
     else:
-        latents = _draw_latents(model, 2 * SPREAD_TASKS, "both", rng)
+        latents = _draw_latents(model, 2 * SPREAD_TASKS, rng)
         outcomes = evaluate_episodes(model, vec_env, latents, np.tile(tasks, (2, 1)), 1, start)
         returns = outcomes.returns.reshape(2, SPREAD_TASKS).T
     return float(np.sqrt(2.0 * returns.var(axis=1, ddof=1).mean()))
@@ -188,23 +168,20 @@ def return_matrix(
     latents: np.ndarray,
     n_episodes: int = 1,
     seed: int = 0,
-    deterministic: bool = True,
 ) -> np.ndarray:
-    """J[i, j], (n_tasks, n_latents), the mean true return on task i (n_tasks, task_dim) of the
-    policy of latent j (n_latents, latent_dim) over so many episodes, whose reset seeds start at
-    ``seed``. Where tasks share their dynamics each latent is rolled out once for all of them.
+    """J[i, j], (n_tasks, n_latents), the mean true return of latent j (n_latents, latent_dim) on
+    task i (n_tasks, task_dim), over episodes whose reset seeds start at ``seed``.
     """
     tasks, latents = np.asarray(tasks, dtype=np.float64), np.asarray(latents, dtype=np.float64)
     family, shape = FamilyView(vec_env), (len(tasks), len(latents))
     if not family.shared_dynamics:
         every, rows = np.tile(latents, (shape[0], 1)), np.repeat(tasks, shape[1], axis=0)
-        how = n_episodes, seed, deterministic
-        found = evaluate_episodes(model, vec_env, every, rows, *how)
+        found = evaluate_episodes(model, vec_env, every, rows, n_episodes, seed)
         return found.returns.mean(axis=1).reshape(shape)
     # The task in effect does not matter, and it must be one that every copy accepts.
     some_task = np.repeat(tasks[:1], n_episodes * shape[1], axis=0)
     every = np.tile(latents, (n_episodes, 1))
-    outcomes = rollout_outcomes(model, vec_env, every, some_task, seed, deterministic)
+    outcomes = rollout_outcomes(model, vec_env, every, some_task, seed)
     features = [outcome.reward_features[None] for outcome in outcomes]
     totals = [family.compute_rewards(tasks[:, None], each).sum(axis=1) for each in features]
     return np.stack(totals, axis=1).reshape(shape[0], n_episodes, shape[1]).mean(axis=1)
@@ -219,12 +196,11 @@ def property_one(similarities: np.ndarray, returns: np.ndarray) -> tuple[float, 
     >>> round(accuracy, 2), round(tau, 2)
     (0.67, 0.33)
 
-    :return: Preference accuracy, the share of pairs of policies with different returns that S puts
-        in the right order (a tie of S counts one half); and Kendall's tau-b, averaged over tasks.
-        NaN if no task tells any two policies apart.
+    :return: The share of pairs of policies with different returns that S puts in the right order (a
+        tie of S counts one half); and Kendall's tau-b, averaged over tasks. NaN if no task tells
+        any two policies apart.
     """
-    similarities = np.asarray(similarities, dtype=np.float64)
-    returns = np.asarray(returns, dtype=np.float64)
+    similarities, returns = (np.asarray(x, dtype=np.float64) for x in (similarities, returns))
     if similarities.shape != returns.shape or similarities.ndim != 2:
         raise ValueError(
             "`similarities` and `returns` must have the same shape (n_tasks, n_policies), but have "
@@ -245,20 +221,14 @@ def property_one(similarities: np.ndarray, returns: np.ndarray) -> tuple[float, 
 
 
 def preference_order(model: HasSimilarity, known: KnownTaskReturn) -> tuple[float, float]:
-    """:func:`property_one` on held-out tasks. A held-out task's latent is the best of the
-    candidates for it; S between those latents is compared with the returns of their policies on
-    those tasks.
-    """
-    best = np.argmax(known.candidate_returns, axis=1)
+    """:func:`property_one` on held-out tasks, whose latents are the best of the candidates."""
+    best, latents = np.argmax(known.candidate_returns, axis=1), known.candidate_latents
     policies = np.unique(best)
-    latents = known.candidate_latents
     similarities = model.similarities(latents[best], latents[policies])
     return property_one(similarities, known.candidate_returns[:, policies])
 
 
-def _draw_latents(model: MetaModel, n: int, source: str, rng: np.random.Generator) -> np.ndarray:
-    of_aggregate = {"prior": 0, "both": n // 2, "aggregate": n}
-    check_choice("source", source, tuple(of_aggregate))
-    numbers = {"prior": n - of_aggregate[source], "aggregate": of_aggregate[source]}
-    drawn = [model.sample_latents(k, rng, source=name) for name, k in numbers.items() if k]
+def _draw_latents(model: MetaModel, n: int, rng: np.random.Generator) -> np.ndarray:
+    numbers = {"prior": n - n // 2, "aggregate": n // 2}
+    drawn = [model.sample_latents(k, rng, source=source) for source, k in numbers.items() if k]
     return np.concatenate(drawn)

@@ -30,11 +30,10 @@ class AnswerLimits:
     """What the best choice of some policies earns after k answers, where the choice is made on
     other tasks and scored on the test tasks by fresh episodes.
 
-    k exact answers tell 2^k policies apart, so a method ends in one of a *codebook* of 2^k; here
-    it is the codebook that is best for the other tasks, and each test task gets the best of it.
-    Answers with errors tell less than a bit each: then policies are chosen as rate-distortion
-    theory says (Shannon 1959), with the marginal that is best for the other tasks at that many
-    bits. Both are of *these policies*: a method with other ones may earn more.
+    k exact answers tell 2^k policies apart: the *codebook* of 2^k is that which is best for the
+    other tasks, and each test task gets the best of it. Answers with errors tell less: then
+    policies are chosen as rate-distortion theory says (Shannon 1959), with the marginal that is
+    best for the other tasks at that many bits. A method with other policies may earn more.
 
     >>> limits = AnswerLimits((-9.0, -5.0, -3.0), bits=(0.0, 2.0), returns=(-9.0, -3.0), spread=9.0)
     >>> limits.after(1), limits.after(10)
@@ -54,14 +53,13 @@ class AnswerLimits:
     def measure(
         cls, others: np.ndarray, chosen: np.ndarray, fresh: np.ndarray, *, ordered: bool = False
     ) -> Self:
-        """Take three matrices of returns of the same policies.
+        """From returns of the same policies.
 
         :param others: (n_others, n_policies), on which codebooks are chosen.
         :param chosen: (n_tasks, n_policies), by which each test task's policy is chosen.
         :param fresh: (n_tasks, n_policies), of other episodes, which score it.
         :param ordered: See :func:`best_codebook`.
         """
-        others, chosen, fresh = (check_returns(returns) for returns in (others, chosen, fresh))
         n_policies, every = others.shape[1], np.arange(len(chosen))
         codebooks = []
         for k in range((n_policies - 1).bit_length() + 1):
@@ -86,8 +84,8 @@ class AnswerLimits:
         """Mean return after k answers.
 
         :param noise_model: How the oracle errs; None is an oracle that does not.
-        :param n_answers: Kinds of answers to a question: m of them name m^k policies. Between two
-            powers of 2 the codebooks' returns are interpolated.
+        :param n_answers: See :func:`information_limit`. Between two powers of 2 the codebooks'
+            returns are interpolated.
         """
         check_whole("k", k, 0)
         capacity = answer_capacity(noise_model, self.spread, n_answers)
@@ -108,14 +106,10 @@ def information_limit(
 ) -> float:
     """The highest mean return that any method can reach with k answers.
 
-    k answers of m kinds tell at most m^k tasks apart, so a method ends in one of at most m^k
-    policies; the best choice of those and, for every task, the best of them, bounds it
-    (:func:`best_codebook`). Answers of an oracle that errs tell less than log2(m) bits each: then
-    the rate-distortion bound at the bits that they do tell applies
-    (:func:`rate_distortion_limit`).
-
-    The bound holds for the tasks that are given: with 30 test tasks it ends at the known-task
-    return after five answers to pairs. For a bound on the family take a dense grid of tasks.
+    k answers of m kinds tell at most m^k policies apart, so the best choice of those bounds it
+    (:func:`best_codebook`); answers of an oracle that errs tell less than log2(m) bits each, so
+    :func:`rate_distortion_limit` does. For a bound on the family take a dense grid of tasks: with
+    30 of them it ends at the known-task return after five answers to pairs.
 
     >>> speeds = np.linspace(0, 3, 61)
     >>> returns = -np.abs(speeds[:, None] - speeds)  # of policies that run at some speed
@@ -126,8 +120,7 @@ def information_limit(
     :param noise_model: How the oracle errs; None is an oracle that does not.
     :param n_answers: Kinds of answers to a question: 2 where left or right is better, 3 with EQUAL
         beside them, 4 where one of four is best, 5 where questions are graded.
-    :raises ValueError: If the matrix is empty or not finite, k is negative, or the noise model is
-        of an unknown kind.
+    :raises ValueError: If an argument is out of its range, or the noise model of an unknown kind.
     """
     check_whole("k", k, 0)
     returns = check_returns(returns)
@@ -144,20 +137,16 @@ def information_limit(
 
 def best_codebook(returns: np.ndarray, size: int, *, ordered: bool = False) -> np.ndarray:
     """The set of policies of a given size with the highest mean over tasks of the best return
-    (k-medoids on the matrix): (min(size, n_policies),) indices, ascending.
-
-    Found exactly where all sets can be tried, or by dynamic programming where tasks lie on a line
-    (``ordered``); else by greedy choice and swaps, which may lie slightly below the optimum.
+    (k-medoids on the matrix): (min(size, n_policies),) indices, ascending. Where not all sets can
+    be tried it is found by greedy choice and swaps, and may lie slightly below the optimum.
 
     >>> places = np.arange(6)
     >>> best_codebook(-np.abs(places[:, None] - places), 2, ordered=True)
     array([1, 4])
 
-    :param ordered: Whether the rows are in the order of a one-dimensional task parameter. The
-        optimum is then found among all ways to cut the line into ``size`` intervals, one policy
-        each. That is exact if of any two policies the one is better up to some task and the other
-        from there on, as with a goal speed; noise in the returns may break this, so the general
-        search is tried too.
+    :param ordered: Whether the rows are in the order of a one-dimensional task parameter: then all
+        ways to cut the line into ``size`` intervals, one policy each, are looked at, too. That is
+        exact if of any two policies the one is better up to some task and the other from there on.
     """
     returns = check_returns(returns)
     check_whole("size", size, 1)
@@ -175,8 +164,8 @@ def best_codebook(returns: np.ndarray, size: int, *, ordered: bool = False) -> n
 
 
 def best_intervals(returns: np.ndarray, size: int) -> np.ndarray:
-    """The policies of the best cut of an ordered list of tasks into at most ``size`` intervals, by
-    dynamic programming: their indices, ascending and each once.
+    """The policies of the best cut of ordered tasks into at most ``size`` intervals, by dynamic
+    programming: their indices, ascending and each once.
     """
     n_tasks = len(returns)
     sums = np.concatenate([np.zeros((1, returns.shape[1])), np.cumsum(returns, axis=0)])
@@ -202,61 +191,51 @@ def best_intervals(returns: np.ndarray, size: int) -> np.ndarray:
 def answer_capacity(noise: NoiseModel | None, spread: float, n_answers: int = 2) -> float:
     """The most that one answer can tell, whatever is asked: bits, in [0, log2(n_answers)].
 
-    Where an answer is left or right it is the capacity of the binary symmetric channel at the
-    oracle's smallest probability of a mistake. Of the probabilities of LEFT that questions can
-    bring about only the extremes matter, since the information is convex in them; and asking in
-    the light of earlier answers adds nothing (Cover & Thomas, Elements of Information Theory,
-    7.12). Of more answers a mistake exchanges each with its opposite: a sum of such channels
-    (ibid., problem 7.28). A Boltzmann oracle's grades tell no more than the difference that it
-    perceives, whose capacity is found by the algorithm of Blahut and Arimoto. Where one of four is
-    best, a mistake is any other one, and a Boltzmann oracle's probabilities are at most a factor
-    apart: the extremes of what questions can bring about have r probable answers and 4 - r others,
-    and as each can be any of the four, the capacity is that of a symmetric channel (ibid., 7.2.1).
+    Left or right are a binary symmetric channel at the smallest probability of a mistake: of the
+    probabilities that questions bring about only the extremes matter, and asking in the light of
+    earlier answers adds nothing (Cover & Thomas, Elements of Information Theory, 7.12). Of more
+    answers a mistake exchanges each with its opposite, a sum of such channels (problem 7.28); a
+    Boltzmann oracle's grades tell no more than the difference that it perceives. Where one of four
+    is best the channel is symmetric (7.2.1): r answers are probable, and 4 - r are not.
 
     >>> from sb3_poem.adaptation import MistakeNoise
     >>> round(answer_capacity(MistakeNoise(0.1), spread=1.0), 2)  # a tenth is wrong
     0.53
 
-    :param noise: How the oracle errs; None is an oracle that does not.
     :param spread: The largest difference of returns that a question can show: with a fixed
         ``beta`` an answer is the surer the larger it is.
-    :param n_answers: See :func:`information_limit`.
+    :param n_answers: See :func:`information_limit`, and for ``noise``.
     """
     check_whole("n_answers", n_answers, 2)
     if noise is None or isinstance(noise, ExactNoise):
         return float(np.log2(n_answers))
-    if n_answers == 4 and isinstance(noise, (MistakeNoise, BoltzmannNoise)):
-        if isinstance(noise, MistakeNoise):
-            rows = [[1.0 - noise.rate, *[noise.rate / 3] * 3]]
-        else:
-            # Of the paper's exponent, |R_i - R_j| / (2 mean |R|), 2 is the largest.
-            odds = np.exp(min(2.0 if noise.beta is None else noise.beta * spread, 700.0))
-            rows = [[*[odds] * r, *[1.0] * (4 - r)] for r in (1, 2, 3)]
-        said = np.array(rows) / np.sum(rows, axis=1, keepdims=True)
-        return float(2.0 - entr(said).sum(axis=1).min() / np.log(2.0))
     if isinstance(noise, MistakeNoise):
         mistake = noise.rate
+        rows = [[1.0 - mistake, *[mistake / 3] * 3]]
     elif isinstance(noise, BoltzmannNoise):
-        # The paper's exponent, |R_left - R_right| / (|R_left| + |R_right|), is at most 1.
-        exponent = 1.0 if noise.beta is None else noise.beta * spread
-        if n_answers > 2:
+        # The paper's exponent, |R_left - R_right| / (|R_left| + |R_right|), is at most 1, and of
+        # four, |R_i - R_j| / (2 mean |R|), at most 2.
+        exponent = (1.0 + (n_answers == 4)) if noise.beta is None else noise.beta * spread
+        if n_answers not in (2, 4):
             return min(float(np.log2(n_answers)), _logistic_capacity(exponent))
         mistake = float(0.5 * (1.0 - np.tanh(0.5 * exponent)))
+        odds = np.exp(min(exponent, 700.0))
+        rows = [[*[odds] * r, *[1.0] * (4 - r)] for r in (1, 2, 3)]
     else:
         known, name = "ExactNoise, MistakeNoise or BoltzmannNoise", type(noise).__name__
         raise ValueError(f"`noise_model` must be {known}, but is of type {name}")
+    if n_answers == 4:
+        said = np.array(rows) / np.sum(rows, axis=1, keepdims=True)
+        return float(2.0 - entr(said).sum(axis=1).min() / np.log(2.0))
     told = 1.0 - float(entr([mistake, 1.0 - mistake]).sum()) / np.log(2.0)
     return float(np.log2(n_answers // 2 * 2.0**told + n_answers % 2))
 
 
 def rate_distortion_limit(returns: np.ndarray, bits: float) -> float:
     """An upper bound on the mean return of any method that learns at most so many bits about which
-    of the tasks it is.
-
-    It is max E[J] over all ways p(j | i) to choose policies with mutual information I(i; j) <=
-    bits, tasks being equally likely (Shannon 1959), found by the algorithm of Blahut and Arimoto.
-    What is returned is the value of the dual problem, with the bound that holds at every iterate
-    (Csiszar 1974): where iterations are stopped early it is too high, never too low.
+    of the tasks it is: max E[J] over all ways p(j | i) to choose policies with mutual information
+    I(i; j) <= bits, tasks being equally likely (Shannon 1959). It is the value of the dual problem,
+    with the bound that holds at every iterate (Csiszar 1974): never too low.
 
     >>> rate_distortion_limit(np.eye(2), bits=1.0), rate_distortion_limit(np.eye(2), bits=0.0)
     (1.0, 0.5)
@@ -299,25 +278,16 @@ def _greedy(returns: np.ndarray, size: int, first: Sequence[int] | np.ndarray = 
 
 def _swap(returns: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     """Replace one policy at a time by the best other one, as long as that helps."""
-    chosen = chosen.copy()
-    value = _value(returns, chosen)
-    every, replaced = np.arange(len(returns)), True
+    chosen, value = chosen.copy(), _value(returns, chosen)
     for _ in range(MAX_SWAP_ROUNDS):
-        improved = False
+        before = value
         for position in range(len(chosen)):
-            if replaced:
-                taken = returns[:, chosen]
-                best = np.argmax(taken, axis=1)
-                first = taken[every, best]
-                taken[every, best] = -np.inf
-                second = taken.max(axis=1)
-            rest = np.where(best == position, second, first)
+            rest = returns[:, np.delete(chosen, position)].max(axis=1, initial=-np.inf)
             values = np.maximum(returns, rest[:, None]).mean(axis=0)
             candidate = int(np.argmax(values))
-            replaced = values[candidate] > value + 1e-12 * max(1.0, abs(value))
-            if replaced:
-                chosen[position], value, improved = candidate, values[candidate], True
-        if not improved:
+            if values[candidate] > value + 1e-12 * max(1.0, abs(value)):
+                chosen[position], value = candidate, float(values[candidate])
+        if value == before:
             break
     return chosen
 
@@ -326,8 +296,8 @@ def check_returns(returns: np.ndarray, axes: str = "(n_tasks, n_policies)") -> n
     """Returns of these two axes as float64; a ``ValueError`` if they are not finite, or none."""
     returns = np.asarray(returns, dtype=np.float64)
     if returns.ndim != 2 or 0 in returns.shape or not np.isfinite(returns).all():
-        expected = f"finite, {axes}, neither 0"
-        raise ValueError(f"`returns` must be {expected}, but has shape {returns.shape}")
+        shape = f"but has shape {returns.shape}"
+        raise ValueError(f"`returns` must be finite, {axes}, neither 0, {shape}")
     return returns
 
 
@@ -335,8 +305,7 @@ def _best_marginal(
     returns: np.ndarray, slope: float, marginal: np.ndarray | None = None
 ) -> tuple[np.ndarray, float]:
     """(n_policies,) how often each policy is taken at the maximum of slope E[J] - I(i; j) over
-    p(j | i), and an upper bound on it, tight within ``TOLERANCE``, by the algorithm of Blahut and
-    Arimoto; it may start at a marginal.
+    p(j | i), and an upper bound on it, by the algorithm of Blahut and Arimoto.
     """
     best = returns.max(axis=1, keepdims=True)
     kernel = np.exp(slope * (returns - best))
@@ -363,8 +332,8 @@ def _channel(returns: np.ndarray, slope: float, marginal: np.ndarray) -> np.ndar
 
 
 def _logistic_capacity(amplitude: float) -> float:
-    """Bits, an upper bound, tight within ``TOLERANCE``: what a number in [-amplitude, amplitude]
-    with a logistic error of scale 1 can tell.
+    """Bits, an upper bound: what a number in [-amplitude, amplitude] with a logistic error of scale
+    1 can tell, by the algorithm of Blahut and Arimoto.
     """
     inputs = np.linspace(-amplitude, amplitude, CHANNEL_INPUTS)
     edges = np.linspace(-amplitude - 12.0, amplitude + 12.0, CHANNEL_OUTPUTS - 1)

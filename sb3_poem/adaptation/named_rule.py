@@ -5,7 +5,8 @@ from typing import Any
 from sb3_poem.adaptation.bayes import Bayes
 from sb3_poem.adaptation.noise import MistakeNoise
 from sb3_poem.adaptation.paper import Paper
-from sb3_poem.adaptation.rule import Rule, check_choice
+from sb3_poem.adaptation.rule import Rule
+from sb3_poem.common.checks import check_choice
 
 
 def named_rule(
@@ -21,8 +22,8 @@ def named_rule(
 
     :param n_candidates: Of Algorithm 2, or particles.
     :param mistake_rate: How often who answers errs, unless ``noise_model`` says how; Algorithm 2
-        takes no notice of it.
-    :param options: Others of the rule; ``noise_model``, too, is nothing to Algorithm 2.
+        takes no notice of either.
+    :param options: Others of the rule.
     """
     check_choice("inference", inference, ("bayes", "paper"))
     if inference == "paper":

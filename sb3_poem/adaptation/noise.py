@@ -1,4 +1,4 @@
-"""How an oracle errs, as the Bayesian rule sees it: P(answer | returns of the two trajectories).
+"""How who answers errs, as the Bayesian rule sees it: P(answer | returns of what was shown).
 
 The doubt about *predicted* returns is folded into the oracle's own noise by averaging over it: a
 step function and a Gaussian error give a probit, a logistic function nearly one of a shrunken
@@ -7,9 +7,12 @@ that the prediction calls impossible should not veto a latent.
 """
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from itertools import product
+from typing import Any
 
 import numpy as np
+
+from sb3_poem.adaptation.preference import ANSWERS, BEST_OF_FOUR
 
 # A probit of unit scale is nearest to a logistic function of this slope.
 PROBIT_SLOPE = 1.702
@@ -17,42 +20,51 @@ PROBIT_SLOPE = 1.702
 # like of). It bounds what one answer can do to the posterior, and costs an error-free oracle's ten
 # answers nothing to speak of.
 LAPSE = 0.01
+#: In the place of a noise model: it is inferred.
+INFER = "infer"
+
+# What people may be like, and how many of them are so before the first answer: rates, and standard
+# deviations, widths and differences in units of the family's spread of returns, the root mean
+# square difference of two random policies' returns on a random task.
+MISTAKES = {0.0: 0.8, 0.25: 0.2}
+DOUBTS = {0.0: 0.8, 2.0: 0.2}
+INDIFFERENCES = {0.0: 0.4, 0.12: 0.4, 0.4: 0.2}
+MUCH = {0.45: 0.3, 1.0: 0.5, 2.0: 0.2}
 
 Values = np.ndarray | float
 
 
-class NoiseModel(Protocol):
-    """P(LEFT) from the difference of two returns.
+class NoiseModel:
+    """What somebody says follows from a difference of two returns that they perceive, and a share
+    ``rate`` of answers is turned round. One of your own overrides :meth:`probability_above`; as it
+    is here the larger return is perceived to be larger.
 
     >>> ExactNoise().to_dict()
     {'kind': 'exact'}
     """
 
-    def probability_left(self, difference: Values, error: Values, magnitude: Values) -> Any:
-        """P(LEFT), given that the oracle says LEFT or RIGHT, in (0, 1); arguments broadcast.
+    kind: str
+    rate = 0.0
+
+    def probability_above(self, difference: Values, error: Values, magnitude: Values) -> Any:
+        """P(the perceived difference is positive), in [0, 1]; arguments broadcast.
 
         :param difference: Predicted return of the left trajectory minus that of the right one.
         :param error: Standard deviation of that prediction, same unit.
         :param magnitude: The sum of both returns' absolute values, same unit.
         """
+        return _logistic(difference, PROBIT_SLOPE / np.maximum(error, 1e-12))
+
+    def probability_left(self, difference: Values, error: Values, magnitude: Values) -> Any:
+        """P(LEFT), given that the oracle says LEFT or RIGHT, in (0, 1)."""
+        left = self.probability_above(difference, error, magnitude)
+        left *= 1.0 - LAPSE
+        left += LAPSE / 2
+        return left if self.rate == 0.0 else self.rate + (1.0 - 2.0 * self.rate) * left
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready; :func:`noise_model_from_dict` reads it."""
-
-
-class GradedNoiseModel(NoiseModel, Protocol):
-    """One that also knows answers of degrees: what somebody says follows from a difference that
-    they perceive, and some say the opposite of that.
-    """
-
-    @property
-    def mistakes(self) -> float:
-        """The share of answers that are turned round."""
-
-    def probability_above(self, difference: Values, error: Values, magnitude: Values) -> Any:
-        """P(the perceived difference is positive), slips aside; arguments as in
-        :meth:`NoiseModel.probability_left`.
-        """
+        return {"kind": self.kind, **vars(self)}
 
 
 def _logistic(x: Values, slope: Values) -> np.ndarray:
@@ -67,33 +79,8 @@ def _logistic(x: Values, slope: Values) -> np.ndarray:
     return np.reciprocal(y, out=y)
 
 
-def _with_lapse(probability: np.ndarray) -> np.ndarray:  # in place
-    probability *= 1.0 - LAPSE
-    probability += LAPSE / 2
-    return probability
-
-
-class _Noise:
-    """The larger return is perceived to be larger, unless a subclass says otherwise."""
-
-    kind: str
-
-    @property
-    def mistakes(self) -> float:
-        return 0.0
-
-    def probability_above(self, difference: Values, error: Values, magnitude: Values) -> Any:
-        return _logistic(difference, PROBIT_SLOPE / np.maximum(error, 1e-12))
-
-    def probability_left(self, difference: Values, error: Values, magnitude: Values) -> Any:
-        return _with_lapse(self.probability_above(difference, error, magnitude))
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"kind": self.kind, **vars(self)}
-
-
 @dataclass(frozen=True)
-class ExactNoise(_Noise):
+class ExactNoise(NoiseModel):
     """The larger return always wins; what doubt there is comes from the prediction.
 
     >>> p = ExactNoise().probability_left(difference=3.0, error=3.0, magnitude=20.0)
@@ -105,7 +92,7 @@ class ExactNoise(_Noise):
 
 
 @dataclass(frozen=True)
-class MistakeNoise(_Noise):
+class MistakeNoise(NoiseModel):
     """The right answer, flipped with a fixed probability, in [0, 0.5].
 
     >>> p = MistakeNoise(0.1).probability_left(difference=3.0, error=0.0, magnitude=20.0)
@@ -120,17 +107,9 @@ class MistakeNoise(_Noise):
         if not 0.0 <= self.rate <= 0.5:
             raise ValueError(f"`rate` must lie in [0, 0.5], but is {self.rate}")
 
-    @property
-    def mistakes(self) -> float:
-        return self.rate
-
-    def probability_left(self, difference: Values, error: Values, magnitude: Values) -> Any:
-        right = super().probability_left(difference, error, magnitude)
-        return self.rate + (1.0 - 2.0 * self.rate) * right
-
 
 @dataclass(frozen=True)
-class BoltzmannNoise(_Noise):
+class BoltzmannNoise(NoiseModel):
     """LEFT with probability 1 / (1 + exp(-beta (R_left - R_right))) (C.6 of Xu & Zhu 2025); a beta
     of None is the paper's ``1 / (|R_left| + |R_right|)``.
 
@@ -152,12 +131,77 @@ class BoltzmannNoise(_Noise):
         return _logistic(difference, beta / shrink)
 
 
-_KINDS: dict[str, type] = {cls.kind: cls for cls in (ExactNoise, MistakeNoise, BoltzmannNoise)}
-
-
 def noise_model_from_dict(data: dict[str, Any]) -> NoiseModel:
     """Read what a noise model's ``to_dict`` wrote."""
+    kinds = {cls.kind: cls for cls in (ExactNoise, MistakeNoise, BoltzmannNoise)}
     arguments, kind = {k: v for k, v in data.items() if k != "kind"}, data.get("kind")
-    if kind not in _KINDS:
-        raise ValueError(f"unknown noise model {kind!r}; known are {sorted(_KINDS)}")
-    return _KINDS[kind](**arguments)
+    if kind not in kinds:
+        raise ValueError(f"unknown noise model {kind!r}; known are {sorted(kinds)}")
+    return kinds[kind](**arguments)
+
+
+class People:
+    """A prior over people, each with a number g of G, who answer questions of one kind; which of
+    them it is is inferred with the task.
+
+    Somebody perceives the difference of the two returns with a doubt of their own, says EQUAL if it
+    is smaller than their width of indifference, MUCH_LEFT or MUCH_RIGHT if it exceeds what they
+    call much, and LEFT or RIGHT else (McCullagh 1980); that is turned round with their rate of
+    mistakes. Of four the best one is chosen by Luce's rule (1959); EQUAL is that none leads all
+    others by the width of indifference (Rao & Kupper 1967), and a mistake is any other one.
+
+    :param kind: Of the questions, see :class:`~sb3_poem.adaptation.preference.Query`.
+    :param noise: How they err, if that is known: then only their widths are not.
+    """
+
+    def __init__(self, kind: str, noise: NoiseModel | None) -> None:
+        self.kind, self.answers, self.noise = kind, ANSWERS[kind], noise
+        known = {0.0: 1.0}
+        priors = (
+            MISTAKES if noise is None else {noise.rate: 1.0},
+            DOUBTS if noise is None else known,
+            INDIFFERENCES,
+            MUCH if kind == "graded" else known,
+        )
+        grid = list(product(*(prior.items() for prior in priors)))
+        values, shares = np.moveaxis(np.array(grid), 2, 0)  # (G, 4) each
+        self.mistakes, self.doubts, indifferences, much = values.T
+        self.log_prior = np.log(shares).sum(axis=1)
+        inner = (-indifferences, indifferences)
+        # (G, answers - 1), ascending: what the perceived difference must exceed for the next answer
+        self.thresholds = np.stack((-much, *inner, much) if kind == "graded" else inner, axis=1)
+
+    def __len__(self) -> int:
+        return len(self.log_prior)
+
+    def probabilities(
+        self, difference: np.ndarray, error: Values, magnitude: Values, spread: float
+    ) -> np.ndarray:
+        """P(answer), (answers, m, G), of differences (m,) of predicted returns, or of the first
+        one's to n - 1 others' (m, n - 1), where the answers are EQUAL and the n from last to first.
+        ``error`` and ``magnitude``, numbers or (m,), are as in
+        :meth:`NoiseModel.probability_above`, in their unit as is the family's ``spread``.
+        """
+        error, magnitude = (np.asarray(value)[..., None] for value in (error, magnitude))
+        noise = self.noise or ExactNoise()
+        if self.noise is None:
+            error = np.hypot(error, spread * self.doubts)
+        differences = np.reshape(difference, (len(difference), -1))
+        thresholds = spread * self.thresholds.T[:, None, :]  # (answers - 1, 1, G)
+        if self.kind == BEST_OF_FOUR:
+            values = np.pad(-differences[:, ::-1].T, ((0, 1), (0, 0)))
+            behind = (values - values.max(axis=0))[:, :, None]
+            odds = noise.probability_above(behind, error, magnitude)
+            odds = odds / (1.0 - odds)  # (n, m, G) of each against the best
+            below, beyond = (noise.probability_above(x, error, magnitude) for x in thresholds)
+            handicap = np.minimum(beyond / below, 1e30).astype(odds.dtype)
+            best = odds / (odds + handicap * (odds.sum(axis=0) - odds))
+            others = (best.sum(axis=0) - best) / (len(best) - 1)
+            equal = np.maximum(1.0 - best.sum(axis=0, keepdims=True), 0.0)
+            best += self.mistakes.astype(odds.dtype) * (others - best)
+            said = np.concatenate([equal, best])
+        else:
+            above = noise.probability_above(differences - thresholds, error, magnitude)
+            perceived = -np.diff(above, axis=0, prepend=1.0, append=0.0)
+            said = perceived + self.mistakes * (perceived[::-1] - perceived)
+        return (1.0 - LAPSE) * said + LAPSE / len(said)

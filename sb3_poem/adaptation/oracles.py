@@ -1,18 +1,40 @@
 """Who answers. Oracles alone may know the task; an adapter never does."""
 
+import time
 from abc import ABC, abstractmethod
-from typing import Self
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
 
 import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_poem.adaptation.noise import BoltzmannNoise, ExactNoise, MistakeNoise, NoiseModel
-from sb3_poem.adaptation.preference import ANSWERS, BEST_OF_FOUR, Preference, check_number
+from sb3_poem.adaptation.noise import INFER, BoltzmannNoise, ExactNoise, MistakeNoise, NoiseModel
+from sb3_poem.adaptation.preference import ANSWERS, BEST_OF_FOUR, Preference, Query, check_shown
+from sb3_poem.common.checks import check_choice, check_number
 from sb3_poem.common.family_view import FamilyView, vectorised
 from sb3_poem.common.trajectory import Trajectory
 
 ORACLE_STREAM = 8
+PROMPTS = {
+    "pair": "Which is better? [l]eft, [r]ight, or [e]qual (can't tell): ",
+    "graded": "Which is better? 1 left, much; 2 left, a bit; 3 can't tell; 4 right, a bit; "
+    "5 right, much: ",
+    BEST_OF_FOUR: "Which is best? 1, 2, 3 or 4, or 0 (can't tell): ",
+}
+NUMBERS = {
+    "pair": {"1": Preference.LEFT, "2": Preference.RIGHT},
+    "graded": dict(zip("54321", ANSWERS["graded"], strict=True)),
+    BEST_OF_FOUR: dict(zip("04321", ANSWERS[BEST_OF_FOUR], strict=True)),
+}
+WORDS = {
+    **{answer.value: answer for answer in Preference},
+    **{"l": Preference.LEFT, "ll": Preference.MUCH_LEFT},
+    **{"r": Preference.RIGHT, "rr": Preference.MUCH_RIGHT},
+    **dict.fromkeys(("e", "=", "can't tell", "cant tell", "?"), Preference.EQUAL),
+}
 
 
 class TaskOracle(ABC):
@@ -28,20 +50,19 @@ class TaskOracle(ABC):
     >>> Spoilt(adapter.env)(query.left, query.right)
     <Preference.RIGHT: 'right'>
 
-    :param env: A task family: a ``gym.Env``, or an SB3 ``VecEnv`` of them. It can be given later by
+    :param env: A task family: a ``gym.Env``, or an SB3 ``VecEnv`` of them; also given by
         :meth:`bind`.
     :param task: (task_dim,) the task by whose reward to judge; None takes the one in effect in
-        ``env`` (in a ``VecEnv``, in its first copy) whenever a question is asked.
-    :param seed: Seeds the oracle's own noise, if it has any.
+        ``env`` (in its first copy) whenever a question is asked.
+    :param seed: Of the oracle's own noise.
     :param thresholds: Answers are graded: EQUAL up to the first difference of returns, MUCH_LEFT or
-        MUCH_RIGHT beyond the second; None compares, and nothing but a difference of 0 is EQUAL. See
-        :func:`~sb3_poem.adaptation.known_task.return_spread` for what is much in a family. Of four
-        the best one is told from the second best by the first of them.
+        MUCH_RIGHT beyond the second (see :func:`~sb3_poem.adaptation.return_spread`); None
+        compares, and only a difference of 0 is EQUAL. Of four the best one is told from the second
+        best by the first of them.
     :param question: The kind of questions that it answers, see :class:`Query`: "best-of-four", or
         None, which is "graded" with ``thresholds`` and else "pair".
     """
 
-    needs_frames = False
     thresholds: tuple[float, float] | None = None
     #: How this oracle errs, for the Bayesian rule.
     noise_model: NoiseModel = ExactNoise()
@@ -57,10 +78,8 @@ class TaskOracle(ABC):
         if thresholds is not None:
             equal, much = thresholds if len(thresholds) == 2 else (np.nan, np.nan)
             if not 0.0 <= equal <= much < np.inf:
-                raise ValueError(
-                    "`thresholds` must be two finite differences of returns, the first not the "
-                    f"larger, but is {thresholds!r}"
-                )
+                two = "two finite differences of returns, the first not the larger"
+                raise ValueError(f"`thresholds` must be {two}, but is {thresholds!r}")
             self.thresholds = (float(equal), float(much))
         usual = "pair" if thresholds is None else "graded"
         if question not in (None, usual, BEST_OF_FOUR):
@@ -87,16 +106,14 @@ class TaskOracle(ABC):
     def _perceive(self, returns: np.ndarray) -> np.ndarray:
         """The returns by which to answer, from true ones; both (n,)."""
 
-    def bind(self, env: gym.Env | VecEnv, task: np.ndarray | None = None) -> Self:
-        """Give the oracle its environment, and its task unless that is None; returns itself."""
+    def bind(self, env: gym.Env | VecEnv) -> Self:
+        """Give the oracle its environment; returns itself."""
         self.env = env
-        if task is not None:
-            self.task = np.asarray(task, dtype=np.float64)
         return self
 
     def __call__(self, *shown: Trajectory) -> Preference:
         """Compare trajectories with reward features, as many as a question of its kind shows."""
-        check_number(self.question, shown)
+        check_shown(self.question, shown)
         perceived = self._perceive(np.array([self.true_return(item) for item in shown]))
         equal, much = self.thresholds or (0.0, np.inf)
         ascending = np.argsort(perceived, kind="stable")
@@ -112,13 +129,14 @@ class TaskOracle(ABC):
 
     def true_return(self, trajectory: Trajectory) -> float:
         """The undiscounted return of a trajectory under the task, from its reward features."""
-        name = type(self).__name__
         if self.env is None:
+            name = type(self).__name__
             raise RuntimeError(f"{name} has no environment: pass `env` or call bind(env)")
         value = float(np.sum(step_rewards(self.env, self.task, trajectory)))
         if not np.isfinite(value):
-            why = "its reward features are not finite"
-            raise ValueError(f"the true return of a trajectory is {value}; {why}")
+            raise ValueError(
+                f"the true return of a trajectory is {value}: its reward features are not finite"
+            )
         return value
 
 
@@ -135,28 +153,18 @@ class ReturnOracle(TaskOracle):
 
 
 class BoltzmannOracle(TaskOracle):
-    """Left wins with probability 1 / (1 + exp(-beta (R_left - R_right))) (C.6 of Xu & Zhu 2025): it
-    perceives the difference with a logistic error of scale 1 / beta.
+    """Left wins with probability 1 / (1 + exp(-beta (R_left - R_right))) (C.6 of Xu & Zhu 2025).
 
     With the paper's beta (None), ``1 / (|R_left| + |R_right|)``, an answer is right at most 73 % of
-    the time, and ten answers carry less than two bits. Of four each wins with a probability
-    proportional to exp(beta R), where the paper's beta becomes ``1 / (2 mean |R|)``. For the other
-    arguments see :class:`TaskOracle`.
+    the time. Of four each wins with a probability proportional to exp(beta R), where the paper's
+    beta becomes ``1 / (2 mean |R|)``. For the other arguments see :class:`TaskOracle`.
 
     >>> BoltzmannOracle(beta=0.5).noise_model
     BoltzmannNoise(beta=0.5)
     """
 
-    def __init__(
-        self,
-        beta: float | None = None,
-        env: gym.Env | VecEnv | None = None,
-        task: np.ndarray | None = None,
-        seed: int | None = None,
-        thresholds: tuple[float, float] | None = None,
-        question: str | None = None,
-    ) -> None:
-        super().__init__(env, task, seed, thresholds, question)
+    def __init__(self, beta: float | None = None, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
         self.beta, self.noise_model = beta, BoltzmannNoise(beta)
 
     def _perceive(self, returns: np.ndarray) -> np.ndarray:
@@ -170,26 +178,17 @@ class BoltzmannOracle(TaskOracle):
 
 
 class MistakeOracle(TaskOracle):
-    """The right answer, flipped with a probability in [0, 1], of which the noise model knows those
-    up to 0.5; of four another one, whichever. Equal returns stay EQUAL. For the other arguments see
-    :class:`TaskOracle`.
+    """The right answer, flipped with a probability in [0, 1]; of four another one, whichever. Equal
+    returns stay EQUAL. For the other arguments see :class:`TaskOracle`.
 
     >>> MistakeOracle(0.1).noise_model
     MistakeNoise(rate=0.1)
     """
 
-    def __init__(
-        self,
-        rate: float = 0.2,
-        env: gym.Env | VecEnv | None = None,
-        task: np.ndarray | None = None,
-        seed: int | None = None,
-        thresholds: tuple[float, float] | None = None,
-        question: str | None = None,
-    ) -> None:
+    def __init__(self, rate: float = 0.2, *args: Any, **kwargs: Any) -> None:
         if not 0.0 <= rate <= 1.0:
             raise ValueError(f"`rate` must lie in [0, 1], but is {rate}")
-        super().__init__(env, task, seed, thresholds, question)
+        super().__init__(*args, **kwargs)
         self.rate, self.noise_model = rate, MistakeNoise(min(rate, 0.5))
 
     def _perceive(self, returns: np.ndarray) -> np.ndarray:
@@ -212,3 +211,88 @@ def step_rewards(
         )
     family = FamilyView(vectorised(env))
     return family.compute_rewards(family.task if task is None else task, trajectory.reward_features)
+
+
+@dataclass(frozen=True, eq=False)
+class HumanAnswer:
+    """An answer with its video, and when (seconds since 1970) it was asked for and shown."""
+
+    preference: Preference
+    query: Query
+    video: Path
+    fps: float
+    asked: float
+    shown: float
+
+
+class HumanOracle:
+    """Shows a question's trajectories beside each other in a video file, and asks at the terminal.
+
+    The n-th question's file is ``query-001.gif`` and so on (or ``.mp4``) within the folder. The
+    prompt takes l or left, r or right, and e, equal, = or ?, or a number: 1 or 2 of a pair, 1 (left
+    is much better) to 5 of a graded question, and 1 to 4, or 0, of a best of four.
+
+    >>> from sb3_poem import PreferenceAdapter
+    >>> import gymnasium as gym
+    >>> env = gym.make("poem/PointGoal-v0", render_mode="rgb_array", width=48, height=48)
+    >>> oracle = HumanOracle(read=lambda prompt: "l")  # without it, ``input`` asks
+    >>> adapter = PreferenceAdapter("PointGoal", env, oracle=oracle, n_queries=1, seed=0)
+    >>> policy = adapter.adapt()
+    Query 1: preference_queries/query-001.gif
+
+    :param video_format: "gif" (any viewer plays it) or "mp4" (smaller).
+    :param mistake_rate: How often a person is taken to err, for the Bayesian rule; None lets it
+        infer how they do.
+    :param question: "pair", "graded" or "best-of-four", as the rule's.
+    :param read: Reads a line after showing a prompt; ``write`` shows one.
+    :param record: Called with each :class:`HumanAnswer`; ``sb3_poem.label.StoreRecorder`` keeps
+        them in the store of the web page.
+    """
+
+    needs_frames = True
+
+    def __init__(
+        self,
+        folder: str | Path = "preference_queries",
+        video_format: str = "gif",
+        fps: float = 20.0,
+        mistake_rate: float | None = None,
+        read: Callable[[str], str] = input,
+        write: Callable[[str], None] = print,
+        record: Callable[[HumanAnswer], None] | None = None,
+        question: str = "pair",
+    ) -> None:
+        check_choice("video_format", video_format, ("gif", "mp4"))
+        check_choice("question", question, tuple(PROMPTS))
+        if mistake_rate is not None:
+            check_number("mistake_rate", mistake_rate, 0.0, 0.5)
+        self.question = question
+        self.folder, self.video_format, self.fps = Path(folder), video_format, fps
+        self.noise_model = INFER if mistake_rate is None else MistakeNoise(mistake_rate)
+        self.n_asked = 0
+        self._read, self._write, self._record = read, write, record
+
+    def __repr__(self) -> str:
+        return f"HumanOracle({self.n_asked} asked, videos in {self.folder})"
+
+    def __call__(self, *shown: Trajectory) -> Preference:
+        """Write the video of trajectories with frames, and ask until an answer is understood; an
+        ``EOFError`` if standard input has ended.
+        """
+        asked, query = time.time(), Query(shown, self.question)
+        name = f"query-{self.n_asked + 1:03d}.{self.video_format}"
+        path = query.to_video(self.folder / name, self.fps)
+        self.n_asked += 1
+        seen = time.time()
+        self._write(f"Query {self.n_asked}: {path}")
+        while True:
+            try:
+                line = self._read(PROMPTS[self.question])
+            except EOFError:
+                raise EOFError("no answer can be read: standard input is closed") from None
+            answer = (WORDS | NUMBERS[self.question]).get(line.strip().lower())
+            if answer in ANSWERS[self.question]:
+                if self._record is not None:
+                    self._record(HumanAnswer(answer, query, path, self.fps, asked, seen))
+                return answer
+            self._write(f"{line.strip()!r} is no answer.")

@@ -11,16 +11,8 @@ from sb3_poem.adaptation.meta_model import HasSimilarity, MetaModel
 from sb3_poem.adaptation.preference import SIGNS, Preference, preference_log_likelihood
 from sb3_poem.adaptation.priors import SOURCES, make_prior
 from sb3_poem.adaptation.queries import tolerance
-from sb3_poem.adaptation.rule import (
-    Answer,
-    Inference,
-    Rule,
-    Setting,
-    Shown,
-    check_choice,
-    latent_of,
-)
-from sb3_poem.common.checks import check_whole
+from sb3_poem.adaptation.rule import Answer, Inference, Rule, Setting, Shown, latent_of
+from sb3_poem.common.checks import check_choice, check_whole
 
 # Bound on the draws for a question.
 MAX_DRAWS = 16384
@@ -31,10 +23,8 @@ class Paper(Rule):
     """Algorithm 2 of Xu & Zhu (2025): candidates that satisfy every answer within the tolerance of
     eq. 9, the pair of eq. 10, and the candidate of highest Bradley-Terry likelihood (line 17).
 
-    The paper's loop draws until N_z candidates are found, which need not happen: contradicting
-    answers leave no such latent, and the accepted share halves with every answer. Here the draws
-    are bounded; what is missing is filled up by the draws that satisfy most answers, and among
-    those by the highest likelihood. EQUAL excludes nobody.
+    Draws are bounded; what is missing of N_z candidates is filled up by those that satisfy most
+    answers, among these by the likeliest. EQUAL excludes nobody.
 
     >>> from sb3_poem import PreferenceAdapter
     >>> rule = Paper(n_candidates=50, epsilon=0.2)
@@ -66,8 +56,9 @@ class Paper(Rule):
         """See :class:`Rule`: Algorithm 2 needs S."""
         super().check(model, setting)
         if not isinstance(model, HasSimilarity):
-            name = type(model).__name__
-            raise ValueError(f"rule=Paper() needs a model with a similarity S; {name} has none")
+            raise ValueError(
+                f"rule=Paper() needs a model with a similarity S; {type(model).__name__} has none"
+            )
 
     def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> Inference:
         return PaperInference(self, model, rng)
@@ -86,7 +77,7 @@ class PaperInference(Inference):
         self.fresh = np.array([True])
 
     def ask(self) -> tuple[Shown, Shown]:
-        """See :class:`Inference`. Draws the candidate set anew, as lines 3 to 9 do."""
+        """Draws the candidate set anew, as lines 3 to 9 do."""
         if not self.fresh:
             self.candidates = self._draw_candidates()
             self.fresh = np.array([True])
@@ -97,17 +88,19 @@ class PaperInference(Inference):
             if self.rule.query_rule == "worst-case":
                 first, second = queries.worst_case_pair(similarities, self.rule.epsilon)
             else:
-                first, second = self._most_informative(similarities)
+                n = len(self.candidates)
+                left = np.exp(log_expit(queries.pair_differences(similarities)))  # eq. 7
+                gains = queries.information_gains(left, np.full(n, 1.0 / n))
+                first, second = queries.best_pair(gains, n)
         return self.candidates[first].copy(), self.candidates[second].copy()
 
-    def tell(self, preference: Preference, *shown: Shown) -> None:
+    def tell(self, preference: Preference, *shown: Any) -> None:
         self.answers.append(Answer(preference, shown))
         self.fresh = np.array([False])
 
     def estimate(self) -> np.ndarray:
-        """See :class:`Inference`. Line 17: of the candidates that were drawn for the last question
-        the one under which the answers, the last one included, are most likely; before any answer
-        the one nearest to their centre.
+        """Line 17: of the candidates of the last question the one under which all answers are most
+        likely; before any answer the one nearest to their centre.
         """
         if not self.answers:
             distances = np.linalg.norm(self.candidates - self.candidates.mean(axis=0), axis=1)
@@ -120,12 +113,6 @@ class PaperInference(Inference):
         if not self.answers:
             return np.zeros(len(latents), dtype=np.int64)
         return self._satisfied(self._differences(latents))
-
-    def _most_informative(self, similarities: np.ndarray) -> tuple[int, int]:
-        probabilities = np.exp(log_expit(queries.pair_differences(similarities)))  # eq. 7
-        n = len(self.candidates)
-        gains = queries.information_gains(probabilities, np.full(n, 1.0 / n))
-        return queries.pair_at(int(np.argmax(gains)), n)
 
     def _differences(self, latents: np.ndarray) -> np.ndarray:
         """(m, k) S(z, z_left) - S(z, z_right) of every answered question."""
@@ -143,9 +130,7 @@ class PaperInference(Inference):
         return preference_log_likelihood(log_expit(differences), log_expit(-differences), told)
 
     def _draw_candidates(self) -> np.ndarray:
-        """Lines 3 to 9, bounded. The last question's candidates take part in the fall-back alone:
-        line 3 starts afresh.
-        """
+        """Lines 3 to 9, bounded; the last question's candidates take part in the fall-back."""
         rest = [(self.candidates, self._differences(self.candidates))]
         found: list[np.ndarray] = []
         max_draws = max(MAX_DRAWS, self.rule.n_candidates)
@@ -165,9 +150,7 @@ class PaperInference(Inference):
         return np.concatenate(found)[: self.rule.n_candidates]
 
     def _best(self, differences: np.ndarray, n: int) -> np.ndarray:
-        """Rows of the n latents that satisfy most answers, and among equals are the likeliest; best
-        first.
-        """
+        """Rows of the n latents that satisfy most answers, among equals the likeliest."""
         satisfied = self._satisfied(differences)
         worst = len(satisfied) - n
         contenders = np.flatnonzero(satisfied >= np.partition(satisfied, worst)[worst])

@@ -30,11 +30,8 @@ class Gaussian(NamedTuple):
 
 
 def fit_gaussian(particles: np.ndarray, weights: np.ndarray) -> Gaussian:
-    """A Gaussian over weighted particles (n, d).
-
-    With fewer effective particles than dimensions the sample covariance is singular, and moves
-    would stay in its plane; it is shrunk towards its own diagonal by as much as particles are
-    missing.
+    """A Gaussian over weighted particles (n, d). As the covariance of fewer particles than
+    dimensions is singular, it is shrunk towards its diagonal by as much as particles are missing.
     """
     mean = weights @ particles
     centred = particles - mean
@@ -52,19 +49,18 @@ def fit_gaussian(particles: np.ndarray, weights: np.ndarray) -> Gaussian:
 def kernel_neighbours(
     particles: np.ndarray,
     fitted: Gaussian,
-    width: float,
     log_prior: Callable[[np.ndarray], np.ndarray] | None,
     rng: np.random.Generator,
+    width: float = 0.3,
 ) -> np.ndarray:
     """A neighbour of each particle (n, d), without a look at the likelihood.
 
     The kernel shrinks towards the mean as much as it spreads by the covariance, so that both stay
-    (Liu & West 2001). Where the prior has holes (between the modes of a mixture, off the surface on
-    which its latents lie) there should be no particles however the likelihood looks: then a step is
-    taken with the ratio of the prior's densities.
+    (Liu & West 2001). Where the prior has holes, between the modes of a mixture say, no particles
+    should lie there: a step is taken with the ratio of the prior's densities.
 
-    :param width: Of the kernel, as a share of the particles' spread, in (0, 1).
     :param log_prior: Maps (m, d) to (m,), up to a constant; None where the prior has no holes.
+    :param width: Of the kernel, as a share of the particles' spread, in (0, 1).
     """
     mean, noise = fitted.mean, rng.standard_normal(particles.shape) @ fitted.factor.T
     proposals = mean + np.sqrt(1.0 - width**2) * (particles - mean) + width * noise
@@ -89,10 +85,9 @@ def elliptical_slice_moves(
 
     The ellipse belongs to a reference Gaussian that is fitted to the posterior, and the ratio of
     prior times likelihood to it is the slice's function (Nishihara, Murray & Adams 2014): so any
-    prior density will do, the step fits the posterior's scale and shape without tuning, and the
-    first tries mostly hit. A particle whose bracket has not hit after the last try stays where it
-    is, which leaves the posterior invariant too: the path to any point within the tries is as
-    probable as its reverse.
+    prior density will do, and the first tries mostly hit. A particle that has not hit after the
+    last try stays where it is, which leaves the posterior invariant too: the path to any point
+    within the tries is as probable as its reverse.
 
     :param log_likelihoods: (n,) at the particles.
     :param tries: Bound on the evaluations per particle.

@@ -33,8 +33,7 @@ class AdaptedPolicy:
     >>> action, _ = AdaptedPolicy.load("policy.safetensors").predict([0.0, 0.0])
 
     :param n_answers: How many answers led to it.
-    :param env: The vector environment to whose task (its first copy's) it was adapted; None for a
-        policy from a file. It does not know the task itself.
+    :param env: To whose task (its first copy's) it was adapted; None for a policy from a file.
     """
 
     def __init__(
@@ -44,9 +43,8 @@ class AdaptedPolicy:
         self.n_answers = n_answers
         self.env = env
         self.latent = np.array(latent, dtype=np.float64)
-        if self.latent.shape != (model.latent_dim,):
-            expected = f"those of the model have ({model.latent_dim},)"
-            raise ValueError(f"`latent` has shape {self.latent.shape}, but {expected}")
+        if self.latent.shape != (expected := (model.latent_dim,)):
+            raise ValueError(f"`latent` has shape {self.latent.shape}, but must have {expected}")
         if not np.isfinite(self.latent).all():
             raise ValueError(f"`latent` must be finite, but is {self.latent}")
         self.observation_space = model.observation_space
@@ -65,7 +63,7 @@ class AdaptedPolicy:
         deterministic: bool = True,
     ) -> tuple[np.ndarray, Any]:
         """SB3's ``predict`` of (obs_dim,) or (n, obs_dim): actions, and the latents as SB3's state.
-        What is given as state is ignored, for the latent is fixed, and ``episode_start`` too.
+        As the latent is fixed, ``state`` and ``episode_start`` are ignored.
         """
         observation = np.asarray(observation)
         single = observation.ndim == len(self.observation_space.shape)
@@ -91,9 +89,7 @@ class AdaptedPolicy:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], device: str = "auto") -> Self:
-        """Read what :meth:`save` wrote, or what the page for answering gives for download; see
-        :meth:`from_bytes`.
-        """
+        """Read what :meth:`save` wrote, or the page gives for download; see :meth:`from_bytes`."""
         return cls.from_bytes(Path(path).read_bytes(), device, os.fspath(path))
 
     @classmethod

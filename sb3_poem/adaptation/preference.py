@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_poem.common.checks import check_choice
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.common.video import in_rows, write_video
 
@@ -65,9 +66,8 @@ class Query:
     kind: str = "pair"
 
     def __post_init__(self) -> None:
-        if self.kind not in ANSWERS:
-            raise ValueError(f"`kind` must be one of {tuple(ANSWERS)}, but is {self.kind!r}")
-        check_number(self.kind, self.shown)
+        check_choice("kind", self.kind, tuple(ANSWERS))
+        check_shown(self.kind, self.shown)
 
     @property
     def left(self) -> Trajectory:
@@ -81,48 +81,43 @@ class Query:
 
     def to_video(self, path: str | Path, fps: float = 20.0) -> Path:
         """Write both side by side, or four in two rows, as MP4 or GIF by the file's suffix, and
-        return its path; missing folders are made. A ``ValueError`` if they have no frames, or the
-        suffix is another.
+        return its path. A ``ValueError`` if they have no frames, or the suffix is another.
         """
         if not all(each.frames for each in self.shown):
             raise ValueError(
                 "the question has no frames to show: ask for them by PreferenceAdapter(..., "
-                "render=True) or oracle=HumanOracle(), with an environment's id, or an environment "
-                'made with render_mode="rgb_array"'
+                'render=True), with an environment\'s id, or one made with render_mode="rgb_array"'
             )
         clips = [each.frames or () for each in self.shown]
         captions = ("LEFT", "RIGHT") if len(clips) == 2 else tuple("1234")
         return write_video(in_rows(clips, captions), path, fps)
 
 
-def check_number(kind: str, shown: Sequence[Any]) -> None:
+def check_shown(kind: str, shown: Sequence[Any]) -> None:
     """Refuse another number of trajectories than this kind of question shows."""
     if len(shown) != len(PLACES[kind]):
         raise ValueError(
             f"a {kind} question is about {len(PLACES[kind])} trajectories, but {len(shown)} were "
-            "given; `query.shown` holds a question's, so that oracle(*query.shown) answers any"
+            "given; oracle(*query.shown) answers any"
         )
 
 
 def as_preference(answer: Any, kind: str = "pair") -> Preference:
     """Read the answer to a question of this kind: a :class:`Preference` that it has, or its word;
-    else a ``ValueError`` or ``TypeError``. Numbers and booleans are refused: their meaning differs
-    between programs, and a preference read the wrong way round is worse than none.
+    else a ``ValueError`` or ``TypeError``. Numbers, whose meaning differs between programs, are
+    refused.
     """
     if isinstance(answer, str):
         answer = next((each for each in Preference if each.value == answer), answer)
-    if isinstance(answer, Preference) and answer in ANSWERS[kind]:
+    if answer in ANSWERS[kind]:
         return answer
+    given = repr(answer)
     if isinstance(answer, Preference):
         others = [each for each in ANSWERS if answer in ANSWERS[each]]
         given = f"{answer.value!r}, which only {' and '.join(others)} questions have"
-    elif isinstance(answer, str):
-        given = repr(answer)
-    else:
-        raise TypeError(
-            "an answer must be Preference.LEFT, Preference.RIGHT or Preference.EQUAL (or the "
-            f"word), but is {answer!r} of type {type(answer).__name__}"
-        )
+    elif not isinstance(answer, str):
+        given = f"{given} of type {type(answer).__name__}"
+        raise TypeError(f"an answer must be Preference.LEFT (or its word) say, but is {given}")
     words = ", ".join(f'"{each.value}"' for each in reversed(ANSWERS[kind]))
     raise ValueError(f"an answer to a {kind} question must be one of {words}, but is {given}")
 
@@ -130,10 +125,8 @@ def as_preference(answer: Any, kind: str = "pair") -> Preference:
 def preference_log_likelihood(
     log_left: np.ndarray, log_right: np.ndarray, answers: list[Preference]
 ) -> np.ndarray:
-    """(m,) log-likelihood of k answers from the log-probabilities (m, k) of LEFT and RIGHT.
-
-    EQUAL has the geometric mean of both: it is largest where neither is more probable and, other
-    than half of each, it tells a latent that calls the two alike from one that is sure of either.
+    """(m,) log-likelihood of k answers from the log-probabilities (m, k) of LEFT and RIGHT. EQUAL
+    has the geometric mean of both, which is largest where neither is more probable.
     """
     left_share = 0.5 + 0.5 * np.array([SIGNS[answer] for answer in answers])
     return log_left @ left_share + log_right @ (1.0 - left_share)

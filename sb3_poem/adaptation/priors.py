@@ -25,9 +25,7 @@ class GaussianPrior:
         return rng.standard_normal((n, self.dim))
 
     def balanced_sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """(n, d) draws that stand for the distribution more evenly than independent ones do: in
-        pairs of z and -z, so that their mean is the prior's own (an odd one is left over).
-        """
+        """(n, d) draws in pairs of z and -z, so that their mean is the prior's own."""
         half = rng.standard_normal(((n + 1) // 2, self.dim))
         return np.concatenate([half, -half])[:n]
 
@@ -37,21 +35,19 @@ class GaussianPrior:
 
 
 class AggregatePrior:
-    """The mixture of the training tasks' posteriors. A model can draw from it but does not give its
-    density, which moving particles needs; so this *is* a mixture of Gaussians around draws (M, d)
-    of the model, whose common width is a share of the draws' distance to their neighbours.
+    """The mixture of the training tasks' posteriors. As a model gives no density of it, this is a
+    mixture of Gaussians around draws (M, d) of the model.
     """
 
     has_holes = True
 
-    def __init__(self, centres: np.ndarray, bandwidth: float = 0.5) -> None:
+    def __init__(self, centres: np.ndarray) -> None:
         self.centres = np.asarray(centres, dtype=np.float64)
         distances = np.linalg.norm(self.centres[:, None, :] - self.centres[None, :, :], axis=2)
         np.fill_diagonal(distances, np.inf)
-        # The median draw's distance to its nearest neighbour: narrow enough to change the mixture
-        # little, wide enough that the density has no holes between neighbours.
+        # Narrow enough to change the mixture little, wide enough for no holes between neighbours.
         nearest = float(np.median(distances.min(axis=1))) / np.sqrt(self.centres.shape[1])
-        self.width = max(bandwidth * nearest, 1e-6)
+        self.width = max(0.5 * nearest, 1e-6)
 
     def sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
         chosen = self.centres[rng.integers(len(self.centres), size=n)]
@@ -64,11 +60,8 @@ class AggregatePrior:
         return chosen + self.width * rng.standard_normal(chosen.shape)
 
     def log_density(self, latents: np.ndarray) -> np.ndarray:
-        squared = (
-            np.square(latents).sum(axis=1)[:, None]
-            - 2.0 * latents @ self.centres.T
-            + np.square(self.centres).sum(axis=1)[None, :]
-        )
+        own, others = np.square(latents).sum(axis=1), np.square(self.centres).sum(axis=1)
+        squared = own[:, None] - 2.0 * latents @ self.centres.T + others
         return logsumexp(-0.5 * squared / self.width**2, axis=1)
 
 

@@ -1,6 +1,4 @@
-"""Which pair of policies to compare next. Everything here works on a matrix of similarities;
-nothing loops over pairs.
-"""
+"""Which policies to compare next, by a matrix of similarities; nothing loops over pairs."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -9,8 +7,7 @@ import numpy as np
 
 QUERY_RULES = ("worst-case", "information-gain", "random")
 
-# Differences that are compared at a time: with a thousand candidates all pairs' would take
-# gigabytes.
+# Differences that are compared at a time: all pairs' of a thousand candidates would take gigabytes.
 BLOCK_ENTRIES = 2**17
 # Pairs that are looked at for one question: each is rolled out.
 MOST_LOOKS = 6
@@ -28,8 +25,7 @@ def check_epsilon(epsilon: float) -> None:
 
 def tolerance(epsilon: float) -> float:
     """How far S(z, z') may fall below S(z, z'') while eq. 9 still holds: log((1 + 2 epsilon) / (1 -
-    2 epsilon)) >= 0. The appendix's proof has the opposite sign, which would shrink the half-space
-    and exclude the true latent; eq. 9 itself widens it.
+    2 epsilon)) >= 0. (The appendix's proof has the opposite sign, which would exclude the truth.)
     """
     return float(np.log1p(2.0 * epsilon) - np.log1p(-2.0 * epsilon))
 
@@ -45,23 +41,22 @@ def worst_case_sizes(
     """
     first, second = _pairs(similarities.shape[1])
     rows, slack = _policy_rows(similarities), tolerance(epsilon)
-    sizes = np.empty(len(first), dtype=np.int64 if weights is None else np.float64)
+    sizes = np.empty(len(first))
+    if weights is None:
+        weights = np.ones(len(similarities))
     block = max(1, BLOCK_ENTRIES // len(similarities))
     for start in range(0, len(first), block):
         some = slice(start, start + block)
         difference = rows[first[some]] - rows[second[some]]
-        survivors = difference >= -slack, difference <= slack
-        sizes[some] = np.maximum(
-            *(np.count_nonzero(s, axis=1) if weights is None else s @ weights for s in survivors)
-        )
+        sizes[some] = np.maximum((difference >= -slack) @ weights, (difference <= slack) @ weights)
     return sizes
 
 
 def worst_case_pair(
     similarities: np.ndarray, epsilon: float, weights: np.ndarray | None = None
 ) -> tuple[int, int]:
-    """The pair of policies after whose worse answer the fewest latents survive (eq. 10), of equally
-    good ones the first; for the arguments see :func:`worst_case_sizes`.
+    """The first pair of policies after whose worse answer the fewest latents survive (eq. 10); for
+    the arguments see :func:`worst_case_sizes`.
     """
     sizes = worst_case_sizes(similarities, epsilon, weights)
     return pair_at(int(np.argmin(sizes)), similarities.shape[1])
@@ -71,9 +66,6 @@ def information_gains(probabilities: np.ndarray, weights: np.ndarray) -> np.ndar
     """Expected information gain of questions, (pairs,) in nats: the entropy of the answer minus its
     mean entropy under each of m latents, whose ``weights`` (m,) sum to one and who say LEFT with
     these probabilities (pairs, m).
-
-    Of two policies that do the same, every latent says 1/2, so the gain is 0: a resolution limit
-    within the probabilities is what keeps questions apart that nobody could answer.
     """
     weights = weights.astype(probabilities.dtype, copy=False)
     return _entropy(probabilities @ weights) - _entropy(probabilities) @ weights
@@ -86,9 +78,7 @@ def most_telling_pair(
     probabilities: np.ndarray,
     visibility: Visibility | None = None,
 ) -> tuple[int, int]:
-    """The pair of n policies of whose comparison the answer, one of several, is expected to tell
-    most about m latents: its entropy minus its mean entropy under each of them (see
-    :func:`best_pair`).
+    """As :func:`best_pair` of :func:`information_gains`, where an answer is one of several.
 
     :param values: (m, n) predicted fitness.
     :param weights: (m,) summing to one.
@@ -113,12 +103,10 @@ def most_telling_set(
     weights: np.ndarray,
     probabilities: Callable[[np.ndarray], np.ndarray],
 ) -> tuple[int, ...]:
-    """A pair of n policies, and others that are added one by one: each time the one with which the
-    answer to which is best is expected to tell most about m latents.
+    """A pair of n policies, and as many others as make ``size``: each time the one with which the
+    answer to which is best is expected to tell most. For the arguments see
+    :func:`most_telling_pair`.
 
-    :param size: How many they are to be, at most n.
-    :param values: (m, n) predicted fitness.
-    :param weights: (m,) summing to one.
     :param probabilities: Maps differences of the first one's value to others', (rows, others), to
         P(answer), (answers, rows).
     """
@@ -135,11 +123,9 @@ def most_telling_set(
 
 
 def best_pair(gains: np.ndarray, n: int, visibility: Visibility | None = None) -> tuple[int, int]:
-    """The pair of n policies with the highest gain times visibility. The pairs of the highest gains
-    are looked at in turn, at most six, and no further than another could still be better.
-
-    :param gains: In the order of :func:`pair_differences`.
-    :param visibility: None counts all as 1.
+    """The pair of n policies with the highest gain (in the order of :func:`pair_differences`) times
+    visibility (None is 1). The pairs of the highest gains are looked at in turn, at most six, and
+    no further than another could still be better.
     """
     order = np.argsort(-gains, kind="stable")[:MOST_LOOKS] if visibility else [np.argmax(gains)]
     best, highest = pair_at(int(order[0]), n), -np.inf
@@ -164,9 +150,7 @@ def pair_differences(values: np.ndarray) -> np.ndarray:
     """
     first, second = _pairs(values.shape[1])
     rows = _policy_rows(values)
-    differences = rows[first]
-    differences -= rows[second]
-    return differences
+    return rows[first] - rows[second]
 
 
 def pair_at(index: int, n: int) -> tuple[int, int]:
@@ -176,8 +160,7 @@ def pair_at(index: int, n: int) -> tuple[int, int]:
 
 
 def _policy_rows(values: np.ndarray) -> np.ndarray:
-    # Whole rows are gathered several times as fast as columns. Networks do not compute in more than
-    # float32 either.
+    # Whole rows are gathered several times as fast as columns; networks compute in float32, too.
     return np.ascontiguousarray(values.T, dtype=np.float32)
 
 

@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_poem.adaptation.environments import check_model_fits
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.preference import PLACES, Preference
-from sb3_poem.common.trajectory import Trajectory, decode_array, encode_array
+from sb3_poem.common.trajectory import Trajectory
 
 # What a question compares: trajectories, or the latents of policies to roll out.
 Shown: TypeAlias = Trajectory | np.ndarray
@@ -19,7 +19,8 @@ Shown: TypeAlias = Trajectory | np.ndarray
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """One answered question: the answer, and what was shown, left and right or in order.
+    """One answered question: the answer, and the trajectories that were shown, in order (or their
+    latents, to a rule that needs no more).
 
     >>> from sb3_poem import PreferenceAdapter
     >>> adapter = PreferenceAdapter("PointGoal", "poem/PointGoal-v0", seed=0)
@@ -30,25 +31,7 @@ class Answer:
     """
 
     preference: Preference
-    shown: tuple[Shown, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Snapshot:
-    """An inference between two answers: its generator's state, and all else that changes."""
-
-    random_state: dict[str, Any]
-    arrays: dict[str, np.ndarray]
-
-    def to_dict(self) -> dict[str, Any]:
-        arrays = {name: encode_array(array) for name, array in self.arrays.items()}
-        return {"random_state": self.random_state, "arrays": arrays}
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Self:
-        """Read what :meth:`to_dict` wrote."""
-        arrays = {str(name): decode_array(array) for name, array in data["arrays"].items()}
-        return cls(dict(data["random_state"]), arrays)
+    shown: tuple[Any, ...]
 
 
 class Inference(ABC):
@@ -63,11 +46,11 @@ class Inference(ABC):
     (5,)
     """
 
-    #: Names of the attributes, arrays, that change while answers come in, beside the answers and
-    #: the generator.
+    #: Names of the arrays that change while answers come in.
     state: tuple[str, ...] = ()
     #: Trajectories to ask about; None where questions are new rollouts.
     library: list[Trajectory] | None = None
+    _library_returns: np.ndarray | None = None  # as far as they have been predicted
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.rng = rng
@@ -75,48 +58,43 @@ class Inference(ABC):
 
     @abstractmethod
     def ask(self) -> tuple[Shown, ...]:
-        """What to compare next, two or as many as the rule's questions are about: latents (d,) to
-        roll out, or trajectories to show.
-        """
+        """What to compare next: latents (d,) to roll out, or trajectories to show."""
 
     def same_latents(self, *latents: np.ndarray) -> tuple[Shown, ...]:
-        """The latents of a question from a file; others where a latent means something to one model
-        object alone.
-        """
+        """A question's latents from a file; others where they mean something to one model alone."""
         return latents
 
     @abstractmethod
-    def tell(self, preference: Preference, *shown: Shown) -> None:
-        """Take an answer about trajectories, or their latents where the rule needs no more."""
+    def tell(self, preference: Preference, *shown: Any) -> None:
+        """Take an answer, see :class:`Answer`."""
 
     @abstractmethod
     def estimate(self) -> np.ndarray:
         """(d,) the latent to act on, given the answers so far."""
 
     def contradicted(self) -> int | None:
-        """The place in :attr:`answers` of the one that the others contradict most; None if they
-        agree, or the rule does not tell.
-        """
+        """See :attr:`PreferenceAdapter.contradicted`."""
         return None
 
-    def snapshot(self) -> Snapshot:
-        """A copy of the posterior and the random state, as they are now."""
+    def snapshot(self) -> dict[str, Any]:
+        """The generator's ``random_state``, and copies of the ``arrays`` of :attr:`state`."""
         arrays = {name: np.array(getattr(self, name)) for name in self.state}
-        return Snapshot(dict(self.rng.bit_generator.state), arrays)
+        return {"random_state": self.rng.bit_generator.state, "arrays": arrays}
 
-    def restore(self, snapshot: Snapshot, answers: list[Answer]) -> None:
+    def restore(self, snapshot: dict[str, Any], answers: list[Answer]) -> None:
         """Go back, or on, to a snapshot of such an inference and the answers up to then."""
-        missing = [name for name in self.state if name not in snapshot.arrays]
+        arrays = snapshot["arrays"]
+        missing = [name for name in self.state if name not in arrays]
         if missing:
             raise ValueError(f"not a snapshot of {type(self).__name__}: {missing[0]} is missing")
         rng = np.random.default_rng(0)
         try:
-            rng.bit_generator.state = snapshot.random_state
+            rng.bit_generator.state = snapshot["random_state"]
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"not the state of a PCG64 generator: {error}") from error
         for name in self.state:
-            setattr(self, name, snapshot.arrays[name].copy())
-        self.rng, self.answers = rng, list(answers)
+            setattr(self, name, arrays[name].copy())
+        self.rng, self.answers, self._library_returns = rng, list(answers), None
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,10 +106,10 @@ class Setting:
 
     :param library: Trajectories to ask about instead of new rollouts.
     :param env: Where rollouts are made; None where none are.
-    :param task: (task_dim,) by which a rule that may read rewards reads them; None takes the one in
+    :param task: (task_dim,) whose rewards a rule may read that reads any; None takes the one in
         effect in ``env``.
-    :param visibility: The share in [0, 1] of a question's information that is left when a person
-        has to see the difference of what is shown; None where nobody looks.
+    :param visibility: The share in [0, 1] of what a question tells that is left when a person has
+        to see the difference of what is shown; None where nobody looks.
     """
 
     n_queries: int = 10
@@ -146,12 +124,9 @@ class Rule(ABC):
     """How to ask and how to infer: a rule's own options and nothing else.
 
     A rule of your own is a frozen dataclass that subclasses this, says in ``__post_init__`` which
-    values its options may have, and starts an :class:`Inference`. Rules that ship show how options
-    are named:
+    values its options may have, and starts an :class:`Inference`.
 
     >>> from sb3_poem import Bayes
-    >>> Bayes(n_particles=100)
-    Bayes(n_particles=100)
     >>> Rule.from_dict(Bayes(n_particles=100).to_dict()) == Bayes(n_particles=100)
     True
     """
@@ -183,26 +158,25 @@ class Rule(ABC):
             check_model_fits(model, setting.env)
         if setting.library is not None and self.refuses_library:
             raise ValueError(f"`library` must be None: {self.refuses_library}")
-        needed = len(PLACES[self.question])
-        if setting.library is not None and len(setting.library) < needed:
-            n = len(setting.library)
-            raise ValueError(f"`library` must hold at least {needed} trajectories, but holds {n}")
+        needed, given = len(PLACES[self.question]), setting.library
+        if given is not None and len(given) < needed:
+            held = f"but holds {len(given)}"
+            raise ValueError(f"`library` must hold at least {needed} trajectories, {held}")
 
     @abstractmethod
     def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> Inference:
         """Begin with a task, with what :meth:`check` has accepted."""
 
     def answered_by(self, oracle: Any) -> Self:
-        """The rule for the answers of this oracle: itself, where it makes no difference. An oracle
-        that says of itself that it answers questions of another kind is refused.
+        """The rule for the answers of this oracle; a ``ValueError`` if it answers questions of
+        another kind.
         """
         kind = getattr(oracle, "question", self.question)
         if kind != self.question:
             raise ValueError(
                 f'the oracle answers "{kind}" questions, but the rule asks "{self.question}" ones: '
-                'Bayes(question="graded") goes with ReturnOracle(thresholds=(20, 100)) or '
-                'HumanOracle(question="graded"), say, and Bayes(question="best-of-four") with '
-                f'ReturnOracle(question="best-of-four"); the oracle is {oracle!r}'
+                'Bayes(question="graded") goes with ReturnOracle(thresholds=(20, 100)), and '
+                f'"best-of-four" with ReturnOracle(question="best-of-four"); it is {oracle!r}'
             )
         return self
 
@@ -221,10 +195,8 @@ class Rule(ABC):
         """Read what :meth:`to_dict` of any imported rule wrote."""
         name, module = data["name"], data["module"]
         if name not in cls._known:
-            raise ValueError(
-                f"the rule is {name!r}, which this program does not know: import it first, by "
-                f"`from {module} import {name}`"
-            )
+            first = f"import it first, by `from {module} import {name}`"
+            raise ValueError(f"the rule is {name!r}, which this program does not know: {first}")
         return cls._known[name](**data["options"])
 
 
@@ -241,24 +213,9 @@ def as_rule(rule: Any) -> Rule:
     raise TypeError(f"`rule` must be an object as {objects}, but is {rule!r}{meant}")
 
 
-def check_choice(name: str, value: Any, allowed: Sequence[str | None]) -> None:
-    """Refuse an option's value that is none of those allowed."""
-    if value not in allowed:
-        raise ValueError(f"`{name}` must be one of {tuple(allowed)}, but is {value!r}")
-
-
 def latent_of(shown: Shown) -> np.ndarray:
     """(d,) the latent behind what was shown."""
     return shown.latent if isinstance(shown, Trajectory) else np.asarray(shown, dtype=np.float64)
-
-
-def trajectories_of(name: str, *shown: Shown) -> tuple[Trajectory, ...]:
-    """What was shown, as trajectories, which a rule of that name needs."""
-    trajectories = tuple(item for item in shown if isinstance(item, Trajectory))
-    if len(trajectories) != len(shown):
-        needed = "the trajectories that were shown, not their latents alone"
-        raise ValueError(f"{name} needs {needed}")
-    return trajectories
 
 
 def inference_rng(seed: int) -> np.random.Generator:

@@ -3,6 +3,10 @@
 
 from sb3_poem.baselines.anole import ANOLE
 from sb3_poem.baselines.fragments import replay_fragments, rollout_fragments, training_rollouts
-from sb3_poem.baselines.maml_reward import MAMLReward, MAMLRewardModel
-from sb3_poem.baselines.meta_reward import MetaReward, meta_train_reward
+from sb3_poem.baselines.maml_reward import (
+    MAMLReward,
+    MAMLRewardModel,
+    MetaReward,
+    meta_train_reward,
+)
 from sb3_poem.baselines.reward_oracle import RewardOracle

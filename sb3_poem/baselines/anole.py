@@ -1,6 +1,4 @@
-"""ANOLE and its two variants: candidates told apart by the reward decoder (Ren et al. 2022), in as
-many ways as the answers still to come may lie (Berlekamp 1968).
-"""
+"""ANOLE and its two variants: twenty questions with a liar (Ren et al. 2022; Berlekamp 1968)."""
 
 from dataclasses import dataclass
 from math import comb, floor
@@ -13,13 +11,13 @@ from sb3_poem.adaptation.meta_model import HasRewardDecoder, MetaModel
 from sb3_poem.adaptation.preference import SIGNS, Preference
 from sb3_poem.adaptation.priors import SOURCES, make_prior
 from sb3_poem.adaptation.queries import random_set
-from sb3_poem.adaptation.rule import Shown, Snapshot, check_choice, trajectories_of
+from sb3_poem.adaptation.rule import Shown
 from sb3_poem.baselines.fragments import (
     check_shared_dynamics,
     default_fragment_length,
     replay_fragments,
 )
-from sb3_poem.common.checks import check_whole
+from sb3_poem.common.checks import check_choice, check_whole
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.pearl_sac import PEARLSAC
 
@@ -30,18 +28,10 @@ MAX_CANDIDATES = 2**14  # each has a predicted return for every fragment
 @dataclass(frozen=True, repr=False)
 class ANOLE(Rule):
     """ANOLE (Ren et al. 2022) asks about fragments of what the training tasks' policies did, and
-    never rolls out on the new task. Candidates are latents; each predicts an answer by the reward
-    decoder's returns of the two fragments, and what counts is how many answers it contradicts;
-    equal returns, and answers of EQUAL, contradict nothing.
+    never rolls out on the new task. Each candidate, a latent, predicts an answer by the reward
+    decoder's returns of the two fragments, and what counts is how many answers it contradicts.
 
-    It takes a ``PEARLSAC`` with its reward decoder and, unless the adapter has a ``library``, its
-    replay buffer.
-
-    - "berlekamp" (ANOLE): of random pairs the one whose worse answer leaves the smallest Berlekamp
-      volume.
-    - "greedy" (greedy binary search): 2^K candidates, the pair that splits them most evenly; what
-      disagrees is dropped, unless nothing would be left.
-    - "random": one random pair, else as ANOLE.
+    It takes a ``PEARLSAC`` with its replay buffer, unless the adapter has a ``library``.
 
     >>> from sb3_poem import PreferenceAdapter
     >>> from sb3_poem.baselines import rollout_fragments
@@ -51,13 +41,14 @@ class ANOLE(Rule):
     >>> adapter.ask().left.actions.shape
     (10, 2)
 
-    :param strategy: "berlekamp", "greedy" or "random".
-    :param n_candidates: Candidates at least; "greedy" takes 2^K.
+    :param strategy: "berlekamp" (ANOLE) asks the pair whose worse answer leaves the smallest
+        Berlekamp volume, "random" a random one; "greedy" (binary search) the pair that splits 2^K
+        candidates most evenly, and drops what disagrees.
+    :param n_candidates: Candidates at least.
     :param mistake_rate: The share of answers that may be mistakes: E = floor(rate K).
-    :param n_pairs: Random pairs to choose from for each question; they are drawn from twice as many
-        fragments.
+    :param n_pairs: Random pairs to choose from for each question, of twice as many fragments.
     :param fragment_length: Steps of a fragment from the replay buffer; None takes 50, or an episode
-        that is shorter (the paper gives none).
+        that is shorter.
     :param candidates: Where candidates come from: "prior" or "aggregate".
     """
 
@@ -89,12 +80,12 @@ class ANOLE(Rule):
     def check(self, model: MetaModel, setting: Setting) -> None:
         """See :class:`Rule`: it needs a decoder, experience, and tasks that share dynamics."""
         super().check(model, setting)
-        most = max(MAX_CANDIDATES, self.n_candidates)
-        allowed = [k for k in range(1, setting.n_queries + 1) if self.total_candidates(k) <= most]
-        if setting.n_queries not in allowed:
+        n, most = setting.n_queries, max(MAX_CANDIDATES, self.n_candidates)
+        if self.total_candidates(n) > most:
+            allowed = max(k for k in range(n) if self.total_candidates(k) <= most)
             raise ValueError(
-                f"`n_queries` must be at most {max(allowed)} with {self}, which keeps no more than "
-                f"{most:,} candidates, but is {setting.n_queries}"
+                f"`n_queries` must be at most {allowed} with {self}, which keeps no more than "
+                f"{most:,} candidates, but is {n}"
             )
         untrained = isinstance(model, PEARLSAC) and model.reward_coef == 0
         if untrained or not isinstance(model, HasRewardDecoder):
@@ -106,10 +97,9 @@ class ANOLE(Rule):
             return
         if not has_experience(model):
             raise ValueError(
-                "`model` has no experience to ask about, because its replay buffer is empty (a "
-                "loaded model has none): call load_replay_buffer, or pass library="
-                "sb3_poem.baselines.training_rollouts(model, env, 200), of another copy of the "
-                "environment"
+                "`model` has no experience to ask about, as its replay buffer is empty (a loaded "
+                "model has none): call load_replay_buffer, or pass library="
+                "sb3_poem.baselines.training_rollouts(model, env, 200)"
             )
         check_shared_dynamics(
             setting,
@@ -118,11 +108,7 @@ class ANOLE(Rule):
         )
 
     def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> Inference:
-        library = setting.library
-        if library is None:
-            length = self.fragment_length or default_fragment_length(model.horizon)
-            library = replay_fragments(model, 2 * self.n_pairs, length, rng)
-        return ANOLEInference(self, model, rng, setting.n_queries, list(library))
+        return ANOLEInference(self, model, rng, setting)
 
 
 class ANOLEInference(Inference):
@@ -131,24 +117,20 @@ class ANOLEInference(Inference):
     state = ("candidates", "priority", "contradictions", "alive")
     library: list[Trajectory]
 
-    def __init__(
-        self,
-        rule: ANOLE,
-        model: Any,
-        rng: np.random.Generator,
-        n_queries: int,
-        library: list[Trajectory],
-    ) -> None:
+    def __init__(self, rule: ANOLE, model: Any, rng: np.random.Generator, setting: Setting) -> None:
         super().__init__(rng)
-        self.rule, self.model, self.n_queries, self.library = rule, model, n_queries, library
-        n = rule.total_candidates(n_queries)
+        self.rule, self.model, self.n_queries = rule, model, setting.n_queries
+        if setting.library is None:
+            length = rule.fragment_length or default_fragment_length(model.horizon)
+            self.library = replay_fragments(model, 2 * rule.n_pairs, length, rng)
+        else:
+            self.library = list(setting.library)
+        n = rule.total_candidates(self.n_queries)
         self.candidates = make_prior(model, rule.candidates, rng).sample(n, rng)
-        # Ties are broken at random, but always alike: looking at the estimate must not change what
-        # comes after.
+        # Ties are broken at random, but always alike.
         self.priority = rng.permutation(n)
         self.contradictions = np.zeros(n, dtype=np.int64)
         self.alive = np.ones(n, dtype=bool)
-        self._library_returns: np.ndarray | None = None
 
     @property
     def budget(self) -> int:
@@ -156,22 +138,22 @@ class ANOLEInference(Inference):
         return max(self.rule.budget(self.n_queries), int(self.contradictions.min()))
 
     def ask(self) -> tuple[Shown, Shown]:
-        """See :class:`Inference`: the best of random pairs, or one random pair."""
-        n = len(self.library)
-        if self.rule.strategy == "random":
-            first, second = random_set(n, 2, self.rng)
-            return self.library[first], self.library[second]
-        pairs = np.array([random_set(n, 2, self.rng) for _ in range(self.rule.n_pairs)])
-        if self._library_returns is None:
-            self._library_returns = self.model.predicted_returns(self.candidates, self.library)
-        returns = self._library_returns
-        scores = self._scores(returns[:, pairs[:, 0]] - returns[:, pairs[:, 1]])
-        first, second = pairs[np.argmin(scores)]
+        """The best of random pairs, or one random pair."""
+        n_pairs = 1 if self.rule.strategy == "random" else self.rule.n_pairs
+        pairs = np.array([random_set(len(self.library), 2, self.rng) for _ in range(n_pairs)])
+        best = 0
+        if n_pairs > 1:
+            if self._library_returns is None:
+                self._library_returns = self.model.predicted_returns(self.candidates, self.library)
+            returns = self._library_returns
+            scores = self._scores(returns[:, pairs[:, 0]] - returns[:, pairs[:, 1]])
+            best = int(np.argmin(scores))
+        first, second = pairs[best]
         return self.library[first], self.library[second]
 
     def _scores(self, differences: np.ndarray) -> np.ndarray:
-        """(n_pairs,) how much of the candidates the worse answer leaves: Berlekamp volumes, or for
-        "greedy" their number. ``differences`` (n_candidates, n_pairs) are of predicted returns.
+        """(n_pairs,) Berlekamp volumes that the worse answer leaves, or for "greedy" the number of
+        candidates; ``differences`` (n_candidates, n_pairs) are of predicted returns.
         """
         if self.rule.strategy == "greedy":
             # Without a budget for mistakes the volume of a candidate is 1 until it is contradicted.
@@ -179,9 +161,8 @@ class ANOLEInference(Inference):
         left = max(0, self.n_queries - len(self.answers) - 1)
         return worst_case_volumes(differences, self.contradictions, left, self.budget)
 
-    def tell(self, preference: Preference, *shown: Shown) -> None:
-        trajectories = trajectories_of("ANOLE", *shown)
-        returns = self.model.predicted_returns(self.candidates, trajectories)
+    def tell(self, preference: Preference, *shown: Any) -> None:
+        returns = self.model.predicted_returns(self.candidates, shown)
         contradicted = SIGNS[preference] * (returns[:, 0] - returns[:, 1]) < 0
         self.contradictions = self.contradictions + contradicted
         if np.any(self.alive & ~contradicted):
@@ -189,13 +170,9 @@ class ANOLEInference(Inference):
         self.answers.append(Answer(preference, shown))
 
     def estimate(self) -> np.ndarray:
-        """See :class:`Inference`: a candidate of fewest contradictions; for "greedy" one left."""
+        """A candidate of fewest contradictions; for "greedy" one that is left."""
         worse = ~self.alive if self.rule.strategy == "greedy" else self.contradictions
         return self.candidates[np.lexsort((self.priority, worse))[0]].copy()
-
-    def restore(self, snapshot: Snapshot, answers: list[Answer]) -> None:
-        super().restore(snapshot, answers)
-        self._library_returns = None
 
 
 def has_experience(model: MetaModel) -> bool:
@@ -205,9 +182,8 @@ def has_experience(model: MetaModel) -> bool:
 
 
 def berlekamp_volumes(contradictions: np.ndarray, n_left: int, budget: int) -> np.ndarray:
-    """In how many ways the ``n_left`` answers to come (K - k) may lie without exceeding the budget
-    (E), if a candidate is the truth that contradicts so many answers (m): sum over e = 0, ..., E -
-    m of C(n_left, e); 0 where m exceeds E.
+    """In how many ways the ``n_left`` answers to come may lie within the budget E, if a candidate
+    is the truth that contradicts m answers: sum over e = 0, ..., E - m of C(n_left, e).
     """
     by_lies_left = np.cumsum([float(comb(n_left, lies)) for lies in range(budget + 1)])
     lies_left = budget - np.asarray(contradictions)
@@ -217,11 +193,8 @@ def berlekamp_volumes(contradictions: np.ndarray, n_left: int, budget: int) -> n
 def worst_case_volumes(
     differences: np.ndarray, contradictions: np.ndarray, n_left: int, budget: int
 ) -> np.ndarray:
-    """(n_pairs,) the volume that the worse of two answers leaves, over all candidates, with
-    ``n_left`` questions to come after it.
-
-    :param differences: (n_candidates, n_pairs) predicted return of the left fragment minus that of
-        the right one.
+    """(n_pairs,) the volume that the worse of two answers leaves, with ``n_left`` questions to come
+    after it; ``differences`` (n_candidates, n_pairs) are of predicted returns, left minus right.
     """
     kept = berlekamp_volumes(contradictions, n_left, budget)
     lost = kept - berlekamp_volumes(contradictions + 1, n_left, budget)
@@ -231,7 +204,5 @@ def worst_case_volumes(
 
 
 def n_distinguishable(n_queries: int, budget: int) -> int:
-    """How many candidates so many answers with so many lies can tell apart at most (the
-    sphere-packing bound): 2^K over the number of ways to lie, rounded down.
-    """
+    """Candidates that so many answers with so many lies can tell apart (sphere-packing bound)."""
     return 2**n_queries // sum(comb(n_queries, lies) for lies in range(budget + 1))

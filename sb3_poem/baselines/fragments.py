@@ -1,6 +1,4 @@
-"""Fragments of the training tasks' trajectories, which ANOLE shows instead of rolling out on the
-new task; and trajectories as rows that networks take.
-"""
+"""Fragments of the training tasks' trajectories, and trajectories as rows that networks take."""
 
 from pathlib import Path
 
@@ -9,7 +7,7 @@ import torch as th
 
 from sb3_poem.adaptation.environments import Env, model_and_env
 from sb3_poem.adaptation.rule import Setting
-from sb3_poem.common.family_view import FamilyView
+from sb3_poem.common.family_view import FamilyView, demanded
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.pearl_sac import PEARLSAC
@@ -28,10 +26,8 @@ def replay_fragments(
     model: PEARLSAC, n: int, length: int, rng: np.random.Generator
 ) -> list[Trajectory]:
     """n fragments of so many steps from the replay buffers of the training tasks, tasks and places
-    drawn uniformly, with reward features.
-
-    A fragment lies within one episode. Which latent acted is not kept in the buffers; a fragment
-    carries the latest latent of the training task that it comes from.
+    drawn uniformly, each within one episode, with reward features and the latest latent of its
+    training task.
     """
     buffer, policy = model.replay_buffer, model.policy
     with_room = np.flatnonzero(buffer.counts >= length)
@@ -57,11 +53,11 @@ def replay_fragments(
 
 
 def training_rollouts(
-    model: PEARLSAC | str | Path, env: Env, n: int, seed: int = 0, deterministic: bool = False
+    model: PEARLSAC | str | Path, env: Env, n: int, seed: int = 0
 ) -> list[Trajectory]:
     """n episodes of training tasks, drawn by ``seed``, under their own policies: a ``library`` for
-    a model that was loaded without its replay buffer. For ``model`` and ``env``, in which tasks are
-    set, see :class:`PreferenceAdapter`.
+    a loaded model. For ``model`` and ``env``, in which tasks are set, see
+    :class:`PreferenceAdapter`.
 
     >>> library = training_rollouts("PointGoal", "poem/PointGoal-v0", 4)
     >>> len(library), library[0].actions.shape
@@ -72,24 +68,24 @@ def training_rollouts(
         raise TypeError(f"`model` must be a PEARLSAC, but is of type {type(trained).__name__}")
     chosen = np.random.default_rng([seed, 4]).integers(len(trained.train_tasks), size=n)
     latents, tasks = trained.task_latents[chosen], trained.train_tasks.tasks[chosen]
-    return rollout_latents(trained, vec_env, latents, tasks, seed, deterministic)
+    return rollout_latents(trained, vec_env, latents, tasks, seed, False)
 
 
 def rollout_fragments(
     model: PEARLSAC | str | Path, env: Env, n: int, length: int, seed: int = 0
 ) -> list[Trajectory]:
-    """Fragments of so many steps of :func:`training_rollouts`, one from a random place of each (of
-    an earlier end all of it): what a replay buffer would hold of the present policies.
+    """Fragments of so many steps of :func:`training_rollouts`, one from a random place of each
+    (all of a shorter one): what a replay buffer would hold of the present policies.
     """
     rng = np.random.default_rng([seed, 6])
     fragments = []
     for episode in training_rollouts(model, env, n, seed):
         steps = min(length, len(episode))
         start = int(rng.integers(len(episode) - steps + 1))
-        part, features = slice(start, start + steps), episode.reward_features
-        seen, done = episode.observations[start : start + steps + 1], episode.actions[part]
-        features = None if features is None else features[part]
-        fragments.append(Trajectory(seen, done, episode.latent, features))
+        part, seen = slice(start, start + steps), slice(start, start + steps + 1)
+        features = demanded(episode.reward_features)[part]
+        about = episode.observations[seen], episode.actions[part], episode.latent, features
+        fragments.append(Trajectory(*about))
     return fragments
 
 
@@ -101,6 +97,7 @@ def check_shared_dynamics(setting: Setting, why: str) -> None:
 
 
 def standardised(policy: LatentPolicy, trajectory: Trajectory) -> th.Tensor:
+    """(T + 1, obs_dim) observations as the networks take them."""
     with th.no_grad():
         return policy.standardise(_tensor(policy, trajectory.observations))
 

@@ -1,33 +1,288 @@
-"""MAML-reward: the answers adapt the reward, and SAC learns from what was shown."""
+"""MAML-reward: the answers adapt a meta-trained reward, and SAC learns from what was shown (Finn et
+al. 2017; Hejna & Sadigh 2023).
+"""
 
 import contextlib
 import copy
 import random
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
+from safetensors import SafetensorError
+from safetensors.torch import load, save
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import set_random_seed
+from torch import nn
+from torch.func import functional_call, grad, vmap
+from torch.nn.functional import softplus
+from torch.nn.utils.rnn import pad_sequence
 
 from sb3_poem.adaptation import Answer, Inference, Rule, Setting
 from sb3_poem.adaptation.meta_model import MetaModel
-from sb3_poem.adaptation.preference import Preference
-from sb3_poem.adaptation.rule import Shown, Snapshot, trajectories_of
-from sb3_poem.baselines.fragments import check_shared_dynamics, standardised
-from sb3_poem.baselines.meta_reward import MetaReward
+from sb3_poem.adaptation.preference import SIGNS, Preference
+from sb3_poem.adaptation.rule import Shown
+from sb3_poem.adaptation.state import read_json, write_json_atomically
+from sb3_poem.baselines.fragments import (
+    check_shared_dynamics,
+    default_fragment_length,
+    replay_fragments,
+    standardised,
+    transition_rows,
+)
 from sb3_poem.common.checks import check_whole
+from sb3_poem.common.files import write_atomically
+from sb3_poem.common.networks import MLP, digest_of
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.pearl_sac import PEARLSAC
+from sb3_poem.pearl_sac.policies import LatentPolicy
+
+FORMAT = "sb3_poem meta reward 2"
+WEIGHTS, CONFIG = "reward.safetensors", "reward.json"
+SETTINGS = ("net_arch", "inner_learning_rate", "inner_steps", "fragment_length")
+#: Of an outer step of the meta-training: tasks, and pairs that each adapts to and is judged by.
+TASKS_PER_BATCH, PAIRS = 16, 10
+
+Parameters = dict[str, th.Tensor]
+
+
+class PreferencePairs(NamedTuple):
+    """Pairs of fragments, (..., pairs, steps, in_dim + 1) transitions as :class:`RewardNetwork`
+    takes them, and ``label`` (..., pairs): 1 where the left one is better, 0 or 0.5.
+    """
+
+    left: th.Tensor
+    right: th.Tensor
+    label: th.Tensor
+
+
+class RewardNetwork(nn.Module):
+    """Reward of a transition (s, a, s') of width ``in_dim``, unknown up to scale; and what MAML
+    does with its parameters, whose inner loop has so many ``steps``.
+    """
+
+    def __init__(
+        self, in_dim: int, net_arch: Sequence[int], learning_rate: float, steps: int
+    ) -> None:
+        super().__init__()
+        # A smooth activation: MAML differentiates the gradient.
+        self.mlp = MLP(in_dim, 1, net_arch, nn.Tanh)
+        self.learning_rate, self.steps = learning_rate, steps
+
+    def forward(self, transitions: th.Tensor) -> th.Tensor:
+        """(..., in_dim + 1), the last entry 1, or 0 for what only fills up an episode that ended
+        early -> (...).
+        """
+        return self.mlp(transitions[..., :-1]).squeeze(-1) * transitions[..., -1]
+
+    def preference_loss(self, parameters: Parameters, pairs: PreferencePairs) -> th.Tensor:
+        """Bradley-Terry cross-entropy of the sums of predicted rewards of one task's pairs."""
+        both = th.stack([pairs.left, pairs.right])
+        left, right = functional_call(self, parameters, (both,)).sum(dim=-1)
+        return (softplus(left - right) - pairs.label * (left - right)).mean()
+
+    def adapted(self, parameters: Parameters, pairs: PreferencePairs) -> Parameters:
+        """MAML's inner loop: gradient steps on one task's preferences."""
+        for _ in range(self.steps):
+            slope = grad(self.preference_loss)(parameters, pairs)
+            parameters = {k: v - self.learning_rate * slope[k] for k, v in parameters.items()}
+        return parameters
+
+    def maml_loss(
+        self, parameters: Parameters, support: PreferencePairs, query: PreferencePairs
+    ) -> th.Tensor:
+        """MAML's outer objective: how well what ``support`` (tasks, pairs, ...) adapts predicts
+        ``query``, other preferences of the same tasks.
+        """
+
+        def task_loss(some: PreferencePairs, others: PreferencePairs) -> th.Tensor:
+            return self.preference_loss(self.adapted(parameters, some), others)
+
+        return vmap(task_loss)(support, query).mean()
+
+
+class MetaReward:
+    """A reward network from which a few preferences lead to a task's reward.
+
+    >>> from sb3_poem import PEARLSAC
+    >>> small = dict(n_train_tasks=4, gradient_steps=2, seed=0)
+    >>> pearl = PEARLSAC("MlpPolicy", "poem/PointGoal-v0", **small).learn(200)
+    >>> meta_train_reward(pearl, n_iterations=1).save("reward")
+    >>> MetaReward.load("reward", pearl.policy).inner_steps
+    5
+
+    :param policy: Whose standardisation of observations is used.
+    :param inner_learning_rate: Step size of MAML's inner loop, which has ``inner_steps``.
+    :param fragment_length: Steps of the fragments of the meta-training; None: any.
+    :param seed: Of the initial parameters.
+    """
+
+    def __init__(
+        self,
+        policy: LatentPolicy,
+        net_arch: Sequence[int] = (64, 64),
+        inner_learning_rate: float = 0.1,
+        inner_steps: int = 5,
+        fragment_length: int | None = None,
+        seed: int = 0,
+    ) -> None:
+        if not inner_learning_rate > 0:
+            raise ValueError(
+                f"`inner_learning_rate` must be positive, but is {inner_learning_rate}"
+            )
+        check_whole("inner_steps", inner_steps, 1)
+        self.policy = policy
+        self.inner_learning_rate, self.inner_steps = inner_learning_rate, inner_steps
+        self.fragment_length = fragment_length
+        self.net_arch = tuple(int(width) for width in net_arch)
+        in_dim = 2 * spaces.flatdim(policy.observation_space) + spaces.flatdim(policy.action_space)
+        with th.random.fork_rng():
+            th.manual_seed(seed)
+            network = RewardNetwork(in_dim, net_arch, inner_learning_rate, inner_steps)
+        self.network = network.to(policy.device)
+        self.parameters: Parameters = {
+            name: value.detach().clone() for name, value in self.network.named_parameters()
+        }
+
+    @property
+    def digest(self) -> str:
+        return digest_of({**self.parameters, **_standardisation(self.policy)})
+
+    def save(self, folder: str | Path) -> None:
+        """Write the parameters as safetensors and the settings as JSON."""
+        tensors = {f"network.{name}": value for name, value in self.parameters.items()}
+        tensors |= _standardisation(self.policy)
+        content = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+        write_atomically(Path(folder) / WEIGHTS, save(content))
+        settings = {name: getattr(self, name) for name in SETTINGS}
+        write_json_atomically(Path(folder) / CONFIG, {"format": FORMAT, **settings})
+
+    @classmethod
+    def load(cls, folder: str | Path, policy: LatentPolicy) -> Self:
+        """Read what :meth:`save` wrote; the policy must be that of the meta-training."""
+        weights, settings = Path(folder) / WEIGHTS, Path(folder) / CONFIG
+        if not settings.is_file():
+            raise FileNotFoundError(f"{folder} holds no meta-trained reward: it has no {CONFIG}")
+        config = read_json(settings, "the settings of a meta-trained reward")
+        if config.get("format") != FORMAT:
+            raise ValueError(f"{settings} is not of this version of sb3_poem, {FORMAT!r}")
+        try:
+            tensors = load(weights.read_bytes())
+        except SafetensorError as error:
+            raise ValueError(f"{weights} is truncated, or no safetensors file: {error}") from error
+        for name, value in _standardisation(policy).items():
+            if not th.equal(tensors[name], value.cpu()):
+                raise ValueError(
+                    f"`policy` is not the one with which the reward in {folder} was meta-trained: "
+                    f"its {name} differs; load the same model again"
+                )
+        meta = cls(policy, **{name: config[name] for name in SETTINGS})
+        for name in meta.parameters:
+            meta.parameters[name] = tensors[f"network.{name}"].to(policy.device)
+        return meta
+
+    def transitions(self, trajectory: Trajectory) -> th.Tensor:
+        """(T, in_dim + 1) standardised (s, a, s') of a trajectory, and 1."""
+        return transition_rows(self.policy, trajectory, 1.0)
+
+    def adapted(self, answers: Sequence[Answer]) -> Parameters:
+        """The network's parameters after some answers. The inner loop's steps suit sums over the
+        fragments of the meta-training: longer trajectories count with their mean over as many.
+        """
+        if not answers:
+            return self.parameters
+        shown = [one for answer in answers for one in answer.shown]
+        # (2 answers, longest, in_dim + 1)
+        rows = pad_sequence([self.transitions(trajectory) for trajectory in shown], True)
+        longest = rows.shape[1]
+        rows[..., -1] *= min(1.0, (self.fragment_length or longest) / longest)
+        labels = [0.5 + 0.5 * SIGNS[answer.preference] for answer in answers]
+        pairs = PreferencePairs(rows[::2], rows[1::2], th.tensor(labels, device=rows.device))
+        adapted = self.network.adapted(self.parameters, pairs)
+        return {name: value.detach() for name, value in adapted.items()}
+
+    def rewards(self, parameters: Parameters, trajectory: Trajectory) -> np.ndarray:
+        """(T,) predicted rewards with what :meth:`adapted` gave, in the network's own unit."""
+        inputs = (self.transitions(trajectory),)
+        with th.no_grad():
+            predicted = th.func.functional_call(self.network, parameters, inputs)
+        return predicted.double().cpu().numpy()
+
+
+def meta_train_reward(
+    model: PEARLSAC,
+    n_iterations: int = 500,
+    n_fragments: int = 500,
+    fragment_length: int | None = None,
+    learning_rate: float = 1e-3,
+    seed: int = 0,
+    **arguments: Any,
+) -> MetaReward:
+    """Meta-train a reward on the preferences of a model's training tasks about fragments from its
+    replay buffer. Every task judges fragments of all of them, so the family must share dynamics.
+
+    :param n_iterations: Steps of the outer loop, by Adam with ``learning_rate``.
+    :param n_fragments: Fragments that pairs are drawn from.
+    :param fragment_length: Their steps; None takes 50, or an episode that is shorter.
+    :param arguments: Of :class:`MetaReward`.
+    """
+    if not model.family.shared_dynamics:
+        raise ValueError(
+            "`model` must be of a family whose tasks share their dynamics, but those of "
+            f"{model.family.env_id} do not: every task judges all tasks' fragments"
+        )
+    if not model.replay_buffer.counts.any():
+        raise ValueError(
+            "`model` has an empty replay buffer (a loaded model has none): call load_replay_buffer"
+        )
+    check_whole("n_iterations", n_iterations, 1)
+    check_whole("n_fragments", n_fragments, 1)
+    rng = np.random.default_rng([seed, 5])
+    length = default_fragment_length(model.horizon) if fragment_length is None else fragment_length
+    meta = MetaReward(model.policy, fragment_length=length, seed=seed, **arguments)
+    fragments = replay_fragments(model, n_fragments, length, rng)
+    inputs = th.stack([meta.transitions(fragment) for fragment in fragments])
+    features = np.stack([np.asarray(fragment.reward_features) for fragment in fragments])
+    tasks = model.train_tasks.tasks[:, None, None, :]
+    returns = model.family.compute_rewards(tasks, features[None]).sum(axis=2)
+    parameters = {name: value.requires_grad_() for name, value in meta.parameters.items()}
+    optimizer = th.optim.Adam(parameters.values(), lr=learning_rate)
+    n_tasks = min(TASKS_PER_BATCH, len(returns))
+    for _ in range(n_iterations):
+        judges = rng.choice(len(returns), size=n_tasks, replace=False)
+        support, query = (_judged(inputs, returns, judges, rng) for _ in range(2))
+        optimizer.zero_grad()
+        meta.network.maml_loss(parameters, support, query).backward()
+        optimizer.step()
+    meta.parameters = {name: value.detach() for name, value in parameters.items()}
+    return meta
+
+
+def _judged(
+    inputs: th.Tensor, returns: np.ndarray, tasks: np.ndarray, rng: np.random.Generator
+) -> PreferencePairs:
+    """Pairs for each of some tasks, by their returns (all tasks, fragments)."""
+    left, right = rng.integers(len(inputs), size=(2, len(tasks), PAIRS))
+    rows = tasks[:, None]
+    label = 0.5 + 0.5 * np.sign(returns[rows, left] - returns[rows, right])
+    labels = th.as_tensor(label, dtype=inputs.dtype, device=inputs.device)
+    return PreferencePairs(inputs[left], inputs[right], labels)
+
+
+def _standardisation(policy: LatentPolicy) -> dict[str, th.Tensor]:
+    """Without which the parameters mean nothing."""
+    return {"obs_mean": policy.obs_norm.mean, "obs_std": policy.obs_norm.std}
 
 
 class MAMLRewardModel(MetaModel):
     """A meta-trained reward with the face of a model. Its policies are SAC's after so many answers
-    to some task; a "latent" names one by its number, and says with its second entry, 1 or -1, with
-    which sign exploration noise is added: so two rollouts of one policy from equal seeds differ.
+    to some task; a "latent" holds the number of one, and the sign, 1 or -1, with which exploration
+    noise is added: so two rollouts of one policy from equal seeds differ.
 
     >>> from sb3_poem import PEARLSAC
     >>> from sb3_poem.baselines import meta_train_reward
@@ -36,8 +291,7 @@ class MAMLRewardModel(MetaModel):
     >>> MAMLRewardModel(meta_train_reward(pearl, n_iterations=1), pearl)
     MAMLRewardModel(poem/PointGoal-v0)
 
-    :param reward: The meta-trained reward.
-    :param model: The :class:`PEARLSAC` that it was meta-trained with, for spaces and horizon.
+    :param model: The :class:`PEARLSAC` that the reward was meta-trained with.
     """
 
     latent_dim = 2
@@ -97,14 +351,11 @@ class MAMLRewardModel(MetaModel):
 @dataclass(frozen=True, repr=False)
 class MAMLReward(Rule):
     """MAML-reward (Hejna & Sadigh 2023): a meta-trained reward is adapted to the answers, and SB3's
-    SAC learns the policy on it from the trajectories that were shown, at most 2 K. The model is a
-    :class:`MAMLRewardModel`.
+    SAC learns the policy on it from the trajectories that were shown. The model is a
+    :class:`MAMLRewardModel`, the options are SAC's.
 
-    After each answer the reward is adapted anew from the meta-trained start to all answers,
-    everything that was shown is relabelled with it, and SAC goes on learning from that
-    (``gradient_steps``; the other options are SAC's too). What is learnt follows from the seed and
-    the answers alone, so a saved adaptation keeps no networks: they are learnt again. Questions
-    show exploring policies: nothing else brings SAC its experience.
+    After each answer the reward is adapted anew to all answers, everything that was shown is
+    relabelled with it, and SAC goes on learning from that; a saved adaptation keeps no networks.
 
     >>> from sb3_poem import PEARLSAC, PreferenceAdapter, ReturnOracle
     >>> from sb3_poem.baselines import meta_train_reward
@@ -140,10 +391,8 @@ class MAMLReward(Rule):
                 "one by MAMLRewardModel(meta_train_reward(model), model)"
             )
         super().check(model, setting)
-        check_shared_dynamics(
-            setting,
-            "MAML-reward's network was trained on what tasks say of each other's fragments",
-        )
+        why = "MAML-reward's network was trained on what tasks say of each other's fragments"
+        check_shared_dynamics(setting, why)
 
     def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> Inference:
         return MAMLRewardInference(self, model, rng, setting.n_queries)
@@ -163,23 +412,23 @@ class MAMLRewardInference(Inference):
         self._restart()
 
     def _restart(self) -> None:
-        self.answers: list[Answer] = []
+        self.answers = []
         with _seeded(int(self.seed[0])):
             self.sac = _make_sac(self.model, self.rule, self.n_queries)
         self.latent = self.model.add(self.sac.actor)
 
     def ask(self) -> tuple[Shown, Shown]:
-        """See :class:`Inference`: the current policy twice, with opposite exploration noise."""
+        """The current policy twice, with opposite exploration noise."""
         return self.latent.copy(), self.latent * np.array([1.0, -1.0])
 
     def same_latents(self, *latents: np.ndarray) -> tuple[Shown, ...]:
-        """See :class:`Inference`: the current policy, whose number in the file was another."""
+        """The current policy, whose number in the file was another."""
         return self.ask()
 
-    def tell(self, preference: Preference, *shown: Shown) -> None:
-        answers = [*self.answers, Answer(preference, shown)]
-        seen = [one for each in answers for one in trajectories_of("MAML-reward", *each.shown)]
-        self.answers, parameters = answers, self.model.reward.adapted(answers)
+    def tell(self, preference: Preference, *shown: Any) -> None:
+        self.answers.append(Answer(preference, shown))
+        seen = [one for each in self.answers for one in each.shown]
+        parameters = self.model.reward.adapted(self.answers)
         rewards = [self.model.reward.rewards(parameters, trajectory) for trajectory in seen]
         # Preferences fix no unit; SAC's entropy needs one.
         scale = max(float(np.concatenate(rewards).std()), 1e-6)
@@ -191,8 +440,8 @@ class MAMLRewardInference(Inference):
     def estimate(self) -> np.ndarray:
         return self.latent.copy()
 
-    def restore(self, snapshot: Snapshot, answers: list[Answer]) -> None:
-        """See :class:`Inference`: the answers are told again."""
+    def restore(self, snapshot: dict[str, Any], answers: list[Answer]) -> None:
+        """Tells the answers again."""
         super().restore(snapshot, [])
         self._restart()
         for answer in answers:
@@ -206,10 +455,10 @@ class MAMLRewardInference(Inference):
             obs = standardised(policy, trajectory).cpu().numpy()
             actions = policy.scale_action(trajectory.actions)
             # Nothing ends but by the time limit, unless an episode is shorter than that.
-            ended = len(trajectory) < self.model.horizon
-            for t in range(len(trajectory)):
-                done = ended and t == len(trajectory) - 1
-                buffer.add(obs[t], obs[t + 1], actions[t], row[t], np.array([done]), [{}])
+            done = np.zeros(len(row), dtype=bool)
+            done[-1] = len(row) < self.model.horizon
+            for t in range(len(row)):
+                buffer.add(obs[t], obs[t + 1], actions[t], row[t], done[t : t + 1], [{}])
 
 
 def _make_sac(model: MAMLRewardModel, rule: MAMLReward, n_queries: int) -> SAC:

@@ -1,28 +1,18 @@
-"""What could be had if rewards were seen at test time: PEARL's own adaptation (Rakelly et al.
-2019).
-"""
+"""PEARL's own adaptation, which sees rewards at test time (Rakelly et al. 2019)."""
 
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.oracles import step_rewards
 from sb3_poem.adaptation.preference import Preference
 from sb3_poem.adaptation.priors import N_CENTRES, SOURCES
-from sb3_poem.adaptation.rule import (
-    Answer,
-    Inference,
-    Rule,
-    Setting,
-    Shown,
-    check_choice,
-    trajectories_of,
-)
+from sb3_poem.adaptation.rule import Answer, Inference, Rule, Setting, Shown
 from sb3_poem.baselines.fragments import transition_rows
+from sb3_poem.common.checks import check_choice
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.pearl_sac import PEARLSAC
@@ -31,17 +21,12 @@ from sb3_poem.pearl_sac import PEARLSAC
 @dataclass(frozen=True, repr=False)
 class RewardOracle(Rule):
     """The reference that sees the new task's rewards: as many rollouts as the others, two for each
-    question, by posterior sampling (Rakelly et al. 2019). Answers are taken and not looked at.
+    question, by posterior sampling (Rakelly et al. 2019). Answers are not looked at. The model is a
+    ``PEARLSAC``, or a ``POEMSAC`` with ``context="pearl"``.
 
-    Latents are drawn from the posterior, rolled out, and the encoder gives the next posterior from
-    what was collected. A context has no more transitions than in training: the posterior is a
-    product over them, and would be too sure of more. So all that was collected is dealt out, at
-    random, to as many contexts as it fills, and their posteriors' means and variances are averaged.
-
-    It is as good as the encoder, whose contexts in training are of the tasks' own policies: where
-    it reads the task from what was done rather than from the rewards, contexts of other policies
-    mislead it. The model is a ``PEARLSAC`` (not a ``POEMSAC`` whose context holds values), and the
-    environment a task family, from which rewards are read.
+    A context has no more transitions than in training, for the posterior, a product over them,
+    would be too sure of more: what was collected is dealt out to as many contexts as it fills, and
+    their posteriors' means and variances are averaged.
 
     >>> from sb3_poem import PEARLSAC, PreferenceAdapter, ReturnOracle
     >>> small = dict(n_train_tasks=4, gradient_steps=2, seed=0)
@@ -65,8 +50,9 @@ class RewardOracle(Rule):
         super().check(model, setting)
         name = type(model).__name__
         if not isinstance(model, PEARLSAC):
-            lacks = f"needs a context encoder, which {name} does not have"
-            raise ValueError(f"`model` {lacks}; pass a PEARLSAC")
+            raise ValueError(
+                f"`model` needs a context encoder, which {name} does not have; pass a PEARLSAC"
+            )
         if model.policy.context_has_value:
             raise ValueError(
                 f"`model` needs an encoder of (s, a, s', r), but this {name}'s context also holds "
@@ -74,12 +60,16 @@ class RewardOracle(Rule):
                 "PEARLSAC"
             )
         if model.context_reward_statistics is None:
-            lacks = "does not know how its contexts' rewards were standardised"
-            raise ValueError(f"`model` {lacks}; train it for an epoch first")
-        FamilyView(_env_of(setting))  # which refuses what is no family
+            raise ValueError(
+                "`model` does not know how its contexts' rewards were standardised; train it for "
+                "an epoch first"
+            )
+        if setting.env is None:
+            raise ValueError("the reward oracle needs `env`, to read its rewards")
+        FamilyView(setting.env)  # which refuses what is no family
 
     def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> Inference:
-        inference = RewardInference(model, rng, _env_of(setting), setting.task)
+        inference = RewardInference(model, rng, setting)
         if self.candidates == "aggregate":
             latents = model.sample_latents(N_CENTRES, rng, source="aggregate")
             inference.mean, inference.variance = latents.mean(axis=0), latents.var(axis=0)
@@ -87,44 +77,34 @@ class RewardOracle(Rule):
 
 
 class RewardInference(Inference):
-    """See :class:`RewardOracle`; a task of None is the one in effect in ``env``, whose rewards are
-    read.
-    """
+    """See :class:`RewardOracle`."""
 
     state = ("mean", "variance", "transitions")
 
-    def __init__(
-        self, model: Any, rng: np.random.Generator, env: VecEnv, task: np.ndarray | None
-    ) -> None:
+    def __init__(self, model: Any, rng: np.random.Generator, setting: Setting) -> None:
         super().__init__(rng)
-        self.model = model
+        self.model, self._env, self._task = model, setting.env, setting.task
         self.mean, self.variance = np.zeros(model.latent_dim), np.ones(model.latent_dim)
         self.transitions: np.ndarray = np.empty((0, 0), dtype=np.float32)
-        self._env, self._task = env, task
 
     def ask(self) -> tuple[Shown, Shown]:
-        """See :class:`Inference`: two draws from the posterior."""
+        """Two draws from the posterior."""
         noise = self.rng.standard_normal((2, len(self.mean)))
         left, right = self.mean + np.sqrt(self.variance) * noise
         return left, right
 
-    def tell(self, preference: Preference, *shown: Shown) -> None:
-        """See :class:`Inference`. The answer is not looked at, the rewards of both trajectories
-        are.
-        """
-        trajectories = trajectories_of("the reward oracle", *shown)
-        rows = np.concatenate([self._context_rows(item) for item in trajectories])
+    def tell(self, preference: Preference, *shown: Any) -> None:
+        """Looks at the rewards of both trajectories, not at the answer."""
+        rows = np.concatenate([self._context_rows(item) for item in shown])
         self.answers.append(Answer(preference, shown))
         before = [self.transitions] if len(self.transitions) else []
         self.transitions = np.concatenate([*before, rows])
         n = min(self.model.context_size, len(self.transitions))
         dealt = self.rng.permutation(len(self.transitions))[: len(self.transitions) // n * n]
+        # (contexts, n, context_dim)
+        contexts = th.as_tensor(self.transitions[dealt.reshape(-1, n)], device=self.model.device)
         with th.no_grad():
-            # (contexts, n, context_dim)
-            contexts = self.transitions[dealt.reshape(-1, n)]
-            mean, variance = self.model.policy.encoder(
-                th.as_tensor(contexts, device=self.model.device)
-            )
+            mean, variance = self.model.policy.encoder(contexts)
         self.mean = mean.double().mean(dim=0).cpu().numpy()
         self.variance = variance.double().mean(dim=0).cpu().numpy()
 
@@ -133,12 +113,7 @@ class RewardInference(Inference):
 
     def _context_rows(self, shown: Trajectory) -> np.ndarray:
         """(T, context_dim) standardised (s, a, s', r), as in training."""
+        assert self._env is not None
         centre, deviation = self.model.context_reward_statistics
         rewards = (step_rewards(self._env, self._task, shown) - centre) / deviation
         return transition_rows(self.model.policy, shown, rewards).cpu().numpy()
-
-
-def _env_of(setting: Setting) -> VecEnv:
-    if setting.env is None:
-        raise ValueError("the reward oracle needs `env`, to read its rewards")
-    return setting.env

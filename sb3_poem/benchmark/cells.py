@@ -12,9 +12,8 @@ import torch as th
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.adaptation import BoltzmannOracle, MistakeOracle, ReturnOracle, TaskOracle
-from sb3_poem.adaptation.evaluation import evaluate_adaptation
+from sb3_poem.adaptation.evaluation import Library, evaluate_adaptation
 from sb3_poem.adaptation.known_task import known_task_return, preference_order
-from sb3_poem.adaptation.many_tasks import Library
 from sb3_poem.adaptation.meta_model import HasSimilarity
 from sb3_poem.baselines import ANOLE, MAMLRewardModel, rollout_fragments
 from sb3_poem.baselines.anole import has_experience

@@ -47,3 +47,9 @@ def check_number_or_auto(name: str, value: Any, low: float = -np.inf) -> None:
         check_number(name, value, low)
     elif not re.fullmatch(r"auto(_[0-9]+[0-9.e+-]*)?", value):
         raise ValueError(f'`{name}` must be a number or "auto", but is {value!r}')
+
+
+def check_choice(name: str, value: Any, allowed: Sequence[str | None]) -> None:
+    """Refuse an option's value that is none of those allowed."""
+    if value not in allowed:
+        raise ValueError(f"`{name}` must be one of {tuple(allowed)}, but is {value!r}")

@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
 from sb3_poem.adaptation.adapter import PreferenceAdapter
 from sb3_poem.adaptation.named_rule import named_rule
-from sb3_poem.adaptation.people import INFER
+from sb3_poem.adaptation.noise import INFER
 from sb3_poem.adaptation.preference import Preference
 from sb3_poem.adaptation.rule import Rule, rollout_seed
 from sb3_poem.common.family_view import FamilyView

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_poem.adaptation.adapter import shown_to_dict
-from sb3_poem.adaptation.human import HumanAnswer
+from sb3_poem.adaptation.oracles import HumanAnswer
 from sb3_poem.adaptation.preference import Preference, as_preference
 from sb3_poem.label.rendering import StorageError, Turn
 

@@ -54,7 +54,6 @@ def vec_env(n=10, **kwargs):
             "`n_episodes` must be",
         ),
         (lambda: known_task_return(MODEL, vec_env(1), GOALS, 0), "`n_latents` must be at least 1"),
-        (lambda: known_task_return(MODEL, vec_env(1), GOALS, source="all"), "`source` must be"),
         (
             lambda: known_task_return(MODEL, vec_env(1), GOALS, selection_episodes=0),
             "`selection_episodes` must be at least 1",

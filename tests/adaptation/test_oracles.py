@@ -20,7 +20,7 @@ from sb3_poem.adaptation import (
     PreferenceAdapter,
     ReturnOracle,
 )
-from sb3_poem.adaptation.human import PROMPTS
+from sb3_poem.adaptation.oracles import PROMPTS
 from sb3_poem.adaptation.rule import inference_rng
 from sb3_poem.common.trajectory import Trajectory
 
@@ -56,7 +56,7 @@ def test_the_task_is_given_or_the_one_in_effect():
     assert ReturnOracle(env, task=[2.1])(at_speed(0.4), at_speed(2.0)) is RIGHT
     vec_env = DummyVecEnv([lambda: env])
     assert ReturnOracle().bind(vec_env)(at_speed(0.4), at_speed(2.0)) is LEFT
-    assert ReturnOracle().bind(vec_env, np.array([2.1]))(at_speed(0.4), at_speed(2.0)) is RIGHT
+    assert ReturnOracle(task=[2.1]).bind(vec_env)(at_speed(0.4), at_speed(2.0)) is RIGHT
 
 
 def test_mistakes_come_at_their_rate():

@@ -8,7 +8,7 @@ from worlds import SpeedModel
 
 from sb3_poem.adaptation.paper import Paper
 from sb3_poem.adaptation.preference import Preference
-from sb3_poem.adaptation.rule import Setting, Snapshot
+from sb3_poem.adaptation.rule import Setting
 
 LEFT, RIGHT, EQUAL = Preference.LEFT, Preference.RIGHT, Preference.EQUAL
 
@@ -135,7 +135,7 @@ def test_reproducible_and_restorable():
         inference.ask()
         inference.tell(LEFT, latent(0.5), latent(-0.5))
     third = make(seed=99)
-    third.restore(Snapshot.from_dict(first.snapshot().to_dict()), first.answers)
+    third.restore(first.snapshot(), first.answers)
     for inference in (second, third):
         np.testing.assert_array_equal(first.candidates, inference.candidates)
     asked = [np.stack(inference.ask()) for inference in (first, second, third)]

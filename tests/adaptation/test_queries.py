@@ -14,9 +14,9 @@ from sb3_poem.adaptation.noise import (
     BoltzmannNoise,
     ExactNoise,
     MistakeNoise,
+    People,
     noise_model_from_dict,
 )
-from sb3_poem.adaptation.people import People
 from sb3_poem.adaptation.queries import (
     best_pair,
     information_gains,

@@ -10,7 +10,7 @@ from sb3_poem import PEARLSAC
 from sb3_poem.adaptation import Preference
 from sb3_poem.adaptation.rule import Answer
 from sb3_poem.baselines import replay_fragments
-from sb3_poem.baselines.meta_reward import (
+from sb3_poem.baselines.maml_reward import (
     MetaReward,
     PreferencePairs,
     RewardNetwork,
@@ -173,9 +173,8 @@ def test_what_will_not_do(trained):
         meta_train_reward(small(PEARLSAC, walks(2), horizon=10, n_train_tasks=2))
     with pytest.raises(ValueError, match="`n_iterations` must be at least 1, but is 0"):
         meta_train_reward(trained, 0)
-    for name in ("n_fragments", "tasks_per_batch"):
-        with pytest.raises(ValueError, match=f"`{name}` must be at least 1, but is 0"):
-            meta_train_reward(trained, 1, **{name: 0})
+    with pytest.raises(ValueError, match="`n_fragments` must be at least 1, but is 0"):
+        meta_train_reward(trained, 1, n_fragments=0)
     with pytest.raises(ValueError, match="`inner_learning_rate` must be positive"):
         MetaReward(trained.policy, inner_learning_rate=0.0)
     with pytest.raises(ValueError, match="`inner_steps` must be at least 1"):
