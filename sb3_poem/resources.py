@@ -12,13 +12,9 @@ _PACKAGE = Path(__file__).resolve().parent
 def shipped_folder(name: str) -> Path:
     """The folder of shipped files of that name, ``"zoo_configs"`` or ``"pretrained"``: inside the
     package when it was installed from a wheel, beside it in a checkout.
-
-    :raises FileNotFoundError: if neither place has it, which means a broken installation
     """
-    for root in (_PACKAGE, _PACKAGE.parent):
-        if (root / name).is_dir():
-            return root / name
-    raise FileNotFoundError(f"sb3_poem was installed without its folder {name!r}: install it anew")
+    inside = _PACKAGE / name
+    return inside if inside.is_dir() else _PACKAGE.parent / name
 
 
 def config_file(algorithm: str) -> Path:

@@ -1,7 +1,7 @@
 """What a store holds of a suite: finished cells, gathered over seeds and summarised."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Self
 
@@ -66,13 +66,6 @@ class Condition:
         return ", ".join(words) + self.version
 
 
-def _success_rates(records: Sequence[Record]) -> np.ndarray | None:
-    """(n_seeds, n_tasks[, n_queries]); None for a family without successes."""
-    if any("task_success_rates" not in record.result for record in records):
-        return None
-    return np.array([record.result["task_success_rates"] for record in records])
-
-
 @dataclass(frozen=True, eq=False)
 class _Measured:
     """A method's records, one a seed."""
@@ -83,6 +76,19 @@ class _Measured:
     @property
     def label(self) -> str:
         return METHODS[self.method].label
+
+    @cached_property
+    def returns(self) -> np.ndarray:
+        """(n_seeds, n_tasks[, n_queries])."""
+        return np.array([record.result["task_returns"] for record in self.records])
+
+    @property
+    def success_rates(self) -> Any:
+        """([n_queries,]) means over seeds and tasks; None for a family without successes."""
+        if any("task_success_rates" not in record.result for record in self.records):
+            return None
+        rates = np.array([record.result["task_success_rates"] for record in self.records])
+        return rates.mean(axis=(0, 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,20 +105,9 @@ class Series(_Measured):
     def queries(self) -> tuple[int, ...]:
         return tuple(self.records[0].result["queries"])
 
-    @cached_property
-    def returns(self) -> np.ndarray:
-        """(n_seeds, n_tasks, n_queries)."""
-        return np.stack([np.array(record.result["task_returns"]) for record in self.records])
-
     @property
     def samples(self) -> float:
         return float(np.mean([record.result["training_samples"] for record in self.records]))
-
-    @property
-    def success_rates(self) -> list[float] | None:
-        """(n_queries,) means over seeds and tasks, where the family has successes."""
-        rates = _success_rates(self.records)
-        return None if rates is None else rates.mean(axis=(0, 1)).tolist()
 
     def at(self, queries: int) -> np.ndarray:
         """(n_seeds, n_tasks) after so many answers."""
@@ -132,13 +127,7 @@ class Reference(_Measured):
     @property
     def known(self) -> np.ndarray:
         """(n_seeds,) mean returns if the task were known."""
-        return np.array([np.mean(record.result["task_returns"]) for record in self.records])
-
-    @property
-    def success_rate(self) -> float | None:
-        """Mean over seeds and tasks if the task were known, where the family has successes."""
-        rates = _success_rates(self.records)
-        return None if rates is None else float(rates.mean())
+        return self.returns.mean(axis=1)
 
     def limits(self, queries: int, oracle: OracleSpec) -> np.ndarray | None:
         """(n_seeds,): the most that so many answers of this oracle allow with these policies; None
@@ -172,18 +161,12 @@ class Selection:
             for one in in_order
             if all(one.identity["model"] == newest[kind] for kind in _kinds(one))
         }
-        shares: dict[Condition, set[float]] = {}
-        for record in self.records.values():
-            some = shares.setdefault(Condition.of(record), set())
-            if record.identity["snapshot"] is not None:
-                some.add(record.identity["snapshot"])
-        order = {name: position for position, name in enumerate(suite.families)}
-
-        def place(one: Condition) -> tuple[int, str, str]:
-            return order.get(one.family, len(order)), one.env_id, str(one)
-
-        self._shares, self.conditions = shares, sorted(shares, key=place)
-        self.seeds = sorted({record.seed for record in self.records.values()})
+        found: dict[Condition, list[Record]] = {}
+        for one in self.records.values():
+            found.setdefault(Condition.of(one), []).append(one)
+        order = (*suite.families, *sorted(one.family for one in found))
+        self._found = found
+        self.conditions = sorted(found, key=lambda one: (order.index(one.family), str(one)))
 
     def series(self, entry: Entry, condition: Condition) -> list[Series]:
         """The finished cells of an entry under a condition, those along the training too."""
@@ -204,10 +187,11 @@ class Selection:
         return [Reference(method, tuple(records)) for method, records in found.items() if records]
 
     def _cells(self, entry: Entry, condition: Condition) -> Iterator[tuple[Cell, Record]]:
-        shares = sorted(self._shares[condition])
-        for seed in self.seeds:
-            base = Cell(condition.env_id, "", seed, revision=condition.revision)
-            base = replace(base, budget=condition.budget, training=condition.training)
+        records = self._found[condition]
+        shares = sorted({record.identity["snapshot"] for record in records} - {None})
+        what = {"budget": condition.budget, "training": condition.training}
+        for seed in sorted({record.seed for record in records}):
+            base = Cell(condition.env_id, "", seed, **what, revision=condition.revision)
             for cell in self.suite.entry_cells(entry, base, shares):
                 if cell.key in self.records:
                     yield cell, self.records[cell.key]

@@ -14,7 +14,6 @@ from sb3_poem.adaptation.limits import AnswerLimits
 from sb3_poem.benchmark.cells import run_cell
 from sb3_poem.benchmark.estimate import cell_seconds, measure_pace, training_seconds
 from sb3_poem.benchmark.models import ModelLibrary, Say, locked, try_lock
-from sb3_poem.benchmark.results import Reference
 from sb3_poem.benchmark.store import Store
 from sb3_poem.benchmark.suites import (
     Budget,
@@ -211,23 +210,22 @@ def export_model(cells: Sequence[Cell], library: ModelLibrary, store: Store, fol
     pretrained folder, with how it was trained and what it earns on its card.
     """
     records = {record.key: record for record in store.records()}
-    [known] = [records[cell.key] for cell in cells if cell.definition.rule is None]
-    reference, limits = Reference("known-task", (known,)), AnswerLimits(**known.result["limits"])
+    found = {cell.definition.rule: records[cell.key] for cell in cells}
+    known = found.pop(None)
+    limits, rates = AnswerLimits(**known.result["limits"]), "task_success_rates"
     adaptations = []
-    for cell in cells:
-        if cell.definition.rule is None:
-            continue
-        result = records[cell.key].result
+    for rule, record in found.items():
+        result = record.result
         figures = {
-            "inference": str(cell.definition.rule).lower(),
+            "inference": str(rule).lower(),
             "queries": result["queries"],
             "mean_return": np.mean(result["task_returns"], axis=0).tolist(),
             "limit": [limits.after(k) for k in result["queries"]],
-            "known_task_return": float(reference.known[0]),
+            "known_task_return": float(np.mean(known.result["task_returns"])),
         }
-        if reference.success_rate is not None:
-            figures["success_rate"] = np.mean(result["task_success_rates"], axis=0).tolist()
-            figures["known_task_success_rate"] = reference.success_rate
+        if rates in known.result:
+            figures["success_rate"] = np.mean(result[rates], axis=0).tolist()
+            figures["known_task_success_rate"] = float(np.mean(known.result[rates]))
         adaptations.append(figures)
     training = known.provenance["model"]
     order = {name: known.result[name] for name in ("preference_accuracy", "kendall_tau")}

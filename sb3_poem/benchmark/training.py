@@ -220,4 +220,4 @@ if __name__ == "__main__":
     end_with_parent(int(sys.argv[1]))
     with timed(Path(sys.argv[2])):
         del sys.argv[1:3]
-        runpy.run_module("sb3_poem.cli", run_name="__main__")
+        runpy.run_module("sb3_poem", run_name="__main__")

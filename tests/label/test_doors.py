@@ -465,7 +465,7 @@ def test_the_list_of_processes_does_not_show_the_password(tmp_path: Path) -> Non
     command = [
         sys.executable,
         "-m",
-        "sb3_poem.cli",
+        "sb3_poem",
         "label",
         "--model",
         "PointGoal",
