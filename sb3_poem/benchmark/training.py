@@ -55,7 +55,7 @@ class FamilyFacts:
 
 @cache
 def family_facts(name: str) -> FamilyFacts:
-    """Look at a family: an id, or AntGoal for poem/AntGoal-v0."""
+    """Of an id, or of AntGoal for poem/AntGoal-v0."""
     env_id = family_id(name)
     try:
         with contextlib.closing(vectorised(gym.make(env_id))) as env:
@@ -118,9 +118,8 @@ def training_plan(key: ModelKey) -> TrainingPlan:
     epoch_steps = rollouts * facts.horizon
     per_epoch = int(hyperparameters.get("gradient_steps", 1000))
     updates = -(-timesteps // epoch_steps) * (epoch_steps if per_epoch < 0 else per_epoch)
-    return TrainingPlan(
-        variant.algorithm, hyperparameters, changes, timesteps, int(epoch_steps), updates
-    )
+    steps = (timesteps, int(epoch_steps), updates)
+    return TrainingPlan(variant.algorithm, hyperparameters, changes, *steps)
 
 
 def train_arguments(key: ModelKey, plan: TrainingPlan, packages: Sequence[str] = ()) -> list[str]:
@@ -139,9 +138,8 @@ def train_arguments(key: ModelKey, plan: TrainingPlan, packages: Sequence[str] =
 def run_training(
     arguments: list[str], save_steps: int, folder: Path, lock: int, device: str, num_threads: int
 ) -> None:
-    """Train, or go on with a training, in a child process, with the arguments of
-    :func:`train_arguments`; it inherits a lock's file descriptor: nobody else trains while it still
-    ends.
+    """Train, or go on with a training, in a child process. It inherits a lock's file descriptor:
+    nobody else trains while it still ends.
     """
     session = folder / SESSIONS / f"{len(list(folder.glob(f'{SESSIONS}/*.json'))) + 1}.json"
     command = [sys.executable, "-m", "sb3_poem.benchmark.training", str(os.getpid()), str(session)]
@@ -173,10 +171,9 @@ def run_training(
 
 
 def end_with_parent(parent: int) -> None:
-    """Have the system kill this process when its parent, which may be gone already, is gone."""
-    if sys.platform == "linux":
-        with contextlib.suppress(OSError, AttributeError):
-            ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    """Have Linux kill this process when its parent, which may be gone already, is gone."""
+    with contextlib.suppress(AttributeError):  # elsewhere
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         sys.exit("the benchmark that started this training is gone")
 
@@ -193,14 +190,13 @@ def timed(session: Path) -> Iterator[None]:
         times = {"seconds": time.monotonic() - started, "cpu_seconds": sum(os.times()[:4])}
         write_json_atomically(session, times)
 
-    def last_checkpoint() -> float:
-        files = session.parents[1].glob(f"*/*/{CHECKPOINT}")
-        return max((file.stat().st_mtime for file in files), default=0.0)
+    def checkpoints() -> list[float]:
+        return [file.stat().st_mtime for file in session.parents[1].glob(f"*/*/{CHECKPOINT}")]
 
     def look() -> None:
-        seen = last_checkpoint()
+        seen = checkpoints()
         while not over.wait(LOOK_SECONDS):
-            if (saved := last_checkpoint()) > seen:
+            if (saved := checkpoints()) != seen:
                 seen = saved
                 note()
 
