@@ -71,9 +71,7 @@ def make_oracle_factory(spec: OracleSpec) -> Callable[..., TaskOracle]:
 
 
 def _episode_seed(cell: Cell) -> int:
-    """Task i takes what follows it by i, so that seeds lie further apart than there are tasks; 0
-    shares nothing with 1.
-    """
+    """Task i takes what follows it by i; seeds lie further apart than there are tasks."""
     return cell.budget.task_seed + SEED_STRIDE * cell.seed
 
 

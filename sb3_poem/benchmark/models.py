@@ -45,9 +45,8 @@ Say = Callable[[str], None]
 
 @contextlib.contextmanager
 def locked(path: Path, on_wait: Callable[[], object] = lambda: None) -> Iterator[int]:
-    """Hold a lock, after waiting (``on_wait`` is called once before) for whoever holds it. The
-    system lets go of it when its holder dies, however it dies. The context's value is the file's
-    descriptor: a child process that inherits it holds the lock as well.
+    """Hold a lock, at the latest until this process dies; ``on_wait`` is called if it is another's.
+    The value is the file's descriptor: a child process that inherits it holds the lock as well.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a") as file:

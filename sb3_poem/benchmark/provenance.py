@@ -23,9 +23,8 @@ def provenance() -> dict[str, Any]:
 
 
 def commit() -> str | None:
-    """The checkout's commit, with a plus sign if the code was changed since; None where this is no
-    checkout. A copy of the tree without its repository, as in a container, may name it by the
-    environment variable ``SB3_POEM_COMMIT``.
+    """The checkout's commit, with a plus sign if the code was changed since; None elsewhere. A copy
+    of the tree without its repository may name it by the environment variable ``SB3_POEM_COMMIT``.
     """
     if COMMIT_VARIABLE in os.environ:
         return os.environ[COMMIT_VARIABLE]
@@ -44,9 +43,7 @@ def versions() -> dict[str, str]:
 
 
 def machine() -> str:
-    """The processor by what it can do: cores that this process may use, architecture, vector
-    instructions; and the GPU.
-    """
+    """What the processor can do: usable cores, architecture, vector instructions; and the GPU."""
     import torch as th
 
     cpuinfo = Path("/proc/cpuinfo")

@@ -1,9 +1,7 @@
 """Runs cells as tasks of Ray, on one machine or many, by the same code as the default backend.
 
-Models come first, each a task that trains it; then the cells. Tasks hand their records to this
-process, which alone writes the store. Trainings go on from their checkpoints in the folder of runs,
-which all machines must share: so a lost worker's task is tried again where it stood, and the same
-command resumes a whole experiment.
+Tasks hand their records to this process, which alone writes the store. A lost worker's training is
+tried again from its checkpoint, in the folder of runs that all machines share.
 """
 
 import importlib

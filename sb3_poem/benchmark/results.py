@@ -32,9 +32,7 @@ BOOTSTRAP_SAMPLES = 2000
 
 @dataclass(frozen=True)
 class Condition:
-    """What must be equal for cells to stand in one table (of the budget all but the numbers of
-    answers).
-    """
+    """What must be equal for cells to stand in one table."""
 
     env_id: str
     budget: Budget
@@ -93,10 +91,7 @@ class _Measured:
 
 @dataclass(frozen=True, eq=False)
 class Series(_Measured):
-    """One method under one condition and one oracle, over seeds.
-
-    :param snapshot: The share of the training after which; None: all.
-    """
+    """One method under one condition and oracle, after a share of the training (None: all)."""
 
     oracle: OracleSpec
     snapshot: float | None
@@ -130,15 +125,12 @@ class Reference(_Measured):
         return self.returns.mean(axis=1)
 
     def limits(self, queries: int, oracle: OracleSpec) -> np.ndarray | None:
-        """(n_seeds,): the most that so many answers of this oracle allow with these policies; None
-        where it was not measured.
-        """
-        results = [record.result for record in self.records]
-        if any("limits" not in result for result in results):
+        """(n_seeds,): the most that so many answers of this oracle allow; None if not measured."""
+        found: list[Any] = [record.result.get("limits") for record in self.records]
+        if None in found:
             return None
         noise = make_oracle_factory(oracle)().noise_model
-        limits = [AnswerLimits(**result["limits"]) for result in results]
-        return np.array([one.after(queries, noise) for one in limits])
+        return np.array([AnswerLimits(**one).after(queries, noise) for one in found])
 
 
 class Selection:
@@ -189,7 +181,7 @@ class Selection:
     def _cells(self, entry: Entry, condition: Condition) -> Iterator[tuple[Cell, Record]]:
         records = self._found[condition]
         shares = sorted({record.identity["snapshot"] for record in records} - {None})
-        what = {"budget": condition.budget, "training": condition.training}
+        what: dict[str, Any] = {"budget": condition.budget, "training": condition.training}
         for seed in sorted({record.seed for record in records}):
             base = Cell(condition.env_id, "", seed, **what, revision=condition.revision)
             for cell in self.suite.entry_cells(entry, base, shares):
@@ -206,9 +198,9 @@ def _kinds(record: Record) -> list[tuple[Any, ...]]:
 
 @dataclass(frozen=True)
 class Summary:
-    """What several seeds earned: the mean of their mean returns, its deviation (n - 1), and the
-    interquartile mean over seeds and tasks with its :func:`interval` (both None for one seed); and
-    the standard error over tasks of their means over seeds (None for one task).
+    """What several seeds earned: mean and deviation (n - 1) of their mean returns, and the
+    interquartile mean over seeds and tasks with its :func:`interval` (None for one seed); and the
+    standard error over tasks of their means over seeds (None for one task).
     """
 
     n_seeds: int

@@ -37,7 +37,7 @@ class Plan:
     skipped: list[tuple[Cell, str]] = field(default_factory=list)
 
     def __str__(self) -> str:
-        done, todo, skipped = map(len, (self.done, self.todo, self.skipped))
+        done, todo, skipped = len(self.done), len(self.todo), len(self.skipped)
         return f"{done} cells done, {todo} to do, {skipped} not possible"
 
     @property
@@ -196,9 +196,7 @@ def summary(result: dict) -> str:
 
 
 def export_model(cells: Sequence[Cell], library: ModelLibrary, store: Store, folder: Path) -> None:
-    """Write the model of finished cells as a pretrained folder, with how it was trained and what it
-    earns on its card.
-    """
+    """Write the model of finished cells as a pretrained folder, with what it earns on its card."""
     records = {record.key: record for record in store.records()}
     found = {cell.definition.rule: records[cell.key] for cell in cells}
     known = found.pop(None)

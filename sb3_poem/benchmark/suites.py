@@ -64,9 +64,7 @@ FILE = "file "
 
 @dataclass(frozen=True)
 class OracleSpec:
-    """Who answers: "return", "boltzmann" with its beta (None is the paper's), or "mistake" with its
-    rate.
-    """
+    """Who answers: "return", "boltzmann" with a beta (None: the paper's), "mistake" with a rate."""
 
     kind: str = "return"
     value: float | None = None
@@ -98,9 +96,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class Training:
-    """What differs from the hyperparameter files, for all models of a run: environment steps, and
-    hyperparameters, sorted by name.
-    """
+    """What differs from the hyperparameter files, for all models of a run; sorted by name."""
 
     timesteps: int | None = None
     hyperparameters: tuple[tuple[str, Any], ...] = ()

@@ -27,14 +27,13 @@ QUERIES = (1, 5, 10)
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """A method, or a yardstick, after some number of answers; what CSV and JSON hold. For the
-    figures see :class:`Summary`.
+    """A method, or a yardstick, after some number of answers; what CSV and JSON hold.
 
-    :param kind: "method", "limit", "known", or "difference": what ``method`` earns more than the
-        method ``against``, see :class:`Comparison`.
-    :param queries: After how many answers; None for "known".
-    :param snapshot: The share of the training after which; None: all.
-    :param samples: Environment steps of the training, mean over seeds.
+    :param kind: "method", "limit", "known", or "difference": what ``method`` earns more than
+        ``against``, see :class:`Comparison`
+    :param queries: After how many answers; None for "known"
+    :param snapshot: The share of the training after which; None: all
+    :param samples: Environment steps of the training, mean over seeds
     """
 
     suite: str
@@ -251,9 +250,7 @@ def _over_seeds(values: np.ndarray) -> dict[str, Any]:
 
 
 def _comparison(entry: Entry, rows: Sequence[Row]) -> Table:
-    """Methods against numbers of answers: mean and deviation, interquartile mean and interval (or
-    the standard error over tasks), the paper's figure.
-    """
+    """Methods against numbers of answers: what they earn, its spread, the paper's figure."""
     queries = [k for k in entry.shown if k in entry.record_at]
     has_paper = any(row.paper_mean is not None for row in rows)
     beside, also = (

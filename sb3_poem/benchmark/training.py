@@ -1,8 +1,5 @@
 """How a family's models are trained, and the training itself: ``sb3-poem train`` as a child of the
-benchmark (``python -m sb3_poem.benchmark.training PARENT SESSION train ...``).
-
-The child ends with its parent, so that a benchmark that was killed leaves no training behind, and
-notes how long it took.
+benchmark, which ends with its parent and notes how long it took.
 """
 
 import contextlib
@@ -73,8 +70,8 @@ def family_facts(name: str) -> FamilyFacts:
 
 @dataclass(frozen=True)
 class TrainingPlan:
-    """A training: all that differs from the algorithm's defaults, the part of it that differs from
-    the hyperparameter file, environment steps in all and of an epoch, and gradient steps.
+    """A training: all that differs from the algorithm's defaults, what of it differs from the file,
+    environment steps in all and of an epoch, and gradient steps.
     """
 
     algorithm: str
@@ -180,9 +177,8 @@ def end_with_parent(parent: int) -> None:
 
 @contextlib.contextmanager
 def timed(session: Path) -> Iterator[None]:
-    """Write to a file how long the training took, by the clock and of the processor (all threads):
-    at its end, and at each new checkpoint, since what comes after the last is lost with a killed
-    process.
+    """Write to a file how long the training took, by the clock and of the processor: at each new
+    checkpoint, as what comes after the last is lost with a killed process, and at its end.
     """
     started = time.monotonic()
 

@@ -1,7 +1,4 @@
-"""The command line, ``sb3-poem``: train, enjoy, record-video, adapt, models, label and benchmark.
-
-What a command needs is imported when it runs.
-"""
+"""The command line, ``sb3-poem``. What a command needs is imported when it runs."""
 
 import argparse
 import os

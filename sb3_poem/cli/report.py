@@ -32,8 +32,7 @@ def write_report(
     json_file: Path | None,
     plot_file: Path | None,
 ) -> None:
-    """Print the table of what adapting a model earned, and write what was asked for: every task's
-    return after every answer, limits, and how it came about; and a plot. Without ``known`` it was
+    """Print the table of what adapting earned, and write JSON and plot; without ``known`` it was
     interrupted.
     """
     console, limits, best = Console(), None, None

@@ -92,9 +92,7 @@ class Subject:
             return known_task_return(*about, selection_episodes=selection, limits=limits)
 
     def make_env(self, render_mode: str | None, show_task: bool) -> DummyVecEnv:
-        """A single environment with the first task, which is drawn too if it is shown; refused if
-        it cannot be drawn so.
-        """
+        """A single environment with the first task, which is drawn too if it is shown."""
         options = {**self.env_kwargs, "render_task": True} if show_task else self.env_kwargs
         env = DummyVecEnv([partial(make_shown_env, self.env_id, render_mode, **options)])
         FamilyView(env).set_tasks(self.tasks[:1])

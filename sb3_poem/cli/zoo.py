@@ -33,10 +33,7 @@ DEFAULTS = {
     "enjoy": ["--folder", "logs"],
 }
 TRAIN_EXAMPLE = "example: sb3-poem train --env poem/PointGoal-v0 -P"
-RESUME_HELP = (
-    "--resume: go on with the last run of the same algorithm, environment and seed, if it did not "
-    "finish"
-)
+RESUME = "--resume: go on with the last run of this algorithm, environment and seed, if unfinished"
 
 
 def register_algorithms() -> None:
@@ -95,9 +92,8 @@ def check_arguments(given: argparse.Namespace) -> None:
 
 
 def resumed(given: argparse.Namespace, arguments: Sequence[str]) -> list[str] | None:
-    """Replace ``--resume`` in the arguments of ``train`` by what it means: ``-i CHECKPOINT`` of the
-    last run of the same algorithm, environment and seed, or nothing, and a word about it, where
-    none has left a checkpoint. None if that run has finished already.
+    """Replace ``--resume`` by ``-i CHECKPOINT`` of the last run of the same algorithm, environment
+    and seed, or by nothing where none has left one; None if that run has finished already.
     """
     if given.trained_agent:
         either = "leave out either --resume or -i/--trained-agent"
@@ -137,9 +133,7 @@ def is_complete(model: Path) -> bool:
 
 
 def last_run(folder: Path, env_name: str, seed: int) -> Path | None:
-    """The newest run in an algorithm's folder that can be continued, or is done, of an environment
-    (with - in place of /), and unless it is negative of a seed.
-    """
+    """The newest run in an algorithm's folder that is done or can go on; of a seed, if not -1."""
 
     def number(run: Path) -> int:
         return int(run.name.removeprefix(env_name).split("_")[1])
@@ -165,8 +159,7 @@ def run_zoo(command: str, arguments: Sequence[str]) -> None:
     if not trains and not has_display() and not asks_help and "--no-render" not in arguments:
         raise OSError("there is no display to draw on: add --no-render")
     if asks_help:
-        print(f"Defaults here: {' '.join(DEFAULTS[command])}")
-        print(f"{RESUME_HELP}\n" if trains else "")
+        print(f"Defaults here: {' '.join(DEFAULTS[command])}\n{RESUME * trains}\n")
     given = [*DEFAULTS[command], *arguments]
     if trains and "--resume" in arguments:
         if (continued := resumed(parse(command, given), given)) is None:
@@ -180,10 +173,11 @@ def run_zoo(command: str, arguments: Sequence[str]) -> None:
     try:
         zoo_train.train() if trains else zoo_enjoy.enjoy()
     except TrainingInterrupted as stop:
+        message, is_saved = stop.args
         again = "the same command begins again"
-        if stop.resumable:
+        if is_saved:
             again = f"go on with: {resume_command(arguments)}"
-        raise KeyboardInterrupt(f"{stop}; {again}") from None
+        raise KeyboardInterrupt(f"{message}; {again}") from None
     except AssertionError as error:
         # rl_zoo3 asserts on what the user gave; an assertion without words is a defect.
         if not str(error):

@@ -425,7 +425,7 @@ def test_the_printed_links_host_can_be_reached(host: str) -> None:
         ([], "", "SB3_POEM_AUTH must have the form USER:PASSWORD"),
         (["--auth", "nobody"], f"ann:{PASSWORD}", "--auth must have the form USER:PASSWORD"),
         (["--instructions", "missing"], None, "--instructions missing: must be a text in UTF-8"),
-        (["--instructions", "empty"], None, "--instructions empty: must be a text or Markdown"),
+        (["--instructions", "empty"], None, "--instructions empty: must be a text, but is empty"),
         (["--instructions", "picture"], None, "--instructions picture: must be a text in UTF-8"),
     ],
 )
