@@ -1,9 +1,4 @@
-"""``make run``: the whole of it once, with the commands that do it.
-
-Meta-trains an agent for PointGoal from nothing and adapts it to 30 unseen tasks by ten preference
-queries each, then does the same adaptation with the HalfCheetahVel model that ships with the
-package.
-"""
+"""``make run``: the whole of it once, with the commands that do it."""
 
 import argparse
 import shlex

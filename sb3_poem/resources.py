@@ -25,7 +25,7 @@ def config_file(algorithm: str) -> Path:
     """
     files = {file.stem: file for file in sorted(shipped_folder("zoo_configs").glob("*.yml"))}
     if algorithm not in files:
-        names = ", ".join(files) or "none"
+        names = ", ".join(files)
         raise FileNotFoundError(f"No hyperparameters ship for {algorithm!r}; there are: {names}")
     return files[algorithm]
 
@@ -64,7 +64,7 @@ def pretrained_folder(name: str) -> Path:
     if name not in names:
         close = difflib.get_close_matches(name, names, n=1)
         hint = f" Did you mean {close[0]!r}?" if close else ""
-        known = ", ".join(names) or "none"
+        known = ", ".join(names)
         raise FileNotFoundError(f"No model {name!r} is shipped; there are: {known}.{hint}")
     return shipped_folder("pretrained") / name
 

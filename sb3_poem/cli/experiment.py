@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
 from typing import Any
+from unittest import mock
 
 import gymnasium as gym
 import optuna
@@ -211,11 +212,10 @@ class PoemExperiment(FamilyExperiment):
                 study.enqueue_trial(entry_params(self.algo, self._hyperparams))
             return study
 
-        optuna.create_study = create_with_entry  # rl_zoo3 has no place for it
-        try:
+        with mock.patch.object(
+            optuna, "create_study", create_with_entry
+        ):  # rl_zoo3 has no other place
             super().hyperparameters_optimization()
-        finally:
-            optuna.create_study = create_study
 
     def objective(self, trial: optuna.Trial) -> float:
         """What ``-optimize`` maximises: the return on held-out tasks after the most answers."""

@@ -9,13 +9,13 @@ import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import gymnasium as gym
 import yaml
 from rl_zoo3 import ALGOS
 from rl_zoo3 import enjoy as zoo_enjoy
 from rl_zoo3 import train as zoo_train
-from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import StoreDict
 
@@ -166,12 +166,12 @@ def run_zoo(command: str, arguments: Sequence[str]) -> None:
             return
         given = continued
     check_arguments(parse(command, given))
-    # rl_zoo3's programs read the process's own arguments.
-    own_arguments = sys.argv
-    sys.argv = [f"sb3-poem {command}", *given]
-    zoo_train.ExperimentManager = make_experiment  # type: ignore[assignment,misc]
     try:
-        zoo_train.train() if trains else zoo_enjoy.enjoy()
+        with (  # what rl_zoo3's programs read, and what they make
+            mock.patch.object(sys, "argv", [f"sb3-poem {command}", *given]),
+            mock.patch.object(zoo_train, "ExperimentManager", make_experiment),
+        ):
+            zoo_train.train() if trains else zoo_enjoy.enjoy()
     except TrainingInterrupted as stop:
         message, is_saved = stop.args
         again = "the same command begins again"
@@ -184,7 +184,5 @@ def run_zoo(command: str, arguments: Sequence[str]) -> None:
             raise
         raise ValueError(str(error)) from error
     finally:
-        sys.argv = own_arguments
-        zoo_train.ExperimentManager = ExperimentManager  # type: ignore[misc]
         if trains and asks_help:
             print(f"\n{TRAIN_EXAMPLE}")
