@@ -25,15 +25,6 @@ examples:
   sb3-poem label
 """
 
-BENCHMARK_EXAMPLES = """\
-examples:
-  sb3-poem benchmark run --suite smoke
-  sb3-poem benchmark run --suite table3 --families HalfCheetahVel --models pretrained --list
-  sb3-poem benchmark run --suite shipped --families HalfCheetahVel --export pretrained
-  sb3-poem benchmark report --suite smoke --out results
-  sb3-poem benchmark verify --cell 1f0c9a
-"""
-
 Group = argparse._ActionsContainer
 
 
@@ -51,11 +42,8 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar=known)
     train = "meta-train an agent (rl_zoo3's train, with poem_sac and pearl_sac)"
     commands.add_parser("train", help=train, add_help=False)
-    enjoy = _add_command(
-        commands,
-        "enjoy --model HalfCheetahVel",
-        "watch a trained agent after adaptation (with another --algo: rl_zoo3's enjoy)",
-    )
+    told = "watch a trained agent after adaptation (with another --algo: rl_zoo3's enjoy)"
+    enjoy = _add_command(commands, "enjoy --model HalfCheetahVel", told)
     _add_show_arguments(enjoy)
     _option(enjoy, "-n --n-timesteps", "show so many steps, in whole episodes", _count(1))
     _switch(enjoy, "--no-render", "without a window: only say what the episodes earn")
@@ -68,19 +56,12 @@ def build_parser() -> argparse.ArgumentParser:
     )
     _add_show_arguments(record)
     _file(record, "--out", "the video (.mp4 or .gif)", required=True)
-    adapt = _add_command(
-        commands,
-        "adapt --model HalfCheetahVel --oracle human",
-        "adapt a trained agent to unseen tasks by preference queries, and say what it earns",
-    )
+    told = "adapt a trained agent to unseen tasks by preference queries, and say what it earns"
+    adapt = _add_command(commands, "adapt --model HalfCheetahVel --oracle human", told)
     _add_adapt_arguments(adapt)
     _add_command(commands, "models", "list the trained models that ship")
-    label = _add_command(
-        commands,
-        "label --model HalfCheetahVel --port 8000",
-        "open the page on which people answer; export and replay their answers",
-    )
-    _add_label_arguments(label)
+    told = "open the page on which people answer; export and replay their answers"
+    _add_label_arguments(_add_command(commands, "label --model HalfCheetahVel --port 8000", told))
     _add_benchmark(commands)
     return parser
 
@@ -257,11 +238,8 @@ def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="label_command", metavar="{export,replay}")
     # Of what the page has too, no defaults: they would overwrite what was given before the part.
     own: dict[str, Any] = {"default": argparse.SUPPRESS}
-    export = _add_command(
-        commands,
-        "export --out answers.jsonl answers.parquet",
-        "write all answers as a data set",
-    )
+    example = "export --out answers.jsonl answers.parquet"
+    export = _add_command(commands, example, "write all answers as a data set")
     _file(export, "--store", f"default: {DEFAULT_STORE}", "FOLDER", **own)
     told = "ends in .jsonl or .parquet; with --format minari a data set's name, as answers-v0"
     _file(export, "--out", told, nargs="+", required=True)
@@ -272,11 +250,8 @@ def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
     _switch(export, "--undone", "with answers that were taken back")
     told = "modules that register environments, for --format minari"
     _option(export, "--gym-packages", told, nargs="+", metavar="MODULE", **own)
-    replay = _add_command(
-        commands,
-        "replay --inference paper --json replay.json",
-        "feed recorded answers to a model and a rule, and say how well these foretell them",
-    )
+    told = "feed recorded answers to a model and a rule, and say how well these foretell them"
+    replay = _add_command(commands, "replay --inference paper --json replay.json", told)
     _file(replay, "--store", f"default: {DEFAULT_STORE}", "FOLDER", **own)
     told = "a model's .zip, a pretrained folder, or a shipped model (default: each session's own)"
     _option(replay, "--model", told, **own)
@@ -287,12 +262,8 @@ def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_benchmark(commands: Any) -> None:
-    parser = commands.add_parser(
-        "benchmark",
-        help="run the paper's comparisons and ablations, report them, and run them again",
-        epilog=BENCHMARK_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    told = "run the paper's comparisons and ablations, report them, and run cells again"
+    parser = _add_command(commands, "benchmark run --suite smoke", told)
     parts = parser.add_subparsers(dest="part", required=True, metavar="{run,report,verify}")
     told = "train what is missing, adapt, evaluate; goes on where it was interrupted"
     _add_run_arguments(_add_command(parts, "run --suite smoke", told))

@@ -77,19 +77,15 @@ def _table(
     columns = [Column(name, justify="right") for name in names]
     look: dict[str, Any] = {"caption_justify": "left", "min_width": TABLE_WIDTH}
     table = Table(*columns, title=title, caption=caption, **look)
-
-    def add_row(n: Any, mean: float, error: float, limit: float | None, rate: float | None) -> None:
-        cells = [str(n), f"{mean:.1f}", "" if np.isnan(error) else f"{error:.1f}"]
-        cells += ["" if limit is None else f"{limit:.1f}", "" if rate is None else f"{rate:.2f}"]
-        table.add_row(*cells[: len(names)])
-
     means = (evaluation.record_at, evaluation.mean_returns, standard_errors(evaluation))
     absent = repeat(None)
-    for row in zip(*means, limits or absent, absent if rates is None else rates, strict=False):
-        add_row(*row)
+    rows = list(zip(*means, limits or absent, absent if rates is None else rates, strict=False))
     if known is not None:
-        table.add_section()
-        add_row("task known", known.mean_return, np.nan, None, known.success_rate)
+        rows.append(("task known", known.mean_return, np.nan, None, known.success_rate))
+    for n, mean, error, limit, rate in rows:
+        cells = [str(n), f"{mean:.1f}", "" if np.isnan(error) else f"{error:.1f}"]
+        cells += ["" if limit is None else f"{limit:.1f}", "" if rate is None else f"{rate:.2f}"]
+        table.add_row(*cells[: len(names)], end_section=n == evaluation.record_at[-1])
     return table
 
 
