@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from sb3_poem.benchmark.methods import INFERENCE_LABELS, METHODS
-from sb3_poem.benchmark.results import Condition, Reference, Selection, Series
+from sb3_poem.benchmark.results import Condition, Selection, Series
 from sb3_poem.benchmark.suites import Entry, OracleSpec
 
 PANEL_WIDTH, PANEL_HEIGHT = 4.2, 3.0
@@ -73,13 +73,13 @@ def _queries_figure(
     return _finish(figure, f"{entry.title}, {oracle.label}")
 
 
-def _draw_yardsticks(axes: Axes, reference: Reference, entry: Entry, oracle: OracleSpec) -> None:
+def _draw_yardsticks(axes: Axes, reference: Series, entry: Entry, oracle: OracleSpec) -> None:
     measured = [reference.limits(k, oracle) for k in entry.record_at]
     limits = [np.nan if values is None else float(values.mean()) for values in measured]
     looks: dict[str, Any] = {"color": "0.25", "linestyle": "--", "label": "limit (POEM's policies)"}
     axes.plot(entry.record_at, limits, linewidth=1.2, **looks)
     looks = {"color": "0.5", "linestyle": ":", "label": "task known (POEM's policies)"}
-    axes.axhline(float(reference.known.mean()), linewidth=1.2, **looks)
+    axes.axhline(float(reference.returns.mean(axis=1).mean()), linewidth=1.2, **looks)
 
 
 def _samples_figure(

@@ -65,11 +65,15 @@ class Condition:
 
 
 @dataclass(frozen=True, eq=False)
-class _Measured:
-    """A method's records, one a seed."""
+class Series:
+    """One method's records, one a seed, under one condition and oracle, after a share of the
+    training (None: all).
+    """
 
     method: str
-    records: tuple[Record, ...]
+    records: list[Record]
+    oracle: OracleSpec
+    snapshot: float | None
 
     @property
     def label(self) -> str:
@@ -87,14 +91,6 @@ class _Measured:
             return None
         rates = np.array([record.result["task_success_rates"] for record in self.records])
         return rates.mean(axis=(0, 1))
-
-
-@dataclass(frozen=True, eq=False)
-class Series(_Measured):
-    """One method under one condition and oracle, after a share of the training (None: all)."""
-
-    oracle: OracleSpec
-    snapshot: float | None
 
     @property
     def queries(self) -> tuple[int, ...]:
@@ -114,18 +110,8 @@ class Series(_Measured):
         common, one, two = np.intersect1d(mine, theirs, return_indices=True)
         return compare(self.at(queries)[one], other.at(queries)[two]) if len(common) else None
 
-
-@dataclass(frozen=True, eq=False)
-class Reference(_Measured):
-    """What the policies of one kind of model could earn."""
-
-    @property
-    def known(self) -> np.ndarray:
-        """(n_seeds,) mean returns if the task were known."""
-        return self.returns.mean(axis=1)
-
     def limits(self, queries: int, oracle: OracleSpec) -> np.ndarray | None:
-        """(n_seeds,): the most that so many answers of this oracle allow; None if not measured."""
+        """(n_seeds,): the most that so many answers of an oracle allow; None if not measured."""
         found: list[Any] = [record.result.get("limits") for record in self.records]
         if None in found:
             return None
@@ -165,18 +151,12 @@ class Selection:
         found: dict[tuple[str, OracleSpec, float | None], list[Record]] = {}
         for cell, record in self._cells(entry, condition):
             found.setdefault((cell.method, cell.oracle, cell.snapshot), []).append(record)
-        series = [
-            Series(name, tuple(records), oracle, snapshot)
-            for (name, oracle, snapshot), records in found.items()
-        ]
+        series = [Series(name, records, *about) for (name, *about), records in found.items()]
         return sorted(series, key=lambda one: entry.methods.index(one.method))
 
-    def references(self, condition: Condition) -> list[Reference]:
+    def references(self, condition: Condition) -> list[Series]:
         """What the models' policies could earn under a condition, in the order of the suite."""
-        found: dict[str, list[Record]] = {name: [] for name in self.suite.references}
-        for cell, record in self._cells(Entry("", "", self.suite.references), condition):
-            found[cell.method].append(record)
-        return [Reference(method, tuple(records)) for method, records in found.items() if records]
+        return self.series(Entry("references", "", self.suite.references), condition)
 
     def _cells(self, entry: Entry, condition: Condition) -> Iterator[tuple[Cell, Record]]:
         records = self._found[condition]

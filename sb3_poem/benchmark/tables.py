@@ -225,8 +225,9 @@ def _rows(
             if measured is not None:
                 values = _over_seeds(measured)
                 yield Row(**of, label=limit, kind="limit", queries=queries, **values)
-        values = {**_over_seeds(reference.known), "success_rate": reference.success_rates}
-        yield Row(**of, label=reference.label, kind="known", **values)
+        known = _over_seeds(reference.returns.mean(axis=1))
+        rate = reference.success_rates
+        yield Row(**of, label=reference.label, kind="known", **known, success_rate=rate)
 
 
 def _paired(place: dict[str, Any], entry: Entry, found: dict[str, Series]) -> Iterator[Row]:

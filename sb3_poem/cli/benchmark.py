@@ -7,14 +7,7 @@ from os.path import abspath
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sb3_poem.benchmark.suites import (
-    SUITES,
-    Budget,
-    Training,
-    family_id,
-    family_label,
-    hashable,
-)
+from sb3_poem.benchmark.suites import SUITES, Budget, Training, family_id, family_label, hashable
 from sb3_poem.cli.needs import check_writable, import_packages, parse_pairs
 
 if TYPE_CHECKING:
@@ -101,11 +94,8 @@ def _report(arguments: argparse.Namespace) -> int:
 
     if arguments.out is not None:
         check_writable(arguments.out)
-    store = Store(arguments.store, create=False)
-    families, seeds = arguments.families, arguments.seeds
-    text, files = make_report(
-        store, arguments.suite, families, arguments.format, arguments.out, seeds
-    )
+    store, what = Store(arguments.store, create=False), (arguments.suite, arguments.families)
+    text, files = make_report(store, *what, arguments.format, arguments.out, arguments.seeds)
     if arguments.out is None:
         print(text)
     for file in files:
@@ -146,13 +136,11 @@ def _library(arguments: argparse.Namespace, device: str, num_threads: int) -> "M
 
 
 def _parse_params(pairs: list[str]) -> tuple[tuple[str, object], ...]:
-    values = []
-    for name, value in sorted(parse_pairs("--params", pairs).items()):
-        try:
-            values.append((name, hashable(value)))
-        except ValueError as error:
-            raise ValueError(f"--params {name}: {error}") from error
-    return tuple(values)
+    params = parse_pairs("--params", pairs)
+    try:
+        return tuple((name, hashable(params[name])) for name in sorted(params))
+    except ValueError as error:
+        raise ValueError(f"--params {' '.join(pairs)}: {error}") from error
 
 
 def _parse_named(text: str) -> tuple[str, str, int, str]:
