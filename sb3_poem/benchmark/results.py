@@ -151,7 +151,10 @@ class Selection:
         found: dict[tuple[str, OracleSpec, float | None], list[Record]] = {}
         for cell, record in self._cells(entry, condition):
             found.setdefault((cell.method, cell.oracle, cell.snapshot), []).append(record)
-        series = [Series(name, records, *about) for (name, *about), records in found.items()]
+        series = [
+            Series(method, some, oracle, snapshot)
+            for (method, oracle, snapshot), some in found.items()
+        ]
         return sorted(series, key=lambda one: entry.methods.index(one.method))
 
     def references(self, condition: Condition) -> list[Series]:

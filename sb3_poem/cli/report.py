@@ -78,8 +78,10 @@ def _table(
     look: dict[str, Any] = {"caption_justify": "left", "min_width": TABLE_WIDTH}
     table = Table(*columns, title=title, caption=caption, **look)
     means = (evaluation.record_at, evaluation.mean_returns, standard_errors(evaluation))
-    absent = repeat(None)
-    rows = list(zip(*means, limits or absent, absent if rates is None else rates, strict=False))
+    absent: Any = repeat(None)
+    rows: list[tuple[Any, ...]] = list(
+        zip(*means, limits or absent, absent if rates is None else rates, strict=False)
+    )
     if known is not None:
         rows.append(("task known", known.mean_return, np.nan, None, known.success_rate))
     for n, mean, error, limit, rate in rows:
