@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Sequence
-from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -77,11 +76,10 @@ def _table(
     columns = [Column(name, justify="right") for name in names]
     look: dict[str, Any] = {"caption_justify": "left", "min_width": TABLE_WIDTH}
     table = Table(*columns, title=title, caption=caption, **look)
+    missing: Any = [None] * len(evaluation.record_at)
     means = (evaluation.record_at, evaluation.mean_returns, standard_errors(evaluation))
-    absent: Any = repeat(None)
-    rows: list[tuple[Any, ...]] = list(
-        zip(*means, limits or absent, absent if rates is None else rates, strict=False)
-    )
+    beside = (limits or missing, missing if rates is None else rates)
+    rows: list[tuple[Any, ...]] = list(zip(*means, *beside, strict=True))
     if known is not None:
         rows.append(("task known", known.mean_return, np.nan, None, known.success_rate))
     for n, mean, error, limit, rate in rows:
