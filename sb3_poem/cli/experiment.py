@@ -127,9 +127,10 @@ class PoemExperiment(FamilyExperiment):
             raise ValueError(
                 f"{self.config} must hold a mapping of hyperparameters for each environment id"
             ) from error
-        source, custom = f"{self.config}, entry {self.env_name.gym_id!r}", self.custom_hyperparams
-        check_entry(custom or {}, self.algo, "-params")
-        own = {key: value for key, value in hyperparams.items() if key not in (custom or {})}
+        source = f"{self.config}, entry {self.env_name.gym_id!r}"
+        custom = self.custom_hyperparams or {}
+        check_entry(custom, self.algo, "-params")
+        own = {key: value for key, value in hyperparams.items() if key not in custom}
         check_entry(own, self.algo, source)
         for key in ("n_timesteps", "policy"):
             if key not in hyperparams:

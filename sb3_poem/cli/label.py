@@ -11,8 +11,7 @@ from typing import Any
 import gymnasium
 from rich.console import Console
 
-from sb3_poem.cli.needs import check_output, import_packages, parse_pairs
-from sb3_poem.cli.subject import say
+from sb3_poem.cli.needs import check_output, import_packages, parse_pairs, say
 
 SHORTEST_PASSWORD = 12
 AUTH_VARIABLE = "SB3_POEM_AUTH"
@@ -160,6 +159,9 @@ def run_export(arguments: argparse.Namespace) -> None:
 
 def run_replay(arguments: argparse.Namespace) -> None:
     """Feed the recorded answers to a model and a rule."""
+    # A model that rl_zoo3 trained may hold its schedules.
+    import rl_zoo3  # noqa: F401
+
     from sb3_poem.adaptation.state import write_json_atomically
     from sb3_poem.label.replay import replay
     from sb3_poem.loading import load_model

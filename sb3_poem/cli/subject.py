@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_poem.adaptation import AdaptedPolicy, KnownTaskReturn, Trajectory, known_task_return
 from sb3_poem.adaptation.evaluation import evaluation_seed
-from sb3_poem.cli.needs import check_device, import_packages, parse_pairs
+from sb3_poem.cli.needs import check_device, import_packages, parse_pairs, say
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.foreign import environment_of
 from sb3_poem.common.rollouts import rollout_latents
@@ -39,11 +39,6 @@ def describe_task(task: Sequence[float] | np.ndarray) -> str:
 def after(n_answers: int) -> str:
     """When a policy was adapted so far."""
     return f"after {n_answers} answer{'s' * (n_answers != 1)}"
-
-
-def say(text: str) -> None:
-    """Print a line as it is, and at once."""
-    print(text, flush=True)
 
 
 class Subject:
