@@ -61,7 +61,7 @@ def run_with_ray(
                 try:
                     record = ray.get(finished)
                 except ray.exceptions.RayError as error:
-                    failures.append(f"{job}: {error}")
+                    failures.append(f"{job}: {getattr(error, 'cause', error)}")
                     continue
                 if record is not None:
                     store.add(record)
