@@ -34,7 +34,7 @@ run: $(STAMP) rendering
 	$(BIN)/python -m sb3_poem.demo --out $(OUT)
 
 label: $(STAMP) rendering
-	$(BIN)/python -m sb3_poem.cli label
+	$(BIN)/python -m sb3_poem label
 
 # Tutorials are executed, which takes minutes; DOCS_ARGS="-D nb_execution_mode=off" leaves that out.
 docs: $(STAMP) rendering

@@ -22,7 +22,7 @@ COMMANDS: dict[str, list[str]] = {
     "import gymnasium": ["-c", "import gymnasium"],
     "import poem_envs": ["-c", "import poem_envs"],
     "import sb3_poem": ["-c", "import sb3_poem"],
-    "sb3-poem --help": ["-m", "sb3_poem.cli", "--help"],
+    "sb3-poem --help": ["-m", "sb3_poem", "--help"],
     "import stable_baselines3": ["-c", "import stable_baselines3"],
     "from sb3_poem import POEMSAC": ["-c", "from sb3_poem import POEMSAC"],
     "first step of learn": ["-c", FIRST_STEP],

@@ -91,7 +91,7 @@ class Person(threading.Thread):
 def label_server(model: str, *words: str) -> Iterator[tuple[subprocess.Popen[str], str, Path]]:
     """``sb3-poem label`` on loopback: its process, its address, and the folder of its store."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-u", "-m", "sb3_poem.cli", "label", "--model", model]
+        command = [sys.executable, "-u", "-m", "sb3_poem", "label", "--model", model]
         command += ["--port", "0", "--store", folder, *words]
         server = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True

@@ -18,10 +18,9 @@ def is_repository(name: str | Path) -> bool:
 
 
 def download(repository: str) -> Path:
-    """The folder of a model of the Hub, in the Hub's own cache; without a network that of an
+    """The folder of a model ``"user/name"`` in the Hub's own cache; without a network that of an
     earlier download.
 
-    :param repository: ``"user/name"``
     :raises ImportError: if the extra ``[hub]`` is not installed
     :raises FileNotFoundError: if there is no such model, or the Hub cannot be reached
     """
@@ -32,31 +31,30 @@ def download(repository: str) -> Path:
     try:
         folder = Path(client.HfApi().snapshot_download(repository, allow_patterns=list(FILES)))
     except client.errors.RepositoryNotFoundError as error:
+        why = "or it is private: then log in with `hf auth login`, or set HF_TOKEN"
         raise FileNotFoundError(
-            f"{what}, and the Hugging Face Hub has none of that name, or it is private: then log "
-            "in with `hf auth login`, or set HF_TOKEN"
+            f"{what}, and the Hugging Face Hub has none of that name, {why}"
         ) from error
     except (OSError, ValueError, HTTPError) as error:
+        why = _first_line(error)
         raise FileNotFoundError(
-            f"{what}, and none came from the Hugging Face Hub: {_first_line(error)}"
+            f"{what}, and none came from the Hugging Face Hub: {why}"
         ) from error
-    missing = [name for name in FILES[:2] if not (folder / name).is_file()]
-    if missing:
-        raise FileNotFoundError(
-            f"{repository} on the Hugging Face Hub is no model of sb3_poem: it has no {missing[0]}"
-        )
+    for name in FILES[:2]:
+        if not (folder / name).is_file():
+            is_none = f"is no model of sb3_poem: it has no {name}"
+            raise FileNotFoundError(f"{repository} on the Hugging Face Hub {is_none}")
     return folder
 
 
 def upload(repository: str, contents: Mapping[str, bytes], private: bool | None = None) -> str:
-    """Write a model's files to the Hub, in one commit; the repository is made if missing.
+    """Write a model's files to the Hub, in one commit; the repository is made if missing. Returns
+    its address.
 
-    :param repository: ``"user/name"``
     :param contents: Of each of :data:`FILES`
     :param private: Of a repository that is made; None takes the account's default
-    :return: Its address
     :raises ImportError: if the extra ``[hub]`` is not installed
-    :raises ValueError: if the name is none that the Hub takes
+    :raises ValueError: if the name is not ``"user/name"``
     :raises OSError: if the Hub refuses it or cannot be reached
     """
     if not is_repository(repository):
@@ -70,10 +68,8 @@ def upload(repository: str, contents: Mapping[str, bytes], private: bool | None 
         address = api.create_repo(repository, private=private, exist_ok=True)
         api.create_commit(repository, files, commit_message="Upload a model of sb3_poem")
     except (OSError, HTTPError) as error:
-        raise OSError(
-            f"{repository} was not written to the Hugging Face Hub: {_first_line(error)}. "
-            "Writing needs a network and a token: `hf auth login`, or HF_TOKEN"
-        ) from error
+        why = f"{_first_line(error)}. It needs a network and a token: `hf auth login`, or HF_TOKEN"
+        raise OSError(f"{repository} was not written to the Hugging Face Hub: {why}") from error
     return str(address)
 
 

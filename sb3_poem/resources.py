@@ -12,13 +12,9 @@ _PACKAGE = Path(__file__).resolve().parent
 def shipped_folder(name: str) -> Path:
     """The folder of shipped files of that name, ``"zoo_configs"`` or ``"pretrained"``: inside the
     package when it was installed from a wheel, beside it in a checkout.
-
-    :raises FileNotFoundError: if neither place has it, which means a broken installation
     """
-    for root in (_PACKAGE, _PACKAGE.parent):
-        if (root / name).is_dir():
-            return root / name
-    raise FileNotFoundError(f"sb3_poem was installed without its folder {name!r}: install it anew")
+    inside = _PACKAGE / name
+    return inside if inside.is_dir() else _PACKAGE.parent / name
 
 
 def config_file(algorithm: str) -> Path:
@@ -29,7 +25,7 @@ def config_file(algorithm: str) -> Path:
     """
     files = {file.stem: file for file in sorted(shipped_folder("zoo_configs").glob("*.yml"))}
     if algorithm not in files:
-        names = ", ".join(files) or "none"
+        names = ", ".join(files)
         raise FileNotFoundError(f"No hyperparameters ship for {algorithm!r}; there are: {names}")
     return files[algorithm]
 
@@ -68,7 +64,7 @@ def pretrained_folder(name: str) -> Path:
     if name not in names:
         close = difflib.get_close_matches(name, names, n=1)
         hint = f" Did you mean {close[0]!r}?" if close else ""
-        known = ", ".join(names) or "none"
+        known = ", ".join(names)
         raise FileNotFoundError(f"No model {name!r} is shipped; there are: {known}.{hint}")
     return shipped_folder("pretrained") / name
 

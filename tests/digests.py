@@ -111,7 +111,7 @@ def killed_and_resumed() -> str:
         command = [
             sys.executable,
             "-m",
-            "sb3_poem.cli",
+            "sb3_poem",
             "train",
             "--env",
             POINT_GOAL,

@@ -243,7 +243,7 @@ def test_a_model_with_a_schedule_of_rl_zoo3_in_a_process_of_its_own(tmp_path: Pa
         "--episodes",
         "1",
     ]
-    command = [sys.executable, "-m", "sb3_poem.cli", "adapt", *flags]
+    command = [sys.executable, "-m", "sb3_poem", "adapt", *flags]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "task known" in done.stdout

@@ -658,7 +658,7 @@ def test_an_interrupt_of_the_program(tmp_path: Path, whole: dict[str, th.Tensor]
     command = [
         sys.executable,
         "-m",
-        "sb3_poem.cli",
+        "sb3_poem",
         "train",
         "--env",
         "poem/PointGoal-v0",

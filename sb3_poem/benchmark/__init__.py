@@ -1,3 +1,1 @@
-"""The benchmark: the paper's comparisons and ablations as cells of declared suites, kept in one
-store.
-"""
+"""The paper's comparisons and ablations: cells of declared suites, kept in one store."""

@@ -1,7 +1,6 @@
-"""One cell: load the model, adapt, measure, and note everything; and again, to see whether it comes
-to the same.
-"""
+"""One cell: load the model, adapt, measure, and note everything; and verify it."""
 
+import textwrap
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -35,7 +34,7 @@ TIMES = ("seconds", "training_seconds", "training_cpu_seconds")
 
 
 def run_cell(cell: Cell, library: ModelLibrary, say: Say = print) -> Record:
-    """Run one cell. Its model is trained first if it is missing (or a ``TrainingError``)."""
+    """Run one cell. Its model is trained first if it is missing."""
     training = library.ensure(cell.model_key, say)
     th.set_num_threads(library.workplace.num_threads)
     env = make_task_vec_env(cell.env_id, 2 * cell.budget.tasks)
@@ -48,21 +47,22 @@ def run_cell(cell: Cell, library: ModelLibrary, say: Say = print) -> Record:
         result["seconds"] = round(time.perf_counter() - started, 2)
     finally:
         env.close()
-    trained = training if cell.snapshot is None else {**training, "snapshot": cell.snapshot}
     if isinstance(model, MAMLRewardModel):
-        samples, updates = training.get("env_steps", 0), training.get("updates", 0)
+        samples, updates = training["env_steps"], training["updates"]
     else:
-        samples, updates = model.num_timesteps, model._n_updates
-    result |= {"training_samples": int(samples), "updates": int(updates)}
+        samples, updates = int(model.num_timesteps), int(model._n_updates)
+    result |= {"training_samples": samples, "updates": updates}
     result |= {f"training_{name}": training.get(name) for name in ("seconds", "cpu_seconds")}
+    if cell.snapshot is not None:
+        training = {**training, "snapshot": cell.snapshot}
     place = library.workplace
     about = {**provenance(), "device": place.device, "num_threads": place.num_threads}
     which = (cell.key, cell.family, cell.method, cell.seed, cell.identity())
-    return Record(*which, result, {**about, "model": trained})
+    return Record(*which, result, {**about, "model": training})
 
 
 def make_oracle_factory(spec: OracleSpec) -> Callable[..., TaskOracle]:
-    """What makes a task's oracle: a function of ``env``, ``task`` and ``seed``."""
+    """A function of ``env``, ``task`` and ``seed``."""
     if spec.kind == "return":
         return ReturnOracle
     kinds: dict[str, Any] = {"boltzmann": BoltzmannOracle, "mistake": MistakeOracle}
@@ -70,9 +70,7 @@ def make_oracle_factory(spec: OracleSpec) -> Callable[..., TaskOracle]:
 
 
 def _episode_seed(cell: Cell) -> int:
-    """Task i takes what follows it by i, so that seeds lie further apart than there are tasks; 0
-    shares nothing with 1.
-    """
+    """Task i takes what follows it by i; seeds lie further apart than there are tasks."""
     return cell.budget.task_seed + SEED_STRIDE * cell.seed
 
 
@@ -119,9 +117,7 @@ def _measure_adaptation(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) 
 
 
 def _measure_known(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) -> dict[str, Any]:
-    """What the model's policies could earn: returns of the best of them for each task, and the
-    limits.
-    """
+    """Returns of the best of the model's policies for each task, and the limits."""
     budget = cell.budget
     episodes = min(budget.episodes, SELECTION_EPISODES)
     how: dict[str, Any] = {"n_episodes": budget.episodes, "selection_episodes": episodes}
@@ -146,14 +142,12 @@ def _rounded(values: Any) -> Any:
 
 
 def find_record(store: Store, cell_id: str) -> Record:
-    """The finished cell of a key, or of a beginning of one that no other has."""
+    """The finished cell of a key, or of the beginning of one."""
     found = [record for record in store.records() if record.key.startswith(cell_id)]
     if len(found) != 1:
         many = f"is the beginning of {len(found)} keys" if found else "is no cell's key"
-        raise ValueError(
-            f"--cell {cell_id} {many} in {store.path}; `sb3-poem benchmark verify` without --cell "
-            "lists the cells that there are"
-        )
+        lists = "`sb3-poem benchmark verify` without --cell lists them"
+        raise ValueError(f"--cell {cell_id} {many} in {store.path}; {lists}")
     return found[0]
 
 
@@ -162,7 +156,7 @@ def verify_cell(record: Record, library: ModelLibrary, say: Say = print) -> list
     them, times left out. What differs, a line each; nothing if nothing does.
 
     :raises ValueError: If the record is of another revision of the code, its identity does not have
-        its key, or its model is not there.
+        its key, or its model is not there
     """
     if record.identity["revision"] != REVISION:
         raise ValueError(
@@ -171,25 +165,22 @@ def verify_cell(record: Record, library: ModelLibrary, say: Say = print) -> list
         )
     cell = Cell.of_identity(record.method, record.identity)
     if cell.key != record.key:
-        raise ValueError(
-            f"the identity of cell {record.key} has the key {cell.key}: it was changed after the "
-            "cell was run"
-        )
+        changed = "it was changed after the cell was run"
+        raise ValueError(f"the identity of cell {record.key} has the key {cell.key}: {changed}")
     origin, state = library.origin(cell.model_key), library.state(cell.model_key)
     if origin != cell.model or state not in ("handed over", "trained"):
-        there = f"that of {origin!r}, {state}"
         raise ValueError(
             f"cell {record.key} needs the model of {cell.model!r}, but for {cell.model_key} there "
-            f"is {there}: say where it is by --runs, --models or --model"
+            f"is that of {origin!r}, {state}: say where it is by --runs, --models or --model"
         )
     again = run_cell(cell, library, say)
-    lines = [
-        line
-        for name in sorted((record.result.keys() | again.result.keys()) - set(TIMES))
-        for line in _differences(name, record.result.get(name), again.result.get(name))
-    ]
-    if lines:
-        lines += _other_places(record.provenance, again.provenance)
+    kept, found = ({**one.result, **dict.fromkeys(TIMES)} for one in (record, again))
+    lines = list(_differences("", kept, found))
+    if lines:  # other code, versions or machines may be why
+        for name in ("commit", "machine", "device", "num_threads", "versions"):
+            then, now = record.provenance.get(name), again.provenance.get(name)
+            if then != now:
+                lines.append(f"  {name}: {then} then, {now} here")
     return lines
 
 
@@ -198,7 +189,8 @@ def _differences(name: str, kept: Any, found: Any) -> Iterator[str]:
         return
     if isinstance(kept, dict) and isinstance(found, dict):
         for part in sorted(kept.keys() | found.keys()):
-            yield from _differences(f"{name}.{part}", kept.get(part), found.get(part))
+            whole = f"{name}.{part}".lstrip(".")
+            yield from _differences(whole, kept.get(part), found.get(part))
         return
     try:
         one, other = np.array(kept, dtype=np.float64), np.array(found, dtype=np.float64)
@@ -206,7 +198,8 @@ def _differences(name: str, kept: Any, found: Any) -> Iterator[str]:
     except (TypeError, ValueError):  # text
         alike = False
     if not alike:
-        yield f"{name}: the store has {_short(kept)}, and this run {_short(found)}"
+        then, now = (textwrap.shorten(str(one), 200) for one in (kept, found))
+        yield f"{name}: the store has {then}, and this run {now}"
         return
     gaps = np.abs(one - other)
     place = np.unravel_index(np.argmax(gaps), gaps.shape)
@@ -214,15 +207,3 @@ def _differences(name: str, kept: Any, found: Any) -> Iterator[str]:
         f"{name}: {np.count_nonzero(gaps)} of {gaps.size} numbers differ, the most at "
         f"{[int(i) for i in place]}: the store has {one[place]:g}, and this run {other[place]:g}"
     )
-
-
-def _other_places(kept: dict[str, Any], found: dict[str, Any]) -> Iterator[str]:
-    """What may be why: other code, versions or machines."""
-    for name in ("commit", "machine", "device", "num_threads", "versions"):
-        if kept.get(name) != found.get(name):
-            yield f"  {name}: {_short(kept.get(name))} then, {_short(found.get(name))} here"
-
-
-def _short(value: Any, limit: int = 200) -> str:
-    text = str(value)
-    return text if len(text) <= limit else f"{text[:limit]}..."

@@ -13,7 +13,7 @@ from sb3_poem.adaptation.known_task import (
     REFINING_DRAWS,
     REFINING_WIDTHS,
 )
-from sb3_poem.baselines import ANOLE, MAMLReward
+from sb3_poem.baselines import MAMLReward
 from sb3_poem.baselines.fragments import default_fragment_length
 from sb3_poem.benchmark.cells import SELECTION_EPISODES
 from sb3_poem.benchmark.methods import META_ITERATIONS, META_ITERATIONS_OF
@@ -28,9 +28,8 @@ PROCESS_SECONDS = 6.0
 # speed as it does.
 #: Of an iteration of MAML-reward's meta-training
 UPDATES_PER_META_ITERATION = 18
-#: Of what is computed for an answer and the next question, by rule; the others are quick, as
-#: is ANOLE where it asks at random
-UPDATES_PER_ANSWER = {"Bayes": 0.7, "ANOLE": 2.0}
+#: Of what is computed for an answer and the next question, by rule or strategy; others are quick
+UPDATES_PER_ANSWER = {"Bayes": 0.7, "berlekamp": 2.0}
 #: Of the same with ANOLE's greedy strategy, for each step of a fragment
 UPDATES_PER_GREEDY_STEP = 0.65
 # MAML-reward adapts by SAC's gradient steps, which cost as much as the model's own.
@@ -83,14 +82,12 @@ def cell_seconds(cell: Cell, pace: Pace) -> float:
         episodes = latents + (latents + refining) * min(budget.episodes, SELECTION_EPISODES)
         return (episodes + budget.tasks * budget.episodes) * facts.horizon * pace.step
     episodes = budget.tasks * budget.episodes * len(budget.record_at)
-    rule = method.make_rule(**dict(cell.overrides))
     if method.rule != "ANOLE" or method.library:  # else it asks about what there is
         episodes += budget.tasks * 2 * queries
-    updates = UPDATES_PER_ANSWER.get(method.rule, 0.0)
-    if isinstance(rule, ANOLE) and rule.strategy == "greedy":
+    asks = method.options.get("strategy", method.rule)
+    updates = UPDATES_PER_ANSWER.get(asks, 0.0)
+    if asks == "greedy":
         updates = UPDATES_PER_GREEDY_STEP * default_fragment_length(facts.horizon)
-    elif isinstance(rule, ANOLE) and rule.strategy == "random":
-        updates = 0.0
-    elif isinstance(rule, MAMLReward):
-        updates = rule.gradient_steps
+    elif asks == "MAMLReward":
+        updates = MAMLReward(**dict(cell.overrides)).gradient_steps
     return episodes * facts.horizon * pace.step + budget.tasks * queries * updates * pace.update

@@ -1,6 +1,4 @@
-"""Figures of a suite, as pure functions of what the store holds: return against queries, samples
-and tolerance.
-"""
+"""Figures of a suite: return against queries, samples and tolerance."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from sb3_poem.benchmark.methods import INFERENCE_LABELS, METHODS
-from sb3_poem.benchmark.results import Condition, Reference, Selection, Series
+from sb3_poem.benchmark.results import Condition, Selection, Series
 from sb3_poem.benchmark.suites import Entry, OracleSpec
 
 PANEL_WIDTH, PANEL_HEIGHT = 4.2, 3.0
@@ -48,7 +46,8 @@ def suite_figures(selection: Selection) -> dict[str, Figure]:
                 for condition, series in found.items()
                 if (some := [one for one in series if one.oracle == oracle])
             }
-            full = name if len(entry.oracles) == 1 else f"{name}-{_slug(oracle)}"
+            value = "" if oracle.value is None else f"-{oracle.value:g}"
+            full = name if len(entry.oracles) == 1 else f"{name}-{oracle.kind}{value}"
             if mine:
                 figures[f"{full}-queries"] = _queries_figure(entry, oracle, mine, selection)
             if any(one.snapshot is not None for series in mine.values() for one in series):
@@ -74,14 +73,13 @@ def _queries_figure(
     return _finish(figure, f"{entry.title}, {oracle.label}")
 
 
-def _draw_yardsticks(axes: Axes, reference: Reference, entry: Entry, oracle: OracleSpec) -> None:
+def _draw_yardsticks(axes: Axes, reference: Series, entry: Entry, oracle: OracleSpec) -> None:
     measured = [reference.limits(k, oracle) for k in entry.record_at]
     limits = [np.nan if values is None else float(values.mean()) for values in measured]
-    thin: dict[str, Any] = {"linewidth": 1.2}
-    limit = thin | {"color": "0.25", "linestyle": "--", "label": "limit (POEM's policies)"}
-    known = thin | {"color": "0.5", "linestyle": ":", "label": "task known (POEM's policies)"}
-    axes.plot(entry.record_at, limits, **limit)
-    axes.axhline(float(reference.known.mean()), **known)
+    looks: dict[str, Any] = {"color": "0.25", "linestyle": "--", "label": "limit (POEM's policies)"}
+    axes.plot(entry.record_at, limits, linewidth=1.2, **looks)
+    looks = {"color": "0.5", "linestyle": ":", "label": "task known (POEM's policies)"}
+    axes.axhline(float(reference.returns.mean(axis=1).mean()), linewidth=1.2, **looks)
 
 
 def _samples_figure(
@@ -96,9 +94,8 @@ def _samples_figure(
             by_seed = [one.at(last).mean(axis=1) for one in mine]
             style, label = _style(entry, mine[0]), mine[0].label
             if len(mine) == 1 and mine[0].snapshot is None:  # not measured along the training
-                line: dict[str, Any] = {"linestyle": "-.", "linewidth": 1.4}
-                line |= {"color": style["color"], "label": f"{label}, at the end"}
-                axes.axhline(float(by_seed[0].mean()), **line)
+                looks = {"color": style["color"], "label": f"{label}, at the end"}
+                axes.axhline(float(by_seed[0].mean()), linestyle="-.", linewidth=1.4, **looks)
             else:
                 _draw(axes, [one.samples for one in mine], by_seed, label, style)
         axes.set_xlabel("environment steps of the training, thousands")
@@ -109,14 +106,12 @@ def _samples_figure(
 def _tolerance_figure(entry: Entry, found: dict[Condition, list[Series]]) -> Figure:
     figure, panels = _grid(entry, {one: series for one, series in found.items() if series}, True)
     for axes, _, series in panels:
-        for number, queries in enumerate((1, 5, 10)):
-            epsilons = [METHODS[one.method].options.get("epsilon", 0.1) for one in series]
-            if series:
-                style = {"color": f"C{number}", "marker": MARKERS[number]}
-                label = f"{queries} quer{'ies' if queries > 1 else 'y'}"
-                _draw(
-                    axes, epsilons, [one.at(queries).mean(axis=1) for one in series], label, style
-                )
+        epsilons = [METHODS[one.method].options.get("epsilon", 0.1) for one in series]
+        for number, queries in enumerate((1, 5, 10) if series else ()):
+            style = {"color": f"C{number}", "marker": MARKERS[number]}
+            label = f"{queries} quer{'ies' if queries > 1 else 'y'}"
+            by_seed = [one.at(queries).mean(axis=1) for one in series]
+            _draw(axes, epsilons, by_seed, label, style)
         axes.set_xlabel("tolerance epsilon")
     return _finish(figure, entry.title)
 
@@ -164,12 +159,9 @@ def _grid(
             axes.spines[["top", "right"]].set_visible(False)
             if column == 0:
                 axes.set_ylabel("return per episode")
-            some = [
-                one
-                for one in series
-                if (one.oracle.label == detail if by_oracle else one.label.startswith(detail))
-            ]
-            panels.append((axes, condition, some))
+            of_oracle = [one for one in series if one.oracle.label == detail]
+            of_rule = [one for one in series if one.label.startswith(detail)]
+            panels.append((axes, condition, of_oracle if by_oracle else of_rule))
     return figure, panels
 
 
@@ -187,7 +179,3 @@ def _finish(figure: Figure, title: str) -> Figure:
     where: dict[str, Any] = {"loc": "outside lower center", "frameon": False, "fontsize": 8}
     figure.legend(list(entries.values()), list(entries), ncols=columns, **where)
     return figure
-
-
-def _slug(oracle: OracleSpec) -> str:
-    return oracle.kind if oracle.value is None else f"{oracle.kind}-{oracle.value:g}"

@@ -52,10 +52,8 @@ RECORDED: dict[str | None, tuple[str, dict[str, str]]] = {
 
 @dataclass(frozen=True)
 class Variant:
-    """A model to be trained, named as its folder.
-
-    :param hyperparameters: What differs from the entry of ``zoo_configs/<algorithm>.yml``.
-    :param base: The variant that this one is derived from without a training run of its own.
+    """A model to be trained, named as its folder: what differs from the hyperparameters in
+    ``zoo_configs/``, or the variant (``base``) from whose model it is derived without training.
     """
 
     name: str
@@ -68,11 +66,11 @@ class Variant:
 class Method:
     """A row of the tables.
 
-    :param variant: The model that it adapts.
-    :param rule: The rule's name in :mod:`sb3_poem`; None for what the model's policies could earn.
-    :param paper_row: Its row in Table 3 of Xu & Zhu 2025.
-    :param library: Whether it asks about whole rollouts on the new task, two for each question, all
-        made before the first.
+    :param variant: The model that it adapts
+    :param rule: The rule's name in :mod:`sb3_poem`; None for what the model's policies could earn
+    :param paper_row: Its row in Table 3 of Xu & Zhu 2025
+    :param library: It asks about whole rollouts on the new task, two for each question, all made
+        before the first
     """
 
     name: str
@@ -95,14 +93,14 @@ class Method:
         return f"its tasks do not share their dynamics, and {reason}"
 
     def make_rule(self, **changes: Any) -> Rule:
-        """The rule, of a method that has one, with these changes of its options."""
+        """The rule, with these changes of its options."""
         import sb3_poem
 
         rule: Rule = getattr(sb3_poem, self.rule or "")(**{**self.options, **changes})
         return rule
 
     def recorded(self, changes: Mapping[str, Any]) -> dict[str, Any]:
-        """What a cell's identity says of the rule, with these changes of its options."""
+        """What a cell's identity says of the rule, with these changes."""
         kind, words = RECORDED[self.rule]
         asked = {"library": "rollouts"} if self.library else {}
         return {"kind": kind, "options": {**words, **self.options, **changes}, **asked}

@@ -45,9 +45,8 @@ Say = Callable[[str], None]
 
 @contextlib.contextmanager
 def locked(path: Path, on_wait: Callable[[], object] = lambda: None) -> Iterator[int]:
-    """Hold a lock, after waiting (``on_wait`` is called once before) for whoever holds it. The
-    system lets go of it when its holder dies, however it dies. The context's value is the file's
-    descriptor: a child process that inherits it holds the lock as well.
+    """Hold a lock, at the latest until this process dies; ``on_wait`` is called if it is another's.
+    The value is the file's descriptor: a child process that inherits it holds the lock as well.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a") as file:
@@ -70,10 +69,10 @@ class Workplace:
     """Where models are kept, and how they are trained and run. Paths should be absolute where other
     processes take part.
 
-    :param runs: Folder of the trainings.
-    :param models: Folders with models that were handed over, see :meth:`ModelLibrary.given`.
-    :param named: Models that were handed over one by one: family, variant, seed, path.
-    :param packages: Modules that register environments, for processes that train.
+    :param runs: Folder of the trainings
+    :param models: Folders with models that were handed over, see :meth:`ModelLibrary.given`
+    :param named: Models that were handed over one by one: family, variant, seed, path
+    :param packages: Modules that register environments
     """
 
     runs: str
@@ -107,19 +106,20 @@ class ModelLibrary:
             return None
         for family, variant, seed, path in self.workplace.named:
             if (family_id(family), variant, seed) == (key.env_id, key.variant, key.seed):
-                _content(Path(path))
+                if _content(Path(path)) is None:
+                    files = f"neither {CHECKPOINT}, nor {MODEL}, nor {CONFIG}"
+                    raise ValueError(f"{path} holds no model: {files}")
                 return Path(path)
         for folder in map(Path, self.workplace.models):
             pretrained = folder / model_folder(key.env_id)
             place = pretrained / key.variant / f"seed{key.seed}"
             for candidate in (place, place.with_suffix(".zip")):
-                if candidate.is_file() or (candidate.is_dir() and _contents(candidate)):
+                if _content(candidate) is not None:
                     return candidate
             if (pretrained / CONFIG).is_file():
-                config, wanted = read_config(pretrained), VARIANTS[key.variant]
-                own = config["algorithm"] == ALGORITHMS[wanted.algorithm].__name__
-                own_env = {name: config[name] for name in ("env_id", "env_kwargs")}
-                facts = {"seed": None, **config["arguments"], **own_env}
+                config = read_config(pretrained)
+                own = config["algorithm"] == _algorithm(key).__name__
+                facts = {"seed": None, **config["arguments"], **config}
                 if own and not _departures(facts, key):
                     return pretrained
         return None
@@ -135,8 +135,9 @@ class ModelLibrary:
 
     def origin(self, key: ModelKey) -> str:
         """What a model is, or will be, made of, as part of a cell's identity: the file that was
-        handed over; or the hyperparameters, and the revision of the code that trained with them. A
-        ``ValueError`` if there are none, or what there is of it was trained with others.
+        handed over; or the hyperparameters, and the revision of the code that trained with them.
+
+        :raises ValueError: If what there is of it was trained with other hyperparameters
         """
         path = self.given(key)
         if path is not None:
@@ -158,9 +159,7 @@ class ModelLibrary:
         return self.folder(key) / ".lock"
 
     def is_taken(self, key: ModelKey) -> bool:
-        """Whether the model, or one that it is made from, is missing and another process is
-        training it.
-        """
+        """Whether another process is training the model, or one that it is made from."""
         if self.state(key) in ("handed over", "trained"):
             return False
         if key.base is not None and self.is_taken(key.base):
@@ -170,7 +169,9 @@ class ModelLibrary:
 
     def ensure(self, key: ModelKey, say: Say = print) -> dict[str, Any]:
         """Train the model if it is missing, or finish its training (another process that is at it
-        is waited for); how it was trained, JSON-ready. A ``TrainingError`` if that fails.
+        is waited for); how it was trained, JSON-ready.
+
+        :raises TrainingError: If that fails
         """
         path = self.given(key)
         if path is not None:
@@ -190,17 +191,17 @@ class ModelLibrary:
         """A model that :meth:`ensure` has made sure of, or a :class:`MAMLRewardModel`; with its
         replay buffer where that was kept.
 
-        :param env: An environment of its family, which it gets.
+        :param env: An environment of its family, which it gets
         :param snapshot: The share of the training after which to take it; None: all, as of one
-            that was handed over.
-        :raises ValueError: If one that was handed over is another.
+            that was handed over
+        :raises ValueError: If one that was handed over is another
         """
         if key.base is not None:
             model = self.load(key.base, env)
             return MAMLRewardModel(MetaReward.load(self.folder(key) / REWARD, model.policy), model)
-        path, algorithm = self.given(key), ALGORITHMS[VARIANTS[key.variant].algorithm]
+        path, algorithm = self.given(key), _algorithm(key)
         if path is not None:
-            file = _content(path)
+            file = _content(path) or path
         elif snapshot is not None:
             file = self.snapshot_file(key, snapshot)
         else:
@@ -302,9 +303,7 @@ class ModelLibrary:
 
 
 def model_folder(env_id: str) -> str:
-    """The folder of an environment's models: two families of one name, from other packages or of
-    other versions, have two.
-    """
+    """The folder of an environment's models, another for each package and version."""
     return family_label(env_id).replace("/", "-")
 
 
@@ -312,15 +311,14 @@ def _zip_name(env_id: str) -> str:
     return env_id.replace("/", "-") + ".zip"
 
 
-def _contents(folder: Path) -> list[Path]:
-    """What a folder holds that can be loaded: the checkpoint first, for its replay buffer."""
-    return [folder / name for name in (CHECKPOINT, MODEL, CONFIG) if (folder / name).is_file()]
+def _algorithm(key: ModelKey) -> type[PEARLSAC]:
+    return ALGORITHMS[VARIANTS[key.variant].algorithm]
 
 
-def _content(path: Path) -> Path:
-    if path.is_dir() and not _contents(path):
-        raise ValueError(f"{path} holds no model: neither {CHECKPOINT}, nor {MODEL}, nor {CONFIG}")
-    return _contents(path)[0] if path.is_dir() else path
+def _content(path: Path) -> Path | None:
+    """What of a file or folder can be loaded: the checkpoint first, for its replay buffer."""
+    files = [path / name for name in (CHECKPOINT, MODEL, CONFIG)] if path.is_dir() else [path]
+    return next(filter(Path.is_file, files), None)
 
 
 def _departures(found: Mapping[str, Any], key: ModelKey) -> list[str]:
@@ -343,8 +341,8 @@ def _kind(values: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 def _describe_given(path: Path) -> dict[str, Any]:
-    """What is known of a model that was handed over; how it was trained if it says so."""
-    file = _content(path)
+    """What is known of a model that was handed over."""
+    file = _content(path) or path
     info: dict[str, Any] = {"source": "handed over", "name": "/".join(path.parts[-3:])}
     if file.name == CONFIG:
         config = read_config(file.parent)

@@ -4,14 +4,15 @@ import os
 import platform
 import re
 import subprocess
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from poem_envs.vector import available_cores
+from sb3_poem import __version__
 
 CODE = ("sb3_poem", "envs", "zoo_configs", "benchmarks/*.py")
-VERSIONED = ("sb3_poem", "stable_baselines3", "rl_zoo3", "torch", "gymnasium", "mujoco", "numpy")
+VERSIONED = ("stable_baselines3", "rl_zoo3", "torch", "gymnasium", "mujoco", "numpy")
 COMMIT_VARIABLE = "SB3_POEM_COMMIT"
 INSTRUCTION_SETS = ("avx2", "avx512f", "avx512_bf16", "amx_bf16")
 
@@ -22,9 +23,8 @@ def provenance() -> dict[str, Any]:
 
 
 def commit() -> str | None:
-    """The checkout's commit, with a plus sign if the code was changed since; None where this is no
-    checkout. A copy of the tree without its repository, as in a container, may name it by the
-    environment variable ``SB3_POEM_COMMIT``.
+    """The checkout's commit, with a plus sign if the code was changed since; None elsewhere. A copy
+    of the tree without its repository may name it by the environment variable ``SB3_POEM_COMMIT``.
     """
     if COMMIT_VARIABLE in os.environ:
         return os.environ[COMMIT_VARIABLE]
@@ -38,21 +38,12 @@ def commit() -> str | None:
 
 def versions() -> dict[str, str]:
     """Of Python and of the packages that matter for a result."""
-    found = {"python": platform.python_version()}
-    for name in VERSIONED:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:  # on the path, but not installed
-            from sb3_poem import __version__
-
-            found[name] = __version__ if name == "sb3_poem" else "unknown"
-    return found
+    own = {"python": platform.python_version(), "sb3_poem": __version__}
+    return own | {name: version(name) for name in VERSIONED}
 
 
 def machine() -> str:
-    """The processor by what it can do: cores that this process may use, architecture, vector
-    instructions; and the GPU.
-    """
+    """What the processor can do: usable cores, architecture, vector instructions; and the GPU."""
     import torch as th
 
     cpuinfo = Path("/proc/cpuinfo")

@@ -1,7 +1,7 @@
 """What a store holds of a suite: finished cells, gathered over seeds and summarised."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Self
 
@@ -32,9 +32,7 @@ BOOTSTRAP_SAMPLES = 2000
 
 @dataclass(frozen=True)
 class Condition:
-    """What must be equal for cells to stand in one table (of the budget all but the numbers of
-    answers).
-    """
+    """What must be equal for cells to stand in one table."""
 
     env_id: str
     budget: Budget
@@ -66,53 +64,41 @@ class Condition:
         return ", ".join(words) + self.version
 
 
-def _success_rates(records: Sequence[Record]) -> np.ndarray | None:
-    """(n_seeds, n_tasks[, n_queries]); None for a family without successes."""
-    if any("task_success_rates" not in record.result for record in records):
-        return None
-    return np.array([record.result["task_success_rates"] for record in records])
-
-
 @dataclass(frozen=True, eq=False)
-class _Measured:
-    """A method's records, one a seed."""
+class Series:
+    """One method's records, one a seed, under one condition and oracle, after a share of the
+    training (None: all).
+    """
 
     method: str
-    records: tuple[Record, ...]
+    records: list[Record]
+    oracle: OracleSpec
+    snapshot: float | None
 
     @property
     def label(self) -> str:
         return METHODS[self.method].label
 
+    @cached_property
+    def returns(self) -> np.ndarray:
+        """(n_seeds, n_tasks[, n_queries])."""
+        return np.array([record.result["task_returns"] for record in self.records])
 
-@dataclass(frozen=True, eq=False)
-class Series(_Measured):
-    """One method under one condition and one oracle, over seeds.
-
-    :param snapshot: The share of the training after which; None: all.
-    """
-
-    oracle: OracleSpec
-    snapshot: float | None
+    @property
+    def success_rates(self) -> Any:
+        """([n_queries,]) means over seeds and tasks; None for a family without successes."""
+        if any("task_success_rates" not in record.result for record in self.records):
+            return None
+        rates = np.array([record.result["task_success_rates"] for record in self.records])
+        return rates.mean(axis=(0, 1))
 
     @property
     def queries(self) -> tuple[int, ...]:
         return tuple(self.records[0].result["queries"])
 
-    @cached_property
-    def returns(self) -> np.ndarray:
-        """(n_seeds, n_tasks, n_queries)."""
-        return np.stack([np.array(record.result["task_returns"]) for record in self.records])
-
     @property
     def samples(self) -> float:
         return float(np.mean([record.result["training_samples"] for record in self.records]))
-
-    @property
-    def success_rates(self) -> list[float] | None:
-        """(n_queries,) means over seeds and tasks, where the family has successes."""
-        rates = _success_rates(self.records)
-        return None if rates is None else rates.mean(axis=(0, 1)).tolist()
 
     def at(self, queries: int) -> np.ndarray:
         """(n_seeds, n_tasks) after so many answers."""
@@ -124,32 +110,13 @@ class Series(_Measured):
         common, one, two = np.intersect1d(mine, theirs, return_indices=True)
         return compare(self.at(queries)[one], other.at(queries)[two]) if len(common) else None
 
-
-@dataclass(frozen=True, eq=False)
-class Reference(_Measured):
-    """What the policies of one kind of model could earn."""
-
-    @property
-    def known(self) -> np.ndarray:
-        """(n_seeds,) mean returns if the task were known."""
-        return np.array([np.mean(record.result["task_returns"]) for record in self.records])
-
-    @property
-    def success_rate(self) -> float | None:
-        """Mean over seeds and tasks if the task were known, where the family has successes."""
-        rates = _success_rates(self.records)
-        return None if rates is None else float(rates.mean())
-
     def limits(self, queries: int, oracle: OracleSpec) -> np.ndarray | None:
-        """(n_seeds,): the most that so many answers of this oracle allow with these policies; None
-        where it was not measured.
-        """
-        results = [record.result for record in self.records]
-        if any("limits" not in result for result in results):
+        """(n_seeds,): the most that so many answers of an oracle allow; None if not measured."""
+        found: list[Any] = [record.result.get("limits") for record in self.records]
+        if None in found:
             return None
         noise = make_oracle_factory(oracle)().noise_model
-        limits = [AnswerLimits(**result["limits"]) for result in results]
-        return np.array([one.after(queries, noise) for one in limits])
+        return np.array([AnswerLimits(**one).after(queries, noise) for one in found])
 
 
 class Selection:
@@ -172,18 +139,12 @@ class Selection:
             for one in in_order
             if all(one.identity["model"] == newest[kind] for kind in _kinds(one))
         }
-        shares: dict[Condition, set[float]] = {}
-        for record in self.records.values():
-            some = shares.setdefault(Condition.of(record), set())
-            if record.identity["snapshot"] is not None:
-                some.add(record.identity["snapshot"])
-        order = {name: position for position, name in enumerate(suite.families)}
-
-        def place(one: Condition) -> tuple[int, str, str]:
-            return order.get(one.family, len(order)), one.env_id, str(one)
-
-        self._shares, self.conditions = shares, sorted(shares, key=place)
-        self.seeds = sorted({record.seed for record in self.records.values()})
+        found: dict[Condition, list[Record]] = {}
+        for one in self.records.values():
+            found.setdefault(Condition.of(one), []).append(one)
+        order = (*suite.families, *sorted(one.family for one in found))
+        self._found = found
+        self.conditions = sorted(found, key=lambda one: (order.index(one.family), str(one)))
 
     def series(self, entry: Entry, condition: Condition) -> list[Series]:
         """The finished cells of an entry under a condition, those along the training too."""
@@ -191,23 +152,21 @@ class Selection:
         for cell, record in self._cells(entry, condition):
             found.setdefault((cell.method, cell.oracle, cell.snapshot), []).append(record)
         series = [
-            Series(name, tuple(records), oracle, snapshot)
-            for (name, oracle, snapshot), records in found.items()
+            Series(method, some, oracle, snapshot)
+            for (method, oracle, snapshot), some in found.items()
         ]
         return sorted(series, key=lambda one: entry.methods.index(one.method))
 
-    def references(self, condition: Condition) -> list[Reference]:
+    def references(self, condition: Condition) -> list[Series]:
         """What the models' policies could earn under a condition, in the order of the suite."""
-        found: dict[str, list[Record]] = {name: [] for name in self.suite.references}
-        for cell, record in self._cells(Entry("", "", self.suite.references), condition):
-            found[cell.method].append(record)
-        return [Reference(method, tuple(records)) for method, records in found.items() if records]
+        return self.series(Entry("references", "", self.suite.references), condition)
 
     def _cells(self, entry: Entry, condition: Condition) -> Iterator[tuple[Cell, Record]]:
-        shares = sorted(self._shares[condition])
-        for seed in self.seeds:
-            base = Cell(condition.env_id, "", seed, revision=condition.revision)
-            base = replace(base, budget=condition.budget, training=condition.training)
+        records = self._found[condition]
+        shares = sorted({record.identity["snapshot"] for record in records} - {None})
+        what: dict[str, Any] = {"budget": condition.budget, "training": condition.training}
+        for seed in sorted({record.seed for record in records}):
+            base = Cell(condition.env_id, "", seed, **what, revision=condition.revision)
             for cell in self.suite.entry_cells(entry, base, shares):
                 if cell.key in self.records:
                     yield cell, self.records[cell.key]
@@ -222,9 +181,9 @@ def _kinds(record: Record) -> list[tuple[Any, ...]]:
 
 @dataclass(frozen=True)
 class Summary:
-    """What several seeds earned: the mean of their mean returns, its deviation (n - 1), and the
-    interquartile mean over seeds and tasks with its :func:`interval` (both None for one seed); and
-    the standard error over tasks of their means over seeds (None for one task).
+    """What several seeds earned: mean and deviation (n - 1) of their mean returns, and the
+    interquartile mean over seeds and tasks with its :func:`interval` (None for one seed); and the
+    standard error over tasks of their means over seeds (None for one task).
     """
 
     n_seeds: int

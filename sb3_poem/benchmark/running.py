@@ -14,7 +14,6 @@ from sb3_poem.adaptation.limits import AnswerLimits
 from sb3_poem.benchmark.cells import run_cell
 from sb3_poem.benchmark.estimate import cell_seconds, measure_pace, training_seconds
 from sb3_poem.benchmark.models import ModelLibrary, Say, locked, try_lock
-from sb3_poem.benchmark.results import Reference
 from sb3_poem.benchmark.store import Store
 from sb3_poem.benchmark.suites import (
     Budget,
@@ -25,31 +24,27 @@ from sb3_poem.benchmark.suites import (
     family_id,
     family_label,
 )
-from sb3_poem.benchmark.training import FamilyFacts, family_facts, training_plan
+from sb3_poem.benchmark.training import FamilyFacts, TrainingError, family_facts, training_plan
 from sb3_poem.common.vec_env import make_task_vec_env
 
 
 @dataclass
 class Plan:
-    """A run: cells to be run, in order; cells that the store has; and cells that cannot be run,
-    with the reason.
-    """
+    """Cells to be run, in order; that the store has; and that cannot be run, with the reason."""
 
     todo: list[Cell] = field(default_factory=list)
     done: list[Cell] = field(default_factory=list)
     skipped: list[tuple[Cell, str]] = field(default_factory=list)
 
     def __str__(self) -> str:
-        sizes = (len(self.done), len(self.todo), len(self.skipped))
-        return "{} cells done, {} to do, {} not possible".format(*sizes)
+        done, todo, skipped = len(self.done), len(self.todo), len(self.skipped)
+        return f"{done} cells done, {todo} to do, {skipped} not possible"
 
     @property
     def models(self) -> list[ModelKey]:
         """What the cells to be run need, each once, a variant after its base."""
-        keys: dict[ModelKey, None] = {}
-        for key in (cell.model_key for cell in self.todo):
-            keys |= dict.fromkeys(one for one in (key.base, key) if one is not None)
-        return list(keys)
+        keys = [key for cell in self.todo for key in (cell.model_key.base, cell.model_key)]
+        return list(filter(None, dict.fromkeys(keys)))
 
 
 def make_plan(
@@ -64,8 +59,8 @@ def make_plan(
     snapshots: int | None = None,
 ) -> Plan:
     """Look at what there is, in a store if there is one yet. For ``families``, ``methods`` and
-    ``snapshots`` None is the suite's own; methods that were not named are left out where they
-    cannot run, families where their extra is missing.
+    ``snapshots`` None is the suite's own; then methods are left out where they cannot run, families
+    where their extra is missing.
     """
     plan = Plan()
     facts: dict[str, FamilyFacts] = {}
@@ -108,9 +103,7 @@ def make_plan(
 
 
 def describe(plan: Plan, library: ModelLibrary) -> list[str]:
-    """The plan in lines, with an estimate of its time on this machine, which takes a few seconds
-    for each family.
-    """
+    """The plan in lines, with an estimate of its time, which takes a few seconds a family."""
     reasons = Counter(reason for _, reason in plan.skipped)
     lines = [str(plan)]
     lines += [f"  not possible, {count} cells: {reason}" for reason, count in reasons.items()]
@@ -138,8 +131,8 @@ def describe(plan: Plan, library: ModelLibrary) -> list[str]:
         lines += ["cells:", *(f"  {cell}" for cell in plan.todo)]
         for cell in plan.todo:
             seconds += cell_seconds(cell, measure_pace(cell.env_id, device, threads))
-        about = _minutes(seconds)
-        lines.append(f"about {about} in one process, if this machine stays as busy as it is")
+        alike = "in one process, if this machine stays as busy as it is"
+        lines.append(f"about {_minutes(seconds)} {alike}")
     return lines
 
 
@@ -150,9 +143,8 @@ def _minutes(seconds: float) -> str:
 def run_cells(
     cells: Sequence[Cell], library: ModelLibrary, store: Store, say: Say = print
 ) -> list[str]:
-    """Run cells, and keep each as soon as it is finished; what failed, a line each. It may be
-    interrupted at any moment; what another process is at, or has finished, is left to it, and cells
-    whose model another process is training come last.
+    """Run cells, and keep each as soon as it is finished; what failed, a line each. What another
+    process is at, or has finished, is left to it, and cells whose model it is training come last.
     """
     failures: list[str] = []
     postponed: list[Cell] = []
@@ -166,16 +158,13 @@ def run_cells(
             failures.append(f"{cell}: {broken[key]}")
             return
         say(f"{place} {cell}")
-        is_trained = False
         try:
-            library.ensure(key, say)
-            is_trained = True
             record = run_cell(cell, library, say)
             store.add(record)
         except Exception as error:
             traceback.print_exc()
             failures.append(f"{cell}: {error}")
-            if not is_trained:
+            if isinstance(error, TrainingError):
                 broken[key] = str(error)
             return
         say(f"    {summary(record.result)}, {record.result['seconds']:.0f} s")
@@ -207,27 +196,24 @@ def summary(result: dict) -> str:
 
 
 def export_model(cells: Sequence[Cell], library: ModelLibrary, store: Store, folder: Path) -> None:
-    """Write the model of finished cells (of its methods with preferences, and what is known) as a
-    pretrained folder, with how it was trained and what it earns on its card.
-    """
+    """Write the model of finished cells as a pretrained folder, with what it earns on its card."""
     records = {record.key: record for record in store.records()}
-    [known] = [records[cell.key] for cell in cells if cell.definition.rule is None]
-    reference, limits = Reference("known-task", (known,)), AnswerLimits(**known.result["limits"])
+    found = {cell.definition.rule: records[cell.key] for cell in cells}
+    known = found.pop(None)
+    limits, rates = AnswerLimits(**known.result["limits"]), "task_success_rates"
     adaptations = []
-    for cell in cells:
-        if cell.definition.rule is None:
-            continue
-        result = records[cell.key].result
+    for rule, record in found.items():
+        result = record.result
         figures = {
-            "inference": str(cell.definition.rule).lower(),
+            "inference": str(rule).lower(),
             "queries": result["queries"],
             "mean_return": np.mean(result["task_returns"], axis=0).tolist(),
             "limit": [limits.after(k) for k in result["queries"]],
-            "known_task_return": float(reference.known[0]),
+            "known_task_return": float(np.mean(known.result["task_returns"])),
         }
-        if reference.success_rate is not None:
-            figures["success_rate"] = np.mean(result["task_success_rates"], axis=0).tolist()
-            figures["known_task_success_rate"] = reference.success_rate
+        if rates in known.result:
+            figures["success_rate"] = np.mean(result[rates], axis=0).tolist()
+            figures["known_task_success_rate"] = float(np.mean(known.result[rates]))
         adaptations.append(figures)
     training = known.provenance["model"]
     order = {name: known.result[name] for name in ("preference_accuracy", "kendall_tau")}

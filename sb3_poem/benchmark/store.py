@@ -32,9 +32,8 @@ PACKED = ("identity", "result", "provenance")
 
 @dataclass(frozen=True)
 class Record:
-    """A finished cell: :attr:`Cell.key`, the method under whose name it was run first,
-    :meth:`Cell.identity`, every task's return after every recorded number of answers with samples
-    and times, where it comes from, and when (UTC).
+    """A finished cell: its :attr:`Cell.key`, the method under whose name it was run first, its
+    :meth:`Cell.identity`, what it earned and took, where it comes from, and when (UTC).
     """
 
     key: str

@@ -23,10 +23,8 @@ CHEETAHS = PAPER_FAMILIES[:2]
 RECORD_AT = (0, 1, 2, 3, 5, 7, 10)
 REVISION = 3
 """Of the code that trains, adapts and measures: part of every cell's identity. Raise it with each
-change after which the same cell may come to another figure (a loss, a default of an algorithm or a
-rule, how tasks and seeds are drawn), not for what only takes less time, nor for ``zoo_configs/``,
-whose hyperparameters are in the identity by themselves. 0 stands for all that was recorded before
-revisions were counted.
+change after which the same cell may come to another figure (a loss, a default, how tasks and seeds
+are drawn), not for ``zoo_configs/``, whose hyperparameters are in the identity by themselves.
 """
 POEMS = ("poem-bayes", "poem-paper")
 ANOLES = ("anole", "anole-greedy", "anole-random")
@@ -66,9 +64,7 @@ FILE = "file "
 
 @dataclass(frozen=True)
 class OracleSpec:
-    """Who answers: "return", "boltzmann" with its beta (None is the paper's), or "mistake" with its
-    rate.
-    """
+    """Who answers: "return", "boltzmann" with a beta (None: the paper's), "mistake" with a rate."""
 
     kind: str = "return"
     value: float | None = None
@@ -88,8 +84,8 @@ NOISES = (BOLTZMANN, OracleSpec("mistake", 0.1), OracleSpec("mistake", 0.2))
 
 @dataclass(frozen=True)
 class Budget:
-    """What a cell may spend on evaluation: test tasks (alike for all methods and seeds, drawn by
-    ``task_seed``), episodes per task and measurement, and after how many answers to measure.
+    """What a cell may spend: test tasks (alike for all methods and seeds, drawn by ``task_seed``),
+    episodes per task and measurement, and after how many answers to measure.
     """
 
     tasks: int = 30
@@ -100,9 +96,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class Training:
-    """What differs from the hyperparameter files, for all models of a run: environment steps, and
-    hyperparameters, sorted by name.
-    """
+    """What differs from the hyperparameter files, for all models of a run; sorted by name."""
 
     timesteps: int | None = None
     hyperparameters: tuple[tuple[str, Any], ...] = ()
@@ -148,10 +142,9 @@ class Cell:
     """One entry of the store: a method with its settings on a family, with one seed, of the
     training and of what is random in the adaptation.
 
-    :param snapshot: The share of the training after which the model is taken; None: all of it.
-    :param overrides: Options of the rule that differ from the method's own, sorted by name.
-    :param model: What the model is made of, see :meth:`ModelLibrary.origin`; None: not told.
-    :param revision: See :data:`REVISION`.
+    :param snapshot: The share of the training after which the model is taken; None: all of it
+    :param overrides: Options of the rule that differ from the method's own, sorted by name
+    :param model: What the model is made of, see :meth:`ModelLibrary.origin`; None: not told
     """
 
     env_id: str
@@ -204,19 +197,17 @@ class Cell:
         usual = METHODS[method].recorded({})["options"]
         options = ((name, hashable(value)) for name, value in identity["options"].items())
         sizes = {name: identity[name] for name in ("tasks", "episodes", "task_seed")}
-        if identity["record_at"] is not None:
-            sizes["record_at"] = tuple(identity["record_at"])
+        record_at = tuple(identity["record_at"] or RECORD_AT)
+        alike = {
+            name: identity[name] for name in ("env_id", "seed", "snapshot", "model", "revision")
+        }
         return cls(
-            identity["env_id"],
-            method,
-            identity["seed"],
-            OracleSpec(**identity["oracle"]) if identity["oracle"] else EXACT,
-            Budget(**sizes),
-            Training.from_dict(identity["training"]),
-            identity["snapshot"],
-            tuple(sorted(one for one in options if one not in usual.items())),
-            identity["model"],
-            identity["revision"],
+            method=method,
+            oracle=OracleSpec(**identity["oracle"] or {}),
+            budget=Budget(**sizes, record_at=record_at),
+            training=Training.from_dict(identity["training"]),
+            overrides=tuple(sorted(one for one in options if one not in usual.items())),
+            **alike,
         )
 
     @property
@@ -238,11 +229,11 @@ class Cell:
 class Entry:
     """Methods that a suite compares under the same conditions: a table, and a figure.
 
-    :param curves: With whose answers the methods are measured along the training too.
-    :param by_inference: Whether figures have a row for each of POEM's inference rules.
-    :param shown: Numbers of answers that tables show, of those that were recorded.
-    :param by_task: Whether tables show the standard error over tasks, and success rates, rather
-        than interquartile means.
+    :param curves: With whose answers the methods are measured along the training too
+    :param by_inference: Figures have a row for each of POEM's inference rules
+    :param shown: Numbers of answers that tables show, of those that were recorded
+    :param by_task: Tables show standard errors over tasks and success rates, and no interquartile
+        means
     """
 
     name: str
@@ -264,12 +255,9 @@ class Suite:
     >>> sorted({cell.oracle.kind for cell in cells})
     ['boltzmann', 'return']
 
-    :param references: Methods that say what the models' policies could earn, for the tables'
-        limits.
-    :param snapshots: In how many equal parts the training is cut for measurements along it; 1
-        measures its end only.
-    :param overrides: Options of rules by the rule's name, where the suite differs from the
-        defaults.
+    :param references: Methods that say what the models' policies could earn, for the limits
+    :param snapshots: In how many parts the training is cut for measurements along it; 1: none
+    :param overrides: Options of rules by the rule's name, where they differ from the defaults
     """
 
     name: str
@@ -295,8 +283,8 @@ class Suite:
         training: Training | None = None,
         snapshots: int | None = None,
     ) -> list[Cell]:
-        """The suite's cells, each once, in the order in which they should be run; None takes all
-        methods, and the suite's own numbers (``record_at`` is always the entries').
+        """The suite's cells, each once, in the order in which they should be run; None takes the
+        suite's own methods and numbers (``record_at`` is always the entries').
         """
         for name in methods or ():
             if name not in self.methods:
@@ -318,9 +306,7 @@ class Suite:
         return list(cells.values())
 
     def entry_cells(self, entry: Entry, base: Cell, shares: Sequence[float]) -> list[Cell]:
-        """The cells of one entry, in all else like ``base``; its curves are measured after these
-        shares of the training too.
-        """
+        """The cells of one entry, in all else like ``base``, with curves at these shares."""
         cells = []
         for name in entry.methods:
             overrides = self.overrides.get(METHODS[name].rule or "", ())
@@ -341,9 +327,7 @@ def digest(data: Any) -> str:
 
 
 def hashable(value: Any) -> Any:
-    """A hyperparameter's value, with tuples for lists: a model is looked up by its hyperparameters,
-    and JSON has no tuples. A dictionary is refused.
-    """
+    """A hyperparameter's value, with tuples for lists. A dictionary is refused."""
     if isinstance(value, dict):
         raise ValueError(
             f'{value!r} is a dictionary; write it as text, as rl_zoo3\'s files do: "dict(...)"'
@@ -357,9 +341,7 @@ def family_name(env_id: str) -> str:
 
 
 def family_label(env_id: str) -> str:
-    """What no other environment is called: AntGoal for poem/AntGoal-v0; ids of other namespaces or
-    versions stay.
-    """
+    """AntGoal of poem/AntGoal-v0; ids of other namespaces or versions stay."""
     name = family_name(env_id)
     return name if env_id == family_id(name) else env_id
 

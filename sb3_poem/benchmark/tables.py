@@ -27,14 +27,13 @@ QUERIES = (1, 5, 10)
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """A method, or a yardstick, after some number of answers; what CSV and JSON hold. For the
-    figures see :class:`Summary`.
+    """A method, or a yardstick, after some number of answers; what CSV and JSON hold.
 
-    :param kind: "method", "limit", "known", or "difference": what ``method`` earns more than the
-        method ``against``, see :class:`Comparison`.
-    :param queries: After how many answers; None for "known".
-    :param snapshot: The share of the training after which; None: all.
-    :param samples: Environment steps of the training, mean over seeds.
+    :param kind: "method", "limit", "known", or "difference": what ``method`` earns more than
+        ``against``, see :class:`Comparison`
+    :param queries: After how many answers; None for "known"
+    :param snapshot: The share of the training after which; None: all
+    :param samples: Environment steps of the training, mean over seeds
     """
 
     suite: str
@@ -111,8 +110,8 @@ def make_report(
         if kind in ("md", "latex"):
             text = format_tables(selection.suite.title, suite_tables(selection), kind)
         else:
-            rows += suite_rows(selection)
-            text = format_rows([row for row in rows if row.suite == name], kind)
+            found = suite_rows(selection)
+            text, rows = format_rows(found, kind), [*rows, *found]
         texts.append(text)
         if out is not None:
             file = out / f"{name}{SUFFIX[kind]}"
@@ -127,30 +126,30 @@ def make_report(
 
 def suite_rows(selection: Selection) -> list[Row]:
     """Everything of a suite in long form."""
-    return [row for *_, rows in _each_table(selection) for row in rows]
+    return [
+        row
+        for condition in selection.conditions
+        for entry in selection.suite.entries
+        for oracle in entry.oracles
+        for row in _rows(selection, condition, entry, oracle)
+    ]
 
 
 def suite_tables(selection: Selection) -> list[Table]:
     """A table for each family, comparison and oracle; and one of the models."""
-    tables: dict[Condition, list[Table]] = {one: [] for one in selection.conditions}
-    for condition, entry, oracle, rows in _each_table(selection):
-        some = tables[condition]
-        if rows:
-            some.append(_comparison(condition, entry, oracle, rows))
-        if any(row.kind == "difference" for row in rows):
-            some.append(_differences(condition, entry, oracle, rows))
-        if entry.by_task and any(row.success_rate is not None for row in rows):
-            some.append(_successes(condition, entry, rows))
-    return [one for each in tables for one in (*tables[each], *_models(selection, each))]
-
-
-def _each_table(
-    selection: Selection,
-) -> Iterator[tuple[Condition, Entry, OracleSpec, list[Row]]]:
+    tables: list[Table] = []
     for condition in selection.conditions:
         for entry in selection.suite.entries:
             for oracle in entry.oracles:
-                yield condition, entry, oracle, list(_rows(selection, condition, entry, oracle))
+                rows = list(_rows(selection, condition, entry, oracle))
+                if rows:
+                    tables.append(_comparison(entry, rows))
+                if any(row.kind == "difference" for row in rows):
+                    tables.append(_differences(entry, rows))
+                if entry.by_task and any(row.success_rate is not None for row in rows):
+                    tables.append(_successes(entry, rows))
+        tables += _models(selection, condition)
+    return tables
 
 
 def format_tables(title: str, tables: Sequence[Table], kind: str) -> str:
@@ -171,11 +170,11 @@ def format_rows(rows: Iterable[Row], kind: str) -> str:
     return text.getvalue()
 
 
-def paper_figure(family: str, row: str | None, queries: int) -> tuple[float, float] | None:
-    """Mean and standard deviation of a row of the paper's table; None if it reports nothing."""
+def paper_figure(family: str, row: str | None, queries: int) -> tuple[Any, Any]:
+    """Mean and standard deviation of a row of the paper's table; None, twice, if it has none."""
     figures = TABLE_3.get(family, {}).get(row or "")
     if figures is None or queries not in QUERIES:
-        return None
+        return None, None
     mean, deviation = map(float, figures[QUERIES.index(queries)])
     return mean, deviation
 
@@ -196,10 +195,10 @@ def _rows(
         final = one.snapshot is None
         # The paper's figures are of the whole training and of its own answers.
         has_paper = final and oracle == EXACT and entry.name == "methods"
-        successes = one.success_rates
+        rates = one.success_rates
         for i, queries in enumerate(one.queries):
             row = METHODS[one.method].paper_row if has_paper else None
-            paper = paper_figure(condition.family, row, queries) or (None, None)
+            paper = paper_figure(condition.family, row, queries)
             yield Row(
                 **place,
                 method=one.method,
@@ -211,7 +210,7 @@ def _rows(
                 **vars(summarise(one.returns[:, :, i])),
                 paper_mean=paper[0],
                 paper_deviation=paper[1],
-                success_rate=None if successes is None else successes[i],
+                success_rate=None if rates is None else rates[i],
             )
     ended = {one.method: one for one in some if one.snapshot is None}
     yield from _paired(place, entry, ended)
@@ -226,8 +225,9 @@ def _rows(
             if measured is not None:
                 values = _over_seeds(measured)
                 yield Row(**of, label=limit, kind="limit", queries=queries, **values)
-        values = {**_over_seeds(reference.known), "success_rate": reference.success_rate}
-        yield Row(**of, label=reference.label, kind="known", **values)
+        known = _over_seeds(reference.returns.mean(axis=1))
+        rate = reference.success_rates
+        yield Row(**of, label=reference.label, kind="known", **known, success_rate=rate)
 
 
 def _paired(place: dict[str, Any], entry: Entry, found: dict[str, Series]) -> Iterator[Row]:
@@ -250,15 +250,19 @@ def _over_seeds(values: np.ndarray) -> dict[str, Any]:
     return {"n_seeds": len(values), "mean": float(values.mean()), "deviation": deviation}
 
 
-def _comparison(
-    condition: Condition, entry: Entry, oracle: OracleSpec, rows: Sequence[Row]
-) -> Table:
-    """Methods against numbers of answers: mean and deviation, interquartile mean and interval (or
-    the standard error over tasks), the paper's figure.
-    """
+def _comparison(entry: Entry, rows: Sequence[Row]) -> Table:
+    """Methods against numbers of answers: what they earn, its spread, the paper's figure."""
     queries = [k for k in entry.shown if k in entry.record_at]
     has_paper = any(row.paper_mean is not None for row in rows)
-    beside = "std. error over tasks" if entry.by_task else "IQM [95 %]"
+    beside, also = (
+        "IQM [95 %]",
+        "interquartile mean over seeds and tasks with its bootstrap interval",
+    )
+    if entry.by_task:
+        beside, also = (
+            "std. error over tasks",
+            "standard error over tasks of their means over seeds",
+        )
     header = ["method", "seeds"]
     for k in queries:
         header += [_after(k), beside, *(["paper"] if has_paper else [])]
@@ -274,11 +278,6 @@ def _comparison(
                 cells += [_number(row.mean, row.deviation), spread]
                 cells += [_number(row.paper_mean, row.paper_deviation)] * has_paper
             body.append(tuple(cells))
-    also = (
-        "standard error over tasks of their means over seeds"
-        if entry.by_task
-        else "interquartile mean over seeds and tasks with its bootstrap interval"
-    )
     notes = [f"Mean and standard deviation over seeds; {also}."]
     notes += [
         f"{row.label}: {_number(row.mean, row.deviation)}" for row in final if row.kind == "known"
@@ -290,13 +289,11 @@ def _comparison(
             "measured by other episodes. It binds no method with other policies, nor the reward "
             "oracle, which sees more than answers."
         )
-    title = f"{condition}; {entry.title.lower()}, {oracle.label}"
+    title = f"{rows[0].condition}; {entry.title.lower()}, {rows[0].oracle}"
     return Table(title, header, body, notes)
 
 
-def _differences(
-    condition: Condition, entry: Entry, oracle: OracleSpec, rows: Sequence[Row]
-) -> Table:
+def _differences(entry: Entry, rows: Sequence[Row]) -> Table:
     """Paired differences, probabilities of improvement, and what may be said."""
     queries = [k for k in entry.shown if k in entry.record_at]
     header = ["method", "against", "seeds"]
@@ -320,18 +317,18 @@ def _differences(
         "A method is ahead or behind if the mean, the interquartile mean and the whole interval of "
         "the mean say so.",
     )
-    title = f"{condition}; differences of {entry.title.lower()}, {oracle.label}"
+    title = f"{rows[0].condition}; differences of {entry.title.lower()}, {rows[0].oracle}"
     return Table(title, header, body, notes)
 
 
-def _successes(condition: Condition, entry: Entry, rows: Sequence[Row]) -> Table:
+def _successes(entry: Entry, rows: Sequence[Row]) -> Table:
     body = []
     for label in dict.fromkeys(row.label for row in rows if row.kind == "method"):
         mine = {row.queries: row.success_rate for row in rows if row.label == label}
         body.append((label, *(f"{mine[k]:.2f}" for k in entry.shown)))
     notes = [f"{row.label}: {row.success_rate:.2f}" for row in rows if row.kind == "known"]
     header = ("method", *map(_after, entry.shown))
-    return Table(f"{condition}; success rates", header, body, notes)
+    return Table(f"{rows[0].condition}; success rates", header, body, notes)
 
 
 def _models(selection: Selection, condition: Condition) -> list[Table]:

@@ -1,8 +1,5 @@
 """How a family's models are trained, and the training itself: ``sb3-poem train`` as a child of the
-benchmark (``python -m sb3_poem.benchmark.training PARENT SESSION train ...``).
-
-The child ends with its parent, so that a benchmark that was killed leaves no training behind, and
-notes how long it took.
+benchmark, which ends with its parent and notes how long it took.
 """
 
 import contextlib
@@ -55,7 +52,7 @@ class FamilyFacts:
 
 @cache
 def family_facts(name: str) -> FamilyFacts:
-    """Look at a family: an id, or AntGoal for poem/AntGoal-v0."""
+    """Of an id, or of AntGoal for poem/AntGoal-v0."""
     env_id = family_id(name)
     try:
         with contextlib.closing(vectorised(gym.make(env_id))) as env:
@@ -73,8 +70,8 @@ def family_facts(name: str) -> FamilyFacts:
 
 @dataclass(frozen=True)
 class TrainingPlan:
-    """A training: all that differs from the algorithm's defaults, the part of it that differs from
-    the hyperparameter file, environment steps in all and of an epoch, and gradient steps.
+    """A training: all that differs from the algorithm's defaults, what of it differs from the file,
+    environment steps in all and of an epoch, and gradient steps.
     """
 
     algorithm: str
@@ -118,9 +115,8 @@ def training_plan(key: ModelKey) -> TrainingPlan:
     epoch_steps = rollouts * facts.horizon
     per_epoch = int(hyperparameters.get("gradient_steps", 1000))
     updates = -(-timesteps // epoch_steps) * (epoch_steps if per_epoch < 0 else per_epoch)
-    return TrainingPlan(
-        variant.algorithm, hyperparameters, changes, timesteps, int(epoch_steps), updates
-    )
+    steps = (timesteps, int(epoch_steps), updates)
+    return TrainingPlan(variant.algorithm, hyperparameters, changes, *steps)
 
 
 def train_arguments(key: ModelKey, plan: TrainingPlan, packages: Sequence[str] = ()) -> list[str]:
@@ -139,9 +135,8 @@ def train_arguments(key: ModelKey, plan: TrainingPlan, packages: Sequence[str] =
 def run_training(
     arguments: list[str], save_steps: int, folder: Path, lock: int, device: str, num_threads: int
 ) -> None:
-    """Train, or go on with a training, in a child process, with the arguments of
-    :func:`train_arguments`; it inherits a lock's file descriptor: nobody else trains while it still
-    ends.
+    """Train, or go on with a training, in a child process. It inherits a lock's file descriptor:
+    nobody else trains while it still ends.
     """
     session = folder / SESSIONS / f"{len(list(folder.glob(f'{SESSIONS}/*.json'))) + 1}.json"
     command = [sys.executable, "-m", "sb3_poem.benchmark.training", str(os.getpid()), str(session)]
@@ -173,19 +168,17 @@ def run_training(
 
 
 def end_with_parent(parent: int) -> None:
-    """Have the system kill this process when its parent, which may be gone already, is gone."""
-    if sys.platform == "linux":
-        with contextlib.suppress(OSError, AttributeError):
-            ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    """Have Linux kill this process when its parent, which may be gone already, is gone."""
+    with contextlib.suppress(AttributeError):  # elsewhere
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         sys.exit("the benchmark that started this training is gone")
 
 
 @contextlib.contextmanager
 def timed(session: Path) -> Iterator[None]:
-    """Write to a file how long the training took, by the clock and of the processor (all threads):
-    at its end, and at each new checkpoint, since what comes after the last is lost with a killed
-    process.
+    """Write to a file how long the training took, by the clock and of the processor: at each new
+    checkpoint, as what comes after the last is lost with a killed process, and at its end.
     """
     started = time.monotonic()
 
@@ -193,14 +186,13 @@ def timed(session: Path) -> Iterator[None]:
         times = {"seconds": time.monotonic() - started, "cpu_seconds": sum(os.times()[:4])}
         write_json_atomically(session, times)
 
-    def last_checkpoint() -> float:
-        files = session.parents[1].glob(f"*/*/{CHECKPOINT}")
-        return max((file.stat().st_mtime for file in files), default=0.0)
+    def checkpoints() -> list[float]:
+        return [file.stat().st_mtime for file in session.parents[1].glob(f"*/*/{CHECKPOINT}")]
 
     def look() -> None:
-        seen = last_checkpoint()
+        seen = checkpoints()
         while not over.wait(LOOK_SECONDS):
-            if (saved := last_checkpoint()) > seen:
+            if (saved := checkpoints()) != seen:
                 seen = saved
                 note()
 
@@ -220,4 +212,4 @@ if __name__ == "__main__":
     end_with_parent(int(sys.argv[1]))
     with timed(Path(sys.argv[2])):
         del sys.argv[1:3]
-        runpy.run_module("sb3_poem.cli", run_name="__main__")
+        runpy.run_module("sb3_poem", run_name="__main__")

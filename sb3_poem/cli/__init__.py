@@ -1,7 +1,4 @@
-"""The command line, ``sb3-poem``: train, enjoy, record-video, adapt, models, label and benchmark.
-
-What a command needs is imported when it runs.
-"""
+"""The command line, ``sb3-poem``. What a command needs is imported when it runs."""
 
 import argparse
 import os
@@ -16,7 +13,6 @@ from poem_envs.headless import can_draw, choose_headless_backend
 from sb3_poem.cli.arguments import COMMANDS, OUR_ALGORITHMS, build_parser
 
 __all__ = ["COMMANDS", "build_parser", "main"]
-TRAIN_EXAMPLE = "example: sb3-poem train --env poem/PointGoal-v0 -P"
 # Where the function ``run_<command>`` is, if not in the module of the command's name.
 MODULES = {"enjoy": "show", "record-video": "show"}
 
@@ -31,10 +27,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         argcomplete.autocomplete(parser)
     given = list(sys.argv[1:] if argv is None else argv)
-    arguments = parser.parse_args(given[:1] if _is_zoo(given) else given)
+    is_zoo = _is_zoo(given)
+    arguments = parser.parse_args(given[:1] if is_zoo else given)
     arguments.given = given
     try:
-        return _run(arguments)
+        return _run(arguments, is_zoo)
     except KeyboardInterrupt as stop:
         print(str(stop) or "Interrupted.", file=sys.stderr)
         return 130
@@ -56,22 +53,17 @@ def _is_zoo(given: Sequence[str]) -> bool:
     return parser.parse_known_args(given)[0].algo not in OUR_ALGORITHMS
 
 
-def _run(arguments: argparse.Namespace) -> int:
+def _run(arguments: argparse.Namespace, is_zoo: bool) -> int:
     from rich.console import Console
 
     if can_draw():
         choose_headless_backend()  # before anything imports MuJoCo
-    command, is_zoo = arguments.command, _is_zoo(arguments.given)
+    command = arguments.command
     name = "zoo" if is_zoo else MODULES.get(command, command)
     # PyTorch and its company take seconds.
     with Console(stderr=True).status("Loading"):
         module: Any = import_module(f"sb3_poem.cli.{name}")
-    if not is_zoo:
-        return getattr(module, f"run_{command.replace('-', '_')}")(arguments) or 0
-    given = arguments.given[1:]
-    try:
-        module.run_zoo(command, given)
-    finally:
-        if command == "train" and {"-h", "--help"} & set(given):
-            print(f"\n{TRAIN_EXAMPLE}")
-    return 0
+    if is_zoo:
+        module.run_zoo(command, arguments.given[1:])
+        return 0
+    return getattr(module, f"run_{command.replace('-', '_')}")(arguments) or 0

@@ -2,7 +2,7 @@
 
 import argparse
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,9 @@ from tqdm import tqdm
 from sb3_poem.adaptation import (
     AdaptationEvaluation,
     AdaptedPolicy,
-    BoltzmannOracle,
     HumanOracle,
     KnownTaskReturn,
-    MistakeOracle,
     PreferenceAdapter,
-    ReturnOracle,
-    TaskOracle,
     evaluate_adaptation,
     evaluate_episodes,
     named_rule,
@@ -29,25 +25,17 @@ from sb3_poem.adaptation import (
 from sb3_poem.adaptation.adapter import shown_from_dict
 from sb3_poem.adaptation.evaluation import evaluation_seed
 from sb3_poem.adaptation.preference import BEST_OF_FOUR
+from sb3_poem.benchmark.cells import make_oracle_factory
+from sb3_poem.benchmark.suites import OracleSpec
 from sb3_poem.cli.arguments import DEFAULT_STORE
-from sb3_poem.cli.needs import check_output
+from sb3_poem.cli.needs import check_output, say
 from sb3_poem.cli.report import row_text, write_report
-from sb3_poem.cli.subject import (
-    COPIES,
-    COPIES_FOR_ONE_TASK,
-    POLICY_SUFFIX,
-    Subject,
-    after,
-    say,
-)
+from sb3_poem.cli.subject import COPIES, COPIES_FOR_ONE_TASK, POLICY_SUFFIX, Subject, after
 from sb3_poem.label import Store, StoreRecorder
 from sb3_poem.label.beliefs import believed_in_words
 
 DEFAULT_TASKS, DEFAULT_MISTAKE_RATE = 30, 0.2
-ORACLE_OF_FLAG = {
-    **{"store": "human", "resume": "human"},
-    **{"beta": "boltzmann", "mistake_rate": "mistake"},
-}
+ORACLE_OF = {"store": "human", "resume": "human", "beta": "boltzmann", "mistake_rate": "mistake"}
 
 
 def run_adapt(arguments: argparse.Namespace) -> int:
@@ -83,7 +71,7 @@ def _check_tasks(arguments: argparse.Namespace) -> int:
     if human and not named and arguments.plot is not None:
         only = "with --oracle human only --task says by which goal to measure them"
         raise ValueError(f"--plot needs returns, and {only}")
-    for flag, oracle in ORACLE_OF_FLAG.items():
+    for flag, oracle in ORACLE_OF.items():
         given = getattr(arguments, flag)
         if given is not None and given is not False and arguments.oracle != oracle:
             name = flag.replace("_", "-")
@@ -103,7 +91,9 @@ class Adaptation:
     def __init__(self, arguments: argparse.Namespace, subject: Subject) -> None:
         self.arguments, self.subject = arguments, subject
         rate = arguments.mistake_rate
-        self.mistake_rate: float = DEFAULT_MISTAKE_RATE if rate is None else rate
+        values = {"mistake": DEFAULT_MISTAKE_RATE if rate is None else rate}
+        values["boltzmann"] = arguments.beta
+        self.oracle = OracleSpec(arguments.oracle, values.get(arguments.oracle))
         names = ("inference", "query_rule", "candidates", "n_candidates", "question")
         chosen = {name: getattr(arguments, name) for name in names}
         chosen["noise_model"] = "infer" if arguments.infer_noise else None
@@ -115,12 +105,7 @@ class Adaptation:
     def ask_oracle(self) -> int:
         """Let a program that knows the tasks answer, and say each measurement as it comes."""
         arguments, subject = self.arguments, self.subject
-        factories: dict[str, Callable[..., TaskOracle]] = {
-            "return": ReturnOracle,
-            "boltzmann": partial(BoltzmannOracle, arguments.beta),
-            "mistake": partial(MistakeOracle, self.mistake_rate),
-        }
-        factory = factories[arguments.oracle]
+        factory = make_oracle_factory(self.oracle)
         if self.rule.question == BEST_OF_FOUR:
             factory = partial(factory, question=BEST_OF_FOUR)
         elif self.rule.question == "graded":
@@ -211,9 +196,7 @@ class Adaptation:
     def _conclude(
         self, adapter: PreferenceAdapter, recorder: StoreRecorder, latents: np.ndarray, stopped: str
     ) -> int:
-        """Write what was asked for, say what is believed by the latents (n_answers + 1,
-        latent_dim), and how to go on; ``stopped`` is why it ended early, if it did.
-        """
+        """Write what was asked for by latents (n_answers + 1, latent_dim), and say how to go on."""
         arguments, subject = self.arguments, self.subject
         interrupted = stopped == "Interrupted"
         if stopped:
@@ -258,14 +241,14 @@ class Adaptation:
 
     def _report(self, evaluation: AdaptationEvaluation, known: KnownTaskReturn | None) -> None:
         """Print and write what was measured; without ``known`` it was interrupted."""
-        arguments, subject, oracle = self.arguments, self.subject, self.arguments.oracle
+        arguments, subject, oracle = self.arguments, self.subject, self.oracle
         settings = {
             "model": arguments.model,
             "env_id": subject.env_id,
             "env_kwargs": subject.env_kwargs,
-            "oracle": oracle,
-            "beta": arguments.beta if oracle == "boltzmann" else None,
-            "mistake_rate": self.mistake_rate if oracle == "mistake" else None,
+            "oracle": oracle.kind,
+            "beta": oracle.value if oracle.kind == "boltzmann" else None,
+            "mistake_rate": oracle.value if oracle.kind == "mistake" else None,
             "thresholds": arguments.thresholds if self.rule.question == "graded" else None,
             **self.options,
             "episodes": arguments.episodes,
@@ -273,7 +256,7 @@ class Adaptation:
             "complete": known is not None,
         }
         n_tasks = len(subject.tasks)
-        title = f"{subject.env_id}, {n_tasks} task{'s' * (n_tasks > 1)}, {oracle} oracle"
+        title = f"{subject.env_id}, {n_tasks} task{'s' * (n_tasks > 1)}, {oracle.kind} oracle"
         title += ", incomplete" * (known is None)
         write_report(title, settings, evaluation, known, arguments.json, arguments.plot)
 

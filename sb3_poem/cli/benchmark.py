@@ -2,26 +2,16 @@
 
 import argparse
 from collections.abc import Sequence
-from functools import partial
 from os.path import abspath
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sb3_poem.benchmark.suites import (
-    SUITES,
-    Budget,
-    Training,
-    family_id,
-    family_label,
-    hashable,
-)
-from sb3_poem.cli.needs import check_writable, import_packages, parse_pairs
+from sb3_poem.benchmark.suites import SUITES, Budget, Training, family_id, family_label, hashable
+from sb3_poem.cli.needs import check_writable, import_packages, parse_pairs, say
 
 if TYPE_CHECKING:
     from sb3_poem.benchmark.models import ModelLibrary
     from sb3_poem.benchmark.running import Plan
-
-_say = partial(print, flush=True)
 
 
 def run_benchmark(arguments: argparse.Namespace) -> int:
@@ -56,15 +46,14 @@ def _run(arguments: argparse.Namespace) -> int:
     for folder in filter(None, (arguments.runs, arguments.export)):
         check_writable(folder)
     store = store or Store(arguments.store)
-    _say(f"{plan}; results in {arguments.store}")
+    say(f"{plan}; results in {arguments.store}")
     if arguments.backend == "ray":
-        from sb3_poem.benchmark.ray_backend import RayOptions, run_with_ray
+        from sb3_poem.benchmark.ray_backend import run_with_ray
 
-        resources = (arguments.cpus_per_trial, arguments.gpus_per_trial, arguments.max_failures)
-        options = RayOptions(arguments.address, *resources)
-        failures = run_with_ray(plan, library, store, options, _say)
+        options = (arguments.address, arguments.cpus_per_trial, arguments.gpus_per_trial)
+        failures = run_with_ray(plan, library, store, *options, arguments.max_failures, say)
     else:
-        failures = run_cells(plan.todo, library, store, _say)
+        failures = run_cells(plan.todo, library, store, say)
     for failure in failures:
         print(f"FAILED {failure}")
     left = f", {len(failures)} failed: the same command tries them again" if failures else ""
@@ -102,11 +91,8 @@ def _report(arguments: argparse.Namespace) -> int:
 
     if arguments.out is not None:
         check_writable(arguments.out)
-    store = Store(arguments.store, create=False)
-    families, seeds = arguments.families, arguments.seeds
-    text, files = make_report(
-        store, arguments.suite, families, arguments.format, arguments.out, seeds
-    )
+    store, what = Store(arguments.store, create=False), (arguments.suite, arguments.families)
+    text, files = make_report(store, *what, arguments.format, arguments.out, arguments.seeds)
     if arguments.out is None:
         print(text)
     for file in files:
@@ -128,7 +114,7 @@ def _verify(arguments: argparse.Namespace) -> int:
     record = find_record(store, arguments.cell)
     where = record.provenance.get("device", "cpu"), record.provenance.get("num_threads", 1)
     print(f"running {record.key} again: {record.family}, {record.method}, seed {record.seed}")
-    differences = verify_cell(record, _library(arguments, *where), _say)
+    differences = verify_cell(record, _library(arguments, *where), say)
     for line in differences or ["the same, bit for bit"]:
         print(line)
     return 1 if differences else 0
@@ -147,13 +133,11 @@ def _library(arguments: argparse.Namespace, device: str, num_threads: int) -> "M
 
 
 def _parse_params(pairs: list[str]) -> tuple[tuple[str, object], ...]:
-    values = []
-    for name, value in sorted(parse_pairs("--params", pairs).items()):
-        try:
-            values.append((name, hashable(value)))
-        except ValueError as error:
-            raise ValueError(f"--params {name}: {error}") from error
-    return tuple(values)
+    params = parse_pairs("--params", pairs)
+    try:
+        return tuple((name, hashable(params[name])) for name in sorted(params))
+    except ValueError as error:
+        raise ValueError(f"--params {' '.join(pairs)}: {error}") from error
 
 
 def _parse_named(text: str) -> tuple[str, str, int, str]:

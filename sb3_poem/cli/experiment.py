@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
 from typing import Any
+from unittest import mock
 
 import gymnasium as gym
 import optuna
@@ -36,11 +37,7 @@ CHECKPOINT = "checkpoint.zip"
 
 
 class TrainingInterrupted(KeyboardInterrupt):
-    """Training was interrupted and saved; ``resumable``: ``--resume`` finds a checkpoint of it."""
-
-    def __init__(self, message: str, resumable: bool) -> None:
-        super().__init__(message)
-        self.resumable = resumable
+    """Training was interrupted and saved, with a checkpoint if its second argument says so."""
 
 
 @contextlib.contextmanager
@@ -106,9 +103,8 @@ class FamilyExperiment(ExperimentManager):
 
 
 class PoemExperiment(FamilyExperiment):
-    """A meta-training run: with our hyperparameter files, evaluated by adaptation to held-out
-    tasks, and resumable from ``checkpoint.zip``, which is written as often as it costs little, or
-    with the models of ``--save-freq``.
+    """A meta-training run: evaluated by adaptation to held-out tasks, and resumable from
+    ``checkpoint.zip``, which is written as often as it costs little, or by ``--save-freq``.
     """
 
     def __init__(self, args: Any, algo: str, env_id: str, *rest: Any, **kwargs: Any) -> None:
@@ -116,8 +112,7 @@ class PoemExperiment(FamilyExperiment):
             raise ValueError(f"--env {env_id} is no task family, and {algo} needs one")
         kwargs["config"] = kwargs.get("config") or str(config_file(algo))
         super().__init__(args, algo, env_id, *rest, **kwargs)
-        self.steps_per_evaluation = self.eval_freq
-        self.steps_per_checkpoint = self.save_freq
+        self.steps_per_evaluation, self.steps_per_checkpoint = self.eval_freq, self.save_freq
         # rl_zoo3's own evaluation would run the policy without telling it the task.
         self.eval_freq = -1
         self.resumes = self.is_interrupted = False
@@ -135,8 +130,8 @@ class PoemExperiment(FamilyExperiment):
         source = f"{self.config}, entry {self.env_name.gym_id!r}"
         custom = self.custom_hyperparams or {}
         check_entry(custom, self.algo, "-params")
-        of_entry = {key: value for key, value in hyperparams.items() if key not in custom}
-        check_entry(of_entry, self.algo, source)
+        own = {key: value for key, value in hyperparams.items() if key not in custom}
+        check_entry(own, self.algo, source)
         for key in ("n_timesteps", "policy"):
             if key not in hyperparams:
                 raise ValueError(f"{source} has no {key!r}")
@@ -151,21 +146,18 @@ class PoemExperiment(FamilyExperiment):
             return super().create_envs(*args, **kwargs)
 
     def setup_experiment(self) -> tuple[Any, dict[str, Any]] | None:
+        """As rl_zoo3's, with the callbacks that count in epochs, whose length the model knows."""
         results = super().setup_experiment()
         if results is not None:
-            assert isinstance(results[0], PEARLSAC)
-            self._add_callbacks(results[0])
+            model: Any = results[0]
+            if self.steps_per_evaluation > 0:
+                how = self._evaluation(model, self.steps_per_evaluation, self.save_path)
+                self.callbacks.append(AdaptationEvalCallback(verbose=self.verbose, **how))
+            steps = self.steps_per_checkpoint
+            every = _epochs(model, steps) if steps > 0 else None
+            self.checkpoint = TrainingCheckpointCallback(Path(self.save_path) / CHECKPOINT, every)
+            self.callbacks.append(self.checkpoint)
         return results
-
-    def _add_callbacks(self, model: PEARLSAC) -> None:
-        """Those which count in epochs, whose length the model knows."""
-        if self.steps_per_evaluation > 0:
-            how = self._evaluation(model, self.steps_per_evaluation, self.save_path)
-            self.callbacks.append(AdaptationEvalCallback(verbose=self.verbose, **how))
-        steps = self.steps_per_checkpoint
-        every = _epochs(model, steps) if steps > 0 else None
-        self.checkpoint = TrainingCheckpointCallback(Path(self.save_path) / CHECKPOINT, every)
-        self.callbacks.append(self.checkpoint)
 
     def _evaluation(self, model: PEARLSAC, steps: int, folder: str | None) -> dict[str, Any]:
         return {
@@ -207,7 +199,7 @@ class PoemExperiment(FamilyExperiment):
         if done < total and self.is_interrupted:
             kept = ", before the first checkpoint" if saved is None else f", saved at {saved:,}"
             message = f"Interrupted at {done:,} of {total:,} steps{kept * (saved != done)}"
-            raise TrainingInterrupted(message, resumable=saved is not None)
+            raise TrainingInterrupted(message, saved is not None)
         if done >= total and self.steps_per_checkpoint <= 0:
             self.checkpoint.path.unlink(missing_ok=True)
 
@@ -221,16 +213,13 @@ class PoemExperiment(FamilyExperiment):
                 study.enqueue_trial(entry_params(self.algo, self._hyperparams))
             return study
 
-        optuna.create_study = create_with_entry  # rl_zoo3 has no place for it
-        try:
+        with mock.patch.object(
+            optuna, "create_study", create_with_entry
+        ):  # rl_zoo3 has no other place
             super().hyperparameters_optimization()
-        finally:
-            optuna.create_study = create_study
 
     def objective(self, trial: optuna.Trial) -> float:
-        """What ``-optimize`` maximises: the return on held-out tasks after the most answers. Trials
-        that are not worth finishing, or fail by their hyperparameters, are pruned.
-        """
+        """What ``-optimize`` maximises: the return on held-out tasks after the most answers."""
         sample, entry = HYPERPARAMS_SAMPLER[self.algo], {"entry": self._hyperparams}
         sampled = self._preprocess_schedules(sample(trial, self.n_actions, self.n_envs, entry))
         env = self.create_envs(self.n_envs, no_log=True)

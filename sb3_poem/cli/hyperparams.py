@@ -19,10 +19,8 @@ from sb3_poem.pearl_sac.arguments import UNSUPPORTED
 # What rl_zoo3 takes out of an entry for itself before the rest goes to the algorithm.
 ZOO_KEYS = frozenset({"callback", "env_kwargs", "monitor_kwargs", "n_envs", "n_timesteps"})
 # What rl_zoo3 gives to the algorithm itself; the same in an entry would be given twice.
-FLAG_OF_KEY = {
-    **{"device": "--device", "env": "--env", "seed": "--seed", "verbose": "--verbose"},
-    "tensorboard_log": "-tb",
-}
+FLAGS = {"device": "--device", "env": "--env", "seed": "--seed", "verbose": "--verbose"}
+FLAGS |= {"tensorboard_log": "-tb"}
 #: Searched from a fourth to four times the entry's value
 COEFFICIENTS = ("kl_coef", "reward_coef", "policy_coef", "preference_coef")
 SCALES = ("one_minus_gamma", "learning_rate", "tau", *COEFFICIENTS)
@@ -41,17 +39,16 @@ def check_entry(entry: Mapping[str, Any], algorithm: str, source: str) -> None:
     parameters = inspect.signature(ALGORITHMS[algorithm]).parameters
     known = {name for name in parameters if not name.startswith("_")} - {"unsupported"} | ZOO_KEYS
     for key in sorted(entry):
-        if key in FLAG_OF_KEY:
-            raise ValueError(f"{key!r} in {source} belongs on the command line: {FLAG_OF_KEY[key]}")
+        if key in FLAGS:
+            raise ValueError(f"{key!r} in {source} belongs on the command line: {FLAGS[key]}")
         if key in UNSUPPORTED:
             raise ValueError(f"{key!r} in {source} is not for {algorithm}: {UNSUPPORTED[key]}")
         if key not in known:
-            close = difflib.get_close_matches(key, known - set(FLAG_OF_KEY), n=3)
+            close = difflib.get_close_matches(key, known - set(FLAGS), n=3)
             names = " or ".join(map(repr, close))
             alike = f"did you mean {names}?" if close else "nor anything like it."
-            raise ValueError(
-                f"Unknown key {key!r} in {source}: {algorithm} has no such hyperparameter, {alike}"
-            )
+            what = f"{algorithm} has no such hyperparameter, {alike}"
+            raise ValueError(f"Unknown key {key!r} in {source}: {what}")
         kind = parameters[key].annotation if key in parameters else None
         _check_value(f"{key} in {source}", key, entry[key], kind)
 
@@ -91,14 +88,14 @@ def check_config(config: str) -> None:
 
 
 def entry_params(algorithm: str, entry: dict[str, Any]) -> dict[str, Any]:
-    """The trial that is an entry itself, by Optuna's names and with schedules of learning rates,
-    without what cannot be searched around it: None, 0, and gradient steps of -1.
+    """The trial that is an entry itself, by Optuna's names, without what cannot be searched around
+    it: None, 0, and gradient steps of -1.
     """
     parameters = inspect.signature(ALGORITHMS[algorithm]).parameters
     values = {name: parameter.default for name, parameter in parameters.items()} | entry
     values["one_minus_gamma"] = 1.0 - values["gamma"]
     rate = values["learning_rate"]
-    if callable(rate):
+    if callable(rate):  # a schedule
         values["learning_rate"] = rate(1.0)
     params = {name: float(values[name]) for name in (*SCALES, *FRACTIONS) if values.get(name)}
     params |= {name: int(values[name]) for name in COUNTS if values[name] > 0}

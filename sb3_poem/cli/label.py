@@ -11,16 +11,14 @@ from typing import Any
 import gymnasium
 from rich.console import Console
 
-from sb3_poem.cli.needs import check_output, import_packages, parse_pairs
-from sb3_poem.cli.subject import say
+from sb3_poem.cli.needs import check_output, import_packages, parse_pairs, say
 
 SHORTEST_PASSWORD = 12
 AUTH_VARIABLE = "SB3_POEM_AUTH"
 
 
 def run_label(arguments: argparse.Namespace) -> None:
-    commands = {"export": run_export, "replay": run_replay, None: run_page}
-    commands[arguments.label_command](arguments)
+    {"export": run_export, "replay": run_replay, None: run_page}[arguments.label_command](arguments)
 
 
 def run_page(arguments: argparse.Namespace) -> None:
@@ -37,7 +35,7 @@ def run_page(arguments: argparse.Namespace) -> None:
     from sb3_poem.label.store import Store
 
     user, password = read_password(arguments.auth, arguments.auth_file)
-    instructions = read_instructions(arguments.instructions)
+    instructions = read_text("--instructions", arguments.instructions)
     token = secrets.token_urlsafe(24) if arguments.token else None
     is_open = not is_loopback(arguments.host)
     if is_open and password is None and token is None:
@@ -113,21 +111,18 @@ def read_password(auth: str | None, file: Path | None) -> tuple[str | None, str 
     return user, password
 
 
-def read_instructions(file: Path | None) -> str:
+def read_text(flag: str, file: Path | None) -> str:
+    """Read a file that a flag named, if it did."""
     if file is None:
         return ""
-    text = read_text("--instructions", file)
-    if not text.strip():
-        raise ValueError(f"--instructions {file}: must be a text or Markdown, but is empty")
-    return text
-
-
-def read_text(flag: str, file: Path) -> str:
     try:
-        return file.read_text(encoding="utf-8")
+        text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         why = getattr(error, "strerror", error)
         raise ValueError(f"{flag} {file}: must be a text in UTF-8 ({why})") from None
+    if not text.strip():
+        raise ValueError(f"{flag} {file}: must be a text, but is empty")
+    return text
 
 
 def check_shown(models: Sequence[Any]) -> None:
@@ -164,6 +159,9 @@ def run_export(arguments: argparse.Namespace) -> None:
 
 def run_replay(arguments: argparse.Namespace) -> None:
     """Feed the recorded answers to a model and a rule."""
+    # A model that rl_zoo3 trained may hold its schedules.
+    import rl_zoo3  # noqa: F401
+
     from sb3_poem.adaptation.state import write_json_atomically
     from sb3_poem.label.replay import replay
     from sb3_poem.loading import load_model

@@ -1,4 +1,4 @@
-"""What a command will need, checked before it spends its time."""
+"""What commands share: a word to the user, and checks before a command spends its time."""
 
 import ast
 import importlib
@@ -6,8 +6,12 @@ import os
 import sys
 import tempfile
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+#: Print a line at once, also into a file
+say = partial(print, flush=True)
 
 
 def check_writable(folder: str | Path) -> None:

@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Sequence
-from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +31,7 @@ def write_report(
     json_file: Path | None,
     plot_file: Path | None,
 ) -> None:
-    """Print the table of what adapting a model earned, and write what was asked for: every task's
-    return after every answer, limits, and how it came about; and a plot. Without ``known`` it was
+    """Print the table of what adapting earned, and write JSON and plot; without ``known`` it was
     interrupted.
     """
     console, limits, best = Console(), None, None
@@ -78,19 +76,16 @@ def _table(
     columns = [Column(name, justify="right") for name in names]
     look: dict[str, Any] = {"caption_justify": "left", "min_width": TABLE_WIDTH}
     table = Table(*columns, title=title, caption=caption, **look)
-
-    def add_row(n: Any, mean: float, error: float, limit: float | None, rate: float | None) -> None:
+    missing: Any = [None] * len(evaluation.record_at)
+    means = (evaluation.record_at, evaluation.mean_returns, standard_errors(evaluation))
+    beside = (limits or missing, missing if rates is None else rates)
+    rows: list[tuple[Any, ...]] = list(zip(*means, *beside, strict=True))
+    if known is not None:
+        rows.append(("task known", known.mean_return, np.nan, None, known.success_rate))
+    for n, mean, error, limit, rate in rows:
         cells = [str(n), f"{mean:.1f}", "" if np.isnan(error) else f"{error:.1f}"]
         cells += ["" if limit is None else f"{limit:.1f}", "" if rate is None else f"{rate:.2f}"]
-        table.add_row(*cells[: len(names)])
-
-    means = (evaluation.record_at, evaluation.mean_returns, standard_errors(evaluation))
-    absent = repeat(None)
-    for row in zip(*means, limits or absent, absent if rates is None else rates, strict=False):
-        add_row(*row)
-    if known is not None:
-        table.add_section()
-        add_row("task known", known.mean_return, np.nan, None, known.success_rate)
+        table.add_row(*cells[: len(names)], end_section=n == evaluation.record_at[-1])
     return table
 
 

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_poem.adaptation import AdaptedPolicy, KnownTaskReturn, Trajectory, known_task_return
 from sb3_poem.adaptation.evaluation import evaluation_seed
-from sb3_poem.cli.needs import check_device, import_packages, parse_pairs
+from sb3_poem.cli.needs import check_device, import_packages, parse_pairs, say
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.foreign import environment_of
 from sb3_poem.common.rollouts import rollout_latents
@@ -39,11 +39,6 @@ def describe_task(task: Sequence[float] | np.ndarray) -> str:
 def after(n_answers: int) -> str:
     """When a policy was adapted so far."""
     return f"after {n_answers} answer{'s' * (n_answers != 1)}"
-
-
-def say(text: str) -> None:
-    """Print a line as it is, and at once."""
-    print(text, flush=True)
 
 
 class Subject:
@@ -92,9 +87,7 @@ class Subject:
             return known_task_return(*about, selection_episodes=selection, limits=limits)
 
     def make_env(self, render_mode: str | None, show_task: bool) -> DummyVecEnv:
-        """A single environment with the first task, which is drawn too if it is shown; refused if
-        it cannot be drawn so.
-        """
+        """A single environment with the first task, which is drawn too if it is shown."""
         options = {**self.env_kwargs, "render_task": True} if show_task else self.env_kwargs
         env = DummyVecEnv([partial(make_shown_env, self.env_id, render_mode, **options)])
         FamilyView(env).set_tasks(self.tasks[:1])

@@ -2,25 +2,28 @@
 
 import argparse
 import difflib
+import json
+import shlex
 import sys
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import gymnasium as gym
+import yaml
 from rl_zoo3 import ALGOS
 from rl_zoo3 import enjoy as zoo_enjoy
 from rl_zoo3 import train as zoo_train
-from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import StoreDict
 
 from poem_envs.headless import has_display
 from sb3_poem.benchmark.suites import family_label
-from sb3_poem.cli.experiment import TrainingInterrupted, make_experiment
+from sb3_poem.cli.experiment import CHECKPOINT, TrainingInterrupted, make_experiment
 from sb3_poem.cli.hyperparams import SAMPLERS, convert_params
 from sb3_poem.cli.needs import check_device, import_packages
-from sb3_poem.cli.resume import resume_command, resumed
 from sb3_poem.loading import ALGORITHMS
 from sb3_poem.pearl_sac.saving import is_checkpoint
 
@@ -29,10 +32,8 @@ DEFAULTS = {
     "train": ["--algo", "poem_sac", "--eval-freq", "100000", "--eval-episodes", "2"],
     "enjoy": ["--folder", "logs"],
 }
-RESUME_HELP = (
-    "--resume: go on with the last run of the same algorithm, environment and seed, if it did not "
-    "finish"
-)
+TRAIN_EXAMPLE = "example: sb3-poem train --env poem/PointGoal-v0 -P"
+RESUME = "--resume: go on with the last run of this algorithm, environment and seed, if unfinished"
 
 
 def register_algorithms() -> None:
@@ -57,17 +58,23 @@ class CheckedPairs(StoreDict):
                 ) from error
 
 
-def check_arguments(command: str, arguments: Sequence[str]) -> None:
-    """Refuse what rl_zoo3's "train" or "enjoy" would stumble over; import ``--gym-packages``."""
+def parse(command: str, arguments: Sequence[str]) -> argparse.Namespace:
+    """What matters here of the arguments of rl_zoo3's "train" or "enjoy", with its defaults."""
     parser = argparse.ArgumentParser(f"sb3-poem {command}", add_help=False, allow_abbrev=False)
     for flags in (("-params", "--hyperparams"), ("--env-kwargs",), ("--eval-env-kwargs",)):
         parser.add_argument(*flags, nargs="+", action=CheckedPairs)
     parser.add_argument("--gym-packages", nargs="+", default=[])
-    parser.add_argument("--env", default="CartPole-v1")  # rl_zoo3's
+    parser.add_argument("--env", default="CartPole-v1")
     parser.add_argument("--algo", default="poem_sac")
     parser.add_argument("--device", default="auto")
+    parser.add_argument("--seed", type=int, default=-1)
+    parser.add_argument("-f", "--log-folder", default="logs")
     parser.add_argument("-i", "--trained-agent")
-    given, _ = parser.parse_known_args(arguments)
+    return parser.parse_known_args(arguments)[0]
+
+
+def check_arguments(given: argparse.Namespace) -> None:
+    """Refuse what rl_zoo3 would stumble over; import ``--gym-packages``."""
     import_packages(given.gym_packages)
     check_device(given.device)
     if given.trained_agent:
@@ -84,6 +91,67 @@ def check_arguments(command: str, arguments: Sequence[str]) -> None:
         raise ValueError(f"--env {given.env}: there is no such environment; {hint}")
 
 
+def resumed(given: argparse.Namespace, arguments: Sequence[str]) -> list[str] | None:
+    """Replace ``--resume`` by ``-i CHECKPOINT`` of the last run of the same algorithm, environment
+    and seed, or by nothing where none has left one; None if that run has finished already.
+    """
+    if given.trained_agent:
+        either = "leave out either --resume or -i/--trained-agent"
+        raise ValueError(f"--resume finds the checkpoint by itself: {either}")
+    rest = [argument for argument in arguments if argument != "--resume"]
+    folder, env_name = Path(given.log_folder) / given.algo, given.env.replace("/", "-")
+    run = last_run(folder, env_name, given.seed)
+    if run is None:
+        which = given.env if given.seed < 0 else f"{given.env} with seed {given.seed}"
+        print(f"--resume: {folder} has no checkpoint of {which}; training begins from zero")
+        return rest
+    if is_complete(run / f"{env_name}.zip"):
+        other = "start another run without --resume, or train it further with -i"
+        print(f"{run} has finished already; {other}")
+        return None
+    return [*rest, "-i", str(run / CHECKPOINT)]
+
+
+def resume_command(arguments: Sequence[str]) -> str:
+    """The command that goes on with a run that was given these arguments and left a checkpoint."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("-i", "--trained-agent")
+    parser.add_argument("--resume", action="store_true")
+    return shlex.join(["sb3-poem", "train", *parser.parse_known_args(arguments)[1], "--resume"])
+
+
+def is_complete(model: Path) -> bool:
+    """Whether a training made all its steps; an interrupted one has a model's file, too."""
+    if not model.exists():
+        return False
+    try:
+        with zipfile.ZipFile(model) as archive:
+            data = json.loads(archive.read("data"))
+        return int(data["num_timesteps"]) >= int(data["_total_timesteps"])
+    except (zipfile.BadZipFile, KeyError, ValueError) as error:
+        raise ValueError(f"{model} is truncated, or no model: {error}; remove it") from error
+
+
+def last_run(folder: Path, env_name: str, seed: int) -> Path | None:
+    """The newest run in an algorithm's folder that is done or can go on; of a seed, if not -1."""
+
+    def number(run: Path) -> int:
+        return int(run.name.removeprefix(env_name).split("_")[1])
+
+    for run in sorted(folder.glob(f"{env_name}_*"), key=number, reverse=True):
+        if seed >= 0 and _seed(run / env_name / "args.yml") != seed:
+            continue
+        if (run / CHECKPOINT).exists() or is_complete(run / f"{env_name}.zip"):
+            return run
+    return None
+
+
+def _seed(file: Path) -> int | None:
+    # rl_zoo3 writes an OrderedDict, which only this loader reads; the file is the user's own
+    arguments = yaml.load(file.read_text(), Loader=yaml.UnsafeLoader) if file.exists() else {}
+    return dict(arguments).get("seed")
+
+
 def run_zoo(command: str, arguments: Sequence[str]) -> None:
     """Run rl_zoo3's "train" or "enjoy" with our algorithms registered and defaults of our own."""
     register_algorithms()
@@ -91,30 +159,30 @@ def run_zoo(command: str, arguments: Sequence[str]) -> None:
     if not trains and not has_display() and not asks_help and "--no-render" not in arguments:
         raise OSError("there is no display to draw on: add --no-render")
     if asks_help:
-        print(f"Defaults here: {' '.join(DEFAULTS[command])}")
-        print(f"{RESUME_HELP}\n" if trains else "")
+        print(f"Defaults here: {' '.join(DEFAULTS[command])}\n{RESUME * trains}\n")
     given = [*DEFAULTS[command], *arguments]
     if trains and "--resume" in arguments:
-        if (continued := resumed(given)) is None:
+        if (continued := resumed(parse(command, given), given)) is None:
             return
         given = continued
-    check_arguments(command, given)
-    # rl_zoo3's programs read the process's own arguments.
-    own_arguments = sys.argv
-    sys.argv = [f"sb3-poem {command}", *given]
-    zoo_train.ExperimentManager = make_experiment  # type: ignore[assignment,misc]
+    check_arguments(parse(command, given))
     try:
-        zoo_train.train() if trains else zoo_enjoy.enjoy()
+        with (  # what rl_zoo3's programs read, and what they make
+            mock.patch.object(sys, "argv", [f"sb3-poem {command}", *given]),
+            mock.patch.object(zoo_train, "ExperimentManager", make_experiment),
+        ):
+            zoo_train.train() if trains else zoo_enjoy.enjoy()
     except TrainingInterrupted as stop:
+        message, is_saved = stop.args
         again = "the same command begins again"
-        if stop.resumable:
+        if is_saved:
             again = f"go on with: {resume_command(arguments)}"
-        raise KeyboardInterrupt(f"{stop}; {again}") from None
+        raise KeyboardInterrupt(f"{message}; {again}") from None
     except AssertionError as error:
         # rl_zoo3 asserts on what the user gave; an assertion without words is a defect.
         if not str(error):
             raise
         raise ValueError(str(error)) from error
     finally:
-        sys.argv = own_arguments
-        zoo_train.ExperimentManager = ExperimentManager  # type: ignore[misc]
+        if trains and asks_help:
+            print(f"\n{TRAIN_EXAMPLE}")

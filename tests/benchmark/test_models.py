@@ -284,7 +284,7 @@ def test_a_named_folder_without_a_model(tmp_path: Path) -> None:
         ),
         (
             ["--params", "net_arch:{'pi': [64]}"],
-            "--params net_arch: .* is a dictionary; write it as text",
+            "--params net_arch:.*: .* is a dictionary; write it as text",
         ),
     ],
 )

@@ -405,7 +405,7 @@ def start(folder: Path) -> subprocess.Popen[str]:
     command = [
         sys.executable,
         "-m",
-        "sb3_poem.cli",
+        "sb3_poem",
         "benchmark",
         "run",
         "--suite",

@@ -59,7 +59,7 @@ class Server:
         self.start()
 
     def start(self) -> None:
-        command = [sys.executable, "-m", "sb3_poem.cli", "label", "--model", self.model]
+        command = [sys.executable, "-m", "sb3_poem", "label", "--model", self.model]
         command += ["--port", str(self.port), "--store", str(self.store), "--workers", "1"]
         command += ["--queries", str(self.queries), "--seed", str(SEED), "--max-sessions", "40"]
         self.process = subprocess.Popen(

@@ -425,7 +425,7 @@ def test_the_printed_links_host_can_be_reached(host: str) -> None:
         ([], "", "SB3_POEM_AUTH must have the form USER:PASSWORD"),
         (["--auth", "nobody"], f"ann:{PASSWORD}", "--auth must have the form USER:PASSWORD"),
         (["--instructions", "missing"], None, "--instructions missing: must be a text in UTF-8"),
-        (["--instructions", "empty"], None, "--instructions empty: must be a text or Markdown"),
+        (["--instructions", "empty"], None, "--instructions empty: must be a text, but is empty"),
         (["--instructions", "picture"], None, "--instructions picture: must be a text in UTF-8"),
     ],
 )
@@ -465,7 +465,7 @@ def test_the_list_of_processes_does_not_show_the_password(tmp_path: Path) -> Non
     command = [
         sys.executable,
         "-m",
-        "sb3_poem.cli",
+        "sb3_poem",
         "label",
         "--model",
         "PointGoal",
