@@ -1,11 +1,20 @@
-"""Runs cells as tasks of Ray, on one machine or many, by the same code as the default backend.
+"""Runs cells as Ray Tune trials, on one machine or many, by the same code as the default backend.
 
-Tasks hand their records to this process, which alone writes the store. A lost worker's training is
-tried again from its checkpoint, in the folder of runs that all machines share.
+Models come first, each a trial that trains it; then the cells. Trials hand their records to this
+process, which alone writes the store. Trainings go on from their checkpoints in the folder of runs,
+which all machines must share: so a lost worker's trial is tried again where it stood, and the same
+command resumes a whole experiment.
 """
 
 import importlib
+import json
 import logging
+import shutil
+import uuid
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from sb3_poem.benchmark.cells import run_cell
 from sb3_poem.benchmark.models import ModelLibrary, Say, Workplace
@@ -14,23 +23,24 @@ from sb3_poem.benchmark.store import Record, Store
 from sb3_poem.benchmark.suites import Cell, ModelKey
 
 
-def run_with_ray(
-    plan: Plan,
-    library: ModelLibrary,
-    store: Store,
-    address: str | None = None,
-    cpus: float = 1.0,
-    gpus: float = 0.0,
-    max_failures: int = 3,
-    say: Say = print,
-) -> list[str]:
-    """Run a plan as tasks of Ray; what failed, a line each. The library's folders must be the same
-    on all machines.
+@dataclass(frozen=True)
+class RayOptions:
+    """How to use Ray: an address of None is the cluster that this process is connected to, or else
+    one on this machine; ``cpus`` and ``gpus`` of a trial, which is tried again ``max_failures``
+    times when it fails or its worker is lost.
+    """
 
-    :param address: Of the cluster; None is the one that this process is connected to, or else one
-        on this machine
-    :param cpus: Of a task, as ``gpus``
-    :param max_failures: How often a task is tried again that fails or loses its worker
+    address: str | None = None
+    cpus: float = 1.0
+    gpus: float = 0.0
+    max_failures: int = 3
+
+
+def run_with_ray(
+    plan: Plan, library: ModelLibrary, store: Store, options: RayOptions, say: Say = print
+) -> list[str]:
+    """Run a plan as Tune trials; what failed, a line each. The library's folders must be the same
+    on all machines.
     """
     try:
         import ray
@@ -40,43 +50,80 @@ def run_with_ray(
         ) from error
     own = not ray.is_initialized()
     if own:
-        quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
-        ray.init(address=address, include_dashboard=False, **quiet)
-    run = ray.remote(_run_job).options(
-        num_cpus=cpus,
-        num_gpus=gpus,
-        max_retries=max_failures,
-        retry_exceptions=True,
-    )
+        quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
+        ray.init(address=options.address, include_dashboard=False, **quiet)
     models = [key for key in plan.models if library.state(key) in ("missing", "interrupted")]
     derived = [key for key in models if key.base is not None]
     trained = [key for key in models if key.base is None]
     failures: list[str] = []
     try:
         for jobs in (trained, derived, plan.todo):  # what is made from others comes after them
-            running = {run.remote(job, library.workplace): job for job in jobs}
-            while running:
-                [finished], _ = ray.wait(list(running))
-                job = running.pop(finished)
-                try:
-                    record = ray.get(finished)
-                except ray.exceptions.RayError as error:
-                    failures.append(f"{job}: {getattr(error, 'cause', error)}")
-                    continue
-                if record is not None:
-                    store.add(record)
-                say(f"finished {job}")
+            failures += _run_trials(jobs, library.workplace, store.path.absolute(), options, say)
     finally:
         if own:
             ray.shutdown()
     return failures
 
 
-def _run_job(job: ModelKey | Cell, workplace: Workplace) -> Record | None:
+def _run_trials(
+    jobs: Sequence[ModelKey | Cell],
+    workplace: Workplace,
+    store: Path,
+    options: RayOptions,
+    say: Say,
+) -> list[str]:
+    """One Tune experiment; returns what failed."""
+    if not jobs:
+        return []
+    from ray import tune
+
+    class KeepRecords(tune.Callback):
+        """Keeps each record when it arrives, so that losing this process loses no finished cell.
+        Tune pickles it with everything else, hence the store's path.
+        """
+
+        def on_trial_result(
+            self, iteration: int, trials: list, trial: Any, result: dict, **info: Any
+        ) -> None:
+            if result.get("record"):
+                with Store(store) as opened:
+                    opened.add(Record(**json.loads(result["record"])))
+            if "name" in result:
+                say(f"finished {result['name']}")
+
+    # Where all machines can see it. Of Tune's own files nothing is needed afterwards: store and
+    # runs hold everything.
+    storage = Path(workplace.runs) / ".ray" / uuid.uuid4().hex
+    storage.mkdir(parents=True)
+    run = tune.with_parameters(_run_trial, jobs=list(jobs), workplace=workplace)
+    tuner = tune.Tuner(
+        tune.with_resources(run, {"cpu": options.cpus, "gpu": options.gpus}),
+        param_space={"number": tune.grid_search(list(range(len(jobs))))},
+        run_config=tune.RunConfig(
+            storage_path=str(storage),
+            failure_config=tune.FailureConfig(max_failures=options.max_failures),
+            callbacks=[KeepRecords()],
+            verbose=0,
+        ),
+    )
+    try:
+        results = tuner.fit()
+    finally:
+        shutil.rmtree(storage, ignore_errors=True)
+    failed = [result for i in range(len(results)) if (result := results[i]).error is not None]
+    return [f"{jobs[(result.config or {})['number']]}: {result.error}" for result in failed]
+
+
+def _run_trial(
+    config: dict[str, Any], jobs: Sequence[ModelKey | Cell], workplace: Workplace
+) -> None:
+    from ray import tune
+
     for package in workplace.packages:
         importlib.import_module(package)
-    library = ModelLibrary(workplace)
-    if isinstance(job, Cell):
-        return run_cell(job, library)
-    library.ensure(job)
-    return None
+    job, library, record = jobs[config["number"]], ModelLibrary(workplace), ""
+    if isinstance(job, ModelKey):
+        library.ensure(job, print)
+    else:
+        record = json.dumps(vars(run_cell(job, library, print)))
+    tune.report({"record": record, "name": str(job)})

@@ -48,10 +48,11 @@ def _run(arguments: argparse.Namespace) -> int:
     store = store or Store(arguments.store)
     say(f"{plan}; results in {arguments.store}")
     if arguments.backend == "ray":
-        from sb3_poem.benchmark.ray_backend import run_with_ray
+        from sb3_poem.benchmark.ray_backend import RayOptions, run_with_ray
 
-        options = (arguments.address, arguments.cpus_per_trial, arguments.gpus_per_trial)
-        failures = run_with_ray(plan, library, store, *options, arguments.max_failures, say)
+        resources = (arguments.cpus_per_trial, arguments.gpus_per_trial, arguments.max_failures)
+        options = RayOptions(arguments.address, *resources)
+        failures = run_with_ray(plan, library, store, options, say)
     else:
         failures = run_cells(plan.todo, library, store, say)
     for failure in failures:
