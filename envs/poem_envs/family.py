@@ -372,6 +372,6 @@ def checked(
         return clipped
     *row, component = map(int, np.argwhere(~acceptable)[0])
     raise ValueError(
-        f"{name}{row or ''} is {array[(*row, component)]:g} at component {component}, but must be "
+        f"{name}{row or ''} is {array[(*row, component)]} at component {component}, but must be "
         f"finite and inside [{low[component]:g}, {high[component]:g}]"
     )

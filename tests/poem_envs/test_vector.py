@@ -191,7 +191,7 @@ def test_bad_input_names_the_copy(env_id, rng):
         envs.step(actions[:2])
     tasks = np.concatenate([envs.sample_tasks(1, rng) for _ in range(3)])
     tasks[1, 0] = 50
-    with pytest.raises(ValueError, match=r"tasks\[1\] is 50 at component 0"):
+    with pytest.raises(ValueError, match=r"tasks\[1\] is 50.0 at component 0"):
         envs.set_tasks(tasks)
     with pytest.raises(ValueError, match="tasks has shape"):
         envs.set_tasks(tasks[:2])
