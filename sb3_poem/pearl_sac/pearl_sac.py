@@ -125,7 +125,6 @@ class PEARLSAC(SAC):
     #: The name of the algorithm on the command line, and of its file in ``zoo_configs/``
     zoo_name: ClassVar[str] = "pearl_sac"
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy}
-    sampler_class: ClassVar[type[MetaBatchSampler]] = MetaBatchSampler
     objective_class: ClassVar[type[Objective]] = Objective
 
     policy: LatentPolicy
@@ -516,7 +515,7 @@ class PEARLSAC(SAC):
         )
 
     def make_sampler(self) -> MetaBatchSampler:
-        return self._part(self.sampler_class, epoch_context=self._known_context)
+        return self._part(MetaBatchSampler, epoch_context=self._known_context)
 
     def make_objective(self) -> Objective:
         rewards = self._known_context.rewards

@@ -17,7 +17,7 @@ from sb3_poem.pearl_sac.arguments import GivenEnv, refuse_unknown, with_argument
 from sb3_poem.pearl_sac.collector import EpochCollector, in_waves, relabelled_returns
 from sb3_poem.pearl_sac.objective import Metrics, Objective, TaskEmbeddings
 from sb3_poem.pearl_sac.pearl_sac import PEARLSAC
-from sb3_poem.pearl_sac.sampler import MetaBatch, MetaBatchSampler
+from sb3_poem.pearl_sac.sampler import MetaBatch
 from sb3_poem.poem_sac.policies import MlpPolicy, POEMPolicy
 
 #: Arguments that are words, and which
@@ -26,22 +26,8 @@ CHOICES = {
     "context": ("optimal", "pearl"),
     "preference_source": ("auto", "relabel", "rollout"),
 }
-
-
-@dataclass
-class GroupSampler(MetaBatchSampler):
-    """Draws meta-batches of whole groups of tasks, where policies are compared within these."""
-
-    groups: list[np.ndarray]
-    preference_group_size: int
-
-    def choose_tasks(self) -> np.ndarray:
-        if not len(self.groups):
-            return super().choose_tasks()
-        wanted = self.meta_batch_size // self.preference_group_size
-        count = max(1, min(wanted, len(self.groups)))
-        chosen = self.generators.numpy.choice(len(self.groups), size=count, replace=False)
-        return np.concatenate([self.groups[index] for index in chosen])
+#: Share of the returns by rollouts that the next epoch still knows, where it measures no newer one
+REMEMBERED = 0.95
 
 
 @dataclass
@@ -130,13 +116,13 @@ class POEMSAC(PEARLSAC):
     :param context: "optimal": (s, a, s', r, Q); "pearl": (s, a, s', r), the ablation
     :param preference_source: Where J[i, j] comes from. "relabel": task i's reward function on task
         j's trajectories; "rollout": task j's policy is run on task i, within random groups of
-        tasks, and the steps are counted; "auto": relabel where the family shares dynamics
+        tasks, and the steps are counted; what earlier epochs measured is forgotten bit by bit, 1 in
+        20 an epoch; "auto": relabel where the family shares dynamics
     :param preference_group_size: Tasks whose policies are run on each other with "rollout"
     """
 
     zoo_name: ClassVar[str] = "poem_sac"
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy}
-    sampler_class: ClassVar[type[MetaBatchSampler]] = GroupSampler
     objective_class: ClassVar[type[Objective]] = POEMObjective
     policy: POEMPolicy
 
@@ -163,8 +149,6 @@ class POEMSAC(PEARLSAC):
         self.context = context
         self.preference_source = preference_source
         self.preference_group_size = preference_group_size
-        #: Tasks whose policies were run on each other's in the last epoch, with returns by rollouts
-        self.groups: list[np.ndarray] = []
         kwargs |= {"kl_coef": kl_coef, "reward_coef": reward_coef, "policy_coef": policy_coef}
         kwargs["context_relabel_fraction"] = 0.0
         super().__init__(policy, env, *args, **kwargs)
@@ -224,18 +208,24 @@ class POEMSAC(PEARLSAC):
         return np.array_split(tasks, max(1, len(tasks) // self.preference_group_size))
 
     def measure_returns(self, epoch: Segment, collector: EpochCollector) -> np.ndarray:
-        """J[i, j] by relabelling or, within random groups of tasks, by running the policies."""
+        """J[i, j] by relabelling or, within random groups of tasks, by running the policies; then
+        with most of what the epochs before measured.
+        """
         family, tasks, n_tasks = self.family, self.train_tasks.tasks, len(self.train_tasks)
         if self.relabels:
             steps = (epoch.features, epoch.first_episode)
             relabelled = relabelled_returns(family.compute_rewards, tasks, *steps)
             return relabelled.reshape(n_tasks, n_tasks, -1).mean(axis=2)
         returns = super().measure_returns(epoch, collector)
-        self.groups = self._split(self.generators.numpy.permutation(n_tasks))
-        pairs = [(i, j) for group in self.groups for i in group for j in group if i != j]
+        groups = self._split(self.generators.numpy.permutation(n_tasks))
+        pairs = [(i, j) for group in groups for i in group for j in group if i != j]
         own_latents = epoch.latents.reshape(n_tasks, -1, self.latent_dim)[:, 0]
         for wave in in_waves(np.array(pairs, dtype=np.int64).reshape(-1, 2), family.num_envs):
             task_ids, policy_ids = wave.T
             segment = collector.roll_out(task_ids, own_latents[policy_ids])
             returns[task_ids, policy_ids] = (segment.rewards * segment.first_episode).sum(axis=1)
+        if self.epoch_context is not None:  # which forgets, since policies change
+            before = self.epoch_context.returns.cpu().numpy()
+            remembered = self.generators.numpy.random(returns.shape) < REMEMBERED
+            returns = np.where(np.isnan(returns) & remembered, before, returns)
         return returns

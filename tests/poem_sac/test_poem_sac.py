@@ -109,14 +109,22 @@ def sources() -> dict[str, tuple[POEMSAC, Spy]]:
     return result
 
 
-@pytest.mark.parametrize("source", ["relabel", "rollout"])
-def test_returns_are_those_of_environments_of_every_task(sources: dict, source: str) -> None:
+@pytest.mark.parametrize(("source", "n_new"), [("relabel", 36), ("rollout", 6 + 2 * 3 * 2)])
+def test_returns_are_those_of_environments_of_every_task(
+    sources: dict, source: str, n_new: int
+) -> None:
     model, spy = sources[source]
-    truth = policy_returns(model, gym.make(POINT_GOAL, reset_noise_scale=0.0), spy.latents[1])
+    env = gym.make(POINT_GOAL, reset_noise_scale=0.0)
+    before, truth = (policy_returns(model, env, latents) for latents in spy.latents)
     assert np.ptp(truth) > 1.0
-    known = np.isfinite(spy.returns[1])
-    assert known.all() == (source == "relabel")
-    np.testing.assert_allclose(spy.returns[1][known], truth[known], atol=1e-3)
+    found = spy.returns[1]
+    new = np.isclose(found, truth, atol=1e-3)
+    assert new.sum() == n_new
+    # what was not measured anew is of the epoch before, where that measured it
+    old = np.isfinite(found) & ~new
+    assert old.any() == (source == "rollout")
+    assert np.isfinite(spy.returns[0][old]).all()
+    np.testing.assert_allclose(found[old], before[old], atol=1e-3)
 
 
 def test_measured_returns_equal_relabelled_ones(sources: dict) -> None:
@@ -129,13 +137,9 @@ def test_measured_returns_equal_relabelled_ones(sources: dict) -> None:
 
 def test_returns_are_measured_within_groups_and_counted(sources: dict) -> None:
     model, spy = sources["rollout"]
-    groups = model.groups
-    assert sorted(np.concatenate(groups)) == list(range(6))  # every task in one group
-    assert [len(group) for group in groups] == [3, 3]
-    expected = np.zeros((6, 6), dtype=bool)
-    for group in groups:
-        expected[np.ix_(group, group)] = True
-    assert np.array_equal(np.isfinite(spy.returns[1]), expected)
+    known = np.isfinite(spy.returns[0])
+    assert known.sum(axis=1).tolist() == [3] * 6  # two groups of three
+    assert np.array_equal(known @ known, known)  # who share one task share all
     # an epoch: 6 tasks in waves of 4, and 2 groups of 3 * 2 pairs in waves of 4; all steps count,
     # and fill the tasks' buffers
     assert model.num_timesteps == 2 * (2 + 3) * 4 * 25
@@ -146,39 +150,21 @@ def test_returns_are_measured_within_groups_and_counted(sources: dict) -> None:
     )  # not a step beyond the collection's own
 
 
-def test_meta_batches_are_whole_groups() -> None:
-    model = small(
-        POEMSAC,
-        preference_source="rollout",
-        n_train_tasks=14,
-        meta_batch_size=9,
-        preference_group_size=4,
-    ).learn(1)
-    assert [len(group) for group in model.groups] == [5, 5, 4]
-    for _ in range(5):
-        batch = model.make_sampler().sample(1, 8)[0]
-        chosen = set(batch.task_ids.tolist())
-        inside = [group for group in model.groups if chosen & set(group)]
-        assert len(inside) == 2
-        assert chosen == {task for group in inside for task in group}
-        # all that is known of these tasks is in the batch: 5 or 4 policies for each
-        known = batch.returns.isfinite()
-        assert set(known.sum(dim=1).tolist()) <= {4, 5}
-        th.testing.assert_close(
-            batch.returns,
-            model.epoch_context.returns[batch.task_ids][:, batch.task_ids],
-            equal_nan=True,
-            rtol=0,
-            atol=0,
-        )
-
-
-def test_measured_groups_change_every_epoch() -> None:
-    model = small(POEMSAC, preference_source="rollout").learn(1)
-    first = [set(group) for group in model.groups]
+def test_returns_by_rollouts_are_forgotten_bit_by_bit() -> None:
+    model = small(POEMSAC, preference_source="rollout", n_train_tasks=40, gradient_steps=0)
+    spy = Spy(model)
+    model.learn(1)
     model.learn(1, reset_num_timesteps=False)
-    assert model.epoch == 2
-    assert [set(group) for group in model.groups] != first
+    first, second = spy.returns
+    known = np.isfinite(first)
+    assert known.sum() == 40 * 4
+    assert np.all(np.diagonal(first) != np.diagonal(second))
+    forgotten = np.isnan(second[known]).mean()
+    assert 0.0 < forgotten < 0.12  # 0.05 of what was not measured again
+    assert np.isfinite(second).sum() > 1.5 * known.sum()
+    batch = model.make_sampler().sample(1, 8)[0]
+    rows = second[batch.task_ids][:, batch.task_ids].astype(np.float32)
+    assert np.array_equal(batch.returns.numpy(), rows, equal_nan=True)
 
 
 def test_auto_relabels_where_it_can() -> None:
@@ -198,9 +184,9 @@ def test_returns_of_tasks_with_their_own_dynamics() -> None:
     arguments = {"gradient_steps": 0, "n_train_tasks": 6, "preference_group_size": 3}
     model = nearly_deterministic(small(POEMSAC, walks(4, StillWindyWalk), horizon=10, **arguments))
     spy = Spy(model)
-    model.learn(2 * 5 * 4 * 10)
-    truth = policy_returns(model, gym.wrappers.TimeLimit(StillWindyWalk(), 10), spy.latents[1])
-    returns = spy.returns[1]
+    model.learn(5 * 4 * 10)
+    truth = policy_returns(model, gym.wrappers.TimeLimit(StillWindyWalk(), 10), spy.latents[0])
+    returns = spy.returns[0]
     known = np.isfinite(returns)
     assert known.sum() == 2 * 9
     np.testing.assert_allclose(returns[known], truth[known], atol=1e-3)
