@@ -26,7 +26,7 @@ function browserStorage() {
   try {
     return window.localStorage;
   } catch {
-    return { getItem: () => null, setItem() {} };
+    return { getItem: () => null, setItem() {}, removeItem() {} };
   }
 }
 
@@ -52,18 +52,15 @@ async function ask(path, body) {
 const unsent = readKept();
 const deliveries = {};
 
+// An item a path: another tab of this conversation may keep or forget something at the same moment.
 function readKept() {
-  return JSON.parse(storage.getItem(base) || "{}");
-}
-
-// Another tab of this conversation may keep something of its own.
-function keep(path, body) {
-  storage.setItem(base, JSON.stringify({ ...readKept(), [path]: body }));
+  const kept = Object.keys(storage).filter((key) => key.startsWith(`${base}/`));
+  return Object.fromEntries(kept.map((key) => [key.slice(base.length), JSON.parse(storage.getItem(key))]));
 }
 
 function send(path, body) {
   unsent[path] = body;
-  keep(path, body);
+  storage.setItem(base + path, JSON.stringify(body));
   deliveries[path] ??= deliver(path).finally(() => delete deliveries[path]);
   return deliveries[path];
 }
@@ -90,7 +87,7 @@ async function deliver(path) {
 
 function forget(path) {
   delete unsent[path];
-  keep(path, undefined);
+  storage.removeItem(base + path);
 }
 
 // No answer, no room, or no disk: it may come.
