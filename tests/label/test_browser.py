@@ -690,7 +690,8 @@ def test_the_choice_of_robots(open_page: Callable[..., Any], server: Server) -> 
     page = open_page(server.url)
     assert page.text_content("h2") == "Where should it go?"
     picture = page.locator("button[value=PointGoal] img")
-    assert picture.evaluate("image => [image.complete, image.naturalWidth]") == [True, 320]
+    picture.evaluate("image => image.decode()")  # waits until it has come
+    assert picture.evaluate("image => image.naturalWidth") == 320
     assert picture.evaluate("image => image.currentSrc").endswith("/PointGoal.webp")
     page = open_page(server.url, reduced_motion="no-preference")
     loop = page.locator("button[value=PointGoal] img")
