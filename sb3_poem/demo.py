@@ -1,4 +1,9 @@
-"""``make run``: the whole of it once, with the commands that do it."""
+"""``make run``: the whole of it once, with the commands that do it.
+
+Meta-trains an agent for PointGoal from nothing and adapts it to 30 unseen tasks by ten preference
+queries each, then does the same adaptation with the HalfCheetahVel model that ships with the
+package.
+"""
 
 import argparse
 import shlex
@@ -8,6 +13,7 @@ import time
 from pathlib import Path
 
 from poem_envs.headless import can_draw
+from sb3_poem.cli.needs import check_writable
 
 ADAPTATION = "--oracle return --queries 10 --tasks 30 --record 0 1 2 5 10"
 # one thread: networks this small gain nothing from more
@@ -42,6 +48,7 @@ def main() -> None:
     what = "folder for what is written (default: %(default)s)"
     parser.add_argument("--out", type=Path, default=Path("out"), help=what)
     out: Path = parser.parse_args().out
+    check_writable(out)
     started = time.perf_counter()
 
     print("1. Meta-train a point that walks to goals on a half-circle. It sees some goals and")

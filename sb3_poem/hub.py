@@ -18,9 +18,10 @@ def is_repository(name: str | Path) -> bool:
 
 
 def download(repository: str) -> Path:
-    """The folder of a model ``"user/name"`` in the Hub's own cache; without a network that of an
+    """The folder of a model of the Hub, in the Hub's own cache; without a network that of an
     earlier download.
 
+    :param repository: ``"user/name"``
     :raises ImportError: if the extra ``[hub]`` is not installed
     :raises FileNotFoundError: if there is no such model, or the Hub cannot be reached
     """
@@ -31,30 +32,31 @@ def download(repository: str) -> Path:
     try:
         folder = Path(client.HfApi().snapshot_download(repository, allow_patterns=list(FILES)))
     except client.errors.RepositoryNotFoundError as error:
-        why = "or it is private: then log in with `hf auth login`, or set HF_TOKEN"
         raise FileNotFoundError(
-            f"{what}, and the Hugging Face Hub has none of that name, {why}"
+            f"{what}, and the Hugging Face Hub has none of that name, or it is private: then log "
+            "in with `hf auth login`, or set HF_TOKEN"
         ) from error
     except (OSError, ValueError, HTTPError) as error:
-        why = _first_line(error)
         raise FileNotFoundError(
-            f"{what}, and none came from the Hugging Face Hub: {why}"
+            f"{what}, and none came from the Hugging Face Hub: {_first_line(error)}"
         ) from error
-    for name in FILES[:2]:
-        if not (folder / name).is_file():
-            is_none = f"is no model of sb3_poem: it has no {name}"
-            raise FileNotFoundError(f"{repository} on the Hugging Face Hub {is_none}")
+    missing = [name for name in FILES[:2] if not (folder / name).is_file()]
+    if missing:
+        raise FileNotFoundError(
+            f"{repository} on the Hugging Face Hub is no model of sb3_poem: it has no {missing[0]}"
+        )
     return folder
 
 
 def upload(repository: str, contents: Mapping[str, bytes], private: bool | None = None) -> str:
-    """Write a model's files to the Hub, in one commit; the repository is made if missing. Returns
-    its address.
+    """Write a model's files to the Hub, in one commit; the repository is made if missing.
 
+    :param repository: ``"user/name"``
     :param contents: Of each of :data:`FILES`
     :param private: Of a repository that is made; None takes the account's default
+    :return: Its address
     :raises ImportError: if the extra ``[hub]`` is not installed
-    :raises ValueError: if the name is not ``"user/name"``
+    :raises ValueError: if the name is none that the Hub takes
     :raises OSError: if the Hub refuses it or cannot be reached
     """
     if not is_repository(repository):
@@ -68,8 +70,10 @@ def upload(repository: str, contents: Mapping[str, bytes], private: bool | None 
         address = api.create_repo(repository, private=private, exist_ok=True)
         api.create_commit(repository, files, commit_message="Upload a model of sb3_poem")
     except (OSError, HTTPError) as error:
-        why = f"{_first_line(error)}. It needs a network and a token: `hf auth login`, or HF_TOKEN"
-        raise OSError(f"{repository} was not written to the Hugging Face Hub: {why}") from error
+        raise OSError(
+            f"{repository} was not written to the Hugging Face Hub: {_first_line(error)}. "
+            "Writing needs a network and a token: `hf auth login`, or HF_TOKEN"
+        ) from error
     return str(address)
 
 

@@ -30,6 +30,8 @@ def test_written_frames_are_read_back(tmp_path: Path, suffix: str) -> None:
     [
         ([], "a.mp4", "no frames"),
         (clip(2), "a.avi", r"\.mp4 or \.gif"),
+        (clip(1) + clip(1, height=20), "a.gif", "one size"),
+        ([np.zeros((4, 4), np.uint8)], "a.gif", "height, width, 3"),
     ],
 )
 def test_bad_frames_are_refused(tmp_path: Path, frames: list, name: str, words: str) -> None:
@@ -58,9 +60,11 @@ def test_captions_are_drawn_above_the_frames() -> None:
     assert (captioned[0][:band, 164:] < 100).any()
 
 
-def test_side_by_side_needs_frames() -> None:
+def test_side_by_side_refuses_what_does_not_fit() -> None:
     with pytest.raises(ValueError, match="need frames"):
         side_by_side([], clip(1))
+    with pytest.raises(ValueError, match="same height"):
+        side_by_side(clip(1), clip(1, height=10))
 
 
 def test_plot_shows_what_it_was_given(tmp_path: Path) -> None:

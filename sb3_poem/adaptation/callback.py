@@ -67,6 +67,7 @@ class AdaptationEvalCallback(EpochCallback):
         self.n_tasks, self.n_episodes, self.seed = n_tasks, n_episodes, seed
         self.record_at = check_whole_numbers("record_at", record_at, 0)
         folder = best_model_save_path
+        self.best_model_save_path = None if folder is None else Path(folder)
         self._best_model = None if folder is None else Path(folder) / "best_model.zip"
         self.adaptation_kwargs = dict(adaptation_kwargs or {})
         self.env_kwargs = dict(env_kwargs or {})

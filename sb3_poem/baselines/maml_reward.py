@@ -176,12 +176,16 @@ class MetaReward:
         except SafetensorError as error:
             raise ValueError(f"{weights} is truncated, or no safetensors file: {error}") from error
         for name, value in _standardisation(policy).items():
-            if not th.equal(tensors[name], value.cpu()):
+            kept = tensors.get(name)
+            if kept is None or kept.shape != value.shape or not th.equal(kept, value.cpu()):
                 raise ValueError(
                     f"`policy` is not the one with which the reward in {folder} was meta-trained: "
                     f"its {name} differs; load the same model again"
                 )
         meta = cls(policy, **{name: config[name] for name in SETTINGS})
+        shapes = {f"network.{name}": value.shape for name, value in meta.parameters.items()}
+        if shapes != {name: t.shape for name, t in tensors.items() if name.startswith("network.")}:
+            raise ValueError(f"{weights} does not hold the network that {CONFIG} describes")
         for name in meta.parameters:
             meta.parameters[name] = tensors[f"network.{name}"].to(policy.device)
         return meta

@@ -1,6 +1,5 @@
 """Checks of numbers that users and files give."""
 
-import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -44,8 +43,13 @@ def check_number(name: str, value: Any, low: float = -np.inf, high: float = np.i
 def check_number_or_auto(name: str, value: Any, low: float = -np.inf) -> None:
     """Refuse what is neither a number from ``low`` on nor "auto" (or "auto_" and such a number)."""
     if not isinstance(value, str):
-        check_number(name, value, low)
-    elif not re.fullmatch(r"auto(_[0-9]+[0-9.e+-]*)?", value):
+        return check_number(name, value, low)
+    word, _, start = value.partition("_")
+    try:
+        known = word == "auto" and (not start or float(start) > 0)
+    except ValueError:
+        known = False
+    if not known:
         raise ValueError(f'`{name}` must be a number or "auto", but is {value!r}')
 
 

@@ -1,11 +1,11 @@
 """What an algorithm needs to know of a task family, asked of any SB3 ``VecEnv`` of it."""
 
-import copy
 import re
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
+import cloudpickle
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
@@ -27,13 +27,15 @@ TEST_TASK_STREAM = 0x7E57
 COMPARED_STEPS = 10
 
 #: These leave alone what is seen, done and paid; the patched one is rl_zoo3's.
-HARMLESS = {
-    *("HumanRendering", "Monitor", "OrderEnforcing", "PassiveEnvChecker", "PatchedTimeLimit"),
-    *("RecordEpisodeStatistics", "RecordVideo", "RenderCollection", "TimeLimit"),
-    *("VecCheckNan", "VecMonitor", "VecVideoRecorder"),
-}
+HARMLESS = frozenset(
+    {
+        *("HumanRendering", "Monitor", "OrderEnforcing", "PassiveEnvChecker", "PatchedTimeLimit"),
+        *("RecordEpisodeStatistics", "RecordVideo", "RenderCollection", "TimeLimit"),
+        *("VecCheckNan", "VecMonitor", "VecVideoRecorder"),
+    }
+)
 #: All others of Gymnasium and Stable-Baselines3 may change it, as may these kinds.
-CHANGING = {*gym.wrappers.__all__, *sb3_vec_env.__all__} - HARMLESS
+CHANGING = frozenset({*gym.wrappers.__all__, *sb3_vec_env.__all__}) - HARMLESS
 CHANGING_KINDS = (gym.ObservationWrapper, gym.RewardWrapper, gym.ActionWrapper)
 
 
@@ -50,7 +52,7 @@ class WrapperError(ValueError):
 
 
 def no_family(env: str) -> str:
-    """What to say of an environment that describes itself so."""
+    """What to say of an environment that is no task family, but describes itself so."""
     return (
         f"env {env} is no task family: an environment whose reward depends on a hidden task. "
         "Subclass poem_envs.TaskFamily, or make one of a goal-conditioned environment by "
@@ -98,9 +100,13 @@ class FamilyView:
         """
         family = cls(env)
         family._unknown_wrappers = ", ".join(family.unknown_wrappers())
-        limit = None if family.spec is None else family.spec.max_episode_steps
+        family.horizon = family._horizon(horizon)
+        return family
+
+    def _horizon(self, horizon: int | None) -> int:
+        limit = None if self.spec is None else self.spec.max_episode_steps
         if limit is None:  # a GoalFamily that was not made by gym.make
-            limit = family._get("max_episode_steps")
+            limit = self._get("max_episode_steps")
         steps = horizon if limit is None else limit
         if steps is None:
             raise ValueError(
@@ -113,42 +119,51 @@ class FamilyView:
                 "they must agree"
             )
         check_whole("horizon", steps, 1)
-        family.horizon = int(steps)
-        return family
+        return int(steps)
 
     @cached_property
     def env_kwargs(self) -> dict[str, Any]:
         """What it was made with beyond its registration, and beyond how it is drawn."""
-        own = {} if self.spec is None else self.spec.kwargs
+        own = {} if self.spec is None else dict(self.spec.kwargs)
         registered = gym.registry[self.env_id].kwargs if self.env_id in gym.registry else {}
-        return {
-            name: value
-            for name, value in own.items()
-            if name not in DRAWING_ARGUMENTS
-            and not (name in registered and np.array_equal(value, registered[name]))
-        }
+        for name, value in registered.items():
+            if name in own and _equal(value, own[name]):
+                del own[name]
+        return {name: value for name, value in own.items() if name not in DRAWING_ARGUMENTS}
 
     def unknown_wrappers(self) -> list[str]:
         """The names of wrappers that may change the family; refuses those that are known to."""
-        env, names = self.env, []  # outermost first
+        env, names = self.env, self._wrapper_names()
+        changing = [name for name in names if name in CHANGING]
+        changing += [kind.__name__ for kind in CHANGING_KINDS if any(env.env_is_wrapped(kind))]
+        if changing:
+            wrappers = ", ".join(names)
+            raise WrapperError(f"env must not be wrapped in {changing[0]} (it is in: {wrappers})")
+        unknown = [name for name in names if name not in HARMLESS]
+        for space in ("observation_space", "action_space") if unknown else ():
+            own, given = getattr(self._get("unwrapped"), space), getattr(env, space)
+            if own != given:
+                raise WrapperError(
+                    f"env's wrappers ({', '.join(names)}) must leave {space} {own}, but make it "
+                    f"{given}"
+                )
+        return unknown
+
+    def _wrapper_names(self) -> list[str]:
+        """Of the wrappers around the environment and around its copies, outermost first."""
+        env, names = self.env, []
         while isinstance(env, VecEnvWrapper):
             names.append(type(env).__name__)
             env = env.venv
         for chain in dict.fromkeys(env.env_method("__str__")):  # which SubprocVecEnv gives too
             words = re.findall(r"<([^<>]+)", chain)
             names += words[: -1 if words and words[-1].endswith(" instance") else -2]
-        names = list(dict.fromkeys(names))
-        changing = [name for name in names if name in CHANGING]
-        changing += [kind.__name__ for kind in CHANGING_KINDS if any(env.env_is_wrapped(kind))]
-        if changing:
-            wrappers = ", ".join(names)
-            raise WrapperError(f"env must not be wrapped in {changing[0]} (it is in: {wrappers})")
-        return [name for name in names if name not in HARMLESS]
+        return list(dict.fromkeys(names))
 
     def check_experience(self, tasks: np.ndarray, seed: int, segment: Segment) -> None:
         """Refuse rewards that are not :meth:`compute_rewards`'s, and unknown wrappers that change
-        the family, by a segment of these tasks (copies, task_dim) from a reset with this seed: the
-        first that it is shown.
+        the family, by a segment of these tasks (copies, task_dim) from a reset with this seed. The
+        first call looks, and the others take its word.
         """
         if self._experience_is_right:
             return
@@ -162,10 +177,10 @@ class FamilyView:
             )
         wrong = np.argwhere(~np.isclose(segment.rewards, expected, rtol=1e-5, atol=1e-6))
         if len(wrong):
-            row, step = wrong[0]
+            copy, step = wrong[0]
             what = (
-                f"env paid {segment.rewards[row, step]:.6g} at step {step} of copy {row}, but "
-                f'compute_rewards(task, info["reward_features"]) is {expected[row, step]:.6g}'
+                f"env paid {segment.rewards[copy, step]:.6g} at step {step} of copy {copy}, but "
+                f'compute_rewards(task, info["reward_features"]) is {expected[copy, step]:.6g}'
             )
             if wrappers:
                 raise WrapperError(f"{what}, by one of its wrappers {wrappers}")
@@ -177,7 +192,14 @@ class FamilyView:
     def _lives_through(self, task: np.ndarray, seed: int, segment: Segment) -> bool:
         """Whether the family without its wrappers repeats the first copy's experience."""
         if self.env_id is None:
-            twin: Any = copy.deepcopy(self._get("unwrapped"))
+            try:
+                twin = cloudpickle.loads(cloudpickle.dumps(self._get("unwrapped")))
+            except Exception as error:
+                raise WrapperError(
+                    f"whether env's wrappers {self._unknown_wrappers} change it cannot be told "
+                    f"without a copy of env, which {type(error).__name__} prevents ({error}): "
+                    "register it"
+                ) from error
         else:
             twin = gym.make(self.env_id, disable_env_checker=True, **self.env_kwargs).unwrapped
         low, high = twin.action_space.low, twin.action_space.high
@@ -188,9 +210,8 @@ class FamilyView:
             action = np.clip(low + 0.5 * (action + 1.0) * (high - low), low, high)
             seen.append(twin.step(action)[0])
         twin.close()
-        shown = np.array([segment.observations[0, 0], *segment.next_observations[0, :steps]])
-        expected = np.array(seen, dtype=np.float32)
-        return shown.shape == expected.shape and np.allclose(expected, shown, 1e-4, 1e-4)
+        shown = [segment.observations[0, 0], *segment.next_observations[0, :steps]]
+        return np.allclose(np.array(seen, dtype=np.float32), shown, rtol=1e-4, atol=1e-4)
 
     @property
     def task(self) -> np.ndarray:
@@ -251,7 +272,8 @@ class FamilyView:
             env.env_method("set_task", task, indices=[index])
 
     def seed_episodes(self, seeds: Sequence[int]) -> None:
-        """Seed every copy's next episode, one seed a copy, without touching its task.
+        """Seed every copy's next episode, one seed a copy, without touching its task, the one that
+        was chosen for the next reset if there is one.
 
         A family that was never given a task draws one whenever it is reset with a seed. So its
         generators are replaced, and its next reset needs no seed; copies that have none to replace
@@ -261,8 +283,8 @@ class FamilyView:
         if any(seed is not None for seed in env.unwrapped._seeds):
             env.reset()  # as make_vec_env seeds, to choose tasks, not these episodes
         if not hasattr(env, "keep_tasks"):
-            for index, seed in enumerate(seeds):
-                env.set_attr("np_random", np.random.default_rng(seed), indices=[index])
+            for copy, seed in enumerate(seeds):
+                env.set_attr("np_random", np.random.default_rng(seed), indices=[copy])
             return
         if env.tasks is None:  # nobody has chosen yet, so that the first seeds do
             seed_copies(env, seeds)
@@ -323,3 +345,8 @@ def seed_copies(vec_env: VecEnv, seeds: Sequence[int]) -> None:
 def vectorised(env: gym.Env | VecEnv) -> VecEnv:
     """The same environment as a vectorised one, of one copy if it is not one."""
     return DummyVecEnv([lambda: env]) if isinstance(env, gym.Env) else env
+
+
+def _equal(one: Any, other: Any) -> bool:
+    """Whether two arguments are the same, of what can be told so; a dictionary may hold arrays."""
+    return one is other or (not isinstance(other, dict) and np.array_equal(one, other))

@@ -193,7 +193,15 @@ class _Perceptron(th.autograd.Function):
         return ctx.network.gradient(grad, values, norms, trained, wanted), None, None
 
 
-_FUSED_LINEAR = th.backends.mkldnn.is_available() and th.ops.mkldnn._is_mkldnn_bf16_supported()
+def _fused_linear_is_available() -> bool:
+    operations = th.ops.mkldnn
+    names = ("_linear_pointwise", "_is_mkldnn_bf16_supported")
+    if not (th.backends.mkldnn.is_available() and all(hasattr(operations, name) for name in names)):
+        return False
+    return bool(operations._is_mkldnn_bf16_supported())
+
+
+_FUSED_LINEAR = _fused_linear_is_available()
 
 
 def _linear_relu(x: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:

@@ -7,6 +7,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_poem.common.checks import check_whole
 from sb3_poem.common.family_view import FamilyView, demanded, reward_features, seed_copies
 from sb3_poem.common.trajectory import Trajectory
 
@@ -26,18 +27,20 @@ def rollout_latents(
     environment has copies; in the order of the latents.
 
     Every rollout resets its copy with a seed of its own: of policies that act by their mode it
-    depends on its latent, task and seed alone, and two with equal seeds start alike (common random
-    numbers). Action noise is drawn for a wave of copies together. A copy's first episode alone is
-    kept; the environment keeps the tasks and the state that it ended in.
+    depends on its latent, task and seed alone, not on the copy or on how many there are, and two
+    with equal seeds start alike (common random numbers). Action noise is drawn for a wave of copies
+    together. A copy's first episode alone is kept; the environment keeps the tasks and the state
+    that it ended in.
 
     :param model: Anything with SB3's ``predict(obs, state=latents, deterministic=...)``.
-    :param latents: (n, latent_dim).
-    :param tasks: (n, task_dim) to set before each rollout; None keeps the environment's own.
+    :param latents: (n, latent_dim), any n.
+    :param tasks: (n, task_dim) to set before each rollout; None keeps the environment's own tasks.
     :param seed: One seed a rollout, or one integer s: then rollout i takes s + i.
     :param deterministic: Whether the policies act by their mode.
-    :param frames: Whether to render every step, or n to render every n-th.
+    :param frames: Whether to render every step, or n to render every n-th; the environment needs
+        ``render_mode="rgb_array"``.
     :param max_steps: Where an episode is cut; None takes ``model.horizon``.
-    :raises ValueError: If a latent, an observation or an action is not finite.
+    :raises ValueError: On wrong shapes, and if an observation or an action is not finite.
     """
     how = (seed, deterministic, frames, max_steps)
     return [seen for seen, _ in _episodes(model, vec_env, latents, tasks, *how)]
@@ -75,14 +78,26 @@ def _episodes(
     frames: int = 0,
     max_steps: int | None = None,
 ) -> Iterator[tuple[Trajectory, bool | None]]:
+    """Of every latent, and whether it was a success."""
     latents = np.asarray(latents, dtype=np.float64)
     n, copies = len(latents), vec_env.num_envs
     if latents.ndim != 2:
         raise ValueError(f"`latents` must have shape (n, latent_dim), but has {latents.shape}")
     if not (finite := np.isfinite(latents).all(axis=1)).all():
         raise ValueError(f"`latents` must be finite, but row {int(np.argmin(finite))} is not")
-    seeds = seed if isinstance(seed, Sequence) else range(seed, seed + n)
+    if tasks is not None:
+        tasks = np.asarray(tasks, dtype=np.float64)
+        if tasks.ndim != 2 or len(tasks) != n:
+            raise ValueError(
+                f"`tasks` must have shape ({n}, task_dim), one a latent, but has shape "
+                f"{tasks.shape}"
+            )
+    seeds = [seed + i for i in range(n)] if isinstance(seed, (int, np.integer)) else list(seed)
+    if len(seeds) != n:
+        raise ValueError(f"`seed` must be one integer or hold one a latent ({n}), not {len(seeds)}")
     steps = model.horizon if max_steps is None else max_steps
+    check_whole("max_steps", steps, 1)
+    check_whole("frames", int(frames), 0)
     if frames and vec_env.render_mode != "rgb_array":
         raise ValueError(
             'rendering needs an environment made with render_mode="rgb_array", but this one has '
@@ -97,13 +112,13 @@ def _episodes(
         with th.random.fork_rng(enabled=not deterministic):
             if not deterministic:
                 th.manual_seed(wave_seeds[0])
-            if family is not None and tasks is not None:
-                family.set_tasks(tasks[wave])
             if family is not None and tasks is None:
                 family.seed_episodes(wave_seeds)
             else:
+                if family is not None and tasks is not None:
+                    family.set_tasks(tasks[wave])
                 seed_copies(vec_env, wave_seeds)
-            how = (deterministic, frames, steps, first, min(copies, n - first))
+            how = (deterministic, frames, int(steps), first, min(copies, n - first))
             yield from _wave(model, vec_env, latents[wave], *how)
 
 
@@ -117,7 +132,7 @@ def _wave(
     first: int,
     n: int,
 ) -> Iterator[tuple[Trajectory, bool | None]]:
-    """An episode of each of ``n`` copies, the first of which has this number."""
+    """An episode of each of ``n`` copies, of which the first has this number."""
     copies = len(latents)
     running, lengths = np.arange(copies) < n, np.zeros(copies, dtype=np.int64)
     successes: list[bool | None] = [None] * copies
@@ -135,17 +150,18 @@ def _wave(
             if running[copy] and image is not None:
                 images[copy].append(np.asarray(image))
 
-    observations = finite(np.asarray(vec_env.reset()).reshape(copies, -1), 0, "an observation")
-    seen, taken, features = [observations.copy()], [], []
+    observations = finite(_flat(vec_env.reset()), 0, "an observation")
+    seen, taken = [observations.copy()], []
+    features: list[np.ndarray | None] = []
     if frames:
         render()
     for step in range(1, max_steps + 1):
         actions, _ = model.predict(observations, state=latents, deterministic=deterministic)
         taken.append(np.array(finite(actions, step, "an action")))
         stepped, _, dones, infos = vec_env.step(actions)
-        observations = np.asarray(stepped).reshape(copies, -1)
-        if (given := reward_features(vec_env, infos)) is not None:
-            features.append(np.array(given, dtype=np.float64))
+        observations = _flat(stepped)
+        given = reward_features(vec_env, infos)
+        features.append(None if given is None else np.array(given, dtype=np.float64))
         after = observations.copy()
         for copy in np.flatnonzero(running):
             if "is_success" in infos[copy]:
@@ -160,7 +176,8 @@ def _wave(
         if not running.any():
             break
 
-    of_rewards = np.stack(features, axis=1) if features else None
+    present = [rows for rows in features if rows is not None]
+    of_rewards = np.stack(present, axis=1) if len(present) == len(features) else None
     observed, acted = np.stack(seen, axis=1), np.stack(taken, axis=1)
     for row, used in enumerate(lengths[:n].tolist()):
         trajectory = Trajectory(
@@ -171,3 +188,10 @@ def _wave(
             frames=images[row] if frames else None,
         )
         yield trajectory, successes[row]
+
+
+def _flat(observations: Any) -> np.ndarray:
+    if not isinstance(observations, np.ndarray):
+        kind = type(observations).__name__
+        raise ValueError(f"observations must be arrays (a Box space), but are of type {kind}")
+    return observations.reshape(len(observations), -1)

@@ -4,13 +4,14 @@ import copy
 import dataclasses
 import functools
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
-from gymnasium.wrappers import TimeLimit
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
@@ -21,8 +22,8 @@ from poem_envs.vector import TaskFamilyVector
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.family_view import no_family
 
-# What these do, the vectorised environment or TaskVecEnv does itself
-ABSORBED_WRAPPERS = ("TimeLimit", "OrderEnforcing", "PassiveEnvChecker", "Monitor")
+# What these do, the vectorised environment or TaskVecEnv does itself.
+ABSORBED_WRAPPERS = (TimeLimit, OrderEnforcing, PassiveEnvChecker, Monitor)
 MAKE_VEC_ARGUMENTS = frozenset({"max_episode_steps", "nthread", "num_envs", "vectorization_mode"})
 #: What TaskVecEnv reads of a vectorised environment's infos by itself
 READ_INFOS = {"reward_features", "final_obs", "_final_obs"}
@@ -34,21 +35,21 @@ class TaskVecEnv(VecEnv):
     ``make_vec_env(id, n, vec_env_cls=TaskVecEnv)``, rl_zoo3.
 
     It steps all copies at once, and gives the same observations, rewards and infos, those of
-    ``Monitor`` included. ``get_attr`` and ``env_method`` see each copy as a single
-    :class:`poem_envs.TaskFamily`.
+    ``Monitor`` and ``DummyVecEnv`` included, and ``"reward_features"``. ``get_attr`` and
+    ``env_method`` see each copy as a single :class:`poem_envs.TaskFamily`.
 
     >>> from stable_baselines3.common.env_util import make_vec_env
     >>> env = make_vec_env("poem/PointGoal-v0", 4, vec_env_cls=TaskVecEnv)
     >>> env.reset().shape
     (4, 2)
 
-    :param env_fns: One function a copy that returns an environment, or a vectorised family. Only
-        the first is called: all copies are made alike, from its registration and arguments. If its
-        ``Monitor`` has a file, the episodes of all copies are written to it.
+    :param env_fns: One function a copy that returns an environment. Only the first is called: all
+        copies are made alike, from its registration and arguments. If its ``Monitor`` has a file,
+        the episodes of all copies are written to that file. Or a vectorised family.
     :param nthread: Threads (or processes, as the family has it) to step with; None for all cores
     :raises ValueError: If the environment is no task family, has no vectorised version, was not
-        made by ``gym.make``, was given a task already, or is in a wrapper that is not gym.make's
-        own or ``Monitor``.
+        made by ``gym.make``, was given a task already, or is inside a wrapper other than
+        ``TimeLimit``, ``OrderEnforcing``, ``PassiveEnvChecker`` and ``Monitor``.
     """
 
     def __init__(
@@ -90,7 +91,7 @@ class TaskVecEnv(VecEnv):
 
     @property
     def tasks(self) -> np.ndarray | None:
-        """The tasks in effect, (num_envs, task_dim); None before the first reset."""
+        """The tasks in effect, ``(num_envs, task_dim)``; None before the first reset."""
         return self.vector_env.tasks
 
     def set_tasks(self, tasks: npt.ArrayLike) -> None:
@@ -143,8 +144,13 @@ class TaskVecEnv(VecEnv):
             self._monitor.results_writer.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        images = self.vector_env.render() if self.render_mode == "rgb_array" else None
-        return [None] * self.num_envs if images is None else images
+        if self.render_mode != "rgb_array":
+            what = "but this method assumes it is `rgb_array` to obtain images."
+            warnings.warn(f"The render mode is {self.render_mode}, {what}", stacklevel=2)
+            return [None] * self.num_envs
+        images = self.vector_env.render()
+        assert images is not None
+        return images
 
     def __repr__(self) -> str:
         spec = self.vector_env.spec
@@ -161,7 +167,10 @@ class TaskVecEnv(VecEnv):
                 "set for all of them"
             )
         if attr_name in ("task", "tasks"):
-            raise AttributeError(f"{attr_name!r} cannot be set; use set_tasks(tasks)")
+            raise AttributeError(
+                f"{attr_name!r} cannot be set; use set_tasks(tasks), which takes effect at the "
+                "next reset"
+            )
         self.vector_env.set_attribute(attr_name, value)
 
     def env_method(
@@ -206,8 +215,12 @@ def as_task_vec_env(vector_env: gym.vector.VectorEnv) -> VecEnv:
 def make_task_vec_env(
     env_id: str, n_envs: int, max_sequential: int = 8, nthread: int | None = None, **env_kwargs: Any
 ) -> VecEnv:
-    """Copies of a registered family: a :class:`TaskVecEnv`, or of a family without a vectorised
-    version a ``DummyVecEnv`` of at most ``max_sequential`` copies.
+    """Copies of a registered family: a :class:`TaskVecEnv`, or a ``DummyVecEnv`` of a family
+    without a vectorised version.
+
+    :param max_sequential: The most copies that a ``DummyVecEnv`` steps one after another
+    :param nthread: As of :class:`TaskVecEnv`
+    :param env_kwargs: Arguments of the environment
     """
     check_whole("n_envs", n_envs, 1)
     env_id = plain_id(env_id)
@@ -272,6 +285,12 @@ class _Copy:
         return getattr(self._vector_env.family, name)
 
 
+def _is_absorbed(wrapper: gym.Wrapper) -> bool:
+    # An import of rl_zoo3 replaces Gymnasium's TimeLimit by a subclass.
+    patched = isinstance(wrapper, TimeLimit) and type(wrapper).__module__ == "rl_zoo3.gym_patches"
+    return patched or type(wrapper) in ABSORBED_WRAPPERS
+
+
 def _vectorised(
     bare: gym.Env, wrappers: list[gym.Wrapper], num_envs: int, nthread: int | None
 ) -> TaskFamilyVector:
@@ -279,11 +298,9 @@ def _vectorised(
     instead = "use DummyVecEnv instead of TaskVecEnv"
     if not isinstance(bare, TaskFamily):
         raise ValueError(no_family(str(bare)))
-    names = [type(wrapper).__name__ for wrapper in wrappers]
-    # an import of rl_zoo3 patches Gymnasium's TimeLimit
-    foreign = [name for name in names if name.removeprefix("Patched") not in ABSORBED_WRAPPERS]
+    foreign = [type(wrapper).__name__ for wrapper in wrappers if not _is_absorbed(wrapper)]
     if foreign:
-        allowed = ", ".join(ABSORBED_WRAPPERS)
+        allowed = ", ".join(kind.__name__ for kind in ABSORBED_WRAPPERS)
         raise ValueError(
             f"the environment is wrapped in {', '.join(foreign)}, but only {allowed} can be "
             f"vectorised; {instead}"
@@ -302,5 +319,7 @@ def _vectorised(
     spec = copy.deepcopy(bare.spec)
     spec.max_episode_steps = min(limits, default=None)
     kwargs: dict[str, Any] = {} if nthread is None else {"nthread": nthread}
-    vector_env: Any = gym.make_vec(spec, num_envs, "vector_entry_point", **kwargs)
+    vector_env = gym.make_vec(spec, num_envs, "vector_entry_point", **kwargs)
+    if not isinstance(vector_env, TaskFamilyVector):
+        raise ValueError(f"{spec.id}'s vector_entry_point is no TaskFamilyVector; {instead}")
     return vector_env

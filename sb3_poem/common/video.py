@@ -11,6 +11,12 @@ Frame = np.ndarray  # (height, width, 3) uint8
 GAP = 4
 
 
+def _even(frame: Frame) -> Frame:
+    """H.264 with 4:2:0 colour needs even sides; repeat the last row or column where one is odd."""
+    height, width = frame.shape[:2]
+    return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+
+
 def write_video(frames: Sequence[Frame], path: str | Path, fps: float = 20.0) -> Path:
     """Write frames, (height, width, 3) uint8 of one size, as MP4 (H.264) or GIF, by the suffix."""
     import imageio.v2 as imageio
@@ -20,6 +26,10 @@ def write_video(frames: Sequence[Frame], path: str | Path, fps: float = 20.0) ->
         raise ValueError(f"path must end in .mp4 or .gif, got {str(path)!r}")
     if len(frames) == 0:
         raise ValueError(f"no frames to write to {str(path)!r}")
+    shapes = {np.shape(frame) for frame in frames}
+    if len(shapes) > 1 or any(len(shape) != 3 or shape[2] != 3 for shape in shapes):
+        raise ValueError(f"frames must all be (height, width, 3) of one size, got {sorted(shapes)}")
+
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".gif":
         # Delays are whole hundredths of a second, two at least in browsers: leave frames out.
@@ -28,9 +38,7 @@ def write_video(frames: Sequence[Frame], path: str | Path, fps: float = 20.0) ->
         ends = np.round(100.0 * step * np.arange(len(kept) + 1) / fps)
         imageio.mimwrite(path, kept, duration=(10.0 * np.diff(ends)).tolist(), loop=0)
     else:
-        height, width = frames[0].shape[:2]  # H.264 with 4:2:0 colour needs even sides
-        spare = ((0, height % 2), (0, width % 2), (0, 0))
-        even: list[Any] = [np.pad(frame, spare, mode="edge") for frame in frames]
+        even: list[Any] = [_even(frame) for frame in frames]
         imageio.mimwrite(path, even, fps=fps, codec="libx264", macro_block_size=2)
     return path
 
@@ -66,6 +74,9 @@ def side_by_side(
     """Two clips beside each other, under captions if any; the shorter one holds its last frame."""
     if len(left) == 0 or len(right) == 0:
         raise ValueError(f"both clips need frames, got {len(left)} and {len(right)}")
+    heights = left[0].shape[0], right[0].shape[0]
+    if heights[0] != heights[1]:
+        raise ValueError(f"both clips need the same height, got {heights[0]} and {heights[1]}")
     if captions is not None:
         left, right = _with_captions((left, right), captions)
     bar = np.full((left[0].shape[0], GAP, 3), 255, dtype=np.uint8)

@@ -226,6 +226,8 @@ def test_frames():
     np.testing.assert_array_equal(third, frames[::3])
     with pytest.raises(ValueError, match="render_mode"):
         rollout_latents(MODEL, vec_env(1), LATENTS[:1], frames=True)
+    with pytest.raises(ValueError, match="frames"):
+        rollout_latents(MODEL, vec_env(1, render_mode="rgb_array"), LATENTS[:1], frames=-1)
 
 
 def test_stochastic_actions_are_reproducible_and_leave_torch_alone():
@@ -272,12 +274,15 @@ def test_an_episode_that_is_not_finite_is_named(culprit):
 
 
 @pytest.mark.parametrize(
-    ("latents", "message"),
+    ("latents", "arguments", "message"),
     [
-        (np.zeros(5), "`latents` must have shape"),
-        (np.full((2, 5), np.nan), "`latents` must be finite"),
+        (np.zeros(5), {}, "`latents` must have shape"),
+        (np.full((2, 5), np.nan), {}, "`latents` must be finite"),
+        (np.zeros((2, 5)), {"tasks": np.zeros((3, 1))}, "`tasks` must have shape"),
+        (np.zeros((2, 5)), {"seed": [1]}, "`seed` must be one integer"),
+        (np.zeros((2, 5)), {"max_steps": 0}, "`max_steps` must be at least 1"),
     ],
 )
-def test_bad_latents(latents, message):
+def test_bad_arguments(latents, arguments, message):
     with pytest.raises(ValueError, match=message):
-        rollout_latents(MODEL, vec_env(1), latents)
+        rollout_latents(MODEL, vec_env(1), latents, **arguments)

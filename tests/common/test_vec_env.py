@@ -252,7 +252,8 @@ def test_images():
     assert env.render().shape == (48, 64, 3)
     assert env.env_method("render", indices=[2])[0].shape == (24, 32, 3)
     silent = make_task_vec_env("poem/PointGoal-v0", 2)
-    assert silent.get_images() == [None, None]
+    with pytest.warns(UserWarning, match="render mode is None"):
+        assert silent.get_images() == [None, None]
 
 
 def test_sb3_algorithms_and_wrappers_take_it():
