@@ -109,7 +109,7 @@ def as_preference(answer: Any, kind: str = "pair") -> Preference:
     """
     if isinstance(answer, str):
         answer = next((each for each in Preference if each.value == answer), answer)
-    if answer in ANSWERS[kind]:
+    if isinstance(answer, Preference) and answer in ANSWERS[kind]:
         return answer
     given = repr(answer)
     if isinstance(answer, Preference):

@@ -483,7 +483,7 @@ def test_the_protocol_is_kept():
     assert a.ask() is query  # the pending question, not another
     with pytest.raises(ValueError, match='"left", "equal", "right", but is \'better\''):
         a.tell("better")
-    for nonsense in (None, 0, True, 1.0, ["left"]):
+    for nonsense in (None, 0, True, 1.0, ["left"], np.array([1, 0])):
         with pytest.raises(TypeError, match="an answer must be Preference"):
             a.tell(nonsense)
     assert a.pending is query  # a refused answer leaves the question waiting
