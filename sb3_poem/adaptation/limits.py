@@ -60,6 +60,7 @@ class AnswerLimits:
         :param fresh: (n_tasks, n_policies), of other episodes, which score it.
         :param ordered: See :func:`best_codebook`.
         """
+        others, chosen, fresh = (check_returns(returns) for returns in (others, chosen, fresh))
         n_policies, every = others.shape[1], np.arange(len(chosen))
         codebooks = []
         for k in range((n_policies - 1).bit_length() + 1):
@@ -243,6 +244,7 @@ def rate_distortion_limit(returns: np.ndarray, bits: float) -> float:
     :param returns: (n_tasks, n_policies), finite.
     """
     check_number("bits", bits, 0.0)
+    returns = check_returns(returns)
     best = float(returns.max(axis=1).mean())
     scale = float(np.ptp(returns))
     if scale == 0.0 or bits >= np.log2(len(returns)):

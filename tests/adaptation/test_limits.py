@@ -301,6 +301,11 @@ class OtherNoise:
         ),
         (lambda: best_codebook(np.zeros((2, 2)), 0), "`size` must be at least 1"),
         (lambda: rate_distortion_limit(np.zeros((2, 2)), -0.1), "`bits` must be at least 0"),
+        (lambda: rate_distortion_limit([[0.0, np.nan]], 0.5), "`returns` must be finite"),
+        *(
+            (lambda bad=bad: AnswerLimits.measure(*bad), "`returns` must be finite")
+            for bad in np.where(np.eye(3)[:, :, None, None], np.nan, np.zeros((2, 2)))
+        ),
     ],
 )
 def test_bad_arguments(call, message):
