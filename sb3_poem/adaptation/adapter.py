@@ -155,7 +155,7 @@ class PreferenceAdapter:
         if self.pending is None:
             self._check_unfinished()
             self.pending = self._make_query(self.inference.ask())
-        elif self._needs_frames and not (self.pending.shown[0].frames or self.inference.library):
+        elif self._needs_frames and self.inference.library is self.pending.shown[0].frames is None:
             # It comes from a file, which holds no frames; the same seed gives the same rollouts.
             latents = self.inference.same_latents(*(item.latent for item in self.pending.shown))
             self.pending = self._make_query(latents, self._number_of(self.pending))

@@ -763,6 +763,12 @@ def test_frames_for_ask_and_tell(tmp_path):
         adapter(render=True).ask()
 
 
+def test_a_question_stays_where_an_environment_draws_nothing(monkeypatch):
+    monkeypatch.setattr(SpeedEnv, "render", lambda self: None)
+    a = adapter(SpeedEnv(render_mode="rgb_array"), render=True)
+    assert a.ask() is a.ask()
+
+
 def test_an_id_and_a_vector_environment_will_do():
     gym.register("test/Speed-v0", SpeedEnv)
     try:
