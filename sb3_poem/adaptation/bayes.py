@@ -141,7 +141,7 @@ class Bayes(Rule):
             object.__setattr__(self, "noise_model", noise_model_from_dict(self.noise_model))
         if self.noise_model not in (None, INFER) and not isinstance(self.noise_model, NoiseModel):
             raise ValueError(
-                '`noise_model` must be None, "infer" or an object as MistakeNoise(0.2), '
+                '`noise_model` must be None, "infer" or a NoiseModel as MistakeNoise(0.2), '
                 f"but is {self.noise_model!r}"
             )
 

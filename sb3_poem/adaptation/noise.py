@@ -36,8 +36,8 @@ Values = np.ndarray | float
 
 class NoiseModel:
     """What somebody says follows from a difference of two returns that they perceive, and a share
-    ``rate`` of answers is turned round. One of your own overrides :meth:`probability_above`; as it
-    is here the larger return is perceived to be larger.
+    ``rate`` of answers is turned round. One of your own has a ``kind``, and overrides
+    :meth:`probability_above`; as it is here the larger return is perceived to be larger.
 
     >>> ExactNoise().to_dict()
     {'kind': 'exact'}
@@ -57,9 +57,7 @@ class NoiseModel:
 
     def probability_left(self, difference: Values, error: Values, magnitude: Values) -> Any:
         """P(LEFT), given that the oracle says LEFT or RIGHT, in (0, 1)."""
-        left = self.probability_above(difference, error, magnitude)
-        left *= 1.0 - LAPSE
-        left += LAPSE / 2
+        left = (1.0 - LAPSE) * self.probability_above(difference, error, magnitude) + LAPSE / 2
         return left if self.rate == 0.0 else self.rate + (1.0 - 2.0 * self.rate) * left
 
     def to_dict(self) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from sb3_poem.adaptation.noise import (
     BoltzmannNoise,
     ExactNoise,
     MistakeNoise,
+    NoiseModel,
     People,
     noise_model_from_dict,
 )
@@ -266,6 +267,16 @@ def test_noise_models_survive_json_and_never_say_never(noise):
 def test_bad_noise_models(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+class Step(NoiseModel):
+    def probability_above(self, difference, error, magnitude):
+        return difference > 0
+
+
+def test_a_noise_model_may_say_never_or_always():
+    probability = Step().probability_left(np.array([-1.0, 1.0]), 1.0, 1.0)
+    np.testing.assert_allclose(probability, [0.005, 0.995])
 
 
 def test_whole_numbers_are_as_good_as_real_ones() -> None:
