@@ -37,7 +37,7 @@ from sb3_poem.adaptation.preference import (
     preference_log_likelihood,
 )
 from sb3_poem.adaptation.priors import SOURCES, make_prior
-from sb3_poem.adaptation.rule import Answer, Inference, Rule, Setting, Shown, latent_of
+from sb3_poem.adaptation.rule import Answer, Inference, Rule, Setting, Shown, check_seen, latent_of
 from sb3_poem.common.checks import check_choice, check_whole
 from sb3_poem.common.trajectory import Trajectory
 
@@ -316,6 +316,8 @@ class BayesInference(Inference):
         return queries.most_telling_set(pair, self.n_shown, values, weights, said)
 
     def tell(self, preference: Preference, *shown: Any) -> None:
+        if self.likelihood == "decoder":
+            check_seen(shown)
         answer = Answer(preference, shown)
         told = self._log_likelihoods(self.particles, [answer], new=True)
         if self.people is not None:
@@ -373,7 +375,7 @@ class BayesInference(Inference):
         than 0.2, and less than 0.5 given all. What was asked about twice is left alone.
         """
         # by what was seen: fragments of one policy differ, and have one latent
-        asked = [[item.observations.tobytes() for item in answer.shown] for answer in self.answers]
+        asked = [[getattr(x, "observations", x).tobytes() for x in a.shown] for a in self.answers]
         asked_twice = np.array([asked.count(shown) > 1 for shown in asked], dtype=bool)
         others, everything = self.agreements().T
         found = np.where(asked_twice | (everything >= BELIEVED), 1.0, others)

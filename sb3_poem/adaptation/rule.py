@@ -218,6 +218,12 @@ def latent_of(shown: Shown) -> np.ndarray:
     return shown.latent if isinstance(shown, Trajectory) else np.asarray(shown, dtype=np.float64)
 
 
+def check_seen(shown: Sequence[Shown]) -> None:
+    """Refuse latents, for a rule that looks at what was done."""
+    if not all(isinstance(item, Trajectory) for item in shown):
+        raise ValueError("this rule needs the trajectories that were shown, not their latents")
+
+
 def inference_rng(seed: int) -> np.random.Generator:
     """The generator of an adaptation's inference, from the adaptation's seed."""
     return np.random.default_rng([seed, 0])

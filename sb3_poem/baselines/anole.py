@@ -11,7 +11,7 @@ from sb3_poem.adaptation.meta_model import HasRewardDecoder, MetaModel
 from sb3_poem.adaptation.preference import SIGNS, Preference
 from sb3_poem.adaptation.priors import SOURCES, make_prior
 from sb3_poem.adaptation.queries import random_set
-from sb3_poem.adaptation.rule import Shown
+from sb3_poem.adaptation.rule import Shown, check_seen
 from sb3_poem.baselines.fragments import (
     check_shared_dynamics,
     default_fragment_length,
@@ -162,6 +162,7 @@ class ANOLEInference(Inference):
         return worst_case_volumes(differences, self.contradictions, left, self.budget)
 
     def tell(self, preference: Preference, *shown: Any) -> None:
+        check_seen(shown)
         returns = self.model.predicted_returns(self.candidates, shown)
         contradicted = SIGNS[preference] * (returns[:, 0] - returns[:, 1]) < 0
         self.contradictions = self.contradictions + contradicted

@@ -26,7 +26,7 @@ from torch.nn.utils.rnn import pad_sequence
 from sb3_poem.adaptation import Answer, Inference, Rule, Setting
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.preference import SIGNS, Preference
-from sb3_poem.adaptation.rule import Shown
+from sb3_poem.adaptation.rule import Shown, check_seen
 from sb3_poem.adaptation.state import read_json, write_json_atomically
 from sb3_poem.baselines.fragments import (
     check_shared_dynamics,
@@ -212,9 +212,8 @@ class MetaReward:
 
     def rewards(self, parameters: Parameters, trajectory: Trajectory) -> np.ndarray:
         """(T,) predicted rewards with what :meth:`adapted` gave, in the network's own unit."""
-        inputs = (self.transitions(trajectory),)
         with th.no_grad():
-            predicted = th.func.functional_call(self.network, parameters, inputs)
+            predicted = functional_call(self.network, parameters, (self.transitions(trajectory),))
         return predicted.double().cpu().numpy()
 
 
@@ -430,6 +429,7 @@ class MAMLRewardInference(Inference):
         return self.ask()
 
     def tell(self, preference: Preference, *shown: Any) -> None:
+        check_seen(shown)
         self.answers.append(Answer(preference, shown))
         seen = [one for each in self.answers for one in each.shown]
         parameters = self.model.reward.adapted(self.answers)

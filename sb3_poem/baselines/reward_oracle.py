@@ -10,7 +10,7 @@ from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.oracles import step_rewards
 from sb3_poem.adaptation.preference import Preference
 from sb3_poem.adaptation.priors import N_CENTRES, SOURCES
-from sb3_poem.adaptation.rule import Answer, Inference, Rule, Setting, Shown
+from sb3_poem.adaptation.rule import Answer, Inference, Rule, Setting, Shown, check_seen
 from sb3_poem.baselines.fragments import transition_rows
 from sb3_poem.common.checks import check_choice
 from sb3_poem.common.family_view import FamilyView
@@ -95,10 +95,10 @@ class RewardInference(Inference):
 
     def tell(self, preference: Preference, *shown: Any) -> None:
         """Looks at the rewards of both trajectories, not at the answer."""
+        check_seen(shown)
         rows = np.concatenate([self._context_rows(item) for item in shown])
         self.answers.append(Answer(preference, shown))
-        before = [self.transitions] if len(self.transitions) else []
-        self.transitions = np.concatenate([*before, rows])
+        self.transitions = np.vstack([self.transitions.reshape(-1, rows.shape[1]), rows])
         n = min(self.model.context_size, len(self.transitions))
         dealt = self.rng.permutation(len(self.transitions))[: len(self.transitions) // n * n]
         # (contexts, n, context_dim)

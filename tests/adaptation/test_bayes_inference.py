@@ -691,6 +691,14 @@ def test_bad_options(model, arguments, message):
         make(model, **arguments)
 
 
+def test_the_decoder_needs_trajectories_and_s_latents():
+    with pytest.raises(ValueError, match="needs the trajectories"):
+        make().tell(LEFT, np.zeros(5), np.ones(5))
+    inference = make(likelihood="similarity")
+    inference.tell(LEFT, np.zeros(5), np.ones(5))
+    assert inference.contradicted() is None
+
+
 class Misled(SpeedModel):
     """From some steps alone it takes the left trajectories for better than they are, by as much for
     every latent.

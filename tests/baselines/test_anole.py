@@ -126,6 +126,8 @@ def test_contradictions_are_counted_and_the_budget_grows():
     inference.contradictions[:] = 3
     assert inference.budget == 3
     assert np.isfinite(inference.estimate()).all()
+    with pytest.raises(ValueError, match="needs the trajectories"):
+        inference.tell(LEFT, left.latent, right.latent)
 
 
 def test_greedy_keeps_candidates_when_none_agrees():

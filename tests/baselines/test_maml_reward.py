@@ -9,7 +9,7 @@ from meta_toys import WindyWalk, small, walks
 from worlds import SpeedEnv, SpeedModel
 
 from sb3_poem import PEARLSAC, MAMLReward, PreferenceAdapter
-from sb3_poem.adaptation import AdaptedPolicy, ReturnOracle, adapt_tasks
+from sb3_poem.adaptation import AdaptedPolicy, Preference, ReturnOracle, adapt_tasks
 from sb3_poem.baselines import MAMLRewardModel, MetaReward
 from sb3_poem.common.rollouts import rollout_latents
 
@@ -135,3 +135,7 @@ def test_what_will_not_do(trained, model):
         MAMLReward(learning_rate=0.0)
     with pytest.raises(ValueError, match="`library` must be None"):
         adapt_tasks(model, walks(1), np.zeros((1, 1)), ReturnOracle, rule=FAST, library=[])
+    inference = PreferenceAdapter(model, walks(1), rule=FAST).inference
+    with pytest.raises(ValueError, match="needs the trajectories"):
+        inference.tell(Preference.LEFT, *inference.ask())
+    assert inference.answers == []

@@ -152,6 +152,8 @@ def test_what_will_not_do(trained):
         sighted(SpeedModel(), SpeedEnv())
     with pytest.raises(ValueError, match="`n_queries` must be at least 1"):
         sighted(trained, walks(1), n_queries=0)
+    with pytest.raises(ValueError, match="needs the trajectories"):
+        sighted(trained, walks(1)).inference.tell(Preference.LEFT, np.zeros(5), np.zeros(5))
     with pytest.raises(ValueError, match="`library` must be None"):
         adapt_tasks(
             trained,
