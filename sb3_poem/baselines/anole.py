@@ -99,7 +99,7 @@ class ANOLE(Rule):
             raise ValueError(
                 "`model` has no experience to ask about, as its replay buffer is empty (a loaded "
                 "model has none): call load_replay_buffer, or pass library="
-                "sb3_poem.baselines.training_rollouts(model, env, 200)"
+                "sb3_poem.baselines.training_rollouts(model, env, 200), of another copy of env"
             )
         check_shared_dynamics(
             setting,
