@@ -96,13 +96,14 @@ def adapt_tasks(
     numbered = list(enumerate(tasks, seed))
     oracles = [oracle_factory(env=vec_env, task=task, seed=number) for number, task in numbered]
     rule = (Bayes() if rule is None else as_rule(rule)).answered_by(oracles[0])
-    libraries = [library(task) if callable(library) else library for task in tasks]
-    rule.check(model, Setting(n_queries, libraries[0], vec_env))
-    warn_if_untrained(model)
-    inferences = [
-        rule.start(model, inference_rng(number), Setting(n_queries, own, vec_env, task))
-        for own, (number, task) in zip(libraries, numbered, strict=True)
+    settings = [
+        Setting(n_queries, library(task) if callable(library) else library, vec_env, task)
+        for task in tasks
     ]
+    for setting in settings:
+        rule.check(model, setting)
+    warn_if_untrained(model)
+    inferences = [rule.start(model, inference_rng(i), own) for i, own in enumerate(settings, seed)]
 
     preferences: list[list[Preference]] = [[] for _ in tasks]
     latents = np.empty((len(tasks), len(kept), model.latent_dim))

@@ -171,6 +171,9 @@ def test_every_task_may_have_a_library_of_its_own():
     for goal, trajectories in shown.items():
         assert len(trajectories) == 6
         assert all(any(one is other for other in own[goal]) for one in trajectories)
+    own[float(GOALS[1, 0])].clear()
+    with pytest.raises(ValueError, match="`library` must hold at least 2 trajectories"):
+        adapt_tasks(MODEL, SpeedVecEnv(4), GOALS[:2], Seen, **options)
 
 
 def test_two_lies_in_ten_answers_are_borne():
