@@ -155,11 +155,14 @@ class PreferenceAdapter:
         if self.pending is None:
             self._check_unfinished()
             self.pending = self._make_query(self.inference.ask())
-        elif self._needs_frames and self.inference.library is self.pending.shown[0].frames is None:
+        elif self._needs_frames and self._frames_are_missing(self.pending):
             # It comes from a file, which holds no frames; the same seed gives the same rollouts.
             latents = self.inference.same_latents(*(item.latent for item in self.pending.shown))
             self.pending = self._make_query(latents, self._number_of(self.pending))
         return self.pending
+
+    def _frames_are_missing(self, query: Query) -> bool:
+        return self.inference.library is None and query.shown[0].frames is None
 
     @property
     def contradicted(self) -> int | None:

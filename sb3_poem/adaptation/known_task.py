@@ -75,6 +75,7 @@ def known_task_return(
     seed: int = 0,
     *,
     selection_episodes: int = 1,
+    deterministic: bool = True,
     limits: bool = True,
 ) -> KnownTaskReturn:
     """The return if the task were known: for each task the best of many latents, half of N(0, I)
@@ -91,6 +92,7 @@ def known_task_return(
     :param n_latents: How many to try at first; None for 300, or 30 where dynamics differ.
     :param n_episodes: Fresh episodes per winner.
     :param selection_episodes: Episodes per latent (and task, where dynamics differ) for choosing.
+    :param deterministic: Whether policies act by their mode.
     :param limits: Whether to measure limits, which takes one more rollout of all latents.
     """
     model, vec_env = model_and_env(model, env)
@@ -112,8 +114,8 @@ def known_task_return(
     every = np.concatenate([tasks, others])
 
     def returns_of(tasks: np.ndarray, latents: np.ndarray, stream: int) -> np.ndarray:
-        start = evaluation_seed(seed, stream)
-        return return_matrix(model, vec_env, tasks, latents, selection_episodes, start)
+        how = selection_episodes, evaluation_seed(seed, stream), deterministic
+        return return_matrix(model, vec_env, tasks, latents, *how)
 
     returns, on_others = np.split(returns_of(every, candidates, 1), [len(tasks)])
     best = candidates[np.argmax(returns, axis=1)]
@@ -127,19 +129,21 @@ def known_task_return(
             best = flat[np.argmax(returns_of(tasks, flat, stream), axis=1)]
             continue
         rows = np.repeat(tasks, draws.shape[1], axis=0)
-        how = selection_episodes, evaluation_seed(seed, stream)
+        how = selection_episodes, evaluation_seed(seed, stream), deterministic
         found = evaluate_episodes(model, vec_env, draws.reshape(len(rows), -1), rows, *how)
         picks = np.argmax(found.returns.mean(axis=1).reshape(draws.shape[:2]), axis=1)
         best = draws[np.arange(len(tasks)), picks]
     measured = None
     if limits:
-        fresh = return_matrix(model, vec_env, tasks, candidates, 1, evaluation_seed(seed, 4))
+        how = 1, evaluation_seed(seed, 4), deterministic
+        fresh = return_matrix(model, vec_env, tasks, candidates, *how)
         chosen_on, along = (on_others, others) if shared else (returns, tasks)
         ordered = along.shape[1] == 1
         if ordered:
             chosen_on = chosen_on[np.argsort(along[:, 0])]
         measured = AnswerLimits.measure(chosen_on, returns, fresh, ordered=ordered)
-    outcomes = evaluate_episodes(model, vec_env, best, tasks, n_episodes, evaluation_seed(seed))
+    how = n_episodes, evaluation_seed(seed), deterministic
+    outcomes = evaluate_episodes(model, vec_env, best, tasks, *how)
     own = {"tasks": tasks, "latents": best, "candidate_latents": candidates}
     return KnownTaskReturn(**vars(outcomes), **own, candidate_returns=returns, limits=measured)
 
@@ -168,6 +172,7 @@ def return_matrix(
     latents: np.ndarray,
     n_episodes: int = 1,
     seed: int = 0,
+    deterministic: bool = True,
 ) -> np.ndarray:
     """J[i, j], (n_tasks, n_latents), the mean true return of latent j (n_latents, latent_dim) on
     task i (n_tasks, task_dim), over episodes whose reset seeds start at ``seed``.
@@ -176,12 +181,12 @@ def return_matrix(
     family, shape = FamilyView(vec_env), (len(tasks), len(latents))
     if not family.shared_dynamics:
         every, rows = np.tile(latents, (shape[0], 1)), np.repeat(tasks, shape[1], axis=0)
-        found = evaluate_episodes(model, vec_env, every, rows, n_episodes, seed)
+        found = evaluate_episodes(model, vec_env, every, rows, n_episodes, seed, deterministic)
         return found.returns.mean(axis=1).reshape(shape)
     # The task in effect does not matter, and it must be one that every copy accepts.
     some_task = np.repeat(tasks[:1], n_episodes * shape[1], axis=0)
     every = np.tile(latents, (n_episodes, 1))
-    outcomes = rollout_outcomes(model, vec_env, every, some_task, seed)
+    outcomes = rollout_outcomes(model, vec_env, every, some_task, seed, deterministic)
     features = [outcome.reward_features[None] for outcome in outcomes]
     totals = [family.compute_rewards(tasks[:, None], each).sum(axis=1) for each in features]
     return np.stack(totals, axis=1).reshape(shape[0], n_episodes, shape[1]).mean(axis=1)

@@ -76,7 +76,7 @@ class TaskOracle(ABC):
         question: str | None = None,
     ) -> None:
         if thresholds is not None:
-            equal, much = thresholds if len(thresholds) == 2 else (np.nan, np.nan)
+            equal, much = thresholds if np.shape(thresholds) == (2,) else (np.nan, np.nan)
             if not 0.0 <= equal <= much < np.inf:
                 two = "two finite differences of returns, the first not the larger"
                 raise ValueError(f"`thresholds` must be {two}, but is {thresholds!r}")

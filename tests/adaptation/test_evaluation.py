@@ -178,6 +178,15 @@ def test_known_task_return():
     assert 0.98 < tau <= 1.0
 
 
+def test_known_task_return_of_policies_that_act_at_random():
+    noisy, by_mode = (
+        known_task_return("PointGoal", "poem/PointGoal-v0", 2, 4, 2, deterministic=mode)
+        for mode in (False, True)
+    )
+    assert not np.array_equal(noisy.returns, by_mode.returns)
+    assert not np.array_equal(noisy.candidate_returns, by_mode.candidate_returns)
+
+
 def test_winners_are_measured_on_fresh_episodes():
     class Lucky(SpeedEnv):
         """Returns are luck, drawn at the reset."""

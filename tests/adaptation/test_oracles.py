@@ -117,7 +117,7 @@ def test_graded_answers_with_mistakes_and_doubts():
 
 
 @pytest.mark.parametrize(
-    "thresholds", [(20.0, 10.0), (-1.0, 10.0), (1.0, np.inf), (0.0, np.nan), (1.0,)]
+    "thresholds", [(20.0, 10.0), (-1.0, 10.0), (1.0, np.inf), (0.0, np.nan), (1.0,), 5.0]
 )
 def test_bad_thresholds(thresholds):
     with pytest.raises(ValueError, match="`thresholds` must be two finite differences"):
