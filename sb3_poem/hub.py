@@ -87,4 +87,4 @@ def _client(what: str) -> Any:
 
 
 def _first_line(error: Exception) -> str:
-    return str(error).partition("\n")[0]
+    return str(error).partition("\n")[0].removeprefix("Got: ")

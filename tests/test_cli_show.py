@@ -160,7 +160,7 @@ def test_record_video_films_before_and_after_or_one_policy(
         ),
         (["enjoy", "--no-render"], "name a model by --model, or by --env the environment"),
         (
-            ["enjoy", "--no-render", "--env", "poem/AntVel-v0", "-f", "none"],
+            ["enjoy", "--env", "poem/AntVel-v0", "-f", "none"],
             "no run of poem_sac on poem/AntVel-v0 in",
         ),
         (["enjoy", "--no-render", "--model", "PointGoaal"], "Did you mean 'PointGoal'?"),

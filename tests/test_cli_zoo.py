@@ -27,7 +27,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem import PEARLSAC, POEMSAC, cli, resources
 from sb3_poem.cli import experiment
-from sb3_poem.cli.hyperparams import SAMPLERS, check_entry
+from sb3_poem.cli.hyperparams import SAMPLERS, check_entry, find_config
 from sb3_poem.cli.zoo import register_algorithms
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.pearl_sac.arguments import UNSUPPORTED
@@ -448,6 +448,13 @@ def test_a_number_that_yaml_reads_as_text_is_named(
     assert "write 0.001" in error
 
 
+def test_files_that_ship_are_found_by_their_names_and_ones_own_come_first(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert Path(find_config("poem_sac_gpu.yml")) == resources.config_file("poem_sac_gpu")
+    Path("poem_sac_gpu.yml").write_text("poem/PointGoal-v0: {}")
+    assert find_config("poem_sac_gpu.yml") == "poem_sac_gpu.yml"
+
+
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
@@ -466,7 +473,7 @@ def test_a_number_that_yaml_reads_as_text_is_named(
         ),
         (("-n", "0"), ("-n/--n-timesteps must be at least 1, got 0",)),
         (("-n", "-300"), ("-n/--n-timesteps must be at least 1, got -300",)),
-        (("-c", "missing.yml"), ("-c missing.yml: there is no such file",)),
+        (("-c", "missing.yml"), ("-c missing.yml: there is no such file", "poem_sac_gpu.yml")),
         (("-c", "missing"), ("-c missing: there is no such module", ".yml")),
         (
             ("--env", "HalfCheetahVel"),

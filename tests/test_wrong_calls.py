@@ -110,6 +110,20 @@ class Untasked(Walk):
     task_space = property()  # type: ignore[assignment]
 
 
+class Rowwise(Toy):
+    """A family whose reward keeps the last dimension."""
+
+    def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
+        return super()._reward(tasks, features)[..., None]
+
+
+class Informing(Toy):
+    """A family whose step returns an info, as Gymnasium's."""
+
+    def _simulate(self, action: np.ndarray) -> Any:
+        return (*super()._simulate(action), {})
+
+
 # ---------------------------------------------------------------- files
 
 #: Configurations of a model's folder that somebody sent.
@@ -217,7 +231,10 @@ ALGORITHMS = [
     refused("net_arch outside", lambda _: made(net_arch=[8]), "net_arch...policy_kwargs"),
     refused("net_arch vf", lambda _: policy(net_arch={"vf": [8]}), r"net_arch...\['vf'\]...qf"),
     argument(policy, "activation_fn", "ReLU"),
-    refused("policy_kwargs misspelt", lambda _: policy(netarch=[8]), "netarch"),
+    argument(policy, "net_arch", 64),
+    refused("net_arch of SB3's past", lambda _: policy(net_arch=[{"pi": [8]}]), "net_arch...pi"),
+    refused("policy_kwargs misspelt", lambda _: policy(netarch=[8]), "'netarch'...net_arch"),
+    refused("widths outside", lambda _: policy(encoder=[8]), r"'encoder'...net_arch=dict\(encoder"),
     argument(made, "policy_kwargs", [64, 64]),
     refused(
         "tensorboard_log", lambda s: made(tensorboard_log=str(s / "text.zip")).learn(1), "text.zip"
@@ -238,6 +255,16 @@ ALGORITHMS = [
         "predict shape",
         lambda _: trained().predict(np.zeros(3)),
         r"observation has shape \(3,\)...\(2,\)",
+    ),
+    refused(
+        "predict what reset returns",
+        lambda _: trained().predict((OBS[0], {})),
+        r"observation...obs, info = env\.reset\(\)",
+    ),
+    refused(
+        "predict a dictionary",
+        lambda _: AdaptedPolicy(trained(), np.zeros(5)).predict({"observation": OBS[0]}),
+        r"observation...\(2,\)...dictionary",
     ),
     refused("predict NaN", lambda _: trained().predict(OBS * NAN), "observation 0 holds NaN"),
     refused("load nothing", lambda s: POEMSAC.load(s / "peom.zip"), "peom"),
@@ -330,14 +357,14 @@ ADAPTERS = [
     refused("library empty", lambda _: adapter(library=[]), "library...2"),
     refused("adapter argument misspelt", lambda _: adapter(queries=5), "'queries'"),
     refused("tell before ask", lambda _: adapter().tell("left"), r"ask\(\)", error=RuntimeError),
-    refused("tell a number", lambda _: asked().tell(1), "answer...LEFT...1"),
+    refused("tell a number", lambda _: asked().tell(1), "answer...left...1"),
     refused("tell another word", lambda _: asked().tell("better"), '"left"...better'),
     refused("ask when done", lambda _: finished().ask(), r"policy\(\)", error=RuntimeError),
     refused("adapt without an oracle", lambda _: adapter().adapt(), r"oracle...ask\(\)"),
     refused(
         "an oracle without an answer",
         lambda _: asked().adapt(lambda left, right: None),
-        "answer...None",
+        "answer...left...None...oracle returned nothing",
     ),
     refused(
         "load misspelt",
@@ -390,6 +417,7 @@ ADAPTERS = [
     ),
     refused("evaluate tasks", lambda _: evaluated(tasks=[[1.0, 2.0]]), r"tasks has shape..., 1\)"),
     argument(evaluated, "record_at", (), "at least one"),
+    refused("AdaptedPolicy of nothing", lambda s: AdaptedPolicy.load(s / "no"), "no such file"),
     refused(
         "AdaptedPolicy of a text",
         lambda s: AdaptedPolicy.load(s / "text.zip"),
@@ -437,6 +465,11 @@ TOOLS = [
         "TaskVecEnv's tasks", lambda _: vec().set_tasks([[1.0]]), r"tasks...\(1, 1\)...\(2, 1\)"
     ),
     argument(AdaptationEvalCallback, "every", 0, "at least 1"),
+    refused(
+        "AdaptationEvalCallback as EvalCallback",
+        lambda _: AdaptationEvalCallback(vec()),
+        "every...whole number...TaskVecEnv",
+    ),
     argument(AdaptationEvalCallback, "n_tasks", 0, "at least 1"),
     argument(AdaptationEvalCallback, "record_at", (), "at least one"),
     refused(
@@ -469,6 +502,18 @@ TOOLS = [
         "check Pendulum",
         lambda _: check_task_family("Pendulum-v1"),
         "TaskFamily",
+        error=AssertionError,
+    ),
+    refused(
+        "check a reward of another shape",
+        lambda _: check_task_family(Rowwise),
+        r"_reward...\(1,\)",
+        error=AssertionError,
+    ),
+    refused(
+        "check four values",
+        lambda _: check_task_family(Informing),
+        "_simulate must return three values",
         error=AssertionError,
     ),
     refused("check an object", lambda _: check_task_family(Toy()), "env...class...id"),

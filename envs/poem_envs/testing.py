@@ -115,15 +115,27 @@ def check_spaces(case: Case) -> None:
     env = case.make()
     observation, _ = env.reset(seed=case.seed)
     _check_observation(observation, env, "reset")
-    observation, reward, _, _, info = env.step(case.actions[0])
-    _check_observation(observation, env, "step")
-    ok = isinstance(reward, float) and np.isfinite(reward)
-    assert ok, f"step must return a finite float as reward, but gave {reward!r}"
-    features, shape = info["reward_features"], (env.reward_feature_dim,)
+    simulated = env._simulate(case.actions[0])
+    ok = isinstance(simulated, tuple) and len(simulated) == 3
+    assert ok, (
+        "_simulate must return three values, observation, reward features and whether the episode "
+        f"ends, but gave {simulated!r}"
+    )
+    features, shape = simulated[1], (env.reward_feature_dim,)
     assert _is_array(features, shape, np.float64), (
         f'info["reward_features"] must be a float64 array of shape (reward_feature_dim,) = {shape},'
         f" but is {features!r}; return it from _simulate"
     )
+    reward = np.asarray(env.compute_rewards(env.task, features))
+    assert reward.shape == (), (
+        "_reward must give one number, of shape (), for one task and its features, but gave shape "
+        f"{reward.shape}: index the last dimension by tasks[..., i] and features[..., i]"
+    )
+    env.reset(seed=case.seed)
+    observation, reward, _, _, info = env.step(case.actions[0])
+    _check_observation(observation, env, "step")
+    ok = isinstance(reward, float) and np.isfinite(reward)
+    assert ok, f"step must return a finite float as reward, but gave {reward!r}"
     success = info.get("success", True)
     ok = isinstance(success, (bool, np.bool_))
     assert ok, f'info["success"] must be a bool, but is {success!r}; convert it in _step_info'

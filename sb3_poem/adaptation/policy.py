@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.adaptation.environments import describe_model
 from sb3_poem.adaptation.meta_model import MetaModel
+from sb3_poem.common.checks import as_observations
 from sb3_poem.common.files import write_atomically
 from sb3_poem.loading import BY_CLASS_NAME
 from sb3_poem.pearl_sac.saving import build_model, config_text, model_contents, parse_config
@@ -52,8 +53,8 @@ class AdaptedPolicy:
 
     def __repr__(self) -> str:
         latent = ", ".join(f"{value:.2f}" for value in self.latent)
-        model, answers = describe_model(self.model), f"{self.n_answers} answers"
-        return f"AdaptedPolicy({model}, {answers}, latent=[{latent}])"
+        answers = f"{self.n_answers} answer{'s' * (self.n_answers != 1)}"
+        return f"AdaptedPolicy({describe_model(self.model)}, {answers}, latent=[{latent}])"
 
     def predict(
         self,
@@ -65,8 +66,9 @@ class AdaptedPolicy:
         """SB3's ``predict`` of (obs_dim,) or (n, obs_dim): actions, and the latents as SB3's state.
         As the latent is fixed, ``state`` and ``episode_start`` are ignored.
         """
-        observation = np.asarray(observation)
-        single = observation.ndim == len(self.observation_space.shape)
+        shape = self.observation_space.shape
+        observation = as_observations(observation, shape)
+        single = observation.ndim == len(shape)
         latents = self.latent if single else np.tile(self.latent, (len(observation), 1))
         actions, _ = self.model.predict(observation, state=latents, deterministic=deterministic)
         return actions, latents
@@ -90,6 +92,8 @@ class AdaptedPolicy:
     @classmethod
     def load(cls, path: str | os.PathLike[str], device: str = "auto") -> Self:
         """Read what :meth:`save` wrote, or the page gives for download; see :meth:`from_bytes`."""
+        if not Path(path).is_file():
+            raise FileNotFoundError(f"{path}: there is no such file of an adapted policy")
         return cls.from_bytes(Path(path).read_bytes(), device, os.fspath(path))
 
     @classmethod

@@ -115,11 +115,12 @@ def as_preference(answer: Any, kind: str = "pair") -> Preference:
     if isinstance(answer, Preference):
         others = [each for each in ANSWERS if answer in ANSWERS[each]]
         given = f"{answer.value!r}, which only {' and '.join(others)} questions have"
-    elif not isinstance(answer, str):
-        given = f"{given} of type {type(answer).__name__}"
-        raise TypeError(f"an answer must be Preference.LEFT (or its word) say, but is {given}")
     words = ", ".join(f'"{each.value}"' for each in reversed(ANSWERS[kind]))
-    raise ValueError(f"an answer to a {kind} question must be one of {words}, but is {given}")
+    must = f"an answer to a {kind} question must be a Preference or its word, one of {words}"
+    if not isinstance(answer, str | Preference):
+        nothing = "; the oracle returned nothing" if answer is None else ""
+        raise TypeError(f"{must}, but is {given} of type {type(answer).__name__}{nothing}")
+    raise ValueError(f"{must}, but is {given}")
 
 
 def preference_log_likelihood(

@@ -90,9 +90,9 @@ def _report(arguments: argparse.Namespace) -> int:
     from sb3_poem.benchmark.store import Store
     from sb3_poem.benchmark.tables import make_report
 
+    store, what = Store(arguments.store, create=False), (arguments.suite, arguments.families)
     if arguments.out is not None:
         check_writable(arguments.out)
-    store, what = Store(arguments.store, create=False), (arguments.suite, arguments.families)
     text, files = make_report(store, *what, arguments.format, arguments.out, arguments.seeds)
     if arguments.out is None:
         print(text)

@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from poem_envs import TaskFamily
 from sb3_poem.adaptation.callback import AdaptationEvalCallback
-from sb3_poem.cli.hyperparams import check_config, check_entry, entry_params
+from sb3_poem.cli.hyperparams import check_entry, entry_params, find_config
 from sb3_poem.cli.needs import check_writable
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.vec_env import TaskVecEnv
@@ -76,7 +76,7 @@ def make_experiment(
     if args.n_timesteps < 1 and args.n_timesteps != -1:
         raise ValueError(f"-n/--n-timesteps must be at least 1, got {args.n_timesteps}")
     if args.conf_file is not None:
-        check_config(args.conf_file)
+        kwargs["config"] = find_config(args.conf_file)
     for folder in (log_folder, args.tensorboard_log, args.optimization_log_path):
         if folder:
             check_writable(folder)

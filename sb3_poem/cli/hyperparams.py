@@ -15,6 +15,7 @@ from rl_zoo3.utils import SimpleLinearSchedule
 
 from sb3_poem.loading import ALGORITHMS
 from sb3_poem.pearl_sac.arguments import UNSUPPORTED
+from sb3_poem.resources import shipped_folder
 
 # What rl_zoo3 takes out of an entry for itself before the rest goes to the algorithm.
 ZOO_KEYS = frozenset({"callback", "env_kwargs", "monitor_kwargs", "n_envs", "n_timesteps"})
@@ -74,17 +75,24 @@ def _number(text: str) -> float | None:
     return None
 
 
-def check_config(config: str) -> None:
-    """Refuse a ``-c`` that is neither a file nor, as rl_zoo3 takes it, a Python module."""
+def find_config(config: str) -> str:
+    """A file that ``-c`` names, its own or one that ships, or as rl_zoo3 takes it a Python module;
+    anything else is refused.
+    """
     if config.endswith((".yml", ".yaml", ".py")):
-        if not os.path.isfile(config):
-            raise ValueError(f"-c {config}: there is no such file")
-        return
+        if os.path.isfile(config):
+            return config
+        shipped = {file.name: str(file) for file in shipped_folder("zoo_configs").glob("*.yml")}
+        if config not in shipped:
+            names = ", ".join(sorted(shipped))
+            raise ValueError(f"-c {config}: there is no such file; those that ship are {names}")
+        return shipped[config]
     found = None
     with contextlib.suppress(ImportError, ValueError):
         found = importlib.util.find_spec(config)
     if found is None:
         raise ValueError(f"-c {config}: there is no such module; a file ends in .yml, .yaml or .py")
+    return config
 
 
 def entry_params(algorithm: str, entry: dict[str, Any]) -> dict[str, Any]:

@@ -18,6 +18,8 @@ from sb3_poem.cli.zoo import last_run
 
 def run_enjoy(arguments: argparse.Namespace) -> None:
     """Show a policy in a window."""
+    if arguments.model is None:
+        arguments.model = _last_run(arguments)
     if not has_display() and not arguments.no_render:
         parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
         parser.add_argument("-n", "--n-timesteps")  # of which a film has no part

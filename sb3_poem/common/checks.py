@@ -53,6 +53,16 @@ def check_number_or_auto(name: str, value: Any, low: float = -np.inf) -> None:
         raise ValueError(f'`{name}` must be a number or "auto", but is {value!r}')
 
 
+def as_observations(observation: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """An observation of this shape, or several, as an array; refuse what people take for one."""
+    if isinstance(observation, tuple) and isinstance(observation[-1], dict):
+        given = "what reset() of a Gymnasium environment returns: obs, info = env.reset()"
+        raise ValueError(f"`observation` must be an array, but is {given}")
+    if isinstance(observation, dict):
+        raise TypeError(f"`observation` must be an array of shape {shape}, but is a dictionary")
+    return np.asarray(observation)
+
+
 def check_choice(name: str, value: Any, allowed: Sequence[str | None]) -> None:
     """Refuse an option's value that is none of those allowed."""
     if value not in allowed:

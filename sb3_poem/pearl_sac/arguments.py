@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import gymnasium as gym
 import numpy as np
 import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -18,6 +19,7 @@ from poem_envs.registration import plain_id
 from sb3_poem.common.checks import check_number, check_number_or_auto, check_whole
 from sb3_poem.common.precision import hidden_dtype
 from sb3_poem.common.vec_env import as_task_vec_env, make_task_vec_env
+from sb3_poem.pearl_sac.policies import DEFAULT_NET_ARCH
 from sb3_poem.pearl_sac.train_tasks import DEFAULT_TRAIN_TASKS, default_train_tasks
 
 #: What a model may be given as its environment
@@ -72,9 +74,10 @@ UNSUPPORTED = {
     **dict.fromkeys(("log_std_init", "use_expln", "clip_mean"), _DEVIATION),
 }
 #: Arguments of the policy, which people give to the algorithm
-POLICY_ARGUMENTS = {
-    *("net_arch", "activation_fn", "layer_norm", "n_critics", "optimizer_class", "optimizer_kwargs")
-}
+POLICY_ARGUMENTS = (
+    *("net_arch", "activation_fn", "layer_norm", "n_critics"),
+    *("optimizer_class", "optimizer_kwargs"),
+)
 
 
 def refuse_unsupported(names: Iterable[str], algorithm: str) -> None:
@@ -103,6 +106,12 @@ def check_arguments(given: Mapping[str, Any], algorithm: type) -> None:
         needed = "a dictionary of the policy's arguments"
         raise TypeError(f"policy_kwargs must be {needed}, but is {policy_kwargs!r}")
     refuse_unsupported(policy_kwargs or (), f"{algorithm.__name__}'s policy")
+    for name in policy_kwargs or () if given["policy"] == "MlpPolicy" else ():
+        if name not in POLICY_ARGUMENTS:
+            known = f"known are {', '.join(POLICY_ARGUMENTS)}"
+            if name in DEFAULT_NET_ARCH:
+                known = f"widths go into net_arch: dict(net_arch=dict({name}=[...]))"
+            raise TypeError(f"policy_kwargs has an unknown key {name!r}; {known}")
     for name, least in LEAST.items():
         if not (given[name] is None and name in OPTIONAL):
             check_whole(name, given[name], least)
@@ -123,6 +132,21 @@ def check_arguments(given: Mapping[str, Any], algorithm: type) -> None:
     if str(device).startswith("cuda") and not th.cuda.is_available():  # which SB3 says nothing of
         what = f"device is {device!r}, but torch sees no CUDA device: the CPU is used"
         warnings.warn(what, stacklevel=3)
+
+
+def warn_of_idle_callbacks(callback: BaseCallback, total_timesteps: int, n_envs: int) -> None:
+    """Say which of SB3's callbacks, which count a step of all copies as one call, never act."""
+    calls = -(-total_timesteps // n_envs)
+    for each in getattr(callback, "callbacks", [callback]):
+        for name in ("save_freq", "eval_freq"):
+            if isinstance(every := getattr(each, name, 0), int) and calls < every:
+                warnings.warn(
+                    f"{type(each).__name__} never acts in this training: {name}={every} counts "
+                    f"calls, of which a training of {total_timesteps:,} steps has {calls:,}, one "
+                    f"for a step of all {n_envs} copies of the environment. For each {every:,} "
+                    f"steps pass {max(every // n_envs, 1)}",
+                    stacklevel=3,
+                )
 
 
 def with_arguments_of(base: type, without: str) -> Callable[[type[T]], type[T]]:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_poem.common.checks import check_whole
 from sb3_poem.pearl_sac.pearl_sac import PEARLSAC
 
 
@@ -20,8 +21,7 @@ class EpochCallback(BaseCallback):
 
     def __init__(self, every: int = 1, verbose: int = 0) -> None:
         super().__init__(verbose)
-        if every < 1:
-            raise ValueError(f"every must be at least 1 epoch, got {every}")
+        check_whole("every", every, 1)
         self.every = every
         self._last_epoch = 0
 

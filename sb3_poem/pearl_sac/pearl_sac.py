@@ -31,7 +31,13 @@ from sb3_poem.common.random import Generators
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.hub import upload
 from sb3_poem.pearl_sac import saving
-from sb3_poem.pearl_sac.arguments import GivenEnv, check_arguments, refuse_unknown, vectorise
+from sb3_poem.pearl_sac.arguments import (
+    GivenEnv,
+    check_arguments,
+    refuse_unknown,
+    vectorise,
+    warn_of_idle_callbacks,
+)
 from sb3_poem.pearl_sac.collector import CollectionStoppedError, EpochCollector, concatenate
 from sb3_poem.pearl_sac.objective import Objective, rows
 from sb3_poem.pearl_sac.policies import OBSERVATION_CLIP, LatentPolicy, MlpPolicy
@@ -320,6 +326,7 @@ class PEARLSAC(SAC):
         total_timesteps, callback = self._setup_learn(
             steps, callback, reset_num_timesteps, tb_log_name or self.algorithm, progress_bar
         )
+        warn_of_idle_callbacks(callback, steps, self.n_envs)
         callback.on_training_start(locals(), globals())
         while self.num_timesteps < total_timesteps:
             # between two epochs: evaluations and checkpoints belong here

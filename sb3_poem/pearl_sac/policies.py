@@ -1,6 +1,7 @@
 """Policy of PEARLSAC: an actor, critics, a context encoder and a reward decoder of one latent."""
 
 import inspect
+import itertools
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
@@ -15,6 +16,7 @@ from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
 from sb3_poem.common.buffers import Segment
+from sb3_poem.common.checks import as_observations, check_whole
 from sb3_poem.common.networks import (
     ContextEncoder,
     LatentActor,
@@ -98,7 +100,12 @@ class LatentPolicy(SACPolicy):
             known = sorted(DEFAULT_NET_ARCH)
             raise ValueError(f"net_arch has unknown keys {unknown}; known are {known}")
         widths = DEFAULT_NET_ARCH | {key: part for key, part in given.items() if part is not None}
+        if not all(np.ndim(part) == 1 for part in widths.values()):
+            needed = "a list of widths, as [256, 256], or a dictionary of such lists"
+            raise TypeError(f"net_arch must be {needed}, but is {net_arch!r}")
         self.net_arch = {key: list(part) for key, part in widths.items()}
+        for width in itertools.chain(*self.net_arch.values()):
+            check_whole("net_arch", width, 1)
         self.activation_fn = activation_fn
         self.layer_norm = layer_norm
         self.latent_dim = latent_dim
@@ -230,7 +237,8 @@ class LatentPolicy(SACPolicy):
         """
         if self.training:  # walking all modules takes longer than a small batch's actions
             self.set_training_mode(False)
-        obs = np.asarray(observation, dtype=np.float32)
+        obs = as_observations(observation, self.observation_space.shape)
+        obs = obs.astype(np.float32, copy=False)
         single = obs.ndim == 1
         obs = np.atleast_2d(obs)
         n, d, expected = len(obs), self.latent_dim, self.observation_space.shape

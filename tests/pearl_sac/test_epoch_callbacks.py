@@ -6,13 +6,14 @@ import errno
 import json
 import os
 import time
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch as th
 from meta_toys import EPOCH, N_TASKS, POINT_GOAL, differing, parameters, small, walks
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.logger import configure
 
 from sb3_poem import (
@@ -54,14 +55,26 @@ def test_is_called_between_epochs_and_at_the_end(every: int, expected: list[int]
 
 def test_every_must_be_positive(tmp_path: Path) -> None:
     for every in (0, -1):
-        with pytest.raises(ValueError, match="every must be at least 1 epoch, got"):
+        with pytest.raises(ValueError, match="`every` must be at least 1"):
             EpochCallback(every)
-        with pytest.raises(ValueError, match="every must be at least 1 epoch, got"):
+        with pytest.raises(ValueError, match="`every` must be at least 1"):
             TrainingCheckpointCallback(tmp_path / "c.pt", every)
-        with pytest.raises(ValueError, match="every must be at least 1 epoch, got"):
+        with pytest.raises(ValueError, match="`every` must be at least 1"):
             AdaptationEvalCallback(every)
     with pytest.raises(ValueError, match="`record_at` must be at least 0, but is -1"):
         AdaptationEvalCallback(record_at=(0, -1))
+
+
+def test_a_callback_that_never_acts_is_told(tmp_path: Path) -> None:
+    model = small(PEARLSAC)
+    calls = EPOCH // model.n_envs  # SB3 counts a step of all copies as one
+    with pytest.warns(UserWarning, match=f"save_freq={EPOCH} counts calls.* pass {calls}$"):
+        model.learn(EPOCH, [CheckpointCallback(EPOCH, str(tmp_path / "never"))])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.learn(EPOCH, CheckpointCallback(calls, str(tmp_path / "once")))
+    assert not (tmp_path / "never").exists() or not list((tmp_path / "never").iterdir())
+    assert len(list((tmp_path / "once").iterdir())) == 1
 
 
 def test_checkpoints_replace_each_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
