@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -286,15 +287,16 @@ def test_a_family_of_ones_own_is_trained_by_the_module_that_registers_it(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.path", [*sys.path])
     words = "benchmark run --suite smoke --families own/Point-v0 --methods poem-bayes --seeds 1"
-    little = "--timesteps 100 --params n_train_tasks:4 gradient_steps:1 --tasks 2 --episodes 1"
-    own = "--gym-packages own_family --snapshots 1"
+    little = "--timesteps 100 --params n_train_tasks:4 gradient_steps:1 learning_rate:lin_1e-3"
+    own = "--gym-packages own_family --snapshots 1 --tasks 2 --episodes 1"
     try:
         assert main(f"{words} {little} {own}".split()) == 0
     finally:
         gym.registry.pop("own/Point-v0", None)
         sys.modules.pop("own_family", None)
     (record, _) = Store(Path("benchmark.sqlite"), create=False).records()
-    assert "--gym-packages own_family" in json.dumps(record.provenance)
+    command = shlex.split(record.provenance["model"]["command"])  # as a shell takes it back
+    assert {"own_family", "learning_rate:'lin_1e-3'"} < set(command)
 
 
 @pytest.mark.parametrize("methods", [["poem-bayes", "poem-paper"], ["anole", "maml-reward"]])
