@@ -28,7 +28,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_poem import PEARLSAC, POEMSAC, cli, resources
 from sb3_poem.cli import experiment
 from sb3_poem.cli.hyperparams import SAMPLERS, check_entry, find_config
-from sb3_poem.cli.zoo import register_algorithms
+from sb3_poem.cli.zoo import last_run, register_algorithms
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.pearl_sac.arguments import UNSUPPORTED
 
@@ -719,6 +719,13 @@ def test_an_interrupt_before_the_first_checkpoint(
     (tmp_path / "poem_sac" / "poem-PointGoal-v0_2" / "poem-PointGoal-v0.zip").write_bytes(b"half")
     assert train("-c", config, "-f", tmp_path, *LONG, "--resume") == 1
     assert "is truncated" in capfd.readouterr().err
+
+
+def test_folders_that_are_no_runs_are_passed_over(tmp_path: Path) -> None:
+    for name in ("2", "10", "11_copy", "old"):
+        (tmp_path / f"poem-PointGoal-v0_{name}").mkdir()
+        (tmp_path / f"poem-PointGoal-v0_{name}" / "checkpoint.zip").touch()
+    assert last_run(tmp_path, "poem-PointGoal-v0", -1) == tmp_path / "poem-PointGoal-v0_10"
 
 
 def test_resume_finds_the_checkpoint_itself(capsys: pytest.CaptureFixture[str]) -> None:

@@ -48,9 +48,10 @@ def suite_figures(selection: Selection) -> dict[str, Figure]:
             }
             value = "" if oracle.value is None else f"-{oracle.value:g}"
             full = name if len(entry.oracles) == 1 else f"{name}-{oracle.kind}{value}"
-            if mine:
+            ended = [one.snapshot is None for series in mine.values() for one in series]
+            if any(ended):
                 figures[f"{full}-queries"] = _queries_figure(entry, oracle, mine, selection)
-            if any(one.snapshot is not None for series in mine.values() for one in series):
+            if not all(ended):
                 figures[f"{full}-samples"] = _samples_figure(entry, oracle, mine)
     return figures
 

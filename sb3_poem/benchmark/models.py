@@ -3,6 +3,7 @@
 import contextlib
 import hashlib
 import re
+import shlex
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -267,7 +268,7 @@ class ModelLibrary:
         return {
             "source": "trained",
             "run": str(file.parent.relative_to(folder)),
-            "command": "sb3-poem " + " ".join(arguments),
+            "command": shlex.join(["sb3-poem", *arguments]),
             "revision": read_json(begun, RECORD)["revision"],
             "hyperparameters": plan.hyperparameters,
             "overrides": plan.overrides,

@@ -24,7 +24,7 @@ from sb3_poem.benchmark.suites import (
     family_id,
     family_label,
 )
-from sb3_poem.benchmark.training import FamilyFacts, TrainingError, family_facts, training_plan
+from sb3_poem.benchmark.training import FamilyFacts, family_facts, training_plan
 from sb3_poem.common.vec_env import make_task_vec_env
 
 
@@ -148,14 +148,14 @@ def run_cells(
     """
     failures: list[str] = []
     postponed: list[Cell] = []
-    broken: dict[ModelKey, str] = {}
+    broken: dict[ModelKey | None, str] = {}
 
     def run_one(cell: Cell, place: str) -> None:
         if cell.key in store:
             return
         key = cell.model_key
-        if key in broken:  # its training has failed, and would again
-            failures.append(f"{cell}: {broken[key]}")
+        if (why := broken.get(key, broken.get(key.base))) is not None:  # a training that failed
+            failures.append(f"{cell}: {why}")
             return
         say(f"{place} {cell}")
         try:
@@ -164,7 +164,7 @@ def run_cells(
         except Exception as error:
             traceback.print_exc()
             failures.append(f"{cell}: {error}")
-            if isinstance(error, TrainingError):
+            if library.state(key) not in ("handed over", "trained"):
                 broken[key] = str(error)
             return
         say(f"    {summary(record.result)}, {record.result['seconds']:.0f} s")

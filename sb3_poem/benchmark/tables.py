@@ -254,15 +254,11 @@ def _comparison(entry: Entry, rows: Sequence[Row]) -> Table:
     """Methods against numbers of answers: what they earn, its spread, the paper's figure."""
     queries = [k for k in entry.shown if k in entry.record_at]
     has_paper = any(row.paper_mean is not None for row in rows)
-    beside, also = (
-        "IQM [95 %]",
-        "interquartile mean over seeds and tasks with its bootstrap interval",
-    )
+    beside = "IQM [95 %]"
+    also = "interquartile mean over seeds and tasks with its bootstrap interval"
     if entry.by_task:
-        beside, also = (
-            "std. error over tasks",
-            "standard error over tasks of their means over seeds",
-        )
+        beside = "std. error over tasks"
+        also = "standard error over tasks of their means over seeds"
     header = ["method", "seeds"]
     for k in queries:
         header += [_after(k), beside, *(["paper"] if has_paper else [])]

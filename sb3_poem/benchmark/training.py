@@ -106,7 +106,11 @@ def training_plan(key: ModelKey) -> TrainingPlan:
     facts, tasks = family_facts(key.env_id), hyperparameters.get("n_train_tasks")
     if tasks is None:
         tasks = min(DEFAULT_TRAIN_TASKS, facts.n_tasks or DEFAULT_TRAIN_TASKS)
-    rollouts = tasks * hyperparameters.get("trajectories_per_task", 1)
+    each = hyperparameters.get("trajectories_per_task", 1)
+    for name, number in (("n_train_tasks", tasks), ("trajectories_per_task", each)):
+        if not isinstance(number, int) or number < 1:
+            raise ValueError(f"{name} must be a whole number of at least 1, got {number!r}")
+    rollouts = tasks * each
     if variant.algorithm == "poem_sac" and not facts.shared_dynamics:
         # each policy is run on the other tasks of its group, too
         n_groups = max(1, tasks // hyperparameters.get("preference_group_size", 4))

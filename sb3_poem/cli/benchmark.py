@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sb3_poem.benchmark.suites import SUITES, Budget, Training, family_id, family_label, hashable
-from sb3_poem.cli.needs import check_writable, import_packages, parse_pairs, say
+from sb3_poem.cli.needs import check_device, check_writable, import_packages, parse_pairs, say
 
 if TYPE_CHECKING:
     from sb3_poem.benchmark.models import ModelLibrary
@@ -24,6 +24,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from sb3_poem.benchmark.running import describe, export_model, make_plan, run_cells
     from sb3_poem.benchmark.store import Store
 
+    check_device(arguments.device)
     import_packages(arguments.gym_packages)
     suite = SUITES[arguments.suite]
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)

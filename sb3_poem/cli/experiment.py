@@ -213,9 +213,8 @@ class PoemExperiment(FamilyExperiment):
                 study.enqueue_trial(entry_params(self.algo, self._hyperparams))
             return study
 
-        with mock.patch.object(
-            optuna, "create_study", create_with_entry
-        ):  # rl_zoo3 has no other place
+        # rl_zoo3 has no other place
+        with mock.patch.object(optuna, "create_study", create_with_entry):
             super().hyperparameters_optimization()
 
     def objective(self, trial: optuna.Trial) -> float:

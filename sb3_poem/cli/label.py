@@ -36,6 +36,8 @@ def run_page(arguments: argparse.Namespace) -> None:
 
     user, password = read_password(arguments.auth, arguments.auth_file)
     instructions = read_text("--instructions", arguments.instructions)
+    if arguments.instructions is not None and not instructions.strip():
+        raise ValueError(f"--instructions {arguments.instructions}: must be a text, but is empty")
     token = secrets.token_urlsafe(24) if arguments.token else None
     is_open = not is_loopback(arguments.host)
     if is_open and password is None and token is None:
@@ -116,13 +118,10 @@ def read_text(flag: str, file: Path | None) -> str:
     if file is None:
         return ""
     try:
-        text = file.read_text(encoding="utf-8")
+        return file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         why = getattr(error, "strerror", error)
         raise ValueError(f"{flag} {file}: must be a text in UTF-8 ({why})") from None
-    if not text.strip():
-        raise ValueError(f"{flag} {file}: must be a text, but is empty")
-    return text
 
 
 def check_shown(models: Sequence[Any]) -> None:

@@ -1,5 +1,6 @@
 """What ``sb3-poem adapt`` says: the table, the JSON and the plot."""
 
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -36,7 +37,7 @@ def write_report(
     """
     console, limits, best = Console(), None, None
     kinds = KINDS_OF_ANSWERS.get(settings.get("question", "pair"), 2)
-    facts = {"command": " ".join(sys.orig_argv), "versions": versions(), **settings}
+    facts = {"command": shlex.join(sys.orig_argv), "versions": versions(), **settings}
     facts |= evaluation.to_dict()
     if known is not None:
         limits = [known.limit(n, n_answers=kinds) for n in evaluation.record_at]

@@ -134,11 +134,9 @@ def is_complete(model: Path) -> bool:
 
 def last_run(folder: Path, env_name: str, seed: int) -> Path | None:
     """The newest run in an algorithm's folder that is done or can go on; of a seed, if not -1."""
-
-    def number(run: Path) -> int:
-        return int(run.name.removeprefix(env_name).split("_")[1])
-
-    for run in sorted(folder.glob(f"{env_name}_*"), key=number, reverse=True):
+    runs = {run.name.removeprefix(f"{env_name}_"): run for run in folder.glob(f"{env_name}_*")}
+    for number in sorted(filter(str.isdecimal, runs), key=int, reverse=True):
+        run = runs[number]
         if seed >= 0 and _seed(run / env_name / "args.yml") != seed:
             continue
         if (run / CHECKPOINT).exists() or is_complete(run / f"{env_name}.zip"):

@@ -282,6 +282,12 @@ def test_a_named_folder_without_a_model(tmp_path: Path) -> None:
             ["--model", "PointGoal:maml-reward:0=."],
             "maml-reward is none of the models of this run: pearl, poem",
         ),
+        (["--device", "gpu"], "--device gpu: there is no such device"),
+        (
+            ["--params", "trajectories_per_task:0"],
+            "trajectories_per_task must be a whole number of at least 1, got 0",
+        ),
+        (["--params", "n_train_tasks:few"], "n_train_tasks must be a whole number .*, got 'few'"),
         (
             ["--params", "net_arch:{'pi': [64]}"],
             "--params net_arch:.*: .* is a dictionary; write it as text",

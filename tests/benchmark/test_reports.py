@@ -343,6 +343,17 @@ def test_figures(suite: str, tmp_path: Path) -> None:
     assert all(file.read_bytes()[:4] == b"\x89PNG" for file in files if file.suffix == ".png")
 
 
+def test_a_store_without_final_cells_has_figures_along_the_training(tmp_path: Path) -> None:
+    cells = SUITES["table3"].cells([VEL], range(1), ["anole"], FOUR)
+    with Store(tmp_path / "store.sqlite") as store:
+        for cell in cells:
+            if cell.snapshot is not None:
+                store.add(finished(cell, ladder))
+        _, files = make_report(store, ["table3"], out=tmp_path)
+    names = [file.name for file in files]
+    assert names == ["table3.md", "table3-methods-samples.png", "table3-methods-samples.pdf"]
+
+
 def test_lines_show_the_values_of_the_store(tmp_path: Path) -> None:
     from sb3_poem.benchmark.figures import suite_figures
 

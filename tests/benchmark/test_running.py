@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -26,6 +27,7 @@ from sb3_poem.benchmark.results import Selection
 from sb3_poem.benchmark.running import make_plan, run_cells
 from sb3_poem.benchmark.store import Store
 from sb3_poem.benchmark.suites import (
+    BOLTZMANN,
     EXACT,
     TABLE_METHODS,
     TABLE_REFERENCES,
@@ -173,14 +175,20 @@ def test_a_finished_cell_is_verified(
     assert "say where it is by --runs, --models or --model" in capsys.readouterr().err
 
 
-def test_a_model_without_experience(tmp_path: Path, handed_over: Path) -> None:
+def test_a_model_without_experience(
+    tmp_path: Path, handed_over: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     library, store = library_of(tmp_path, handed_over / "without")
     methods = ["anole-random", "maml-reward"]
-    plan = make_plan(TINY, library, store, None, methods, range(1), BUDGET, Training(), 1)
-    [failure] = run_cells(plan.todo, library, store)
-    assert "which the model that was handed over does not have; hand over its checkpoint" in failure
-    [record] = store.records()
-    assert record.result["fragments"] == "rollouts of the training tasks"
+    suite = replace(TINY, entries=(replace(TINY.entries[0], oracles=(EXACT, BOLTZMANN)),))
+    plan = make_plan(suite, library, store, None, methods, range(1), BUDGET, Training(), 1)
+    failures = run_cells(plan.todo, library, store)
+    assert len(failures) == 2
+    assert capsys.readouterr().err.count("Traceback") == 1  # not tried twice
+    for failure in failures:
+        assert "which the model that was handed over does not have; hand over its" in failure
+    for record in store.records():
+        assert record.result["fragments"] == "rollouts of the training tasks"
 
 
 def test_what_is_made_from_a_model_is_made_anew_of_another(
@@ -279,23 +287,25 @@ def test_a_family_of_ones_own_is_trained_by_the_module_that_registers_it(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.path", [*sys.path])
     words = "benchmark run --suite smoke --families own/Point-v0 --methods poem-bayes --seeds 1"
-    little = "--timesteps 100 --params n_train_tasks:4 gradient_steps:1 --tasks 2 --episodes 1"
-    own = "--gym-packages own_family --snapshots 1"
+    little = "--timesteps 100 --params n_train_tasks:4 gradient_steps:1 learning_rate:lin_1e-3"
+    own = "--gym-packages own_family --snapshots 1 --tasks 2 --episodes 1"
     try:
         assert main(f"{words} {little} {own}".split()) == 0
     finally:
         gym.registry.pop("own/Point-v0", None)
         sys.modules.pop("own_family", None)
     (record, _) = Store(Path("benchmark.sqlite"), create=False).records()
-    assert "--gym-packages own_family" in json.dumps(record.provenance)
+    command = shlex.split(record.provenance["model"]["command"])  # as a shell takes it back
+    assert {"own_family", "learning_rate:'lin_1e-3'"} < set(command)
 
 
-def test_a_training_that_fails_is_reported_and_the_rest_is_run(tmp_path: Path) -> None:
+@pytest.mark.parametrize("methods", [["poem-bayes", "poem-paper"], ["anole", "maml-reward"]])
+def test_a_training_that_fails_is_reported_and_the_rest_is_run(
+    tmp_path: Path, methods: list[str]
+) -> None:
     library, store = library_of(tmp_path)
     broken = Training(600, (("gradient_stebs", 3),))
-    plan = make_plan(
-        TINY, library, store, None, ["poem-bayes", "poem-paper"], range(1), BUDGET, broken, 1
-    )
+    plan = make_plan(TINY, library, store, None, methods, range(1), BUDGET, broken, 1)
     lines: list[str] = []
     failures = run_cells(plan.todo, library, store, lines.append)
     assert len(failures) == 2

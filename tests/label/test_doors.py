@@ -422,6 +422,7 @@ def test_the_printed_links_host_can_be_reached(host: str) -> None:
             "ann:short",
             "SB3_POEM_AUTH: the password must have at least 12 characters, but has 5",
         ),
+        (["--auth-file", "empty"], None, "--auth-file empty must have the form USER:PASSWORD"),
         ([], "", "SB3_POEM_AUTH must have the form USER:PASSWORD"),
         (["--auth", "nobody"], f"ann:{PASSWORD}", "--auth must have the form USER:PASSWORD"),
         (["--instructions", "missing"], None, "--instructions missing: must be a text in UTF-8"),
