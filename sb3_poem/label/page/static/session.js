@@ -178,7 +178,7 @@ async function show(next) {
   showRace();
   byId("answers").hidden = phase !== "question";
   byId("result").hidden = phase !== "result";
-  byId("hint").hidden = phase !== "question" || answered > 2;
+  byId("hint").hidden = phase !== "question";
   byId("task").textContent = phase === "question" ? question()
     : accepted ? "This is what it learned." : "This is what it learned. Is this what you meant?";
   screens[0].setAttribute("aria-label", phase === "question" ? firstLabel : "What it learned");
@@ -272,6 +272,7 @@ function race() {
   say(wantsRace ? "Both in one picture." : "Two pictures.");
 }
 byId("race").addEventListener("click", race);
+showRace(); // the first films find their place kept, and move nothing
 
 // Films and answers alone, as large as the screen.
 function fullScreen() {
