@@ -768,6 +768,14 @@ def test_a_phone(open_page: Callable[..., Any], server: Server, point_goal: Mode
         assert box["height"] >= 44 or selector == ".speed"
         assert box["width"] >= 60 or not selector.startswith("[")
         assert box["y"] + box["height"] <= PHONE["height"]  # all that is needed is in sight
+    assert page.locator("#frame").bounding_box()["width"] >= 200
+    assert page.is_visible("#moment")
+    undo, stop = (page.locator(selector).bounding_box() for selector in ("#undo", "#stop"))
+    assert undo["y"] == stop["y"]
+    assert undo["x"] + undo["width"] <= stop["x"]
+    assert page.is_hidden("#keys")
+    page.keyboard.press(".")  # there is a keyboard after all: WCAG 2.1.4
+    assert page.is_visible("#keys")
 
 
 def test_a_phone_on_its_side(
