@@ -534,6 +534,40 @@ def test_a_pair_is_shown_again_where_answers_contradict_each_other(
     assert [answer["repeats"] for answer in record["answers"]] == [None] * answered + [0]
 
 
+TOPS = """() => {
+  window.tops = new Set();
+  const measure = () => {
+    const answers = document.getElementById("answers");
+    const shown = answers && answers.offsetParent;
+    if (shown) tops.add(Math.round(answers.getBoundingClientRect().top + scrollY));
+    requestAnimationFrame(measure);
+  };
+  measure();
+}"""
+
+
+@pytest.mark.parametrize("viewport", [DESKTOP, PHONE], ids=["desktop", "phone"])
+def test_the_answers_stay_where_they_are(
+    open_page: Callable[..., Any], server: Server, point_goal: ModelInfo, viewport: dict[str, int]
+) -> None:
+    page = open_page(server.url, viewport=viewport)
+    page.add_init_script(f"({TOPS})()")  # in every frame, from the first on
+    page.click(f"button[value={point_goal.name}]")
+    page.wait_for_selector("#progress:visible")
+    page.wait_for_function(SHOWN)
+    person = Person(server, page, point_goal, 2.5)
+    page.evaluate("() => showError('The server does not answer. '.repeat(9))")
+    person.say("much right" if "left" in person.judge() else "much left")
+    while not page.is_visible("#doubt"):
+        person.answer()
+    assert person.answered() < server.queries
+    page.click("#again")
+    page.wait_for_function("() => view.turn.repeats === 0 && !busy")
+    person.answer(server.queries - person.answered())
+    page.wait_for_selector("#result:visible")
+    assert len(page.evaluate("() => [...tops]")) == 1
+
+
 def test_both_halves_of_the_film_are_in_step(
     open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
 ) -> None:
@@ -734,6 +768,14 @@ def test_a_phone(open_page: Callable[..., Any], server: Server, point_goal: Mode
         assert box["height"] >= 44 or selector == ".speed"
         assert box["width"] >= 60 or not selector.startswith("[")
         assert box["y"] + box["height"] <= PHONE["height"]  # all that is needed is in sight
+    assert page.locator("#frame").bounding_box()["width"] >= 200
+    assert page.is_visible("#moment")
+    undo, stop = (page.locator(selector).bounding_box() for selector in ("#undo", "#stop"))
+    assert undo["y"] == stop["y"]
+    assert undo["x"] + undo["width"] <= stop["x"]
+    assert page.is_hidden("#keys")
+    page.keyboard.press(".")  # there is a keyboard after all: WCAG 2.1.4
+    assert page.is_visible("#keys")
 
 
 def test_a_phone_on_its_side(

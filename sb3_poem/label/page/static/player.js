@@ -15,7 +15,7 @@ class Player {
     this.video.preload = "auto";
     this.fps = 20;
     this.frames = 1;
-    this.parts = 2;
+    this.parts = canvases.length; // until a film says otherwise
     this.wantsToPlay = !window.matchMedia("(prefers-reduced-motion: reduce)").matches;
     this.drawn = -1;
     this.video.addEventListener("seeked", () => this.draw());

@@ -162,7 +162,9 @@ async function show(next) {
     byId("belief-sentence").textContent = next.belief.sentence;
   }
   byId("undo").hidden = !next.can_undo;
-  byId("undo-text").textContent = result && answered < target ? "Back to the questions" : "Undo the last answer";
+  const back = result && answered < target;
+  byId("undo-text").textContent = back ? "Back to the questions" : "Undo";
+  byId("undo-what").hidden = back;
   byId("stop").hidden = phase !== "question" || answered === 0;
   for (const button of document.querySelectorAll(".answer")) button.setAttribute("aria-disabled", String(waiting));
   showDoubt();
@@ -178,7 +180,7 @@ async function show(next) {
   showRace();
   byId("answers").hidden = phase !== "question";
   byId("result").hidden = phase !== "result";
-  byId("hint").hidden = phase !== "question" || answered > 2;
+  byId("hint").hidden = phase !== "question";
   byId("task").textContent = phase === "question" ? question()
     : accepted ? "This is what it learned." : "This is what it learned. Is this what you meant?";
   screens[0].setAttribute("aria-label", phase === "question" ? firstLabel : "What it learned");
@@ -272,6 +274,7 @@ function race() {
   say(wantsRace ? "Both in one picture." : "Two pictures.");
 }
 byId("race").addEventListener("click", race);
+showRace(); // the first films find their place kept, and move nothing
 
 // Films and answers alone, as large as the screen.
 function fullScreen() {
@@ -344,9 +347,10 @@ document.querySelectorAll("[data-preference]").forEach((button, index) => {
 });
 if (four) KEYS[0] = () => answer("equal");
 document.addEventListener("keydown", (event) => {
-  if (!byId("keys").checked) return;
   if (event.altKey || event.ctrlKey || event.metaKey || event.repeat) return;
   if (event.target.closest("textarea, select")) return;
+  byId("keys-box").classList.add("used");
+  if (!byId("keys").checked) return;
   const control = event.target.closest("input, button, a, summary"); // has a meaning for some keys
   if (control && (event.key === " " || (event.key.startsWith("Arrow") && control.matches("input")))) return;
   if (event.key === " ") {
