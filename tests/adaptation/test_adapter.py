@@ -484,7 +484,7 @@ def test_the_protocol_is_kept():
     with pytest.raises(ValueError, match='"left", "equal", "right", but is \'better\''):
         a.tell("better")
     for nonsense in (None, 0, True, 1.0, ["left"], np.array([1, 0])):
-        with pytest.raises(TypeError, match="an answer must be Preference"):
+        with pytest.raises(TypeError, match="an answer to a pair question must be a Preference"):
             a.tell(nonsense)
     assert a.pending is query  # a refused answer leaves the question waiting
     a.tell(Preference.LEFT)
@@ -500,7 +500,10 @@ def test_the_protocol_is_kept():
 
 @pytest.mark.parametrize("nothing", [1, None, 0.3])
 def test_an_oracle_that_returns_something_else(nothing):
-    with pytest.raises(TypeError, match=f"an answer must be Preference.*but is {nothing} of type"):
+    with pytest.raises(
+        TypeError,
+        match=f"an answer to a pair question must be a Preference.*but is {nothing} of type",
+    ):
         adapter(oracle=lambda left, right: nothing).adapt()
     with pytest.raises(ValueError, match="adapt\\(\\) needs an oracle"):
         adapter().adapt()
