@@ -76,15 +76,20 @@ def row(family: str, method: str, queries: int | None = None, kind: str = "metho
     return None
 
 
+def digits(value: float) -> int:
+    """Decimals with which a return is shown."""
+    return 0 if abs(value) >= 100 else 1
+
+
 def cell(found: Any, error: bool = False) -> str:
     """A return, with its deviation over training seeds, or the standard error over tasks of one."""
     if found is None:
         return ""
-    digits = 0 if abs(found["mean"]) >= 100 else 1
-    text = f"{found['mean']:,.{digits}f}"
+    n = digits(found["mean"])
+    text = f"{found['mean']:,.{n}f}"
     spread = found["task_error" if found["n_seeds"] == 1 else "deviation"]
     if error and spread is not None:
-        text += f"\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{spread:.{digits}f}"
+        text += f"\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{spread:.{n}f}"
     return text
 
 
@@ -271,7 +276,7 @@ def by_seed(family: str) -> list[list[str]]:
         ours, known = found[seed, "poem-bayes"], np.mean(found[seed, "known-task"]["task_returns"])
         earned = np.mean(ours["task_returns"], axis=0)
         figures = [*(earned[ours["queries"].index(k)] for k in (1, 10)), known]
-        rows.append([str(seed), *(f"{one:,.{0 if abs(one) >= 100 else 1}f}" for one in figures)])
+        rows.append([str(seed), *(f"{one:,.{digits(one)}f}" for one in figures)])
     return rows
 
 

@@ -55,7 +55,7 @@ def check_number_or_auto(name: str, value: Any, low: float = -np.inf) -> None:
 
 def as_observations(observation: Any, shape: tuple[int, ...]) -> np.ndarray:
     """An observation of this shape, or several, as an array; refuse what people take for one."""
-    if isinstance(observation, tuple) and isinstance(observation[-1], dict):
+    if isinstance(observation, tuple) and any(isinstance(part, dict) for part in observation):
         given = "what reset() of a Gymnasium environment returns: obs, info = env.reset()"
         raise ValueError(f"`observation` must be an array, but is {given}")
     if isinstance(observation, dict):

@@ -106,8 +106,8 @@ def check_arguments(given: Mapping[str, Any], algorithm: type) -> None:
         needed = "a dictionary of the policy's arguments"
         raise TypeError(f"policy_kwargs must be {needed}, but is {policy_kwargs!r}")
     refuse_unsupported(policy_kwargs or (), f"{algorithm.__name__}'s policy")
-    for name in policy_kwargs or () if given["policy"] == "MlpPolicy" else ():
-        if name not in POLICY_ARGUMENTS:
+    for name in policy_kwargs or ():
+        if given["policy"] == "MlpPolicy" and name not in POLICY_ARGUMENTS:
             known = f"known are {', '.join(POLICY_ARGUMENTS)}"
             if name in DEFAULT_NET_ARCH:
                 known = f"widths go into net_arch: dict(net_arch=dict({name}=[...]))"
@@ -139,7 +139,8 @@ def warn_of_idle_callbacks(callback: BaseCallback, total_timesteps: int, n_envs:
     calls = -(-total_timesteps // n_envs)
     for each in getattr(callback, "callbacks", [callback]):
         for name in ("save_freq", "eval_freq"):
-            if isinstance(every := getattr(each, name, 0), int) and calls < every:
+            every = getattr(each, name, 0)
+            if isinstance(every, int) and every - each.n_calls % max(every, 1) > calls:
                 warnings.warn(
                     f"{type(each).__name__} never acts in this training: {name}={every} counts "
                     f"calls, of which a training of {total_timesteps:,} steps has {calls:,}, one "
