@@ -773,6 +773,7 @@ def test_a_phone(open_page: Callable[..., Any], server: Server, point_goal: Mode
     undo, stop = (page.locator(selector).bounding_box() for selector in ("#undo", "#stop"))
     assert undo["y"] == stop["y"]
     assert undo["x"] + undo["width"] <= stop["x"]
+    assert max(undo["height"], stop["height"]) < 48  # a line
     assert page.is_hidden("#keys")
     page.keyboard.press(".")  # there is a keyboard after all: WCAG 2.1.4
     assert page.is_visible("#keys")
