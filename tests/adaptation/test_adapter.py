@@ -1,6 +1,5 @@
-"""Ask and tell: the protocol, what it may see, and that it resumes exactly."""
+"""Ask and tell: the protocol, and what it may see."""
 
-import json
 import re
 import warnings
 from dataclasses import dataclass
@@ -9,7 +8,7 @@ from functools import partial
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
+from adapters import GOAL, RULES, SMALL, adapter, answer, kind_of, make_env, outside_oracle
 from gymnasium import spaces
 from meta_toys import small
 from stable_baselines3 import SAC
@@ -39,57 +38,9 @@ from sb3_poem.adaptation import (
     named_rule,
 )
 from sb3_poem.adaptation.rule import Answer
-from sb3_poem.common.networks import digest_of
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.resources import pretrained_folder
-
-GOAL = np.array([2.2])
-SMALL = Bayes(n_particles=20)
-RULES = [
-    Bayes(),
-    Bayes(likelihood="similarity"),
-    Bayes(question="graded", noise_model="infer"),
-    Bayes(question="best-of-four"),
-    Paper(),
-]
-
-
-def kind_of(rule):
-    """What an oracle is given to answer this rule's questions."""
-    four = {"question": "best-of-four"}
-    return {"graded": {"thresholds": (20, 200)}, "best-of-four": four}.get(rule.question, {})
-
-
-def make_env(goal=GOAL, **kwargs):
-    env = SpeedEnv(**kwargs)
-    env.set_task(goal)
-    return env
-
-
-def outside_oracle(*shown):
-    """Knows the goal, and sees observations only."""
-    misses = [np.abs(trajectory.observations[1:, 1] - GOAL).sum() for trajectory in shown]
-    if len(shown) == 2:
-        return Preference.LEFT if misses[0] < misses[1] else Preference.RIGHT
-    return ("first", "second", "third", "fourth")[int(np.argmin(misses))]
-
-
-@pytest.fixture(scope="module")
-def point_goal():
-    return POEMSAC.from_pretrained("PointGoal", device="cpu")
-
-
-def adapter(env=None, seed=0, model=None, **kwargs):
-    return PreferenceAdapter(
-        model or SpeedModel(), make_env() if env is None else env, seed=seed, **kwargs
-    )
-
-
-def answer(a, times, oracle=outside_oracle):
-    for _ in range(times):
-        query = a.ask()
-        a.tell(oracle(*query.shown))
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -176,132 +127,6 @@ def test_without_a_seed_one_is_drawn_and_kept():
     answer(second, 2)
     np.testing.assert_array_equal(first.policy().latent, second.policy().latent)
     assert adapter(seed=None).seed != first.seed
-
-
-@pytest.mark.parametrize("rule", RULES)
-@pytest.mark.parametrize("pending", [False, True])
-def test_a_saved_adaptation_continues_exactly(tmp_path, rule, pending):
-    rule = rule.answered_by(MistakeOracle(0.1, **kind_of(rule)))
-    whole = adapter(rule=rule)
-    answer(whole, 8)
-
-    first = adapter(rule=rule, n_queries=8)
-    answer(first, 3)
-    query = first.ask() if pending else None
-    path = tmp_path / "adaptation.json"
-    first.save(path)
-    assert [p.name for p in tmp_path.iterdir()] == ["adaptation.json"]
-    assert [item["preference"] for item in json.loads(path.read_text())["answers"]] == [
-        a.preference.value for a in first.answers
-    ]
-
-    second = PreferenceAdapter.load(path, SpeedModel(), make_env())
-    assert second.n_answers == 3
-    assert second.rule == first.rule
-    np.testing.assert_array_equal(second.policy().latent, first.policy().latent)
-    if pending:
-        np.testing.assert_array_equal(second.pending.left.observations, query.left.observations)
-        np.testing.assert_array_equal(second.ask().right.latent, query.right.latent)
-    answer(second, 5)
-    assert second.done
-    np.testing.assert_array_equal(second.policy().latent, whole.policy().latent)
-    third = PreferenceAdapter.from_json(second.to_json(), SpeedModel(), make_env())
-    np.testing.assert_array_equal(third.policy().latent, whole.policy().latent)
-
-
-def test_saving_replaces_the_file_only_once_the_new_one_is_whole(tmp_path, monkeypatch):
-    import os
-
-    a = adapter()
-    path = tmp_path / "adaptation.json"
-    a.save(path)
-    before = path.read_bytes()
-    answer(a, 1)
-
-    def full_disk(descriptor):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full_disk)
-    with pytest.raises(OSError, match="No space left"):
-        a.save(path)
-    assert path.read_bytes() == before
-    assert [p.name for p in tmp_path.iterdir()] == ["adaptation.json"]
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("", "is not a saved adaptation"),
-        ('{"format": "sb3_poem.Pref', "is not a saved adaptation"),
-        ("[1]", "holds a list"),
-        ('{"format": "optuna"}', "`format` is 'optuna'"),
-        ('{"format": "sb3_poem.PreferenceAdapter", "version": 99}', "version 99"),
-        ('{"format": "sb3_poem.PreferenceAdapter", "version": 3}', "incomplete"),
-    ],
-)
-def test_foreign_and_truncated_files_are_refused(tmp_path, content, message):
-    path = tmp_path / "adaptation.json"
-    path.write_text(content)
-    with pytest.raises(ValueError, match=message):
-        PreferenceAdapter.load(path, SpeedModel(), make_env())
-
-
-def test_another_models_file_is_refused():
-    text = adapter().to_json()
-    with pytest.raises(ValueError, match="latent_dim=5, but the model has 4"):
-        PreferenceAdapter.from_json(text, SpeedModel(latent_dim=4), make_env())
-
-
-def test_the_same_weights_go_on_and_others_are_refused(point_goal, tmp_path):
-    env = make_task_vec_env(point_goal.env_id, 1)
-    begun = PreferenceAdapter(
-        point_goal, env, oracle=ReturnOracle(), seed=0, n_queries=2, rule=SMALL
-    )
-    answer(begun, 1, begun.oracle)
-    text = begun.to_json()
-    point_goal.save(tmp_path / "m.zip")
-    point_goal.save_pretrained(tmp_path / "folder")
-    for again in (
-        POEMSAC.load(tmp_path / "m.zip", device="cpu"),
-        POEMSAC.from_pretrained(tmp_path / "folder", device="cpu"),
-    ):
-        assert again.digest == point_goal.digest
-        np.testing.assert_array_equal(
-            PreferenceAdapter.from_json(text, again, env).policy().latent, begun.policy().latent
-        )
-        with torch.no_grad():
-            again.policy.critic.members[0].output.bias += 1.0  # which adaptation does not use
-        assert again.digest == point_goal.digest
-        for tensor in (
-            again.policy.actor.mlp.output.bias,
-            again.policy.obs_norm.mean,
-            again.policy.reward_mapping.output.weight,
-        ):
-            with torch.no_grad():
-                tensor += 0.01
-            with pytest.raises(
-                ValueError,
-                match="saved with a model of other weights than this POEMSAC on poem/PointGoal-v0",
-            ):
-                PreferenceAdapter.from_json(text, again, env)
-            with torch.no_grad():
-                tensor -= 0.01
-    other = POEMSAC.load(tmp_path / "m.zip", device="cpu")
-    other.train_tasks.latent_means += 0.1
-    begun.save(tmp_path / "state.json")
-    with pytest.raises(ValueError, match="other weights"):
-        PreferenceAdapter.load(tmp_path / "state.json", other, env)
-
-
-def test_a_digest_is_of_the_numbers_not_of_how_they_are_kept():
-    numbers = torch.arange(6, dtype=torch.float32).reshape(2, 3) / 8
-    digest = digest_of({"a": numbers, "b": torch.ones(1)})
-    for kind in (torch.float64, torch.bfloat16, torch.float16):
-        assert digest_of({"b": torch.ones(1, dtype=torch.int64), "a": numbers.to(kind)}) == digest
-    assert digest_of({"a": numbers.T.contiguous().T, "b": torch.ones(1)}) == digest
-    assert digest_of({"a": numbers.reshape(3, 2), "b": torch.ones(1)}) != digest
-    assert digest_of({"a": numbers, "c": torch.ones(1)}) != digest
-    assert digest_of({"a": numbers + 1e-7, "b": torch.ones(1)}) != digest
 
 
 class WatchedEnv(SpeedEnv):
@@ -664,18 +489,6 @@ def test_the_id_of_the_models_own_environment_makes_that():
     assert a.env.get_attr("step_length") == [0.1]
 
 
-def test_an_adaptation_resumes_by_names():
-    a = PreferenceAdapter(POINT_GOAL, POINT, seed=0, n_queries=2)
-    a.ask()
-    a.tell("left")
-    resumed = PreferenceAdapter.from_json(a.to_json(), POINT_GOAL, POINT)
-    np.testing.assert_array_equal(resumed.policy().latent, a.policy().latent)
-    for one in (a, resumed):  # on the task that the first question drew
-        one.ask()
-    assert a.env.get_attr("task") == resumed.env.get_attr("task")
-    np.testing.assert_array_equal(a.pending.left.observations, resumed.pending.left.observations)
-
-
 def test_an_oracle_without_an_environment_judges_by_that_of_each_adapter():
     elsewhere = make_env(np.array([0.3]))
     elsewhere.reset()
@@ -899,18 +712,6 @@ def test_answers_that_say_more_find_a_task_in_fewer_questions():
     assert misses(best, 2, question="best-of-four") < pairs
 
 
-def test_numbers_of_numpy_can_be_saved():
-    adapter = PreferenceAdapter(
-        SpeedModel(),
-        make_env(),
-        n_queries=np.int64(3),
-        rule=Bayes(epsilon=np.float32(0.125)),
-        seed=0,
-    )
-    resumed = PreferenceAdapter.from_json(adapter.to_json(), SpeedModel(), make_env())
-    assert (resumed.n_queries, resumed.rule.epsilon) == (3, 0.125)
-
-
 def test_a_library_in_an_environment_that_was_not_reset(point_goal):
     model = point_goal
     source = PreferenceAdapter(
@@ -960,72 +761,6 @@ def test_a_library_needs_no_rollouts():
         PreferenceAdapter.from_json(a.to_json(), model, make_env())
     resumed = PreferenceAdapter.from_json(a.to_json(), model, make_env(), library=library)
     np.testing.assert_array_equal(resumed.policy().latent, a.policy().latent)
-
-
-@pytest.mark.parametrize("rule", RULES)
-def test_many_tasks_in_lockstep_as_each_alone(rule):
-    tasks = np.array([[0.4], [1.3], [2.7]])
-    model = SpeedModel()
-    together = adapt_tasks(
-        model,
-        DummyVecEnv([SpeedEnv] * 4),
-        tasks,
-        partial(MistakeOracle, 0.2, **kind_of(rule)),
-        n_queries=5,
-        seed=7,
-        rule=rule,
-    )
-    assert together.latents.shape == (3, 6, 5)
-    assert together.record_at == (0, 1, 2, 3, 4, 5)
-    for i, task in enumerate(tasks):
-        oracle = MistakeOracle(0.2, task=task, seed=7 + i, **kind_of(rule))
-        alone = PreferenceAdapter(
-            model, make_env(task), oracle=oracle, seed=7 + i, n_queries=5, rule=rule
-        )
-        np.testing.assert_array_equal(together.latents[i, 0], alone.policy().latent)
-        for query in range(1, 6):
-            answer(alone, 1, oracle)
-            np.testing.assert_array_equal(together.latents[i, query], alone.policy().latent)
-        assert together.preferences[i] == [item.preference for item in alone.answers]
-
-
-def test_lockstep_options(capsys):
-    env, model, tasks = DummyVecEnv([SpeedEnv] * 2), SpeedModel(), np.array([[0.4]])
-    how = {"n_queries": 4, "record_at": [2, 0], "progress_bar": True}
-    result = adapt_tasks(model, env, tasks, ReturnOracle, **how)
-    assert "2/2" in capsys.readouterr().err
-    assert result.record_at == (0, 2)
-    assert result.latents.shape == (1, 2, 5)
-    assert len(result.preferences[0]) == 2  # nothing is asked that nobody will look at
-    for arguments, message in [
-        ({"record_at": [5]}, "`record_at` must be at most 4, but is 5"),
-        ({"record_at": []}, "`record_at` must hold"),
-        ({"n_queries": 0}, "`n_queries` must be at least 1"),
-    ]:
-        with pytest.raises(ValueError, match=message):
-            adapt_tasks(model, env, tasks, ReturnOracle, **{"n_queries": 4, **arguments})
-    with pytest.raises(ValueError, match="`tasks` must have shape"):
-        adapt_tasks(model, env, np.zeros(3), ReturnOracle)
-
-
-def test_lockstep_with_a_library():
-    model, tasks = SpeedModel(), np.array([[0.4], [2.1]])
-    source = PreferenceAdapter(model, make_env(), seed=3, rule=Bayes(query_rule="random"))
-    answer(source, 10)
-    library = [trajectory for item in source.answers for trajectory in item.shown]
-    together = adapt_tasks(
-        model, DummyVecEnv([SpeedEnv]), tasks, ReturnOracle, n_queries=4, library=library
-    )
-    for i, task in enumerate(tasks):
-        alone = PreferenceAdapter(
-            model,
-            make_env(task),
-            oracle=ReturnOracle(task=task),
-            seed=i,
-            n_queries=4,
-            library=library,
-        )
-        np.testing.assert_array_equal(together.latents[i, -1], alone.adapt().latent)
 
 
 @pytest.mark.parametrize(
