@@ -180,6 +180,7 @@ def test_wheel_works_installed_elsewhere(wheel: Path, tmp_path: Path) -> None:
     """In a fresh environment which finds the dependencies of this one behind its own packages, away
     from the checkout.
     """
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     subprocess.run([sys.executable, "-m", "venv", str(tmp_path / "venv")], check=True)
     python = tmp_path / "venv/bin/python"
     install = [
@@ -192,12 +193,11 @@ def test_wheel_works_installed_elsewhere(wheel: Path, tmp_path: Path) -> None:
         "--no-index",
         str(wheel),
     ]
-    subprocess.run(install, check=True, cwd=tmp_path)
+    subprocess.run(install, check=True, cwd=tmp_path, env=environment)
     # A plain path line: the .pth files in that folder, and so the editable install of the checkout,
     # are not read.
     site_packages = next((tmp_path / "venv/lib").glob("python*/site-packages"))
     (site_packages / "dependencies.pth").write_text(sysconfig.get_paths()["purelib"] + "\n")
-    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
 
     def run(*command: str) -> str:
         done = subprocess.run(
