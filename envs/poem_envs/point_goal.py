@@ -2,8 +2,9 @@
 
 import time
 from collections.abc import Sequence
+from copy import copy as shallow_copy
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -119,14 +120,16 @@ class PointGoalEnv(BatchFamily):
         self, paths: Sequence[np.ndarray], shown: Sequence[int], size: tuple[int, int]
     ) -> list[np.ndarray]:
         """See :class:`~poem_envs.films.Filmed`."""
-        images, chosen = [], [paths[i] for i in shown]
+        images, chosen, trails = [], [paths[i] for i in shown], Canvas(*size)
+        drawn = [0] * len(chosen)
         for moments in moments_of(chosen):
-            canvas = Canvas(*size)
+            for number, now in enumerate(moments):
+                for x, y in chosen[number][drawn[number] : now]:
+                    trails.disc(x, y, 0.02, _COLOURS[shown[number]])
+                drawn[number] = now
+            canvas = trails.copy()
             for i, path, now in zip(shown, chosen, moments, strict=True):
-                colour = _COLOURS[i]
-                for x, y in path[:now]:
-                    canvas.disc(x, y, 0.02, colour)
-                canvas.disc(path[now][0], path[now][1], 0.07, colour)
+                canvas.disc(path[now][0], path[now][1], 0.07, _COLOURS[i])
             images.append(canvas.image())
         return images
 
@@ -149,6 +152,12 @@ class Canvas:
         line = np.abs(np.hypot(self._x, self._y) - 1.0) - 0.0075
         self._paint(np.maximum(line, -self._y), GREY, self._pixels)
         self.disc(0.0, 0.0, 0.02, GREY)
+
+    def copy(self) -> Self:
+        """One of its own with the same shapes on it."""
+        copied = shallow_copy(self)
+        copied._pixels = self._pixels.copy()
+        return copied
 
     def disc(self, x: float, y: float, radius: float, colour: npt.ArrayLike) -> None:
         """Paint a filled circle around a point."""

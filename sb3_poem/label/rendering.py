@@ -270,16 +270,20 @@ def write_clip(frames: Sequence[np.ndarray], path: Path, fps: float) -> None:
 
     height, width = frames[0].shape[:2]
     source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
-    pixels = b"".join(frame.tobytes() for frame in frames)
     try:
         with tempfile.NamedTemporaryFile(suffix=".mp4") as file:
             # Not imageio's writer, which takes no notice when ffmpeg fails at the end.
             command = [get_ffmpeg_exe(), "-y", "-v", "error", *source, "-r", f"{fps:.02f}"]
             command += ["-i", "-", *ENCODER, file.name]
-            done = subprocess.run(command, input=pixels, capture_output=True, check=False)
-            if done.returncode != 0:
-                words = done.stderr.decode(errors="replace").partition("\n")[0]
-                raise OSError(f"ffmpeg ended with status {done.returncode} {words}")
+            # Not communicate(), which hands frames over in pieces of 4 kB.
+            with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
+                assert ffmpeg.stdin is not None
+                with contextlib.suppress(BrokenPipeError):  # its status says why it ended
+                    for frame in frames:
+                        ffmpeg.stdin.write(frame.tobytes())
+                words = ffmpeg.communicate()[1].decode(errors="replace").partition("\n")[0]
+            if ffmpeg.returncode != 0:
+                raise OSError(f"ffmpeg ended with status {ffmpeg.returncode} {words}")
             write_atomically(path, file.read())
     except OSError as error:
         raise StorageError(f"{path} cannot be written: {error}") from error
