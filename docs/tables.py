@@ -26,13 +26,22 @@ FAMILIES = (*TABLE_3, "FetchReach", "PointGoal")
 ANSWERS = (0, 1, 2, 5, 10)
 #: The store of a family's part of Table 3, of the models that the suite ``shipped`` made
 TABLE3_STORE = "table3.sqlite"
-#: Which row of each part of Table 3 the others are compared with
-OWN = {"methods": "poem-bayes", "informed": "poem-bayes-aggregate"}
-METHODS = """All methods, by the same test tasks and seeds, each with as many updates; "training
-tasks": with candidates from their posteriors; `Bayes()` chooses. The last columns say where it
-stands against the row, with candidates of the row's kind: ahead or behind if mean, interquartile
-mean and the whole 95 % interval of the paired difference say so, else open: not
-distinguishable."""
+#: Which row of each part of Table 3 the others are compared with, the first that there is
+OWN = {
+    "prior": ("poem-bayes-prior-decoder", "poem-bayes-prior-similarity"),
+    "informed": ("poem-bayes-aggregate",),
+}
+PAPERS = {"prior": "poem-paper", "informed": "poem-paper-aggregate"}
+SOURCES = {"prior": "prior", "informed": "training tasks"}
+PARTS = """What `Bayes()` owes to its parts: rule, candidates, likelihood (S or decoder), POEM's
+model, its preference loss. The last columns say how `Bayes()` as it is stands against the row."""
+METHODS = """All methods, by the same test tasks and seeds, each with as many updates, with
+candidates from the prior or from the training tasks' posteriors. `Bayes()` takes the latter where
+they are far from the prior. The last columns say how `Bayes` and `Paper` with candidates of the
+same kind stand against the row: ahead (+) or behind (-) if mean, interquartile mean and the whole
+95 % interval of the paired difference say so, else not to be told apart (?)."""
+#: How tables write a claim
+SIGNS = {"ahead": "+", "behind": "-", "not distinguishable": "?"}
 #: What else is to be known of a family's figures
 REMARKS = {
     "MetaWorldML10": "The likelihood that `Bayes` has by default here was chosen by what another "
@@ -41,16 +50,12 @@ REMARKS = {
 MANIPULATIONS = """By manipulation, three test tasks each. An episode succeeds by Meta-World's own
 criterion if one of its 200 steps does; rewards are version 2."""
 CAPTIONS = {
-    "table3-methods-queries": "Methods, against the number of exact answers",
-    "table3-methods-samples": "Methods, against the samples that training had",
-    "table3-informed-queries": "Methods with candidates from the training tasks",
-    "table3-parts-queries": "What the rows of POEM owe to what",
-    "noise": "Methods under answers with errors",
-    "ablation": "Ablations",
-    "smoke": "Methods, against the number of exact answers",
+    "table3-prior-queries": "Return against answers, the prior's candidates",
+    "table3-informed-queries": "Return against answers, training tasks' candidates",
+    "smoke": "Return against the number of exact answers",
 }
 PAGES = {
-    "table3": "all methods under exact answers, with intervals",
+    "table3": "all methods, with intervals",
     "noise": "under answers with errors",
     "ablation": "ablations",
     "epsilon": "tolerances of eq. 9",
@@ -81,16 +86,25 @@ def digits(value: float) -> int:
     return 0 if abs(value) >= 100 else 1
 
 
-def cell(found: Any, error: bool = False) -> str:
-    """A return, with its deviation over training seeds, or the standard error over tasks of one."""
+def cell(found: Any, spread: str = "") -> str:
+    """A return, with a spread of this name if there is one."""
     if found is None:
         return ""
     n = digits(found["mean"])
     text = f"{found['mean']:,.{n}f}"
-    spread = found["task_error" if found["n_seeds"] == 1 else "deviation"]
-    if error and spread is not None:
-        text += f"\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{spread:.{n}f}"
+    if spread and found[spread] is not None:
+        text += f"\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{found[spread]:,.{n}f}"
     return text
+
+
+def spread_of(family: str) -> tuple[str, str]:
+    """What ± is in a family's table, in words and by its name."""
+    seeds, tasks = row(family, "poem-bayes", 10)["n_seeds"], effort(family)["tasks"]
+    if seeds > 1:
+        return f"{seeds} seeds; ± is the deviation over them.", "deviation"
+    if len(np.unique(tasks, axis=0)) < len(tasks):
+        return "One seed.", ""  # of the same two tasks, again and again
+    return "One seed; ± is the standard error over tasks.", "task_error"
 
 
 def rate(found: Any) -> str:
@@ -123,7 +137,7 @@ def summary() -> str:
         if poem is not None:
             best = [max(figures[i][0] for figures in paper.values()) for i in (0, 2)]
             quoted = [f"{figure:,}" for figure in (*best, poem[0][0], poem[2][0])]
-        ours = [cell(row(family, "poem-bayes", k), error=True) for k in (1, 10)]
+        ours = [cell(row(family, "poem-bayes", k)) for k in (1, 10)]
         limits = [cell(row(family, "known-task", k, "limit")) for k in (1, 10)]
         known = cell(row(family, "known-task", kind="known"))
         seeds = str(row(family, "poem-bayes", 10)["n_seeds"])
@@ -132,29 +146,114 @@ def summary() -> str:
     return "\n".join(table([*head, "ours: 1", "10", "limit: 1", "10", "task known"], rows))
 
 
+def spreads() -> str:
+    """What stands behind the summary's figures after ten answers, a row a family."""
+    rows = []
+    for family in FAMILIES:
+        found, trained = row(family, "poem-bayes", 10), effort(family)
+        n = digits(found["mean"])
+        deviation, error = (
+            "" if value is None else f"{value:,.{n}f}"
+            for value in (found["deviation"], found["task_error"])
+        )
+        if len(np.unique(trained["tasks"], axis=0)) < len(trained["tasks"]):
+            error = ""
+        shares = [share(family, k) for k in (1, 5, 10)]
+        rows.append([family, str(found["n_seeds"]), f"{trained['updates']:,}", deviation, error])
+        rows[-1] += [f"{trained['training_cpu_seconds'] / 60:.0f}", *shares]
+    head = ["family", "seeds", "updates", "± over seeds", "± over tasks", "minutes of a core"]
+    return "\n".join(table([*head, "share of the limit's range, 1", "5", "10"], rows))
+
+
+def effort(family: str) -> dict[str, Any]:
+    """The result of seed 0's cell of the task known, which says what its training took."""
+    [found] = [
+        one.result
+        for one in SHIPPED.records()
+        if (one.family, one.method, one.seed) == (family, "known-task", 0)
+    ]
+    return found
+
+
+def share(family: str, queries: int) -> str:
+    """How much `Bayes()` earns of what the limit gains by so many answers."""
+    nothing, limit = (row(family, "known-task", k, "limit")["mean"] for k in (0, queries))
+    return (
+        f"{100 * (row(family, 'poem-bayes', queries)['mean'] - nothing) / (limit - nothing):.0f} %"
+    )
+
+
+def paper_rule() -> str:
+    """What `Paper()` earns with the models that ship, a row a family."""
+    rows = []
+    for family in FAMILIES:
+        if poem := TABLE_3.get(family, {}).get("POEM"):
+            ours = [row(family, "poem-paper", k) for k in (1, 5, 10)]
+            figures = [*(f"{mean:,}" for mean, _ in poem), *map(cell, ours)]
+            rows.append([family, str(ours[0]["n_seeds"]), *figures])
+    head = ["family", "seeds", "the paper: 1", "5", "10", "`Paper()`: 1", "5", "10"]
+    return "\n".join(table(head, rows))
+
+
 def methods(family: str) -> list[str]:
-    """A family's part of Table 3: what every method earns, and whether `Bayes()` is ahead of it."""
+    """A family's part of Table 3: what every method earns, and whether `Bayes` is ahead of it."""
     store = Store(RESULTS / family / TABLE3_STORE, create=False)
     found = json.loads(make_report(store, ["table3"], kind="json")[0])
-    groups = ("methods", "informed")
-    found = [one for one in found if one["entry"] in groups and one["queries"] in (1, 5, 10)]
-    earned: dict[tuple[str, int], Any] = {}
-    for one in found:
-        if one["kind"] == "method":  # some stand in both groups, with the paper's figures in one
-            earned.setdefault((one["label"], one["queries"]), one)
-    ahead = {
-        (one["against"], one["queries"]): one["claim"].replace("not distinguishable", "open")
+    found = [one for one in found if one["queries"] in (1, 5, 10)]
+    of_paper = {
+        (one["method"], one["queries"]): one["paper_mean"]
         for one in found
-        if one["kind"] == "difference" and one["method"] == OWN[one["entry"]]
+        if one["entry"] == "methods" and one["kind"] == "method"
     }
     rows = []
-    for label in dict.fromkeys(label for label, _ in earned):
-        own = [earned[label, k] for k in (1, 5, 10)]
-        paper = ["" if one["paper_mean"] is None else f"{one['paper_mean']:,.0f}" for one in own]
-        claims = [ahead.get((one["method"], one["queries"]), "") for one in own]
-        rows.append([label, *paper, *(cell(one, error=True) for one in own), *claims])
-    head = ["method", "paper: 1", "5", "10", "ours: 1", "5", "10", "Bayes, 1", "5", "10"]
-    return [*table(head, rows), ""]
+    for entry, source in SOURCES.items():
+        here = [one for one in found if one["entry"] == entry]
+        earned = {(one["method"], one["queries"]): one for one in here if one["kind"] == "method"}
+        names = list(dict.fromkeys(name for name, _ in earned))
+        own = next(name for name in OWN[entry] if name in names)
+        claims = {
+            (one["method"], one["against"], one["queries"]): SIGNS[one["claim"]]
+            for one in here
+            if one["kind"] == "difference"
+        }
+        for name in names:
+            if name in OWN["prior"] and name != own:
+                continue
+            label = "POEM (Bayes)" if name == own else earned[name, 1]["label"]
+            label = label.removesuffix(f", {source}")
+            paper = [of_paper.get((name, k)) for k in (1, 5, 10)]
+            rows.append([label, "" if name == "maml-reward" else source])
+            rows[-1] += ["" if one is None else f"{one:,.0f}" for one in paper]
+            rows[-1] += [cell(earned[name, k], "deviation") for k in (1, 5, 10)]
+            for subject in (own, PAPERS[entry]):
+                rows[-1] += [claims.get((subject, name, k), "") for k in (1, 5, 10)]
+            if name == own:
+                rows[-1][0] = "**POEM (Bayes)**"
+    rows = list(map(list, dict.fromkeys(map(tuple, rows))))  # MAML-reward stands in both
+    head = ["method", "candidates", "paper: 1", "5", "10", "ours: 1", "5", "10"]
+    return [*table([*head, "Bayes: 1", "5", "10", "Paper: 1", "5", "10"], rows), ""]
+
+
+def parts(family: str) -> list[str]:
+    """What `Bayes()` owes to what: other candidates, likelihoods, models."""
+    store = Store(RESULTS / family / TABLE3_STORE, create=False)
+    found = json.loads(make_report(store, ["table3"], kind="json")[0])
+    found = [one for one in found if one["entry"] == "parts" and one["queries"] in (1, 5, 10)]
+    earned = {(one["method"], one["queries"]): one for one in found if one["kind"] == "method"}
+    claims = {
+        (one["against"], one["queries"]): SIGNS[one["claim"]]
+        for one in found
+        if one["kind"] == "difference" and one["method"] == "poem-bayes"
+    }
+    rows = [
+        [
+            earned[name, 1]["label"],
+            *(cell(earned[name, k], "deviation") for k in (1, 5, 10)),
+            *(claims.get((name, k), "") for k in (1, 5, 10)),
+        ]
+        for name in dict.fromkeys(name for name, _ in earned)
+    ]
+    return [*table(["method", "1", "5", "10", "`Bayes()`, 1", "5", "10"], rows), ""]
 
 
 def by_manipulation(family: str) -> list[str]:
@@ -183,7 +282,7 @@ def by_manipulation(family: str) -> list[str]:
 def family_section(family: str) -> str:
     """A family's part of the results page."""
     folder, where = RESULTS / family, f"../benchmarks/results/{family}"
-    rows = []
+    rows, (about, spread) = [], spread_of(family)
     for name, method, kind in (
         ("`Bayes()`", "poem-bayes", "method"),
         ("`Paper()`", "poem-paper", "method"),
@@ -193,21 +292,22 @@ def family_section(family: str) -> str:
         if not any(figures):
             continue
         known = row(family, "known-task", kind="known") if kind == "method" else None
-        rows.append([name, *(cell(one, error=True) for one in figures), cell(known)])
+        rows.append([name, *(cell(one, spread) for one in figures), cell(known)])
         rates = [rate(one) for one in (*figures, known)]
         if any(rates):
             rows.append([f"{name}, success", *rates])
-    lines = [f"## {family}", "", fill(training(family), 120), ""]
+    lines = [f"## {family}", "", fill(f"{training(family)} {about}", 120), ""]
     lines += [*table(["rule", *(f"k = {k}" for k in ANSWERS), "task known"], rows), ""]
     if family == "MetaWorldML10":
         lines += [fill(MANIPULATIONS, 120), "", *by_manipulation(family), ""]
     if (folder / TABLE3_STORE).exists():
         lines += [fill(METHODS, 120), "", *methods(family)]
-    links = [
-        f"[{text}]({where}/{page}.md)"
-        for page, text in PAGES.items()
-        if (folder / f"{page}.md").exists()
-    ]
+        lines += [fill(PARTS, 120), "", *parts(family)]
+    links = []
+    for page, text in PAGES.items():
+        if (folder / f"{page}.md").exists():
+            old = "revision 0 of the code" in (folder / f"{page}.md").read_text()
+            links.append(f"[{text}]({where}/{page}.md)" + " (revision 0)" * old)
     if links:
         lines += ["More: " + ",\n".join(links) + ".", ""]
     for picture in sorted(folder.glob("*.png")):
@@ -220,48 +320,57 @@ def results_page() -> str:
     """The page docs/results.md."""
     head = f"""# Results
 
-Mean return of the families' models, over 30 test tasks that no training saw, 10 episodes each,
-after exact answers. Of *seeds* trainings seed 0 ships.
+**The paper's claim.** It has POEM 20 to 50 % ahead of all baselines. With its own rule, `Paper()`,
+and its own candidates that does not appear where all methods were measured, on HalfCheetahVel:
+after one answer it is not to be told apart from ANOLE and ANOLE-greedy, after ten it is ahead of
+ANOLE and not to be told apart from ANOLE-greedy. With candidates from the training tasks for all of
+them it is behind them after one answer, and ahead after five and ten.
+
+**The models that ship.** Mean return over 30 test tasks, 10 episodes each, after exact answers. No
+training saw the test tasks, but those of the two FwdBack families: these have two tasks, forward
+and backward, and training has both. Of *seeds* trainings seed 0 ships.
 
 - *paper*: Table 3 of [Xu & Zhu 2025](https://proceedings.mlr.press/v267/); *baseline* is the best
   of its baselines after so many answers.
-- *ours*: the rule `Bayes()`; ± is the deviation over seeds, or of one seed the standard error over
-  tasks. [`Paper()`](algorithms/paper.md) stands below, by family.
-- *limit*: the best choice of 2^k of the model's policies, all that k answers can tell apart. They
-  are chosen by one episode each, on other tasks where dynamics are shared, and measured by other
-  episodes; so it is an estimate, and a rule that acts on policies outside of that choice may pass
-  it.
+- *ours*: the rule `Bayes()`. [`Paper()`](algorithms/paper.md#results) stands below, by family.
+- *limit*: the best choice of 2^k of the model's policies, all that k answers can tell apart, of 300
+  (MetaWorldML10: 30). It is chosen by three episodes a policy, on other tasks where dynamics are
+  shared, and measured by one other episode a policy, so that it is an estimate: it may lie above
+  the task known, and a rule that acts on other policies may pass it.
 - *task known*: the best of the model's policies for each task, found by trying.
-- The paper has POEM ahead of all baselines by 20 to 50 %. With its own rule, `Paper()`, that does
-  not appear where all methods were measured: on HalfCheetahVel it is behind ANOLE-greedy after one
-  answer, level after five, and 15 % ahead after ten, which three seeds do not tell from chance.
-- Each model is what the family's entry in `zoo_configs/` makes, in one run from nothing.
+
+Each model is what the family's entry in `zoo_configs/` makes, in one run from nothing.
+
+{summary()}
+
+What stands behind the figures after ten answers, and how much of what the limit gains over no
+answer `Bayes()` has after 1, 5 and 10:
+
+{spreads()}
 
 `sb3-poem benchmark run --suite shipped --families FAMILY --seeds N` trains and measures (with
 `--models pretrained --seeds 1` it measures what ships), `python docs/tables.py` writes this page
-from [its stores](../benchmarks/results/shipped/manifest.md). HalfCheetahVel's table of all methods,
-with its figures, is of the models above and their seeds. The other figures below a family are of
-models of their own, by the revision of the code that each record names. What is not listed was not
-measured.
+from [its stores](../benchmarks/results/shipped/manifest.md). Pages of *revision 0* are of
+earlier and shorter trainings, and their figures are not comparable with those here.
 
-{summary()}
+**What was not measured.** All methods on eight of the nine families, methods that are not told the
+noise on most, ablations and tolerances with the models that ship.
+`sb3-poem benchmark run --suite table3 --seeds 3 --snapshots 1 --list` says what each would take.
 """
     return "\n".join([head, *(family_section(family) for family in FAMILIES)])
 
 
 def trainings() -> str:
     """What the models that ship cost."""
-    records = [one for one in SHIPPED.records() if (one.method, one.seed) == ("known-task", 0)]
-    known = {one.family: one.result for one in records}
+    known = {family: effort(family) for family in FAMILIES}
     rows = [
         [
             family,
-            f"{known[family]['training_samples']:,}",
-            f"{known[family]['updates']:,}",
-            f"{known[family]['training_cpu_seconds'] / 60:.1f}",
+            f"{found['training_samples']:,}",
+            f"{found['updates']:,}",
+            f"{found['training_cpu_seconds'] / 60:.1f}",
         ]
-        for family in FAMILIES
-        if family in known
+        for family, found in known.items()
     ]
     return "\n".join(table(["family", "environment steps", "updates", "minutes of a core"], rows))
 
@@ -307,12 +416,14 @@ def card(folder: Path) -> str:
     return text.replace("\n## Limits\n", f"\n{all_of_them}\n\n## Limits\n", 1)
 
 
+PAPER = TOP / "docs/algorithms/paper.md"
 README, PERFORMANCE = TOP / "README.md", TOP / "docs/performance.md"
 PRETRAINED = TOP / "pretrained/README.md"
 WRITTEN = {
     PRETRAINED: lambda: with_table(PRETRAINED, "models", models()),
     README: lambda: with_table(README, "results", summary()),
     PERFORMANCE: lambda: with_table(PERFORMANCE, "trainings", trainings()),
+    PAPER: lambda: with_table(PAPER, "paper-rule", paper_rule()),
     TOP / "docs/results.md": results_page,
     **{
         folder / "README.md": partial(card, folder)

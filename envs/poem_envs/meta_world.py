@@ -149,8 +149,7 @@ class MetaWorldML1Env(MetaWorldEnv):
     object and, for some, that of the goal. It is drawn as Meta-World draws it. Observations show
     the object, as Meta-World's do.
 
-    `split="train"` and `split="test"` are different draws from the same distribution; the benchmark
-    takes 50 of each: `sample_tasks(50, rng)`.
+    `split="train"` and `split="test"` are different draws from the same distribution.
 
     ## Action Space
     The action space is a `Box(-1, 1, (4,), float32)`: a movement of the hand in x, y and z, by up

@@ -8,18 +8,20 @@ from typing import Any, Self
 
 from sb3_poem.benchmark.methods import EPSILONS, METHODS, QUERY_RULES, VARIANTS, Method
 
+#: Those of Table 3, the quickest to train first
 PAPER_FAMILIES = (
     "HalfCheetahVel",
-    "HalfCheetahFwdBack",
-    "AntFwdBack",
-    "AntDir2D",
-    "AntVel",
-    "AntGoal",
     "MetaWorldML1",
+    "AntVel",
+    "AntDir2D",
+    "HalfCheetahFwdBack",
+    "AntGoal",
+    "AntFwdBack",
     "HumanoidDir2D",
     "MetaWorldML10",
 )
-CHEETAHS = PAPER_FAMILIES[:2]
+#: Of figures 7 and 12 to 15
+ABLATED_FAMILIES = ("HalfCheetahVel", "AntDir2D", "AntGoal", "HumanoidDir2D")
 RECORD_AT = (0, 1, 2, 3, 5, 7, 10)
 REVISION = 3
 """Of the code that trains, adapts and measures: part of every cell's identity. Raise it with each
@@ -29,11 +31,17 @@ are drawn), not for ``zoo_configs/``, whose hyperparameters are in the identity 
 POEMS = ("poem-bayes", "poem-paper")
 ANOLES = ("anole", "anole-greedy", "anole-random")
 TABLE_METHODS = (*POEMS, *ANOLES, "maml-reward", "reward-oracle")
-#: The same with candidates from the training tasks, where a method has candidates, and ANOLE
-#: with questions about rollouts on the new task
+#: By each likelihood; tasks with dynamics of their own allow the second alone
+PRIOR_BAYES = ("poem-bayes-prior-decoder", "poem-bayes-prior-similarity")
+#: Methods that have as much to choose from: candidates from the prior, or from the training tasks.
+#: ANOLE may ask about rollouts on the new task, too
+PRIOR_METHODS = (
+    *(*PRIOR_BAYES, "poem-paper", *ANOLES),
+    *("anole-rollouts", "maml-reward", "reward-oracle"),
+)
 INFORMED_METHODS = (
     *(f"{name}-aggregate" for name in (*POEMS, *ANOLES)),
-    *("anole-rollouts", "anole-rollouts-aggregate", "maml-reward", "reward-oracle-aggregate"),
+    *("anole-rollouts-aggregate", "maml-reward", "reward-oracle-aggregate"),
 )
 #: What makes the difference between the paper's row and the other: rule, candidates, likelihood,
 #: model, preference loss
@@ -48,11 +56,6 @@ PARTS = (
 UNTOLD_METHODS = (
     *("poem-bayes-untold", "poem-bayes-untold-aggregate", "poem-paper", "poem-paper-aggregate"),
     *("anole", "anole-aggregate", "anole-rollouts-aggregate", "maml-reward"),
-)
-#: Methods whose differences from all others tables show
-SUBJECTS = (
-    *("poem-bayes", "poem-bayes-untold", "poem-bayes-aggregate", "poem-bayes-untold-aggregate"),
-    *("poem-paper", "poem-paper-aggregate"),
 )
 TABLE_REFERENCES = ("known-task", "known-task-pearl")
 # MAML-reward trains a reward only, so its return does not depend on how long a policy was trained;
@@ -234,6 +237,7 @@ class Entry:
     :param shown: Numbers of answers that tables show, of those that were recorded
     :param by_task: Tables show standard errors over tasks and success rates, and no interquartile
         means
+    :param compared: Methods whose differences from all others tables show
     """
 
     name: str
@@ -245,6 +249,7 @@ class Entry:
     by_inference: bool = False
     shown: tuple[int, ...] = (1, 5, 10, 20)
     by_task: bool = False
+    compared: tuple[str, ...] = POEMS
 
 
 @dataclass(frozen=True)
@@ -356,7 +361,25 @@ _DESIGNS = (*POEMS, *(f"{variant}-{rule}" for variant in _ABLATED for rule in ("
 # A rule's own way of asking has no name of its own.
 _ASKING = (*POEMS, *(name for b in POEMS for q in QUERY_RULES if (name := f"{b}-{q}") in METHODS))
 _TABLE = Entry("methods", "Methods", TABLE_METHODS, curves=(EXACT,))
-_INFORMED = Entry("informed", "Methods with candidates from the training tasks", INFORMED_METHODS)
+_PRIOR = Entry(
+    "prior",
+    "Methods with candidates from the prior",
+    PRIOR_METHODS,
+    compared=(*PRIOR_BAYES, "poem-paper"),
+)
+_INFORMED = Entry(
+    "informed",
+    "Methods with candidates from the training tasks",
+    INFORMED_METHODS,
+    compared=tuple(f"{name}-aggregate" for name in POEMS),
+)
+_UNTOLD = Entry(
+    "untold",
+    "Methods that are not told the noise",
+    UNTOLD_METHODS,
+    NOISES,
+    compared=("poem-bayes-untold", "poem-bayes-untold-aggregate"),
+)
 
 SUITES = {
     suite.name: suite
@@ -365,7 +388,7 @@ SUITES = {
             "table3",
             "Methods under exact answers (Table 3; figures 5, 9, 10)",
             PAPER_FAMILIES,
-            (_TABLE, _INFORMED, Entry("parts", "What POEM's rows owe to what", PARTS)),
+            (_TABLE, _PRIOR, _INFORMED, Entry("parts", "What POEM's rows owe to what", PARTS)),
             TABLE_REFERENCES,
         ),
         Suite(
@@ -379,17 +402,14 @@ SUITES = {
         Suite(
             "noise",
             "Methods under answers with errors (figures 6, 11)",
-            CHEETAHS,
-            (
-                replace(_TABLE, oracles=NOISES, curves=(BOLTZMANN,)),
-                Entry("untold", "Methods that are not told the noise", UNTOLD_METHODS, NOISES),
-            ),
+            PAPER_FAMILIES,
+            (replace(_TABLE, oracles=NOISES, curves=(BOLTZMANN,)), _UNTOLD),
             TABLE_REFERENCES,
         ),
         Suite(
             "ablation",
             "Ablations of POEM (figures 7, 12, 13)",
-            CHEETAHS,
+            ABLATED_FAMILIES,
             (
                 Entry(
                     "design",
@@ -406,7 +426,7 @@ SUITES = {
         Suite(
             "epsilon",
             "Tolerance of the paper's rule (figures 14, 15)",
-            CHEETAHS,
+            ABLATED_FAMILIES,
             tuple(
                 Entry(
                     f"tolerance{of}",

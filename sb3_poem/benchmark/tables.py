@@ -14,7 +14,7 @@ from sb3_poem.benchmark.figures import write_figures
 from sb3_poem.benchmark.methods import METHODS
 from sb3_poem.benchmark.results import Condition, Selection, Series, summarise
 from sb3_poem.benchmark.store import Store
-from sb3_poem.benchmark.suites import EXACT, SUBJECTS, SUITES, Entry, OracleSpec
+from sb3_poem.benchmark.suites import EXACT, SUITES, Entry, OracleSpec
 
 SUFFIX = {"md": ".md", "latex": ".tex", "csv": ".csv", "json": ".json"}
 #: Table 3 of Xu & Zhu (ICML 2025): family -> row -> [mean, standard deviation] after 1, 5 and 10
@@ -231,8 +231,8 @@ def _rows(
 
 
 def _paired(place: dict[str, Any], entry: Entry, found: dict[str, Series]) -> Iterator[Row]:
-    """Each of :data:`SUBJECTS` against every other method, each pair once."""
-    subjects = [name for name in SUBJECTS if name in found and not entry.by_task]
+    """Each of the methods that the entry compares against every other, each pair once."""
+    subjects = [name for name in entry.compared if name in found and not entry.by_task]
     for position, name in enumerate(subjects):
         for other, theirs in found.items():
             if other in subjects[: position + 1]:

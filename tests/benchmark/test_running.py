@@ -167,6 +167,8 @@ def test_a_finished_cell_is_verified(
     with Store(words[-1]) as store:
         missing = Cell.of_identity("poem-paper", {**record.identity, "model": trained})
         store.add(replace(record, key=missing.key, identity=missing.identity()))
+    assert main(["benchmark", "verify", *words, "--cell", missing.key]) == 0  # of equal weights
+    assert capsys.readouterr().out.endswith("the same, bit for bit\n")
     nowhere = ["--runs", str(tmp_path / "nowhere"), "--store", words[-1], "--cell", missing.key]
     assert main(["benchmark", "verify", *nowhere]) != 0  # and nothing is trained
     assert "missing: say where it is by --runs" in capsys.readouterr().err
