@@ -2,9 +2,9 @@
 
 Every contender is stepped by the same loop with the same untrained policy (one call for all
 copies). "training" is what ``learn`` does: the same with relabelling features, checks, episode
-infos, callbacks and storage. The limit is bare ``mujoco.rollout`` on the very states and controls
-of "TaskVecEnv", with as many threads and nothing else. EnvPool (``pip install sb3_poem[bench]``)
-steps its own versions of these robots.
+infos, callbacks and storage. The limit, which Meta-World does not have, is bare ``mujoco.rollout``
+on states and controls of "TaskVecEnv", with as many threads and nothing else. EnvPool (``pip
+install sb3_poem[bench]``) steps its own versions of these robots.
 
     python benchmarks/bench_collection.py --env poem/AntVel-v0 poem/MetaWorldML1-v0
 """
@@ -15,6 +15,7 @@ import multiprocessing
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any
+from unittest import mock
 
 import common
 import gymnasium as gym
@@ -24,8 +25,9 @@ import torch as th
 from mujoco.rollout import Rollout
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
+from poem_envs.mujoco_family import MujocoFamily
 from poem_envs.vector import available_cores
-from sb3_poem import POEMSAC, TaskVecEnv
+from sb3_poem import POEMSAC
 from sb3_poem.benchmark.suites import family_name
 from sb3_poem.common.vec_env import make_task_vec_env
 
@@ -64,24 +66,24 @@ class Loop:
 
 
 class Limit:
-    """Bare ``mujoco.rollout`` over recorded states and controls."""
+    """Bare ``mujoco.rollout`` over the states and controls of a few steps of a MuJoCo family."""
 
-    def __init__(self, env: TaskVecEnv, nthread: int) -> None:
-        family: Any = env.vector_env
+    def __init__(self, loop: Loop, family: MujocoFamily, nthread: int) -> None:
         self.model, self.frame_skip = family.model, family.frame_skip
-        self.recorded: list[tuple[np.ndarray, np.ndarray]] = []
         self.rollout = Rollout(nthread=nthread if nthread > 1 else 0)
         self.data = [mujoco.MjData(self.model) for _ in range(nthread)]
-        shape = (env.num_envs, self.frame_skip)
+        shape = (loop.copies, self.frame_skip)
         self.controls = np.empty((*shape, self.model.nu))
-        self.states = np.empty((*shape, 1 + self.model.nq + self.model.nv))
-        advance = family._integrator.advance
+        self.states = np.empty((*shape, family.states.shape[1]))
+        self.recorded: list[tuple[np.ndarray, np.ndarray]] = []
+        integrate = family._integrate
 
-        def recording(states: np.ndarray, controls: np.ndarray) -> np.ndarray:
-            self.recorded = [*self.recorded, (states.copy(), controls.copy())][-STEPS:]
-            return advance(states, controls)
+        def recording(actions: np.ndarray) -> np.ndarray:
+            self.recorded.append((family.states.copy(), actions.copy()))
+            return integrate(actions)
 
-        family._integrator.advance = recording
+        with mock.patch.object(family, "_integrate", recording):
+            loop()
 
     def __call__(self) -> None:
         for states, controls in self.recorded:
@@ -130,11 +132,12 @@ def measure(env_id: str, nthread: int, repeats: int) -> dict[str, Any]:
     settings |= {"buffer_size": 1000, "learning_starts": 0}
     env, own_env = (make_task_vec_env(env_id, N_TASKS, nthread=nthread) for _ in range(2))
     model, own = (POEMSAC("MlpPolicy", each, **settings) for each in (env, own_env))
-    contenders: dict[str, Callable[[], Any]] = {"TaskVecEnv": Loop(env, model)}
+    loop = Loop(env, model)
+    contenders: dict[str, Callable[[], Any]] = {"TaskVecEnv": loop}
     contenders["training (with storage)"] = training(own)
-    contenders["TaskVecEnv"]()
-    if hasattr(env.vector_env, "_integrator"):
-        contenders["limit: bare mujoco.rollout"] = Limit(env, nthread)
+    loop()
+    if isinstance(family := env.vector_env.family, MujocoFamily):
+        contenders["limit: bare mujoco.rollout"] = Limit(loop, family, nthread)
     contenders["SB3 DummyVecEnv"] = Loop(DummyVecEnv([make] * others), model)
     gymnasium = gym.vector.SyncVectorEnv([make] * others)
     contenders["Gymnasium SyncVectorEnv"] = Loop(gymnasium, model)
