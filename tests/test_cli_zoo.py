@@ -223,22 +223,34 @@ def test_evaluation_takes_its_own_arguments_of_the_environment(
     assert [arguments.get("step_length") for arguments in made] == [0.2]
 
 
-def test_a_search_on_a_family_without_shared_dynamics(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def windy_config(tmp_path: Path) -> Iterator[Path]:
+    """Of a family without shared dynamics, which is registered as long."""
     gym.register("Windy-v0", lambda **kwargs: WindyWalk(), max_episode_steps=10)
+    entry = {"policy": "MlpPolicy", "n_timesteps": 60, "n_envs": 2, "n_train_tasks": 6}
+    entry |= {"gradient_steps": 2, "meta_batch_size": 2}
+    entry |= {name: SMALL[name] for name in ("batch_size", "context_size")}
     config = tmp_path / "windy.yml"
-    entry = {
-        "policy": "MlpPolicy",
-        "n_timesteps": 60,
-        "n_envs": 2,
-        **{k: SMALL[k] for k in ("batch_size", "context_size")},
-    }
-    config.write_text(
-        yaml.safe_dump(
-            {"Windy-v0": {**entry, "n_train_tasks": 6, "gradient_steps": 2, "meta_batch_size": 2}}
-        )
-    )
+    config.write_text(yaml.safe_dump({"Windy-v0": entry}))
+    yield config
+    del gym.registry["Windy-v0"]
+
+
+def test_epochs_are_counted_with_the_rollouts_that_compare_policies(
+    windy_config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    saved = []
+    monkeypatch.setattr(POEMSAC, "save_checkpoint", lambda self, _: saved.append(self.epoch))
+    flags = ["-c", windy_config, "-f", tmp_path / "logs", "--eval-freq", -1]
+    # 6 tasks in groups of 2: 12 rollouts of 10 steps
+    flags += ["--save-freq", 120, "-params", "n_timesteps:360", "preference_group_size:2"]
+    assert train("--env", "Windy-v0", *flags) == 0
+    assert saved == [1, 2, 3]
+
+
+def test_a_search_on_a_family_without_shared_dynamics(
+    windy_config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(
         SAMPLERS,
         "poem_sac",
@@ -259,20 +271,8 @@ def test_a_search_on_a_family_without_shared_dynamics(
         "1",
         "--no-optim-plots",
     ]
-    command = [
-        "train",
-        "--env",
-        "Windy-v0",
-        "-c",
-        str(config),
-        "-f",
-        str(tmp_path / "logs"),
-        *flags,
-    ]
-    try:
-        assert cli.main(command) == 0
-    finally:
-        del gym.registry["Windy-v0"]
+    where = ["-c", windy_config, "-f", tmp_path / "logs"]
+    assert train("--env", "Windy-v0", *where, *flags) == 0
     (report,) = (tmp_path / "logs" / "poem_sac").glob("report_*.csv")
     assert "COMPLETE" in report.read_text()
 

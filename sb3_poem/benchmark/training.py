@@ -19,13 +19,14 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 import yaml
 
 from sb3_poem.adaptation.state import write_json_atomically
 from sb3_poem.benchmark.methods import VARIANTS
 from sb3_poem.benchmark.suites import ModelKey, family_id
 from sb3_poem.common.family_view import FamilyView, vectorised
+from sb3_poem.pearl_sac.train_tasks import DEFAULT_TRAIN_TASKS
+from sb3_poem.poem_sac.poem_sac import comparing_rollouts
 from sb3_poem.resources import config_file
 
 CHECKPOINT, SESSIONS, LOG = "checkpoint.zip", "sessions", "train.log"
@@ -94,8 +95,6 @@ def overrides(key: ModelKey) -> dict[str, Any]:
 
 def training_plan(key: ModelKey) -> TrainingPlan:
     """How a model is trained: by its family's entry, or the file's default."""
-    from sb3_poem.pearl_sac.train_tasks import DEFAULT_TRAIN_TASKS
-
     variant = VARIANTS[key.variant]
     entries = yaml.safe_load(config_file(variant.algorithm).read_text())
     changes = overrides(key)
@@ -112,14 +111,11 @@ def training_plan(key: ModelKey) -> TrainingPlan:
             raise ValueError(f"{name} must be a whole number of at least 1, got {number!r}")
     rollouts = tasks * each
     if variant.algorithm == "poem_sac" and not facts.shared_dynamics:
-        # each policy is run on the other tasks of its group, too
-        n_groups = max(1, tasks // hyperparameters.get("preference_group_size", 4))
-        sizes = map(len, np.array_split(np.arange(tasks), n_groups))
-        rollouts += sum(size * (size - 1) for size in sizes)
+        rollouts += comparing_rollouts(tasks, hyperparameters.get("preference_group_size", 4))
     epoch_steps = rollouts * facts.horizon
     per_epoch = int(hyperparameters.get("gradient_steps", 1000))
     updates = -(-timesteps // epoch_steps) * (epoch_steps if per_epoch < 0 else per_epoch)
-    steps = (timesteps, int(epoch_steps), updates)
+    steps = (timesteps, epoch_steps, updates)
     return TrainingPlan(variant.algorithm, hyperparameters, changes, *steps)
 
 

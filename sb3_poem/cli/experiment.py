@@ -246,8 +246,7 @@ class PoemExperiment(FamilyExperiment):
 
 def _epochs(model: PEARLSAC, steps: int) -> int:
     """How many epochs take about so many environment steps, at least 1."""
-    rollouts = len(model.train_tasks) * model.trajectories_per_task
-    return max(1, round(steps / (rollouts * model.family.horizon)))
+    return max(1, round(steps / model.epoch_steps))
 
 
 class TrialAdaptationCallback(AdaptationEvalCallback):

@@ -87,6 +87,17 @@ class _PreferenceLoss(th.autograd.Function):
         return ctx.gradient * of_loss, None
 
 
+def preference_groups(tasks: np.ndarray, size: int) -> list[np.ndarray]:
+    """Groups of about so many tasks, whose policies are run on each other's."""
+    return np.array_split(tasks, max(1, len(tasks) // size))
+
+
+def comparing_rollouts(n_tasks: int, group_size: int) -> int:
+    """How many rollouts of an epoch run a policy on another task of its group."""
+    groups = preference_groups(np.arange(n_tasks), group_size)
+    return sum(len(group) * (len(group) - 1) for group in groups)
+
+
 @with_arguments_of(PEARLSAC, without="context_relabel_fraction")
 class POEMSAC(PEARLSAC):
     """Preference-order-preserving embedding on soft actor-critic (POEM, Xu & Zhu, ICML 2025),
@@ -200,12 +211,8 @@ class POEMSAC(PEARLSAC):
         """Environment steps of an epoch's collection, those that compare policies included."""
         if self.relabels:
             return super().epoch_steps
-        sizes = [len(group) for group in self._split(np.arange(len(self.train_tasks)))]
-        return super().epoch_steps + self._steps_of(sum(size * (size - 1) for size in sizes))
-
-    def _split(self, tasks: np.ndarray) -> list[np.ndarray]:
-        """Groups of tasks, whose policies are run on each other's."""
-        return np.array_split(tasks, max(1, len(tasks) // self.preference_group_size))
+        rollouts = comparing_rollouts(len(self.train_tasks), self.preference_group_size)
+        return super().epoch_steps + self._steps_of(rollouts)
 
     def measure_returns(self, epoch: Segment, collector: EpochCollector) -> np.ndarray:
         """J[i, j] by relabelling or, within random groups of tasks, by running the policies; then
@@ -217,7 +224,8 @@ class POEMSAC(PEARLSAC):
             relabelled = relabelled_returns(family.compute_rewards, tasks, *steps)
             return relabelled.reshape(n_tasks, n_tasks, -1).mean(axis=2)
         returns = super().measure_returns(epoch, collector)
-        groups = self._split(self.generators.numpy.permutation(n_tasks))
+        shuffled = self.generators.numpy.permutation(n_tasks)
+        groups = preference_groups(shuffled, self.preference_group_size)
         pairs = [(i, j) for group in groups for i in group for j in group if i != j]
         own_latents = epoch.latents.reshape(n_tasks, -1, self.latent_dim)[:, 0]
         for wave in in_waves(np.array(pairs, dtype=np.int64).reshape(-1, 2), family.num_envs):
