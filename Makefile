@@ -57,7 +57,7 @@ test-mujoco: rendering
 	$(NEWEST)/bin/python -m pip install --quiet --upgrade mujoco
 	$(THREADS) $(NEWEST)/bin/python -m pytest -n 2 -m "not slow and not gpu and not metaworld" \
 		tests/poem_envs tests/test_family_contract.py tests/common/test_vec_env.py \
-		tests/common/test_collection.py tests/poem_sac/test_external_families.py $(PYTEST_ARGS)
+		tests/pearl_sac/test_collection.py tests/poem_sac/test_external_families.py $(PYTEST_ARGS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

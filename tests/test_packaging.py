@@ -74,6 +74,25 @@ def test_every_package_of_the_tree_is_declared(setup_cfg: configparser.ConfigPar
     assert declared == present
 
 
+def test_every_path_in_the_makefile_exists() -> None:
+    named = re.findall(
+        r"\b(?:tests|benchmarks|envs|docs)/[\w*./]*\w", (ROOT / "Makefile").read_text()
+    )
+    assert len(named) > 5
+    missing = [
+        path for path in named if not path.startswith("docs/_build") and not any(ROOT.glob(path))
+    ]
+    assert not missing
+
+
+def test_every_pattern_of_package_data_has_a_file(setup_cfg: configparser.ConfigParser) -> None:
+    places = dict(line.split(" = ") for line in setup_cfg["options"]["package_dir"].split("\n")[2:])
+    for package, patterns in setup_cfg["options.package_data"].items():
+        folder = ROOT / places.get(package, package.replace(".", "/"))
+        for pattern in patterns.split():
+            assert any(folder.glob(pattern)), f"{package}: {pattern}"
+
+
 def test_every_tested_version_is_within_the_declared_ranges(
     setup_cfg: configparser.ConfigParser,
 ) -> None:
