@@ -262,7 +262,7 @@ class PreferenceAdapter:
         if self.done:
             raise RuntimeError(f"all {self.n_queries} questions have been answered; take policy()")
 
-    def _take_oracle(self, oracle: Oracle | None) -> None:
+    def _take_oracle(self, oracle: Any) -> None:
         self.oracle = oracle
         #: Whether somebody looks at the questions, also while answers given before are told again
         self._watched = getattr(oracle, "needs_frames", self.render and oracle is None)
@@ -270,7 +270,7 @@ class PreferenceAdapter:
         # Nor is one that another adapter lent it its own
         if bind is not None and (env is None or env is getattr(oracle, "lent_env", None)):
             bind(self.env)
-            oracle.lent_env = self.env  # type: ignore[union-attr]
+            oracle.lent_env = self.env
 
     def _number_of(self, query: Query) -> int:
         """Of the answer about the very trajectories of a question; else the next one's."""

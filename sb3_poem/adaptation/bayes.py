@@ -235,6 +235,9 @@ class BayesInference(Inference):
         weights = np.exp(self.log_weights - self.log_weights.max())
         return weights / weights.sum()
 
+    def posterior(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.particles, self.weights
+
     @property
     def effective_size(self) -> float:
         """How many equally weighted particles the weighted ones are worth."""

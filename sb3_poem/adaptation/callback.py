@@ -87,7 +87,7 @@ class AdaptationEvalCallback(EpochCallback):
         if self._best_model is not None:
             self._best_model.parent.mkdir(parents=True, exist_ok=True)
             if self._best_model.exists():  # a run that goes on
-                self.best_return = getattr(self.model, "best_adapted_return", self.best_return)
+                self.best_return = self.model.best_adapted_return
 
     def _make_env(self) -> tuple[VecEnv, np.ndarray]:
         if self._env is None:

@@ -66,6 +66,8 @@ class TaskOracle(ABC):
     thresholds: tuple[float, float] | None = None
     #: How this oracle errs, for the Bayesian rule.
     noise_model: NoiseModel = ExactNoise()
+    #: The environment that an adapter has bound it to, which another one may replace.
+    lent_env: VecEnv | None = None
 
     def __init__(
         self,

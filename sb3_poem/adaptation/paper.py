@@ -11,7 +11,15 @@ from sb3_poem.adaptation.meta_model import HasSimilarity, MetaModel
 from sb3_poem.adaptation.preference import SIGNS, Preference, preference_log_likelihood
 from sb3_poem.adaptation.priors import SOURCES, make_prior
 from sb3_poem.adaptation.queries import tolerance
-from sb3_poem.adaptation.rule import Answer, Inference, Rule, Setting, Shown, latent_of
+from sb3_poem.adaptation.rule import (
+    Answer,
+    Inference,
+    Rule,
+    Setting,
+    Shown,
+    equally_weighted,
+    latent_of,
+)
 from sb3_poem.common.checks import check_choice, check_whole
 
 # Bound on the draws for a question.
@@ -107,6 +115,9 @@ class PaperInference(Inference):
             return self.candidates[np.argmin(distances)].copy()
         differences = self._differences(self.candidates)
         return self.candidates[np.argmax(self._log_likelihoods(differences))].copy()
+
+    def posterior(self) -> tuple[np.ndarray, np.ndarray]:
+        return equally_weighted(self.candidates)
 
     def satisfied(self, latents: np.ndarray) -> np.ndarray:
         """(m,) how many answers each latent (m, d) satisfies within the tolerance (eq. 9)."""

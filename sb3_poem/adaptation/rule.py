@@ -76,6 +76,12 @@ class Inference(ABC):
         """See :attr:`PreferenceAdapter.contradicted`."""
         return None
 
+    def posterior(self) -> tuple[np.ndarray, np.ndarray]:
+        """The latents (n, d) that are still possible, and weights (n,) summing to one: the estimate
+        alone unless overridden.
+        """
+        return equally_weighted(self.estimate()[None])
+
     def snapshot(self) -> dict[str, Any]:
         """The generator's ``random_state``, and copies of the ``arrays`` of :attr:`state`."""
         arrays = {name: np.array(getattr(self, name)) for name in self.state}
@@ -211,6 +217,11 @@ def as_rule(rule: Any) -> Rule:
     meant = f"; write rule={known[rule.lower()]}()" if str(rule).lower() in known else ""
     objects = "Bayes(), Paper(n_candidates=50) or ANOLE()"
     raise TypeError(f"`rule` must be an object as {objects}, but is {rule!r}{meant}")
+
+
+def equally_weighted(latents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Latents (n, d), and the same weight for each, (n,)."""
+    return latents, np.full(len(latents), 1.0 / len(latents))
 
 
 def latent_of(shown: Shown) -> np.ndarray:

@@ -11,7 +11,7 @@ from sb3_poem.adaptation.meta_model import HasRewardDecoder, MetaModel
 from sb3_poem.adaptation.preference import SIGNS, Preference
 from sb3_poem.adaptation.priors import SOURCES, make_prior
 from sb3_poem.adaptation.queries import random_set
-from sb3_poem.adaptation.rule import Shown, check_seen
+from sb3_poem.adaptation.rule import Shown, check_seen, equally_weighted
 from sb3_poem.baselines.fragments import (
     check_shared_dynamics,
     default_fragment_length,
@@ -174,6 +174,9 @@ class ANOLEInference(Inference):
         """A candidate of fewest contradictions; for "greedy" one that is left."""
         worse = ~self.alive if self.rule.strategy == "greedy" else self.contradictions
         return self.candidates[np.lexsort((self.priority, worse))[0]].copy()
+
+    def posterior(self) -> tuple[np.ndarray, np.ndarray]:
+        return equally_weighted(self.candidates)
 
 
 def has_experience(model: MetaModel) -> bool:

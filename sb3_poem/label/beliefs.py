@@ -31,7 +31,7 @@ def belief(adapter: Any, env_id: str) -> dict[str, Any]:
         be taken now), ``extent``, ``unit``, ``words`` (what is to the right, upwards, to the left
         and downwards) and ``sentence``.
     """
-    latents, weights = posterior(adapter.inference)
+    latents, weights = adapter.inference.posterior()
     everything = np.concatenate([latents, adapter.inference.estimate()[None, :]])
     tasks = np.asarray(adapter.model.train_tasks.tasks, dtype=np.float64)
     description = describe(env_id, tasks.shape[1])
@@ -60,14 +60,6 @@ def believed_in_words(adapter: Any, env_id: str) -> str:
         return str(believed["sentence"])
     numbers = ", ".join(f"{value:.3g}" for value in adapter.inference.estimate())
     return f"It takes the policy of the latent ({numbers})."
-
-
-def posterior(inference: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The latents (n, d) that are still possible, and weights (n,) summing to one."""
-    if hasattr(inference, "particles"):
-        return inference.particles, inference.weights
-    candidates = inference.candidates
-    return candidates, np.full(len(candidates), 1.0 / len(candidates))
 
 
 def sentence(

@@ -43,6 +43,9 @@ def test_candidates_satisfy_every_answer_within_the_tolerance(epsilon):
     inference.ask()
     odds = 1.0 / (1.0 + np.exp(-differences(inference, inference.candidates)))
     assert inference.candidates.shape == (100, 5)
+    latents, weights = inference.posterior()
+    assert latents is inference.candidates
+    np.testing.assert_array_equal(weights, np.full(100, 0.01))
     assert np.all(odds >= 0.5 - epsilon - 1e-12)
     # ... and the half-spaces are not narrower than eq. 9 says: on a grid, exactly those satisfy
     # all.

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from sb3_poem.label.beliefs import belief, posterior, sentence, weighted_quantiles
+from sb3_poem.label.beliefs import belief, sentence, weighted_quantiles
 from sb3_poem.label.families import as_points, describe
 from sb3_poem.label.rendering import HEIGHT, WIDTH, beside, fit
 from sb3_poem.pearl_sac.train_tasks import TrainTasks
@@ -20,7 +20,7 @@ def adapter(latents: np.ndarray, weights: np.ndarray, tasks: np.ndarray, means: 
     latent.
     """
     inference = SimpleNamespace(
-        particles=latents, weights=weights, estimate=lambda: weights @ latents
+        posterior=lambda: (latents, weights), estimate=lambda: weights @ latents
     )
     variances = np.full(means.shape, 0.01)
     variances[:, 1:] = 1.0  # what training has left unused keeps the prior's variance
@@ -210,12 +210,6 @@ def test_forward_and_backward_are_told_apart() -> None:
     ):
         points = as_points(f"poem/{env_id}-v0", np.array(tasks))
         np.testing.assert_allclose(points, [[1.0, 0.0], [-1.0, 0.0]], atol=1e-12)
-
-
-def test_the_papers_candidates_weigh_the_same() -> None:
-    latents, weights = posterior(SimpleNamespace(candidates=np.ones((4, 2))))
-    assert latents.shape == (4, 2)
-    np.testing.assert_allclose(weights, 0.25)
 
 
 def test_clips_beside_each_other_last_as_long_as_the_longer() -> None:
