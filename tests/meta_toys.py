@@ -15,6 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from poem_envs import TaskFamily
+from sb3_poem.common.buffers import TaskBatch
 from sb3_poem.pearl_sac.pearl_sac import PEARLSAC
 from sb3_poem.poem_sac.poem_sac import POEMSAC
 
@@ -41,6 +42,13 @@ Model = TypeVar("Model", bound=PEARLSAC)
 def small(algorithm: type[Model], env: Any = POINT_GOAL, **arguments: Any) -> Model:
     """A model that trains an epoch in a tenth of a second."""
     return algorithm("MlpPolicy", env, **{**SMALL, **arguments})
+
+
+def experience_of(model: PEARLSAC, task: int) -> TaskBatch:
+    """All transitions of a training task, in the order of their slots, each (1, count, ...)."""
+    buffer = model.replay_buffer
+    slots = th.arange(int(buffer.counts[task]), device=buffer.device)[None]
+    return buffer.at(th.full_like(slots, task), slots)
 
 
 class Walk(TaskFamily):

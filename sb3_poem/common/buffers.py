@@ -130,11 +130,6 @@ class TaskReplayBuffer(ReplayBuffer):
         """The transitions in slots (...) of tasks (...); next steps follow, round the ring."""
         return self._gather(tasks * self.rows.shape[1] + slots)
 
-    def transitions(self, task: int) -> TaskBatch:
-        """All transitions of a task, in the order of their slots, each (1, count, ...)."""
-        slots = th.arange(int(self.counts[task]), device=self.device)[None]
-        return self._gather(task * self.rows.shape[1] + slots)
-
     def reward_magnitudes(self) -> th.Tensor:
         """(n_tasks,) root mean square of each task's rewards; NaN of a task without any."""
         rewards = self.rows[..., self._mark - 1].contiguous().view(th.float32)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch as th
-from meta_toys import LEARN, LEARN_EPOCH, POINT_GOAL, point_goal_bounds
+from meta_toys import LEARN, LEARN_EPOCH, POINT_GOAL, experience_of, point_goal_bounds
 
 from sb3_poem import PEARLSAC
 from sb3_poem.adaptation.evaluation import evaluate_episodes
@@ -25,7 +25,5 @@ def test_pearl_learns_point_goal() -> None:
     assert foreign < blind
     # the decoder knows a reward to a tenth: rewards deviate by about 0.35, distances are about 1
     assert model.predicted_rewards_error < 0.2
-    rewards = th.cat(
-        [model.replay_buffer.transitions(task).rewards for task in range(len(tasks))], dim=1
-    )
+    rewards = th.cat([experience_of(model, task).rewards for task in range(len(tasks))], dim=1)
     assert model.predicted_rewards_error < 0.5 * rewards.std().item()

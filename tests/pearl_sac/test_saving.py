@@ -19,6 +19,7 @@ from meta_toys import (
     WindyWalk,
     assert_same_model,
     differing,
+    experience_of,
     parameters,
     small,
     walks,
@@ -78,7 +79,7 @@ def test_loaded_models_continue_with_any_number_of_copies(
     } <= set(changed)
     assert "policy.reward_norm.std" not in changed  # rewards keep the first epoch's
     assert (trained.policy.obs_norm.count, loaded.policy.obs_norm.count) == (2 * EPOCH, 3 * EPOCH)
-    third = th.cat([loaded.replay_buffer.transitions(task).observations for task in range(N_TASKS)])
+    third = th.cat([experience_of(loaded, task).observations for task in range(N_TASKS)])
     mean = third.reshape(-1, 2).mean(dim=0)  # what the buffer, which is new, holds
     th.testing.assert_close(
         loaded.policy.obs_norm.mean,
@@ -218,8 +219,8 @@ def test_replay_buffer_saves_alone(algorithm: type[PEARLSAC], tmp_path: Path) ->
     other.load_replay_buffer(tmp_path / "buffer")
     for task in range(N_TASKS):
         stored = zip(
-            other.replay_buffer.transitions(task),
-            model.replay_buffer.transitions(task),
+            experience_of(other, task),
+            experience_of(model, task),
             strict=True,
         )
         assert all(th.equal(one, two) for one, two in stored)
