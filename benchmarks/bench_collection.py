@@ -26,9 +26,9 @@ from mujoco.rollout import Rollout
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from poem_envs.mujoco_family import MujocoFamily
+from poem_envs.registration import family_name
 from poem_envs.vector import available_cores
 from sb3_poem import POEMSAC
-from sb3_poem.benchmark.suites import family_name
 from sb3_poem.common.vec_env import make_task_vec_env
 
 N_TASKS, STEPS = 120, 25

@@ -6,6 +6,11 @@ import importlib
 import gymnasium as gym
 
 
+def family_name(env_id: str) -> str:
+    """AntGoal of poem/AntGoal-v0: an id without namespace and version."""
+    return env_id.split("/")[-1].rsplit("-v", 1)[0]
+
+
 def plain_id(env_id: str) -> str:
     """An environment's id as the registry has it.
 

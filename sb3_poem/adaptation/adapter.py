@@ -26,9 +26,9 @@ from sb3_poem.adaptation.rule import (
     latent_of,
     rollout_seed,
 )
-from sb3_poem.adaptation.state import parse_json, read_json, write_json_atomically
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.family_view import FamilyView
+from sb3_poem.common.files import parse_json, read_json, write_json_atomically
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory, decode_array, encode_array
 from sb3_poem.loading import as_model

@@ -23,6 +23,9 @@ from sb3_poem.common.rollouts import rollout_outcomes
 # Latents to try for each task, where every one must be rolled out in every task, and where one
 # rollout serves all of them.
 LATENTS_WITH_OWN_DYNAMICS, LATENTS_WITH_SHARED_DYNAMICS = 30, 300
+#: Episodes for choosing a task's best latent, where nothing more exact is asked for: the fewer,
+#: the more luck counts in what is found
+SELECTION_EPISODES = 3
 SPREAD_TASKS = 40
 #: Draws around the best latent of each task, in each of two rounds, and how far from it they go, as
 #: a share of the first latents' deviation

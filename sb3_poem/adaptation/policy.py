@@ -8,14 +8,14 @@ from typing import Any, Self
 
 import numpy as np
 import torch as th
-from safetensors import SafetensorError
-from safetensors.torch import load, save
+from safetensors.torch import save
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.adaptation.environments import describe_model
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.common.checks import as_observations
 from sb3_poem.common.files import write_atomically
+from sb3_poem.common.networks import parse_tensors
 from sb3_poem.loading import BY_CLASS_NAME
 from sb3_poem.pearl_sac.saving import build_model, config_text, model_contents, parse_config
 
@@ -101,11 +101,8 @@ class AdaptedPolicy:
         """Read what :meth:`to_bytes` gave; a ``ValueError``, which names ``source``, if it is
         truncated or of another program.
         """
-        try:
-            tensors = load(content)
-            header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
-        except (SafetensorError, ValueError) as error:
-            raise ValueError(f"{source} is truncated, or no safetensors file: {error}") from error
+        tensors = parse_tensors(content, source)
+        header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
         facts = header.get("__metadata__", {})
         if facts.get("format") != FORMAT:
             raise ValueError(

@@ -99,7 +99,7 @@ def check_shared_dynamics(setting: Setting, why: str) -> None:
 def standardised(policy: LatentPolicy, trajectory: Trajectory) -> th.Tensor:
     """(T + 1, obs_dim) observations as the networks take them."""
     with th.no_grad():
-        return policy.standardise(_tensor(policy, trajectory.observations))
+        return policy.standardise(policy.tensor(trajectory.observations))
 
 
 def transition_rows(
@@ -107,10 +107,6 @@ def transition_rows(
 ) -> th.Tensor:
     """(T, ...) standardised (s, a, s') and a last column."""
     obs = standardised(policy, trajectory)
-    actions = _tensor(policy, policy.scale_action(trajectory.actions))
-    column = _tensor(policy, np.full(len(actions), last))[:, None]
+    actions = policy.tensor(policy.scale_action(trajectory.actions))
+    column = policy.tensor(np.full(len(actions), last))[:, None]
     return th.cat([obs[:-1], actions, obs[1:], column], dim=1)
-
-
-def _tensor(policy: LatentPolicy, array: np.ndarray) -> th.Tensor:
-    return th.as_tensor(array, dtype=th.float32, device=policy.device)

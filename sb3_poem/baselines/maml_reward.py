@@ -13,8 +13,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from safetensors import SafetensorError
-from safetensors.torch import load, save
+from safetensors.torch import save
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import set_random_seed
@@ -27,7 +26,6 @@ from sb3_poem.adaptation import Answer, Inference, Rule, Setting
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.preference import SIGNS, Preference
 from sb3_poem.adaptation.rule import Shown, check_seen
-from sb3_poem.adaptation.state import read_json, write_json_atomically
 from sb3_poem.baselines.fragments import (
     check_shared_dynamics,
     default_fragment_length,
@@ -36,8 +34,8 @@ from sb3_poem.baselines.fragments import (
     transition_rows,
 )
 from sb3_poem.common.checks import check_whole
-from sb3_poem.common.files import write_atomically
-from sb3_poem.common.networks import MLP, digest_of
+from sb3_poem.common.files import read_json, write_atomically, write_json_atomically
+from sb3_poem.common.networks import MLP, digest_of, parse_tensors
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.pearl_sac import PEARLSAC
 from sb3_poem.pearl_sac.policies import LatentPolicy
@@ -171,10 +169,7 @@ class MetaReward:
         config = read_json(settings, "the settings of a meta-trained reward")
         if config.get("format") != FORMAT:
             raise ValueError(f"{settings} is not of this version of sb3_poem, {FORMAT!r}")
-        try:
-            tensors = load(weights.read_bytes())
-        except SafetensorError as error:
-            raise ValueError(f"{weights} is truncated, or no safetensors file: {error}") from error
+        tensors = parse_tensors(weights.read_bytes(), weights)
         for name, value in _standardisation(policy).items():
             kept = tensors.get(name)
             if kept is None or kept.shape != value.shape or not th.equal(kept, value.cpu()):

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.adaptation import BoltzmannOracle, MistakeOracle, ReturnOracle, TaskOracle
 from sb3_poem.adaptation.evaluation import Library, evaluate_adaptation
-from sb3_poem.adaptation.known_task import known_task_return, preference_order
+from sb3_poem.adaptation.known_task import SELECTION_EPISODES, known_task_return, preference_order
 from sb3_poem.adaptation.meta_model import HasSimilarity
 from sb3_poem.baselines import ANOLE, MAMLRewardModel, rollout_fragments
 from sb3_poem.baselines.anole import has_experience
@@ -26,7 +26,6 @@ from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.common.vec_env import make_task_vec_env
 
-SELECTION_EPISODES = 3
 SEED_STRIDE = 10_000
 DIGITS = 4  # of returns in the store
 #: What a result holds that is another at each run

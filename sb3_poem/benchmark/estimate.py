@@ -12,10 +12,10 @@ from sb3_poem.adaptation.known_task import (
     LATENTS_WITH_SHARED_DYNAMICS,
     REFINING_DRAWS,
     REFINING_WIDTHS,
+    SELECTION_EPISODES,
 )
 from sb3_poem.baselines import MAMLReward
 from sb3_poem.baselines.fragments import default_fragment_length
-from sb3_poem.benchmark.cells import SELECTION_EPISODES
 from sb3_poem.benchmark.methods import META_ITERATIONS, META_ITERATIONS_OF
 from sb3_poem.benchmark.suites import Cell, ModelKey
 from sb3_poem.benchmark.training import family_facts, training_plan

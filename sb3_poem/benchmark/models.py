@@ -16,14 +16,12 @@ import rl_zoo3  # noqa: F401
 from filelock import lock_descriptor
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_poem.adaptation.state import read_json, write_json_atomically
 from sb3_poem.baselines import MAMLRewardModel, MetaReward, meta_train_reward
 from sb3_poem.baselines.fragments import default_fragment_length
 from sb3_poem.benchmark.methods import META_ITERATIONS, META_ITERATIONS_OF, VARIANTS
 from sb3_poem.benchmark.provenance import provenance
 from sb3_poem.benchmark.suites import FILE, REVISION, ModelKey, digest, family_id, family_label
 from sb3_poem.benchmark.training import (
-    CHECKPOINT,
     LOG,
     SESSIONS,
     TrainingError,
@@ -32,10 +30,11 @@ from sb3_poem.benchmark.training import (
     train_arguments,
     training_plan,
 )
+from sb3_poem.common.files import read_json, write_json_atomically
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.loading import ALGORITHMS
 from sb3_poem.pearl_sac import PEARLSAC
-from sb3_poem.pearl_sac.saving import CONFIG, WEIGHTS, is_checkpoint, read_config
+from sb3_poem.pearl_sac.saving import CHECKPOINT, CONFIG, WEIGHTS, is_checkpoint, read_config
 from sb3_poem.resources import config_file, zoo_entry
 
 MODEL, BEGUN, FINISHED, REWARD = "model.zip", "begun.json", "trained.json", "reward"

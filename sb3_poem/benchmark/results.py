@@ -8,6 +8,7 @@ from typing import Any, Self
 import numpy as np
 from scipy.stats import sem, trim_mean
 
+from poem_envs.registration import family_name
 from sb3_poem.adaptation.limits import AnswerLimits, check_returns
 from sb3_poem.benchmark.cells import make_oracle_factory
 from sb3_poem.benchmark.methods import METHODS
@@ -24,7 +25,6 @@ from sb3_poem.benchmark.suites import (
     digest,
     family_id,
     family_label,
-    family_name,
 )
 
 BOOTSTRAP_SAMPLES = 2000

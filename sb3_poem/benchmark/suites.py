@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
+from poem_envs.registration import family_name
 from sb3_poem.benchmark.methods import EPSILONS, METHODS, QUERY_RULES, VARIANTS, Method
 
 #: Those of Table 3, the quickest to train first
@@ -338,11 +339,6 @@ def hashable(value: Any) -> Any:
             f'{value!r} is a dictionary; write it as text, as rl_zoo3\'s files do: "dict(...)"'
         )
     return tuple(map(hashable, value)) if isinstance(value, (list, tuple)) else value
-
-
-def family_name(env_id: str) -> str:
-    """AntGoal of poem/AntGoal-v0."""
-    return env_id.split("/")[-1].split("-")[0]
 
 
 def family_label(env_id: str) -> str:

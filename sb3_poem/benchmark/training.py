@@ -21,15 +21,17 @@ from typing import Any
 import gymnasium as gym
 import yaml
 
-from sb3_poem.adaptation.state import write_json_atomically
+from poem_envs.registration import family_name
 from sb3_poem.benchmark.methods import VARIANTS
 from sb3_poem.benchmark.suites import ModelKey, family_id
 from sb3_poem.common.family_view import FamilyView, vectorised
+from sb3_poem.common.files import write_json_atomically
+from sb3_poem.pearl_sac.saving import CHECKPOINT
 from sb3_poem.pearl_sac.train_tasks import DEFAULT_TRAIN_TASKS
 from sb3_poem.poem_sac.poem_sac import comparing_rollouts
 from sb3_poem.resources import config_file
 
-CHECKPOINT, SESSIONS, LOG = "checkpoint.zip", "sessions", "train.log"
+SESSIONS, LOG = "sessions", "train.log"
 #: Models are saved, for curves and against interruptions, this many times in a training.
 SAVES = 20
 LOG_LINES = 15
@@ -59,7 +61,7 @@ def family_facts(name: str) -> FamilyFacts:
         with contextlib.closing(vectorised(gym.make(env_id))) as env:
             family = FamilyView.for_training(env)
     except gym.error.Error as error:
-        own = sorted(spec[5:].split("-")[0] for spec in gym.registry if spec.startswith("poem/"))
+        own = sorted(family_name(spec) for spec in gym.registry if spec.startswith("poem/"))
         raise ValueError(
             f"--families {name}: {error} The package's own families are: {', '.join(own)}"
         ) from error

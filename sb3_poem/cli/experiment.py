@@ -30,10 +30,8 @@ from sb3_poem.loading import ALGORITHMS
 from sb3_poem.pearl_sac import PEARLSAC
 from sb3_poem.pearl_sac.arguments import default_copies
 from sb3_poem.pearl_sac.callbacks import TrainingCheckpointCallback
-from sb3_poem.pearl_sac.saving import is_checkpoint
+from sb3_poem.pearl_sac.saving import CHECKPOINT, is_checkpoint
 from sb3_poem.resources import config_file
-
-CHECKPOINT = "checkpoint.zip"
 
 
 class TrainingInterrupted(KeyboardInterrupt):

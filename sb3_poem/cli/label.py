@@ -161,7 +161,7 @@ def run_replay(arguments: argparse.Namespace) -> None:
     # A model that rl_zoo3 trained may hold its schedules.
     import rl_zoo3  # noqa: F401
 
-    from sb3_poem.adaptation.state import write_json_atomically
+    from sb3_poem.common.files import write_json_atomically
     from sb3_poem.label.replay import replay
     from sb3_poem.loading import load_model
     from sb3_poem.resources import pretrained_folder

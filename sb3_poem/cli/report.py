@@ -13,9 +13,9 @@ from scipy.stats import sem
 
 from sb3_poem.adaptation import AdaptationEvaluation, KnownTaskReturn
 from sb3_poem.adaptation.preference import BEST_OF_FOUR
-from sb3_poem.adaptation.state import write_json_atomically
 from sb3_poem.benchmark.provenance import versions
 from sb3_poem.cli.subject import after
+from sb3_poem.common.files import write_json_atomically
 from sb3_poem.plotting import plot_returns
 
 HEADER = ("answers", "return", "std. error", "limit", "success rate")

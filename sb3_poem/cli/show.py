@@ -10,10 +10,10 @@ from rich.console import Console
 
 from poem_envs.headless import has_display
 from sb3_poem.adaptation import evaluate_adaptation
-from sb3_poem.cli.experiment import CHECKPOINT
 from sb3_poem.cli.needs import check_output, say
 from sb3_poem.cli.subject import COPIES_FOR_ONE_TASK, Subject, after, describe_task
 from sb3_poem.cli.zoo import last_run
+from sb3_poem.pearl_sac.saving import CHECKPOINT
 
 
 def run_enjoy(arguments: argparse.Namespace) -> None:

@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_poem.adaptation import AdaptedPolicy, KnownTaskReturn, Trajectory, known_task_return
 from sb3_poem.adaptation.evaluation import evaluation_seed
+from sb3_poem.adaptation.known_task import SELECTION_EPISODES
 from sb3_poem.cli.needs import check_device, import_packages, parse_pairs, say
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.foreign import environment_of
@@ -24,10 +25,8 @@ from sb3_poem.common.vec_env import make_shown_env, make_task_vec_env
 from sb3_poem.common.video import side_by_side, write_video
 from sb3_poem.loading import load_model
 
-# Copies that step in lockstep: for many tasks, and for one, whose questions need but two of them.
-COPIES, COPIES_FOR_ONE_TASK = 60, 20
-# Episodes per latent when looking for a task's best: the fewer, the more luck counts in the limit.
-SELECTION_EPISODES = 3
+# Copies that step in lockstep for one task, whose questions need but two of them.
+COPIES_FOR_ONE_TASK = 20
 POLICY_SUFFIX = ".safetensors"
 
 

@@ -21,11 +21,11 @@ from rl_zoo3.utils import StoreDict
 
 from poem_envs.headless import has_display
 from sb3_poem.benchmark.suites import family_label
-from sb3_poem.cli.experiment import CHECKPOINT, TrainingInterrupted, make_experiment
+from sb3_poem.cli.experiment import TrainingInterrupted, make_experiment
 from sb3_poem.cli.hyperparams import SAMPLERS, convert_params
 from sb3_poem.cli.needs import check_device, import_packages
 from sb3_poem.loading import ALGORITHMS
-from sb3_poem.pearl_sac.saving import is_checkpoint
+from sb3_poem.pearl_sac.saving import CHECKPOINT, is_checkpoint
 
 # Those of our own that differ from rl_zoo3's; what the user gives comes later, and wins.
 DEFAULTS = {

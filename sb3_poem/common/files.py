@@ -1,11 +1,13 @@
-"""Writing files so that what was there before survives a failure."""
+"""Writing files so that what was there before survives a failure, and reading JSON."""
 
 import contextlib
+import json
 import os
 import uuid
 from collections.abc import Callable
 from io import BufferedWriter
 from pathlib import Path
+from typing import Any
 
 
 def write_atomically(path: str | Path, content: bytes | Callable[[BufferedWriter], object]) -> None:
@@ -34,3 +36,25 @@ def write_atomically(path: str | Path, content: bytes | Callable[[BufferedWriter
             os.fsync(folder)
         finally:
             os.close(folder)
+
+
+def write_json_atomically(path: str | os.PathLike[str], data: dict[str, Any]) -> None:
+    """Write JSON, so that the file is always the old one or the whole new one; makes folders."""
+    write_atomically(Path(path), json.dumps(data, indent=1, allow_nan=False).encode())
+
+
+def read_json(path: str | os.PathLike[str], what: str) -> dict[str, Any]:
+    """Read a JSON object; a ``ValueError`` if the file is truncated, or not ``what``."""
+    text = Path(path).read_text(encoding="utf-8")
+    return parse_json(text, f"{os.fspath(path)} is not {what}")
+
+
+def parse_json(text: str, message: str) -> dict[str, Any]:
+    """A JSON object as data; ``message`` begins that of a ``ValueError``."""
+    try:
+        data = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{message}: {error}") from error
+    if not isinstance(data, dict):
+        raise ValueError(f"{message}: it holds a {type(data).__name__}, not an object")
+    return data

@@ -8,10 +8,13 @@ import hashlib
 import itertools
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch as th
+from safetensors import SafetensorError
+from safetensors.torch import load
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from torch import nn
 from torch.autograd.function import once_differentiable
@@ -302,3 +305,11 @@ def digest_of(tensors: Mapping[str, th.Tensor]) -> str:
         digest.update(f"{name} {tuple(value.shape)}".encode())
         digest.update(value.contiguous().numpy().tobytes())
     return digest.hexdigest()
+
+
+def parse_tensors(content: bytes, source: str | Path) -> dict[str, th.Tensor]:
+    """Tensors by name, of safetensors; a ``ValueError`` that names ``source`` if it is none."""
+    try:
+        return load(content)
+    except (SafetensorError, ValueError) as error:
+        raise ValueError(f"{source} is truncated, or no safetensors file: {error}") from error

@@ -10,6 +10,7 @@ from poem_envs.ant import AntDir2DEnv, AntGoalEnv
 from poem_envs.films import Look
 from poem_envs.humanoid import HumanoidDir2DEnv
 from poem_envs.meta_world import MetaWorldEnv
+from poem_envs.registration import family_name
 from poem_envs.robotics import AntMazeEnv, FetchPushEnv, FetchReachEnv
 from sb3_poem.common.foreign import environment_of
 from sb3_poem.pearl_sac.saving import CONFIG, read_config
@@ -108,16 +109,11 @@ def describe(env_id: str, task_dim: int | None = None) -> Description:
     """The description of a family, of which one that is not known here gets a general one, as do
     those of Meta-World whose tasks (task_dim,) are more than a place.
     """
-    name = family_of(env_id)
+    name = family_name(env_id)
     description = DESCRIPTIONS.get(name, Description(name, OTHER_HINT, "projection"))
     if description.origin is not None and task_dim not in (None, 3):
         return Description(description.title, ARM_HINT, "projection")
     return description
-
-
-def family_of(env_id: str) -> str:
-    """The name of an environment, without namespace and version."""
-    return env_id.rpartition("/")[2].rpartition("-v")[0] or env_id
 
 
 def as_points(env_id: str, tasks: np.ndarray) -> np.ndarray:
@@ -132,7 +128,7 @@ def as_points(env_id: str, tasks: np.ndarray) -> np.ndarray:
         return (tasks - description.origin) @ np.array([look.right, look.up]).T
     if picture == "place" and tasks.shape[1] >= 2:
         points = tasks[:, :2]
-    elif family_of(env_id) == "HalfCheetahFwdBack":
+    elif family_name(env_id) == "HalfCheetahFwdBack":
         points = np.stack([tasks[:, 0], np.zeros(len(tasks))], axis=1)
     else:
         points = np.stack([np.cos(tasks[:, 0]), np.sin(tasks[:, 0])], axis=1)
@@ -154,7 +150,7 @@ class ModelInfo:
 
     @property
     def family(self) -> str:
-        return family_of(self.env_id)
+        return family_name(self.env_id)
 
 
 def find_models(

@@ -3,6 +3,8 @@
 from textwrap import fill
 from typing import Any
 
+from poem_envs.registration import family_name
+
 RULES = {"bayes": "`Bayes()`", "paper": "`Paper()`"}
 
 
@@ -13,7 +15,7 @@ def model_card(config: dict[str, Any], name: str | None = None) -> str:
     :param name: By which the model is loaded; None is its family's, as of a shipped one
     """
     card, algorithm, env_id = config["card"], config["algorithm"], config["env_id"]
-    name = name or str(env_id).split("/")[-1].rsplit("-v", 1)[0]
+    name = name or family_name(str(env_id))
     return f"""---
 library_name: sb3_poem
 license: {card.get("license", "mit")}

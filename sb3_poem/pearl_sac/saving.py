@@ -15,8 +15,6 @@ from typing import Any, TypeVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from safetensors import SafetensorError
-from safetensors.torch import load as load_tensors
 from safetensors.torch import save as tensors_to_bytes
 from stable_baselines3 import SAC
 from stable_baselines3.common.save_util import load_from_zip_file
@@ -25,6 +23,7 @@ from torch import nn
 from sb3_poem.common.buffers import ContextStore
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.foreign import check_env_id
+from sb3_poem.common.networks import parse_tensors
 from sb3_poem.hub import FILES
 from sb3_poem.pearl_sac.model_card import model_card
 from sb3_poem.pearl_sac.policies import DEFAULT_NET_ARCH
@@ -33,6 +32,8 @@ from sb3_poem.resources import find_folder, pretrained_names
 
 FORMAT = "sb3_poem pretrained 2"
 WEIGHTS, CONFIG, CARD = FILES
+#: The name of a training's checkpoint
+CHECKPOINT = "checkpoint.zip"
 #: What a configuration holds of a model, as it is, and of its policy
 FACTS = ("env_id", "env_kwargs", "reward_feature_dim", "num_timesteps", "n_envs")
 POLICY_FACTS = ("net_arch", "layer_norm", "n_critics", "optimizer_kwargs")
@@ -267,10 +268,7 @@ def from_pretrained(algorithm: type[Model], folder: str | Path, device: th.devic
     found = config["algorithm"]
     if found != algorithm.__name__:
         raise ValueError(f"{folder} holds a {found}; load it with {found}.from_pretrained")
-    try:
-        tensors = load_tensors(weights.read_bytes())
-    except SafetensorError as error:
-        raise ValueError(f"{weights} is truncated, or no safetensors file: {error}") from error
+    tensors = parse_tensors(weights.read_bytes(), weights)
     return build_model(algorithm, config, tensors, str(folder), device)
 
 

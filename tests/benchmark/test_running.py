@@ -21,7 +21,6 @@ import pytest
 from meta_toys import small
 
 from sb3_poem import PEARLSAC, POEMSAC
-from sb3_poem.adaptation.state import write_json_atomically
 from sb3_poem.benchmark.models import ModelLibrary, Workplace, locked
 from sb3_poem.benchmark.results import Selection
 from sb3_poem.benchmark.running import make_plan, run_cells
@@ -40,6 +39,7 @@ from sb3_poem.benchmark.suites import (
 )
 from sb3_poem.benchmark.tables import suite_rows
 from sb3_poem.cli import main
+from sb3_poem.common.files import write_json_atomically
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.pearl_sac.callbacks import EpochCallback, TrainingCheckpointCallback
 

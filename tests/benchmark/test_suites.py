@@ -9,6 +9,7 @@ import pytest
 import yaml
 from benchmark_records import cells_of
 
+from poem_envs.registration import family_name
 from sb3_poem.benchmark.cells import _episode_seed
 from sb3_poem.benchmark.methods import METHODS, VARIANTS
 from sb3_poem.benchmark.suites import (
@@ -20,7 +21,6 @@ from sb3_poem.benchmark.suites import (
     Budget,
     Training,
     family_id,
-    family_name,
     hashable,
 )
 from sb3_poem.benchmark.tables import TABLE_3, paper_figure
