@@ -90,7 +90,7 @@ def compare_losses(model: POEMSAC, plain: PlainPOEM, size: dict[str, Any]) -> di
     """The plain implementation's losses against ours on the same batch and noise; returns the
     relative differences.
 
-    :raises AssertionError: if one differs by more than float32 explains
+    :raises AssertionError: If one differs by more than float32 explains
     """
     batch = model.make_sampler().sample(1, size["batch"])[0]
     noises = [batch.latent_noise, batch.next_action_noise, batch.action_noise]

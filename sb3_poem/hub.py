@@ -22,8 +22,8 @@ def download(repository: str) -> Path:
     earlier download.
 
     :param repository: ``"user/name"``
-    :raises ImportError: if the extra ``[hub]`` is not installed
-    :raises FileNotFoundError: if there is no such model, or the Hub cannot be reached
+    :raises ImportError: If the extra ``[hub]`` is not installed
+    :raises FileNotFoundError: If there is no such model, or the Hub cannot be reached
     """
     what = f"{repository}: there is no such file or folder of a model"
     client = _client(f"{what}, and one of the Hugging Face Hub")
@@ -55,9 +55,9 @@ def upload(repository: str, contents: Mapping[str, bytes], private: bool | None 
     :param contents: Of each of :data:`FILES`
     :param private: Of a repository that is made; None takes the account's default
     :return: Its address
-    :raises ImportError: if the extra ``[hub]`` is not installed
-    :raises ValueError: if the name is none that the Hub takes
-    :raises OSError: if the Hub refuses it or cannot be reached
+    :raises ImportError: If the extra ``[hub]`` is not installed
+    :raises ValueError: If the name is none that the Hub takes
+    :raises OSError: If the Hub refuses it or cannot be reached
     """
     if not is_repository(repository):
         raise ValueError(f'`repo_id` must have the form "user/name", but is {repository!r}')

@@ -19,7 +19,7 @@ def as_model(model: Any, device: th.device | str = "auto") -> Any:
 
     :param model: A model with latents, of whichever class, or what :func:`load_model` takes
     :param device: For a model that is loaded
-    :raises TypeError: if it is neither
+    :raises TypeError: If it is neither
     """
     if isinstance(model, (str, Path)):
         return load_model(model, device)
@@ -43,8 +43,8 @@ def load_model(name: str | Path, device: th.device | str = "auto") -> PEARLSAC:
         ``save_pretrained`` wrote, the name of a shipped model, or ``"user/name"`` on the Hugging
         Face Hub
     :param device: As PyTorch names it
-    :raises FileNotFoundError: if it is none of these; the message lists the shipped models
-    :raises ValueError: if a file is truncated, or of another program
+    :raises FileNotFoundError: If it is none of these; the message lists the shipped models
+    :raises ValueError: If a file is truncated, or of another program
     """
     path = Path(name)
     archive = path if path.is_file() else Path(f"{path}.zip")

@@ -29,10 +29,10 @@ def plot_returns(
         over tasks
     :param limit: (n_records,) the best that so many error-free answers allow
         (:func:`information_limit`)
-    :param known_task: the return of the best policy for each task, had the task been known
-    :param label: of the adapted policy's line
-    :param path: where to save the figure; the suffix names the format
-    :raises ValueError: if the shapes do not fit
+    :param known_task: The return of the best policy for each task, had the task been known
+    :param label: Of the adapted policy's line
+    :param path: Where to save the figure; the suffix names the format
+    :raises ValueError: If the shapes do not fit
     """
     # the object interface: a figure of pyplot would stay in its list, and choose a window system
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -20,8 +20,8 @@ def shipped_folder(name: str) -> Path:
 def config_file(algorithm: str) -> Path:
     """The shipped hyperparameters of an algorithm.
 
-    :param algorithm: its name on the command line, such as ``"poem_sac"``
-    :raises FileNotFoundError: if there is none; the message lists those that there are
+    :param algorithm: Its name on the command line, such as ``"poem_sac"``
+    :raises FileNotFoundError: If there is none; the message lists those that there are
     """
     files = {file.stem: file for file in sorted(shipped_folder("zoo_configs").glob("*.yml"))}
     if algorithm not in files:
@@ -34,8 +34,8 @@ def zoo_entry(file: Path, env_id: str, **changes: Any) -> dict[str, Any]:
     """An environment's entry of a file of hyperparameters, or its ``default`` entry.
 
     :param file: YAML in rl_zoo3's syntax; as there, Python in ``policy_kwargs`` is evaluated
-    :param changes: what shall differ
-    :raises ValueError: if the file has neither; the message lists those that there are
+    :param changes: What shall differ
+    :raises ValueError: If the file has neither; the message lists those that there are
     """
     import yaml
     from torch import nn
@@ -58,7 +58,7 @@ def pretrained_names() -> list[str]:
 def pretrained_folder(name: str) -> Path:
     """The folder of a shipped model.
 
-    :raises FileNotFoundError: if there is none of that name; the message lists those that there are
+    :raises FileNotFoundError: If there is none of that name; the message lists those that there are
     """
     names = pretrained_names()
     if name not in names:
@@ -72,10 +72,10 @@ def pretrained_folder(name: str) -> Path:
 def find_folder(name: str | Path) -> Path:
     """The folder of a model.
 
-    :param name: a folder's path, the name of a shipped model, or ``"user/name"``, which is fetched
+    :param name: A folder's path, the name of a shipped model, or ``"user/name"``, which is fetched
         from the Hugging Face Hub
-    :raises FileNotFoundError: if it is none of these; the message lists the shipped models
-    :raises ImportError: if it may be on the Hub, and the extra ``[hub]`` is not installed
+    :raises FileNotFoundError: If it is none of these; the message lists the shipped models
+    :raises ImportError: If it may be on the Hub, and the extra ``[hub]`` is not installed
     """
     path = Path(name)
     if path.is_dir():

@@ -134,8 +134,8 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
     asks for, has ``"is_success"`` there too, as SB3 calls it: whether any step of the episode so
     far did. Training, evaluation and the command line then report success rates.
 
-    :param render_mode: one of ``metadata["render_modes"]``, or None
-    :param render_task: whether rendering shows the hidden task, for a developer who debugs
+    :param render_mode: One of ``metadata["render_modes"]``, or None
+    :param render_task: Whether rendering shows the hidden task, for a developer who debugs
     """
 
     observation_space: spaces.Box
@@ -187,7 +187,7 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin an episode; returns the observation and an empty info.
 
-        :param seed: makes this and the following episodes reproducible; draws another task, unless
+        :param seed: Makes this and the following episodes reproducible; draws another task, unless
             one was chosen
         :param options: ``{"task": task}`` is short for :meth:`set_task` just before
         """
@@ -209,8 +209,8 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
         """Take one step: observation, reward, terminated, truncated (always False, time limits are
         a wrapper's), info.
 
-        :param action: inside ``action_space``, or refused; a tiny excess (1e-6) is clipped
-        :raises gymnasium.error.ResetNeeded: before the first reset
+        :param action: Inside ``action_space``, or refused; a tiny excess (1e-6) is clipped
+        :raises gymnasium.error.ResetNeeded: Before the first reset
         """
         if self._task is None:
             raise ResetNeeded("step() was called before the first reset()")
@@ -248,7 +248,7 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
         """Draw ``(n, task_dim)`` float64 tasks from the family's own distribution with a generator
         (not the environment's own); of a finite family without replacement.
 
-        :raises ValueError: if ``n`` is below 1 or above the number of tasks of a finite family
+        :raises ValueError: If ``n`` is below 1 or above the number of tasks of a finite family
         """
         if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1:
             raise ValueError(f"n={n!r} must be a whole number, at least 1")
@@ -295,7 +295,7 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
         robot, roughly, in tasks ``(..., task_dim)``; by it training can be shaped (Ng, Harada &
         Russell, ICML 1999), which changes how fast policies are learned, not which are best.
 
-        :raises NotImplementedError: if the family defines none (:attr:`has_potential`)
+        :raises NotImplementedError: If the family defines none (:attr:`has_potential`)
         """
         return self._potential(np.asarray(tasks), np.asarray(observations))
 
@@ -311,8 +311,8 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
         of ``spread``, or the difference of their lengths, in units of a tenth of the longer one,
         whichever is larger. A family whose features are not what its films show overrides it.
 
-        :param left: reward features ``(steps, reward_feature_dim)``
-        :param right: those of the other episode, which may have another number of steps
+        :param left: Reward features ``(steps, reward_feature_dim)``
+        :param right: Those of the other episode, which may have another number of steps
         :param spread: ``(reward_feature_dim,)`` the features' standard deviation over all steps of
             the films that the person has seen, and of these two
         """

@@ -101,10 +101,10 @@ class Filmed(Protocol):
         """Film episodes: images ``(height, width, 3)`` uint8, one a moment of the longest path,
         after whose end the shorter ones stand still.
 
-        :param paths: of each episode the states ``(moments, state_dim)``; all have a part in where
+        :param paths: Of each episode the states ``(moments, state_dim)``; all have a part in where
             the camera is
-        :param shown: the numbers of those that are in the film, together in one scene
-        :param size: width and height, pixels
+        :param shown: The numbers of those that are in the film, together in one scene
+        :param size: Width and height, pixels
         """
 
 

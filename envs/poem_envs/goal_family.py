@@ -49,19 +49,19 @@ class GoalFamily(TaskFamily):
     (:attr:`max_episode_steps`), unless the family is registered with another or ``gym.make`` is
     given one. Other wrappers than those of ``gym.make`` are refused.
 
-    :param env: an id, or a function that makes the environment
-    :param observe_achieved_goal: whether the observation holds the achieved goal, which is needed
+    :param env: An id, or a function that makes the environment
+    :param observe_achieved_goal: Whether the observation holds the achieved goal, which is needed
         unless ``"observation"`` says where the agent is by itself
-    :param set_goal: gives the environment a goal after its reset, so that its own info and images
+    :param set_goal: Gives the environment a goal after its reset, so that its own info and images
         follow it: called as ``set_goal(env.unwrapped, goal)``; None sets the attribute ``goal``, as
         gymnasium-robotics has it
-    :param goal_low: lower bounds of the goals, ``(goal_dim,)``; None takes those of
+    :param goal_low: Lower bounds of the goals, ``(goal_dim,)``; None takes those of
         ``desired_goal``
-    :param goal_high: upper bounds
-    :param render_task: whether rendering shows the goal. If not, MuJoCo sites that mark it are made
+    :param goal_high: Upper bounds
+    :param render_task: Whether rendering shows the goal. If not, MuJoCo sites that mark it are made
         invisible, and whatever else is drawn for it is drawn at the achieved goal
-    :param env_kwargs: further arguments of the environment
-    :raises ValueError: if the environment is not goal-conditioned, or wrapped
+    :param env_kwargs: Further arguments of the environment
+    :raises ValueError: If the environment is not goal-conditioned, or wrapped
     """
 
     metadata = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012 (Gymnasium declares it so)

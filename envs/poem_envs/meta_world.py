@@ -24,9 +24,9 @@ PUCK_TO_GOAL = 0.15
 class MetaWorldEnv(MujocoFilms, TaskFamily):
     """What ML1 and ML10 have in common: observations, actions, simulators and their rendering.
 
-    :param width: of rendered images, pixels
-    :param height: of rendered images, pixels
-    :param camera_name: one of Meta-World's cameras
+    :param width: Of rendered images, pixels
+    :param height: Of rendered images, pixels
+    :param camera_name: One of Meta-World's cameras
     :param render_quality: "full", or "fast": without shadows and antialiasing, for RGB images alone
     """
 

@@ -38,16 +38,16 @@ class MujocoFamily(MujocoFilms, BatchFamily):
 
     Images have ``width`` and ``height`` in pixels, and hold at most ``max_geom`` shapes.
 
-    :param xml_file: model file; a bare name is one of Gymnasium's
-    :param frame_skip: physics steps in a control step
-    :param reset_noise_scale: scale of the random start around the model's initial pose
-    :param camera_name: camera of the model to render from; None for one that follows the robot
-    :param default_camera_config: attributes of the following camera, such as ``{"distance": 4.0}``,
+    :param xml_file: Model file; a bare name is one of Gymnasium's
+    :param frame_skip: Physics steps in a control step
+    :param reset_noise_scale: Scale of the random start around the model's initial pose
+    :param camera_name: Camera of the model to render from; None for one that follows the robot
+    :param default_camera_config: Attributes of the following camera, such as ``{"distance": 4.0}``,
         over the robot's own
     :param render_quality: "full", or "fast": without shadows, reflections and antialiasing, for RGB
         images alone
-    :raises OSError: if there is no such model file
-    :raises ValueError: if the rendering quality is unknown, or does not go with the render mode
+    :raises OSError: If there is no such model file
+    :raises ValueError: If the rendering quality is unknown, or does not go with the render mode
     """
 
     #: Number of positions at the head of ``qpos`` that the observation leaves out.

@@ -14,9 +14,9 @@ def family_name(env_id: str) -> str:
 def plain_id(env_id: str) -> str:
     """An environment's id as the registry has it.
 
-    :param env_id: as for ``gym.make``: an id, or ``"module:id"``, whose module is imported first
-    :raises ModuleNotFoundError: if there is no such module
-    :raises gymnasium.error.NameNotFound: if there is no such id; the message names one like it
+    :param env_id: As for ``gym.make``: an id, or ``"module:id"``, whose module is imported first
+    :raises ModuleNotFoundError: If there is no such module
+    :raises gymnasium.error.NameNotFound: If there is no such id; the message names one like it
     """
     module, _, name = env_id.rpartition(":")
     if module:

@@ -150,10 +150,10 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
       bit for bit, whatever ``nthread``.
     - What else a family has, its attributes and methods, the vectorised one has too.
 
-    :param family: a :class:`~poem_envs.TaskFamily` class, or a function that makes such an
+    :param family: A :class:`~poem_envs.TaskFamily` class, or a function that makes such an
         environment; ``family_kwargs`` are its arguments
-    :param nthread: number of threads, or processes; None for as many as this process may use cores
-    :param max_episode_steps: episodes are truncated after so many steps; None for as many as a
+    :param nthread: Number of threads, or processes; None for as many as this process may use cores
+    :param max_episode_steps: Episodes are truncated after so many steps; None for as many as a
         :class:`GoalFamily`'s environment has, or no limit
     """
 
@@ -380,10 +380,10 @@ def set_task(env: Any, task: npt.ArrayLike) -> None:
     >>> env.unwrapped.task
     array([1.5])
 
-    :param env: a ``gym.Env``, a Gymnasium ``VectorEnv``, or an SB3 ``VecEnv``
+    :param env: A ``gym.Env``, a Gymnasium ``VectorEnv``, or an SB3 ``VecEnv``
     :param task: ``(task_dim,)``; of a vectorised environment for all copies, or
         ``(num_envs, task_dim)``, one for each
-    :raises TypeError: if ``env`` is none of these, or no task family
+    :raises TypeError: If ``env`` is none of these, or no task family
     """
     if isinstance(env, gym.Env) and env.has_wrapper_attr("set_task"):
         env.get_wrapper_attr("set_task")(task)

@@ -44,8 +44,8 @@ def environment_of(
     are checked, unless the user gives others, which are taken as they are.
 
     :param source: The model's name, for the message
-    :raises ValueError: if nobody names an environment, or the file's id or arguments are refused
-    :raises gymnasium.error.Error: if the file's environment is not registered
+    :raises ValueError: If nobody names an environment, or the file's id or arguments are refused
+    :raises gymnasium.error.Error: If the file's environment is not registered
     """
     given_kwargs = given_kwargs or {}
     chosen = given_id or env_id

@@ -81,7 +81,7 @@ POLICY_ARGUMENTS = (
 
 
 def refuse_unsupported(names: Iterable[str], algorithm: str) -> None:
-    """:raises TypeError: at the first name of an argument that SAC takes and ours do not"""
+    """:raises TypeError: At the first name of an argument that SAC takes and ours do not"""
     for name in names:
         if name in UNSUPPORTED:
             raise TypeError(f"{algorithm} takes no {name!r}: {UNSUPPORTED[name]}")

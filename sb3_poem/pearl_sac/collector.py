@@ -49,8 +49,8 @@ class EpochCollector:
         which goes to the buffer too. An episode that ends early is followed by another of the same
         task.
 
-        :raises ValueError: for NaN and infinity, and as :meth:`FamilyView.check_experience`
-        :raises CollectionStoppedError: if ``on_step`` ended it
+        :raises ValueError: For NaN and infinity, and as :meth:`FamilyView.check_experience`
+        :raises CollectionStoppedError: If ``on_step`` ended it
         """
         family, tasks = self.family, self.train_tasks.tasks[task_ids]
         n, seed, steps = family.num_envs, self.generators.integer_seed(), []

@@ -122,9 +122,9 @@ class PEARLSAC(SAC):
     :param verbose: 0 no output, 1 how long an epoch is and a table after each, 2 debug
     :param seed: Seed of everything: tasks, networks, sampling, environments
     :param device: PyTorch device; "auto" takes a CUDA device where there is one
-    :raises ValueError: for an environment that is no task family, and for arguments outside their
+    :raises ValueError: For an environment that is no task family, and for arguments outside their
         range
-    :raises TypeError: for arguments that it does not have; of those of SB3's SAC, the message says
+    :raises TypeError: For arguments that it does not have; of those of SB3's SAC, the message says
         what to do instead
     """
 
@@ -284,7 +284,7 @@ class PEARLSAC(SAC):
 
         :param arguments: What shall differ: arguments of the constructor, ``n_envs`` (copies of the
             environment) and ``n_timesteps``. With ``env``, another family is trained by this entry
-        :raises ValueError: if its file has no entry for it, nor a default one
+        :raises ValueError: If its file has no entry for it, nor a default one
         """
         entry = zoo_entry(config_file(cls.zoo_name), plain_id(env_id), **arguments)
         timesteps, n_envs = int(entry.pop("n_timesteps")), entry.pop("n_envs", None)
@@ -579,7 +579,7 @@ class PEARLSAC(SAC):
         return family
 
     def _check_family(self, family: FamilyView) -> None:
-        """:raises ValueError: if the model's arguments need what the family does not have"""
+        """:raises ValueError: If the model's arguments need what the family does not have"""
         for name in ("relabel_fraction", "context_relabel_fraction"):
             if getattr(self, name) is None:
                 setattr(self, name, 0.5 if family.shared_dynamics else 0.0)
@@ -683,7 +683,7 @@ class PEARLSAC(SAC):
     ) -> None:
         """As SB3's.
 
-        :raises ValueError: if it is the experience of other tasks than this model's
+        :raises ValueError: If it is the experience of other tasks than this model's
         """
         own = self.replay_buffer
         super().load_replay_buffer(path, truncate_last_traj)
@@ -709,7 +709,7 @@ class PEARLSAC(SAC):
         """As SB3's. ``env`` may be a registered id too, see :meth:`set_env`. Further arguments are
         the constructor's; a ``seed`` begins new random streams.
 
-        :raises ValueError: if it is a folder, the file is truncated or holds another algorithm's
+        :raises ValueError: If it is a folder, the file is truncated or holds another algorithm's
             model, env is of another family, or an argument would change what the networks are
         """
         refuse_unknown(kwargs.keys() - inspect.signature(cls).parameters.keys(), cls)
@@ -742,7 +742,7 @@ class PEARLSAC(SAC):
         """Read what :meth:`save_checkpoint` or :class:`TrainingCheckpointCallback` wrote;
         :meth:`resume` then continues the run, in an environment with as many copies.
 
-        :raises ValueError: if the file is truncated or foreign, or env of another family
+        :raises ValueError: If the file is truncated or foreign, or env of another family
         """
         if not saving.is_checkpoint(path):
             raise ValueError(f"{path} is truncated, or no checkpoint of sb3_poem")
@@ -761,8 +761,8 @@ class PEARLSAC(SAC):
         :param folder: Where; made if missing
         :param card: What the card should say: ``command``, ``seed``, ``commit``, ``machine``,
             ``note``, ``license`` (default: MIT), ``results``: any JSON
-        :raises OSError: if the folder cannot be written
-        :raises ValueError: if the policy's activation is none of torch.nn's or its optimiser none
+        :raises OSError: If the folder cannot be written
+        :raises ValueError: If the policy's activation is none of torch.nn's or its optimiser none
             of torch.optim's, which JSON could not name
         """
         for name, content in saving.pretrained_files(self, card).items():
@@ -778,7 +778,7 @@ class PEARLSAC(SAC):
             missing
         :param private: Of a repository that is made; None takes the account's default
         :return: Its address
-        :raises OSError: if the Hub refuses it or cannot be reached
+        :raises OSError: If the Hub refuses it or cannot be reached
         """
         return upload(repo_id, saving.pretrained_files(self, card, repo_id), private)
 
@@ -794,8 +794,8 @@ class PEARLSAC(SAC):
         :param folder: The folder, the name of a shipped model, or ``"user/name"`` on the Hugging
             Face Hub (extra ``[hub]``), if there is no such folder
         :param env: An environment of the model's family, if it shall be trained on
-        :raises FileNotFoundError: if there is no such model
-        :raises ValueError: if a file is truncated or foreign, the model is of another algorithm, or
+        :raises FileNotFoundError: If there is no such model
+        :raises ValueError: If a file is truncated or foreign, the model is of another algorithm, or
             env of another family
         """
         model = saving.from_pretrained(cls, folder, device)

@@ -232,8 +232,8 @@ class LatentPolicy(SACPolicy):
             prior's mean, of which a warning tells once
         :param episode_start: Not used: a latent outlives episodes
         :param deterministic: Mean action instead of a sample
-        :return: actions in the environment's units, and the latents (n, latent_dim)
-        :raises ValueError: for observations or a state that are not finite or of another shape
+        :return: Actions in the environment's units, and the latents (n, latent_dim)
+        :raises ValueError: For observations or a state that are not finite or of another shape
         """
         if self.training:  # walking all modules takes longer than a small batch's actions
             self.set_training_mode(False)

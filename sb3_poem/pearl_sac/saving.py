@@ -239,7 +239,7 @@ def read_config(folder: str | Path) -> dict[str, Any]:
 def parse_config(text: str | bytes, source: str) -> dict[str, Any]:
     """What :func:`config_text` wrote; ``source`` is where it comes from, for the message.
 
-    :raises ValueError: if it is truncated, of another program or version, or its ``env_id`` would
+    :raises ValueError: If it is truncated, of another program or version, or its ``env_id`` would
         import a module
     """
     try:
@@ -282,7 +282,7 @@ def build_model(
     """Make a model from what :func:`model_contents` took it apart into. No memory is taken for
     networks before the configuration has been found to agree with the tensors.
 
-    :raises ValueError: if something is missing or does not fit; the message names ``source``
+    :raises ValueError: If something is missing or does not fit; the message names ``source``
     """
     try:
         _check_numbers(algorithm, config, tensors)

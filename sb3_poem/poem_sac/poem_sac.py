@@ -59,7 +59,7 @@ def preference_loss(similarity: th.Tensor, returns: th.Tensor) -> tuple[th.Tenso
 
     :param similarity: (tasks, tasks), S[i, j] = S(z_i, z_j)
     :param returns: (tasks, tasks), J[i, j], NaN where unknown
-    :return: loss, and the share of pairs in the right order (NaN without pairs)
+    :return: Loss, and the share of pairs in the right order (NaN without pairs)
     """
     return _PreferenceLoss.apply(similarity, returns)
 
