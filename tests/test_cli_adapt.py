@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import imageio.v3 as imageio
 import numpy as np
 import pytest
 from rl_zoo3.utils import SimpleLinearSchedule
@@ -116,7 +117,6 @@ def test_json_holds_what_the_library_measures(
 def test_table_plot_and_video(
     model: tuple[POEMSAC, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    imageio = pytest.importorskip("imageio.v3")
     plot, video = tmp_path / "plot.png", tmp_path / "video.gif"
     flags = [
         "--env",

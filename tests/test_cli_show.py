@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import imageio.v3 as imageio
 import numpy as np
 import pytest
 
@@ -127,7 +128,6 @@ def test_a_family_of_one_s_own_is_named_with_the_module_that_registers_it(
 def test_record_video_films_before_and_after_or_one_policy(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    imageio = pytest.importorskip("imageio.v3")
     pair, one = tmp_path / "pair.gif", tmp_path / "one.gif"
     assert show("record-video", "--model", "PointGoal", "--out", pair, *QUICK, *TINY) == 0
     assert "after 2 answers" in capsys.readouterr().out

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import imageio.v3 as imageio
 import numpy as np
 import pytest
 
@@ -15,7 +16,6 @@ def clip(length: int, height: int = 33, width: int = 47, value: int = 0) -> list
 
 @pytest.mark.parametrize("suffix", [".mp4", ".gif"])
 def test_written_frames_are_read_back(tmp_path: Path, suffix: str) -> None:
-    imageio = pytest.importorskip("imageio.v3")
     path = write_video(clip(12), tmp_path / "new" / f"clip{suffix}", fps=10)
     frames = imageio.imread(path, index=None)
     assert frames.shape[0] == 12
