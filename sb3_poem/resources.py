@@ -1,9 +1,9 @@
 """Where the files that ship with the package are: hyperparameters and trained models."""
 
-import difflib
 from pathlib import Path
 from typing import Any
 
+from poem_envs.registration import did_you_mean
 from sb3_poem.hub import download, is_repository
 
 _PACKAGE = Path(__file__).resolve().parent
@@ -62,10 +62,8 @@ def pretrained_folder(name: str) -> Path:
     """
     names = pretrained_names()
     if name not in names:
-        close = difflib.get_close_matches(name, names, n=1)
-        hint = f" Did you mean {close[0]!r}?" if close else ""
-        known = ", ".join(names)
-        raise FileNotFoundError(f"No model {name!r} is shipped; there are: {known}.{hint}")
+        known = f"there are: {', '.join(names)}{did_you_mean(name, names)}"
+        raise FileNotFoundError(f"No model {name!r} is shipped; {known}")
     return shipped_folder("pretrained") / name
 
 

@@ -163,7 +163,7 @@ def test_record_video_films_before_and_after_or_one_policy(
             ["enjoy", "--env", "poem/AntVel-v0", "-f", "none"],
             "no run of poem_sac on poem/AntVel-v0 in",
         ),
-        (["enjoy", "--no-render", "--model", "PointGoaal"], "Did you mean 'PointGoal'?"),
+        (["enjoy", "--no-render", "--model", "PointGoaal"], "did you mean 'PointGoal'?"),
         (["enjoy", "--algo", "ppo", "--env", "Pendulum-v1"], "add --no-render"),
         (
             ["enjoy", "--model", "PointGoal", "--no-render", "--device", "gpu"],

@@ -406,8 +406,8 @@ ADAPTERS = [
         lambda _: ReturnOracle(vec(), task=[1.0, 2.0])(*pair()),
         r"task...\(2,\)",
     ),
-    argument(BoltzmannOracle, "beta", -1.0, "positive"),
-    argument(MistakeOracle, "rate", 1.5, r"\[0, 1\]"),
+    argument(BoltzmannOracle, "beta", -1.0, "above 0"),
+    argument(MistakeOracle, "rate", 1.5, "at most 1"),
     argument(HumanOracle, "video_format", "avi", "gif"),
     refused("HumanOracle without frames", lambda _: HumanOracle()(*pair()), "render_mode"),
     refused(

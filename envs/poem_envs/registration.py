@@ -2,6 +2,7 @@
 
 import difflib
 import importlib
+from collections.abc import Iterable
 
 import gymnasium as gym
 
@@ -9,6 +10,16 @@ import gymnasium as gym
 def family_name(env_id: str) -> str:
     """AntGoal of poem/AntGoal-v0: an id without namespace and version."""
     return env_id.split("/")[-1].rsplit("-v", 1)[0]
+
+
+def did_you_mean(name: str, known: Iterable[str], n: int = 1, cutoff: float = 0.6) -> str:
+    """The end of a message that refuses a name: up to ``n`` known ones like it; empty if none is.
+
+    >>> did_you_mean("AntGaol", ["AntGoal", "AntVel"])
+    "; did you mean 'AntGoal'?"
+    """
+    close = difflib.get_close_matches(name, list(known), n, cutoff)
+    return f"; did you mean {' or '.join(map(repr, close))}?" if close else ""
 
 
 def plain_id(env_id: str) -> str:
@@ -22,10 +33,9 @@ def plain_id(env_id: str) -> str:
     if module:
         importlib.import_module(module)
     if name not in gym.registry:
-        close = difflib.get_close_matches(name, gym.registry, n=1)
-        hint = f"did you mean {close[0]!r}?" if close else "nor any like it."
+        hint = did_you_mean(name, gym.registry) or ", nor any like it."
         raise gym.error.NameNotFound(
-            f"No environment {name!r} is registered with Gymnasium, {hint} One of your own is "
+            f"No environment {name!r} is registered with Gymnasium{hint} One of your own is "
             "registered by an import of its module: 'module:id', on the command line --gym-packages"
         )
     return name

@@ -2,7 +2,6 @@
 
 import collections
 import copy
-import difflib
 import functools
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
@@ -11,6 +10,7 @@ import mujoco
 import numpy as np
 
 from poem_envs.mujoco_rendering import close_viewers, fit_buffer, leave_out_details, prepared_viewer
+from poem_envs.registration import did_you_mean
 
 INSTALL = "pip install 'sb3_poem[metaworld]'"
 
@@ -40,9 +40,8 @@ def checked_manipulation(env_name: str) -> str:
     known, name = manipulation_names(), str(env_name).removesuffix("-v3")
     if name in known:
         return name
-    near = difflib.get_close_matches(name, known, n=5, cutoff=0.4)
-    hint = f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(known)}"
-    raise ValueError(f"{env_name=} is none of Meta-World's {len(known)} manipulations; {hint}")
+    hint = did_you_mean(name, known, cutoff=0.4) or f"; choose one of {', '.join(known)}"
+    raise ValueError(f"{env_name=} is none of Meta-World's {len(known)} manipulations{hint}")
 
 
 class Sawyer:

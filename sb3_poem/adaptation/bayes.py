@@ -38,7 +38,7 @@ from sb3_poem.adaptation.preference import (
 )
 from sb3_poem.adaptation.priors import SOURCES, make_prior
 from sb3_poem.adaptation.rule import Answer, Inference, Rule, Setting, Shown, check_seen, latent_of
-from sb3_poem.common.checks import check_choice, check_whole
+from sb3_poem.common.checks import check_choice, check_number, check_whole
 from sb3_poem.common.trajectory import Trajectory
 
 LIKELIHOODS = ("decoder", "similarity")
@@ -130,7 +130,7 @@ class Bayes(Rule):
         check_choice("candidates", self.candidates, (*SOURCES, None))
         check_choice("likelihood", self.likelihood, (*LIKELIHOODS, None))
         check_choice("decision", self.decision, DECISIONS)
-        queries.check_epsilon(self.epsilon)
+        check_number("epsilon", self.epsilon, 0.0, below=0.5)
         check_choice("question", self.question, tuple(ANSWERS))
         if self.question == BEST_OF_FOUR and self.query_rule == "worst-case":
             raise ValueError(

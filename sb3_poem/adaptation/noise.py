@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from sb3_poem.adaptation.preference import ANSWERS, BEST_OF_FOUR
+from sb3_poem.common.checks import check_number
 
 # A probit of unit scale is nearest to a logistic function of this slope.
 PROBIT_SLOPE = 1.702
@@ -102,8 +103,7 @@ class MistakeNoise(NoiseModel):
     kind = "mistake"
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.rate <= 0.5:
-            raise ValueError(f"`rate` must lie in [0, 0.5], but is {self.rate}")
+        check_number("rate", self.rate, 0.0, 0.5)
 
 
 @dataclass(frozen=True)
@@ -120,8 +120,8 @@ class BoltzmannNoise(NoiseModel):
     kind = "boltzmann"
 
     def __post_init__(self) -> None:
-        if self.beta is not None and not (np.isfinite(self.beta) and self.beta > 0):
-            raise ValueError(f"`beta` must be positive and finite, or None, but is {self.beta}")
+        if self.beta is not None:
+            check_number("beta", self.beta, above=0.0)
 
     def probability_above(self, difference: Values, error: Values, magnitude: Values) -> Any:
         beta = 1.0 / np.maximum(magnitude, 1e-12) if self.beta is None else self.beta

@@ -188,8 +188,7 @@ class MistakeOracle(TaskOracle):
     """
 
     def __init__(self, rate: float = 0.2, *args: Any, **kwargs: Any) -> None:
-        if not 0.0 <= rate <= 1.0:
-            raise ValueError(f"`rate` must lie in [0, 1], but is {rate}")
+        check_number("rate", rate, 0.0, 1.0)
         super().__init__(*args, **kwargs)
         self.rate, self.noise_model = rate, MistakeNoise(min(rate, 0.5))
 

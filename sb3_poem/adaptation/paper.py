@@ -20,7 +20,7 @@ from sb3_poem.adaptation.rule import (
     equally_weighted,
     latent_of,
 )
-from sb3_poem.common.checks import check_choice, check_whole
+from sb3_poem.common.checks import check_choice, check_number, check_whole
 
 # Bound on the draws for a question.
 MAX_DRAWS = 16384
@@ -56,7 +56,7 @@ class Paper(Rule):
 
     def __post_init__(self) -> None:
         check_whole("n_candidates", self.n_candidates, 2)  # a question compares two
-        queries.check_epsilon(self.epsilon)
+        check_number("epsilon", self.epsilon, 0.0, below=0.5)
         check_choice("candidates", self.candidates, SOURCES)
         check_choice("query_rule", self.query_rule, queries.QUERY_RULES)
 

@@ -17,12 +17,6 @@ MOST_LOOKS = 6
 Visibility = Callable[[int, int], float]
 
 
-def check_epsilon(epsilon: float) -> None:
-    """Refuse a tolerated error outside [0, 0.5)."""
-    if not 0.0 <= epsilon < 0.5:
-        raise ValueError(f"`epsilon` must lie in [0, 0.5), but is {epsilon}")
-
-
 def tolerance(epsilon: float) -> float:
     """How far S(z, z') may fall below S(z, z'') while eq. 9 still holds: log((1 + 2 epsilon) / (1 -
     2 epsilon)) >= 0. (The appendix's proof has the opposite sign, which would exclude the truth.)

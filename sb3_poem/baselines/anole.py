@@ -17,7 +17,7 @@ from sb3_poem.baselines.fragments import (
     default_fragment_length,
     replay_fragments,
 )
-from sb3_poem.common.checks import check_choice, check_whole
+from sb3_poem.common.checks import check_choice, check_number, check_whole
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.pearl_sac import PEARLSAC
 
@@ -65,8 +65,7 @@ class ANOLE(Rule):
                 check_whole(name, getattr(self, name), 1)
         check_choice("strategy", self.strategy, STRATEGIES)
         check_choice("candidates", self.candidates, SOURCES)
-        if not 0.0 <= self.mistake_rate < 0.5:
-            raise ValueError(f"`mistake_rate` must lie in [0, 0.5), but is {self.mistake_rate}")
+        check_number("mistake_rate", self.mistake_rate, 0.0, below=0.5)
 
     def budget(self, n_queries: int) -> int:
         """Mistakes that all answers together may hold, E."""

@@ -33,7 +33,7 @@ from sb3_poem.baselines.fragments import (
     standardised,
     transition_rows,
 )
-from sb3_poem.common.checks import check_whole
+from sb3_poem.common.checks import check_number, check_whole
 from sb3_poem.common.files import read_json, write_atomically, write_json_atomically
 from sb3_poem.common.networks import MLP, digest_of, parse_tensors
 from sb3_poem.common.trajectory import Trajectory
@@ -129,10 +129,7 @@ class MetaReward:
         fragment_length: int | None = None,
         seed: int = 0,
     ) -> None:
-        if not inner_learning_rate > 0:
-            raise ValueError(
-                f"`inner_learning_rate` must be positive, but is {inner_learning_rate}"
-            )
+        check_number("inner_learning_rate", inner_learning_rate, above=0.0)
         check_whole("inner_steps", inner_steps, 1)
         self.policy = policy
         self.inner_learning_rate, self.inner_steps = inner_learning_rate, inner_steps
@@ -376,10 +373,8 @@ class MAMLReward(Rule):
     def __post_init__(self) -> None:
         for name in ("gradient_steps", "batch_size"):
             check_whole(name, getattr(self, name), 1)
-        if not self.learning_rate > 0:
-            raise ValueError(f"`learning_rate` must be positive, but is {self.learning_rate}")
-        if not 0.0 <= self.gamma <= 1.0:
-            raise ValueError(f"`gamma` must lie in [0, 1], but is {self.gamma}")
+        check_number("learning_rate", self.learning_rate, above=0.0)
+        check_number("gamma", self.gamma, 0.0, 1.0)
 
     def check(self, model: MetaModel, setting: Setting) -> None:
         """See :class:`Rule`: it needs a meta-trained reward, and tasks that share dynamics."""

@@ -1,7 +1,6 @@
 """Hyperparameters: checks before anything starts, and what ``train -optimize`` searches."""
 
 import contextlib
-import difflib
 import importlib.util
 import inspect
 import math
@@ -13,6 +12,7 @@ from typing import Any
 import optuna
 from rl_zoo3.utils import SimpleLinearSchedule
 
+from poem_envs.registration import did_you_mean
 from sb3_poem.loading import ALGORITHMS
 from sb3_poem.pearl_sac.arguments import UNSUPPORTED
 from sb3_poem.resources import shipped_folder
@@ -45,10 +45,8 @@ def check_entry(entry: Mapping[str, Any], algorithm: str, source: str) -> None:
         if key in UNSUPPORTED:
             raise ValueError(f"{key!r} in {source} is not for {algorithm}: {UNSUPPORTED[key]}")
         if key not in known:
-            close = difflib.get_close_matches(key, known - set(FLAGS), n=3)
-            names = " or ".join(map(repr, close))
-            alike = f"did you mean {names}?" if close else "nor anything like it."
-            what = f"{algorithm} has no such hyperparameter, {alike}"
+            alike = did_you_mean(key, known - set(FLAGS), n=3) or ", nor anything like it."
+            what = f"{algorithm} has no such hyperparameter{alike}"
             raise ValueError(f"Unknown key {key!r} in {source}: {what}")
         kind = parameters[key].annotation if key in parameters else None
         _check_value(f"{key} in {source}", key, entry[key], kind)

@@ -2,10 +2,8 @@
 
 import argparse
 import difflib
-import json
 import shlex
 import sys
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -25,7 +23,7 @@ from sb3_poem.cli.experiment import TrainingInterrupted, make_experiment
 from sb3_poem.cli.hyperparams import SAMPLERS, convert_params
 from sb3_poem.cli.needs import check_device, import_packages
 from sb3_poem.loading import ALGORITHMS
-from sb3_poem.pearl_sac.saving import CHECKPOINT, is_checkpoint
+from sb3_poem.pearl_sac.saving import CHECKPOINT, facts_of, is_checkpoint
 
 # Those of our own that differ from rl_zoo3's; what the user gives comes later, and wins.
 DEFAULTS = {
@@ -124,12 +122,10 @@ def is_complete(model: Path) -> bool:
     """Whether a training made all its steps; an interrupted one has a model's file, too."""
     if not model.exists():
         return False
-    try:
-        with zipfile.ZipFile(model) as archive:
-            data = json.loads(archive.read("data"))
-        return int(data["num_timesteps"]) >= int(data["_total_timesteps"])
-    except (zipfile.BadZipFile, KeyError, ValueError) as error:
-        raise ValueError(f"{model} is truncated, or no model: {error}; remove it") from error
+    facts = facts_of(model)
+    if "_total_timesteps" not in facts:
+        raise ValueError(f"{model} is truncated, or no model; remove it")
+    return int(facts["num_timesteps"]) >= int(facts["_total_timesteps"])
 
 
 def last_run(folder: Path, env_name: str, seed: int) -> Path | None:

@@ -29,8 +29,18 @@ def check_whole_numbers(
     return tuple(sorted(map(int, set(values))))
 
 
-def check_number(name: str, value: Any, low: float = -np.inf, high: float = np.inf) -> None:
-    """Refuse what is no finite number from ``low`` to ``high``; True and False are none."""
+def check_number(
+    name: str,
+    value: Any,
+    low: float = -np.inf,
+    high: float = np.inf,
+    *,
+    above: float = -np.inf,
+    below: float = np.inf,
+) -> None:
+    """Refuse what is no finite number from ``low`` to ``high``, or not ``above`` and ``below``
+    others; True and False are none.
+    """
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
     if not (number and np.isfinite(value)):
         raise ValueError(f"`{name}` must be a finite number, but is {value!r}")
@@ -38,6 +48,9 @@ def check_number(name: str, value: Any, low: float = -np.inf, high: float = np.i
         raise ValueError(f"`{name}` must be at least {low:g}, but is {value}")
     if value > high:
         raise ValueError(f"`{name}` must be at most {high:g}, but is {value}")
+    if not above < value < below:
+        bound = f"above {above:g}" if value <= above else f"below {below:g}"
+        raise ValueError(f"`{name}` must be {bound}, but is {value}")
 
 
 def check_number_or_auto(name: str, value: Any, low: float = -np.inf) -> None:

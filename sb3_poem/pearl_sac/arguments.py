@@ -1,7 +1,6 @@
 """Arguments: their ranges, what an environment may be, and why SAC's others are not taken."""
 
 import contextlib
-import difflib
 import inspect
 import re
 import warnings
@@ -15,7 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 
-from poem_envs.registration import plain_id
+from poem_envs.registration import did_you_mean, plain_id
 from sb3_poem.common.checks import check_number, check_number_or_auto, check_whole
 from sb3_poem.common.precision import hidden_dtype
 from sb3_poem.common.vec_env import as_task_vec_env, make_task_vec_env
@@ -94,8 +93,7 @@ def refuse_unknown(names: Iterable[str], algorithm: type) -> None:
         if name in POLICY_ARGUMENTS:
             instead = f"policy_kwargs: policy_kwargs=dict({name}=...)"
             raise TypeError(f"{algorithm.__name__} takes {name!r} in {instead}")
-        close = difflib.get_close_matches(name, inspect.signature(algorithm).parameters, n=1)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
+        hint = did_you_mean(name, inspect.signature(algorithm).parameters)
         raise TypeError(f"{algorithm.__name__} got an unexpected keyword argument {name!r}{hint}")
 
 

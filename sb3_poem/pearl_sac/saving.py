@@ -106,15 +106,15 @@ def check_archive(
 
 def algorithm_of(path: str | Path) -> str:
     """Name of the class whose model a zip holds; empty where it says none."""
-    return str(_facts(path).get("algorithm", ""))
+    return str(facts_of(path).get("algorithm", ""))
 
 
 def is_checkpoint(path: str | Path) -> bool:
     """Whether a file is a checkpoint of a training run, rather than a model that ``save`` wrote."""
-    return bool(_facts(path).get("keeps_experience"))
+    return bool(facts_of(path).get("keeps_experience"))
 
 
-def _facts(path: str | Path) -> dict[str, Any]:
+def facts_of(path: str | Path) -> dict[str, Any]:
     """What a zip says of its model in plain JSON; nothing where it is none of ours."""
     try:
         with zipfile.ZipFile(path) as archive:

@@ -339,7 +339,7 @@ def test_an_oracle_that_returns_something_else(nothing):
     [
         ({"query_rule": "best"}, "`query_rule` must be one of"),
         ({"candidates": "uniform"}, "`candidates` must be one of"),
-        ({"epsilon": 0.5}, "`epsilon` must lie in"),
+        ({"epsilon": 0.5}, "`epsilon` must be below 0.5"),
         ({"n_candidates": 1}, "`n_(candidates|particles)` must be at least 2"),
         ({"inference": "map"}, "`inference` must be one of .*bayes.*paper.*, but is 'map'"),
     ],

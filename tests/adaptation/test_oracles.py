@@ -67,7 +67,7 @@ def test_mistakes_come_at_their_rate():
     assert oracle.noise_model == MistakeNoise(0.2)
     assert MistakeOracle(1.0, env_with_goal(2.0))(at_speed(1.9), at_speed(1.0)) is RIGHT
     assert MistakeOracle(1.0).noise_model == MistakeNoise(0.5)
-    with pytest.raises(ValueError, match="`rate` must lie"):
+    with pytest.raises(ValueError, match="`rate` must be at most"):
         MistakeOracle(1.5)
 
 

@@ -160,9 +160,9 @@ def test_every_rule_asks_about_two_policies(rule, candidates):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"epsilon": 0.5}, r"`epsilon` must lie in \[0, 0.5\), but is 0.5"),
-        ({"epsilon": -0.1}, "`epsilon` must lie in"),
-        ({"epsilon": float("nan")}, "`epsilon` must lie in"),
+        ({"epsilon": 0.5}, "`epsilon` must be below 0.5, but is 0.5"),
+        ({"epsilon": -0.1}, "`epsilon` must be at least 0"),
+        ({"epsilon": float("nan")}, "`epsilon` must be a finite number"),
         ({"n_candidates": 1}, "`n_candidates` must be at least 2"),
         (
             {"candidates": "uniform"},

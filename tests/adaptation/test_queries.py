@@ -255,9 +255,9 @@ def test_noise_models_survive_json_and_never_say_never(noise):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: MistakeNoise(0.6), "`rate` must lie"),
-        (lambda: BoltzmannNoise(0.0), "`beta` must be positive"),
-        (lambda: BoltzmannNoise(float("nan")), "`beta` must be positive"),
+        (lambda: MistakeNoise(0.6), "`rate` must be at most"),
+        (lambda: BoltzmannNoise(0.0), "`beta` must be above 0"),
+        (lambda: BoltzmannNoise(float("nan")), "`beta` must be a finite number"),
         (
             lambda: noise_model_from_dict({"kind": "gaussian"}),
             "unknown noise model 'gaussian'; known are",

@@ -302,7 +302,7 @@ class Blind(SpeedModel):
         ({"n_queries": 0}, "`n_queries` must be at least 1"),
         ({"strategy": "greedy", "n_queries": 15}, "`n_queries` must be at most 14"),
         ({"mistake_rate": 0.0, "n_queries": 30}, "at most 14 .* than 16,384 candidates, but is 30"),
-        ({"mistake_rate": 0.5}, r"`mistake_rate` must lie in \[0, 0.5\)"),
+        ({"mistake_rate": 0.5}, "`mistake_rate` must be below 0.5"),
         ({"candidates": "all"}, "`candidates` must be one of"),
         ({"fragment_length": 0}, "`fragment_length` must be at least 1"),
         ({"library": LIBRARY[:1]}, "`library` must hold at least 2 trajectories, but holds 1"),

@@ -175,7 +175,7 @@ def test_what_will_not_do(trained):
         meta_train_reward(trained, 0)
     with pytest.raises(ValueError, match="`n_fragments` must be at least 1, but is 0"):
         meta_train_reward(trained, 1, n_fragments=0)
-    with pytest.raises(ValueError, match="`inner_learning_rate` must be positive"):
+    with pytest.raises(ValueError, match="`inner_learning_rate` must be above 0"):
         MetaReward(trained.policy, inner_learning_rate=0.0)
     with pytest.raises(ValueError, match="`inner_steps` must be at least 1"):
         MetaReward(trained.policy, inner_steps=0)

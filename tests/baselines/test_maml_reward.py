@@ -129,9 +129,9 @@ def test_what_will_not_do(trained, model):
         AdaptedPolicy(model, np.zeros(2)).to_bytes()
     with pytest.raises(ValueError, match="`gradient_steps` must be at least 1, but is 0"):
         MAMLReward(gradient_steps=0)
-    with pytest.raises(ValueError, match=r"`gamma` must lie in \[0, 1\], but is 1.5"):
+    with pytest.raises(ValueError, match=r"`gamma` must be at most 1, but is 1.5"):
         MAMLReward(gamma=1.5)
-    with pytest.raises(ValueError, match="`learning_rate` must be positive"):
+    with pytest.raises(ValueError, match="`learning_rate` must be above 0, but is"):
         MAMLReward(learning_rate=0.0)
     with pytest.raises(ValueError, match="`library` must be None"):
         adapt_tasks(model, walks(1), np.zeros((1, 1)), ReturnOracle, rule=FAST, library=[])

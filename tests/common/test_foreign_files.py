@@ -429,7 +429,7 @@ def test_files_of_the_wrong_kind(folder: Path, monkeypatch: pytest.MonkeyPatch) 
         POEMSAC.from_pretrained("model.zip")
     with refused("text.zip is a file, but must be the folder of a model", FileNotFoundError):
         POEMSAC.from_pretrained("text.zip")
-    with refused("Did you mean 'HalfCheetahVel'", FileNotFoundError):
+    with refused("did you mean 'HalfCheetahVel'", FileNotFoundError):
         POEMSAC.from_pretrained("HalfCheetahVell")
     with refused("HalfCheetahVel holds a POEMSAC; load it with POEMSAC.from_pretrained"):
         PEARLSAC.from_pretrained("HalfCheetahVel")
