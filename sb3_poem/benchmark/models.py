@@ -32,9 +32,8 @@ from sb3_poem.benchmark.training import (
 )
 from sb3_poem.common.files import read_json, write_json_atomically
 from sb3_poem.common.vec_env import make_task_vec_env
-from sb3_poem.loading import ALGORITHMS
-from sb3_poem.pearl_sac import PEARLSAC
-from sb3_poem.pearl_sac.saving import CHECKPOINT, CONFIG, WEIGHTS, is_checkpoint, read_config
+from sb3_poem.loading import ALGORITHMS, load_model
+from sb3_poem.pearl_sac.saving import CHECKPOINT, CONFIG, WEIGHTS, read_config
 from sb3_poem.resources import config_file, zoo_entry
 
 MODEL, BEGUN, FINISHED, REWARD = "model.zip", "begun.json", "trained.json", "reward"
@@ -118,9 +117,7 @@ class ModelLibrary:
                     return candidate
             if (pretrained / CONFIG).is_file():
                 config = read_config(pretrained)
-                own = config["algorithm"] == _algorithm(key).__name__
-                facts = {"seed": None, **config["arguments"], **config}
-                if own and not _departures(facts, key):
+                if not _departures({"seed": None, **config["arguments"], **config}, key):
                     return pretrained
         return None
 
@@ -199,7 +196,7 @@ class ModelLibrary:
         if key.base is not None:
             model = self.load(key.base, env)
             return MAMLRewardModel(MetaReward.load(self.folder(key) / REWARD, model.policy), model)
-        path, algorithm = self.given(key), _algorithm(key)
+        path = self.given(key)
         if path is not None:
             file = _content(path) or path
         elif snapshot is not None:
@@ -207,15 +204,12 @@ class ModelLibrary:
         else:
             run = self.folder(key) / read_json(self.folder(key) / FINISHED, RECORD)["run"]
             # PEARL's replay buffer is asked about
-            file = run / (CHECKPOINT if algorithm is PEARLSAC else _zip_name(key.env_id))
-        read: Callable[..., Any] = algorithm.load
-        if file.name == CONFIG:
-            read, file = algorithm.from_pretrained, file.parent
-        elif is_checkpoint(file):
-            read = algorithm.load_checkpoint
-        model = read(file, env, device=self.workplace.device)
+            is_pearl = VARIANTS[key.variant].algorithm == "pearl_sac"
+            file = run / (CHECKPOINT if is_pearl else _zip_name(key.env_id))
+        model = load_model(file.parent if file.name == CONFIG else file, self.workplace.device)
         if path is not None and (wrong := _departures(vars(model), key)):
             raise ValueError(f"{path} was handed over as {key}, but has {', '.join(wrong)}")
+        model.set_env(env)
         return model
 
     def snapshot_file(self, key: ModelKey, snapshot: float) -> Path:
@@ -311,10 +305,6 @@ def _zip_name(env_id: str) -> str:
     return env_id.replace("/", "-") + ".zip"
 
 
-def _algorithm(key: ModelKey) -> type[PEARLSAC]:
-    return ALGORITHMS[VARIANTS[key.variant].algorithm]
-
-
 def _content(path: Path) -> Path | None:
     """What of a file or folder can be loaded: the checkpoint first, for its replay buffer."""
     files = [path / name for name in (CHECKPOINT, MODEL, CONFIG)] if path.is_dir() else [path]
@@ -327,7 +317,8 @@ def _departures(found: Mapping[str, Any], key: ModelKey) -> list[str]:
     made = zoo_entry(config_file(variant.algorithm), key.env_id, **overrides(key))
     if variant.algorithm == "poem_sac":
         made = {"similarity": "two-encoder", "context": "optimal", **made}
-    expected = {"env_id": key.env_id, "env_kwargs": {}, "seed": key.seed}
+    expected: dict[str, Any] = {"algorithm": ALGORITHMS[variant.algorithm].__name__}
+    expected |= {"env_id": key.env_id, "env_kwargs": {}, "seed": key.seed}
     both = [(name, found[name], value) for name, value in expected.items()]
     kinds = "(similarity, context, latent_dim, without preferences)"
     both.append((kinds, _kind(found), _kind(made)))
