@@ -18,12 +18,8 @@ def is_repository(name: str | Path) -> bool:
 
 
 def download(repository: str) -> Path:
-    """The folder of a model of the Hub, in the Hub's own cache; without a network that of an
-    earlier download.
-
-    :param repository: ``"user/name"``
-    :raises ImportError: If the extra ``[hub]`` is not installed
-    :raises FileNotFoundError: If there is no such model, or the Hub cannot be reached
+    """The folder of the Hub's model ``"user/name"``, in the Hub's own cache; without a network that
+    of an earlier download. A ``FileNotFoundError`` if there is none, or no way to the Hub.
     """
     what = f"{repository}: there is no such file or folder of a model"
     client = _client(f"{what}, and one of the Hugging Face Hub")
@@ -49,15 +45,8 @@ def download(repository: str) -> Path:
 
 
 def upload(repository: str, contents: Mapping[str, bytes], private: bool | None = None) -> str:
-    """Write a model's files to the Hub, in one commit; the repository is made if missing.
-
-    :param repository: ``"user/name"``
-    :param contents: Of each of :data:`FILES`
-    :param private: Of a repository that is made; None takes the account's default
-    :return: Its address
-    :raises ImportError: If the extra ``[hub]`` is not installed
-    :raises ValueError: If the name is none that the Hub takes
-    :raises OSError: If the Hub refuses it or cannot be reached
+    """Write the contents of :data:`FILES` to the Hub, in one commit; see
+    :meth:`PEARLSAC.push_to_hub`.
     """
     if not is_repository(repository):
         raise ValueError(f'`repo_id` must have the form "user/name", but is {repository!r}')

@@ -68,13 +68,7 @@ def pretrained_folder(name: str) -> Path:
 
 
 def find_folder(name: str | Path) -> Path:
-    """The folder of a model.
-
-    :param name: A folder's path, the name of a shipped model, or ``"user/name"``, which is fetched
-        from the Hugging Face Hub
-    :raises FileNotFoundError: If it is none of these; the message lists the shipped models
-    :raises ImportError: If it may be on the Hub, and the extra ``[hub]`` is not installed
-    """
+    """The folder of a model, fetched if it is on the Hub; see :meth:`PEARLSAC.from_pretrained`."""
     path = Path(name)
     if path.is_dir():
         return path

@@ -778,6 +778,8 @@ class PEARLSAC(SAC):
             missing
         :param private: Of a repository that is made; None takes the account's default
         :return: Its address
+        :raises ImportError: If the extra is not installed
+        :raises ValueError: If the name is none that the Hub takes
         :raises OSError: If the Hub refuses it or cannot be reached
         """
         return upload(repo_id, saving.pretrained_files(self, card, repo_id), private)
@@ -794,7 +796,7 @@ class PEARLSAC(SAC):
         :param folder: The folder, the name of a shipped model, or ``"user/name"`` on the Hugging
             Face Hub (extra ``[hub]``), if there is no such folder
         :param env: An environment of the model's family, if it shall be trained on
-        :raises FileNotFoundError: If there is no such model
+        :raises FileNotFoundError: If there is no such model; the message lists those that ship
         :raises ValueError: If a file is truncated or foreign, the model is of another algorithm, or
             env of another family
         """
