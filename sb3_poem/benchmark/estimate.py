@@ -51,7 +51,7 @@ def measure_pace(env_id: str, device: str = "cpu", num_threads: int = 1) -> Pace
     """Train for two short epochs with the hyperparameters that ship, and look at the second."""
     th.set_num_threads(num_threads)
     facts = family_facts(env_id)
-    tasks, steps = min(COPIES, facts.n_tasks or COPIES), min(facts.horizon, STEPS)
+    tasks, steps = min(COPIES, facts.n_train_tasks), min(facts.horizon, STEPS)
     with contextlib.closing(make_task_vec_env(env_id, COPIES, max_episode_steps=steps)) as env:
         changes: dict[str, Any] = {"env": env, "gradient_steps": UPDATES, "device": device}
         changes |= {"n_train_tasks": tasks, "trajectories_per_task": COPIES // tasks}

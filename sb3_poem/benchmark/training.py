@@ -27,7 +27,7 @@ from sb3_poem.benchmark.suites import ModelKey, family_id
 from sb3_poem.common.family_view import FamilyView, vectorised
 from sb3_poem.common.files import write_json_atomically
 from sb3_poem.pearl_sac.saving import CHECKPOINT
-from sb3_poem.pearl_sac.train_tasks import DEFAULT_TRAIN_TASKS
+from sb3_poem.pearl_sac.train_tasks import default_train_tasks
 from sb3_poem.poem_sac.poem_sac import comparing_rollouts
 from sb3_poem.resources import config_file
 
@@ -45,11 +45,12 @@ class TrainingError(RuntimeError):
 
 @dataclass(frozen=True)
 class FamilyFacts:
-    """What must be known of a family before anything starts; ``n_tasks`` None: infinitely many."""
+    """What must be known of a family before anything starts."""
 
     env_id: str
     horizon: int
-    n_tasks: int | None
+    #: How many tasks are trained on unless told
+    n_train_tasks: int
     shared_dynamics: bool
 
 
@@ -67,8 +68,8 @@ def family_facts(name: str) -> FamilyFacts:
         ) from error
     except ValueError as error:
         raise ValueError(f"--families {name}: {error}") from error
-    n_tasks = None if family.all_tasks is None else len(family.all_tasks)
-    return FamilyFacts(env_id, family.horizon, n_tasks, family.shared_dynamics)
+    n_train_tasks = default_train_tasks(family.all_tasks)
+    return FamilyFacts(env_id, family.horizon, n_train_tasks, family.shared_dynamics)
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ def training_plan(key: ModelKey) -> TrainingPlan:
     hyperparameters = json.loads(json.dumps({**hyperparameters, "n_timesteps": timesteps}))
     facts, tasks = family_facts(key.env_id), hyperparameters.get("n_train_tasks")
     if tasks is None:
-        tasks = min(DEFAULT_TRAIN_TASKS, facts.n_tasks or DEFAULT_TRAIN_TASKS)
+        tasks = facts.n_train_tasks
     each = hyperparameters.get("trajectories_per_task", 1)
     for name, number in (("n_train_tasks", tasks), ("trajectories_per_task", each)):
         if not isinstance(number, int) or number < 1:

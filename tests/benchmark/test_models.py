@@ -21,7 +21,7 @@ from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.resources import shipped_folder
 
 POINT = "poem/PointGoal-v0"
-ML10 = FamilyFacts("poem/MetaWorldML10-v0", 200, None, False)  # which takes seconds to make
+ML10 = FamilyFacts("poem/MetaWorldML10-v0", 200, 120, False)  # which takes seconds to make
 
 
 def plan_for(
@@ -211,7 +211,7 @@ def test_families_whose_extra_is_missing_are_left_out_unless_named(
     def facts(name: str) -> FamilyFacts:
         if "MetaWorld" in name:
             raise ImportError("pip install 'sb3_poem[metaworld]'")
-        return FamilyFacts(family_id(name), 200, None, True)
+        return FamilyFacts(family_id(name), 200, 120, True)
 
     monkeypatch.setattr("sb3_poem.benchmark.running.family_facts", facts)
     library = ModelLibrary(Workplace(str(tmp_path)))
