@@ -22,9 +22,9 @@ OWN_COLOUR, SOLIDITY = 0.3, 0.85
 # Field of view of the camera, degrees, and half the height that it sees at distance one.
 FIELD_OF_VIEW, HALF_HEIGHT = 45.0, 0.4142
 # Of half the picture, that stays free around paths, for robots that are drawn larger, and else.
-MARGIN, LEAST_MARGIN = 0.42, 0.05
+MARGIN, LEAST_MARGIN = 0.48, 0.05
 # In a picture of whole paths a robot is as large as in a film of its own, times this, or larger.
-LEAST_SIZE = 0.6
+LEAST_SIZE = 0.68
 TRAIL_PIECES, TRAIL_PIXELS = 16, 3.0
 # Of the distance from the camera, at which ways in space are drawn: in front of what hides them.
 IN_FRONT = 0.5
@@ -33,7 +33,7 @@ LAYER = 0.004
 SLICES, MAX_SHAPES = 24, 2000
 # To either side, m: seen from cameras over a hundred away its end is at the horizon. One without an
 # end takes longer to draw.
-FLOOR_SIZE, FARTHEST = 2000.0, 3000.0
+FLOOR_SIZE, FARTHEST = 2500.0, 3000.0
 # Distances between marks, m, of which a picture takes the first that gives it few enough.
 MARK_DISTANCES, MOST_MARKS = (1, 2, 5, 10, 20, 50, 100), 8
 # Size, position and orientation of a shape that gets others.
@@ -58,7 +58,7 @@ class Look:
     #: In the middle of the picture; x and y from the robot's where the camera goes along with it
     lookat: tuple[float, float, float] = (0.0, 0.0, 0.5)
     #: What tells directions and distances: "metres" (lines across the x axis), "compass" (words,
-    #: and circles around the start), "circles" (the same without the words), or nothing
+    #: and circles around the start), "circles" (the same, at 1, 2 and 3 m), or nothing
     marks: str = ""
     #: The body whose way is drawn, or the site
     body: str | int = 1
@@ -86,6 +86,11 @@ class Look:
         """The unit vector (3,) that points upwards in the picture."""
         tilt = np.radians(self.elevation)
         return np.array([0.0, 0.0, np.cos(tilt)]) - np.sin(tilt) * self.ahead
+
+    @property
+    def axes(self) -> np.ndarray:
+        """To the right, upwards and away from who looks, (3, 3)."""
+        return np.stack([self.right, self.up, np.cross(self.up, self.right)])
 
 
 @runtime_checkable
@@ -167,8 +172,7 @@ class FilmRenderer(StateRenderer):
         self._viewer = viewer = prepared_viewer(self._renderer, "rgb_array", fast=True)
         self._camera, self._scene, self._viewport = viewer.cam, viewer.scn, viewer.viewport
         self._camera.azimuth, self._camera.elevation = look.azimuth, look.elevation
-        # To the right, upwards and away from who looks, (3, 3).
-        self._axes = np.stack([look.right, look.up, np.cross(look.up, look.right)])
+        self._axes = look.axes
         viewer.vopt.sitegroup[:] = 0
         looks_down = look.elevation <= -FIELD_OF_VIEW / 2
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = not looks_down
@@ -243,14 +247,13 @@ class FilmRenderer(StateRenderer):
         aspect = self._viewport.width / self._viewport.height
         needed = np.maximum(np.abs(aside) / (half * aspect), np.abs(upwards) / half) - beyond
         camera.distance = max(look.distance, needed.max())
+        if look.follows:  # ways are as far below the middle as in a film of its own
+            camera.lookat[2] *= camera.distance / look.distance
 
     def _image(
         self, paths: Sequence[np.ndarray], places: list[np.ndarray], shown: dict[int, int]
     ) -> np.ndarray:
         model, scene, viewport, viewer = self._model, self._scene, self._viewport, self._viewer
-        growth = 1.0
-        if len(shown) > 1 and self.look.follows:
-            growth = max(1.0, LEAST_SIZE * self._camera.distance / self.look.distance)
         for order, (i, now) in enumerate(shown.items()):
             data, first = (self._others, scene.ngeom) if order else (self._data, 0)
             self._pose(data, paths[i][now])
@@ -260,6 +263,10 @@ class FilmRenderer(StateRenderer):
             else:
                 moving = mujoco.mjtCatBit.mjCAT_DYNAMIC
                 mujoco.mjv_addGeoms(model, data, viewer.vopt, viewer.pert, moving, scene)
+            growth = 1.0
+            if len(shown) > 1 and self.look.follows:
+                away = (places[i][now] - self._eye()) @ self._axes[2]
+                growth = max(growth, LEAST_SIZE * away / self.look.distance)
             # Those who run along a line have lanes.
             lane = np.array([0.0, 1.2 * growth * order, 0.0]) * (self.look.marks == "metres")
             if len(shown) > 1:
@@ -317,14 +324,14 @@ class FilmRenderer(StateRenderer):
         apart = next((far for far in MARK_DISTANCES if width / far <= MOST_MARKS), 100)
         add = self._add_metres if marks == "metres" else self._add_circles
         labels = add(start, width, apart)
-        away = np.array([place for _, place in labels]) - self._eye()
+        away = np.array([place for _, place in labels]).reshape(-1, 3) - self._eye()
         aside, upwards, beyond = self._axes @ away.T
         depth = np.maximum(beyond, 1e-6)
         x = (1 + aside / depth / HALF_HEIGHT / aspect) / 2
         y = (1 + upwards / depth / HALF_HEIGHT) / 2
         inside = (depth > 1e-3) & (np.abs(x - 0.5) < 0.4) & (np.abs(y - 0.5) < 0.42)
         seen = [(labels[i][0], x[i], y[i]) for i in np.flatnonzero(inside)]
-        return seen + (list(COMPASS) if marks == "compass" else [])
+        return seen + (list(COMPASS) if marks != "metres" else [])
 
     def _add_metres(
         self, start: np.ndarray, width: float, apart: int
@@ -344,11 +351,13 @@ class FilmRenderer(StateRenderer):
         self, start: np.ndarray, width: float, apart: int
     ) -> list[tuple[str, np.ndarray]]:
         """Circles around the start; their words and where these stand."""
-        look, away = self.look, float(np.linalg.norm(self._camera.lookat[:2] - start[:2]))
+        look, way = self.look, (self._camera.lookat - start) * (1, 1, 0)
+        away = float(np.linalg.norm(way))
         if look.marks == "circles":
             apart, first, last, beside = 1, 1, 3, look.right - look.ahead
         else:
-            apart, beside = max(apart, 2), look.right + look.ahead
+            # Beside the way, where the camera is.
+            apart, beside = max(apart, 2), way + 0.15 * width * (look.right - 0.5 * look.ahead)
             first, last = (
                 1 + int(max(away + side, 0.0) // apart) for side in (-0.7 * width, 0.7 * width)
             )
@@ -359,7 +368,9 @@ class FilmRenderer(StateRenderer):
             place = np.array([start[0], start[1], height])
             size = np.array([apart * number, height / 4, 0.0])
             self._add_shape(CYLINDER, place, size, BANDS[number % 2])
-            labels.append((f"{apart * number} m", place + 0.7 * apart * number * beside))
+            there = place + apart * number / np.linalg.norm(beside) * beside
+            if apart * number <= away + 0.35 * width:  # beyond they lie on each other
+                labels.append((f"{apart * number} m", there))
         return labels
 
     def _eye(self) -> np.ndarray:

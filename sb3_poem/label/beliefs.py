@@ -19,6 +19,9 @@ STRAIGHT, BIT = 8.0, 30.0
 ANY_WAY = 60.0
 # Half the width of a picture, m, up to which distances in it are told in centimetres.
 NEARBY = 0.5
+# Of a distance in space, the part towards who looks or away that is worth saying.
+DEEP = 0.5
+NOTHING_YET = "It knows nothing yet of what you want."
 
 
 def belief(adapter: Any, env_id: str) -> dict[str, Any]:
@@ -43,13 +46,15 @@ def belief(adapter: Any, env_id: str) -> dict[str, Any]:
     points, estimate = points[:-1], points[-1]
     return {
         "picture": picture,
-        "points": np.round(points, 4).tolist(),
+        "points": np.round(points[:, :2], 4).tolist(),
         "weights": np.round(weights, 6).tolist(),
-        "estimate": np.round(estimate, 4).tolist(),
+        "estimate": np.round(estimate[:2], 4).tolist(),
         "extent": float(extent),
         "unit": unit,
         "words": list(description.words),
-        "sentence": sentence(description, points, weights, estimate),
+        "sentence": sentence(description, points, weights, estimate)
+        if adapter.inference.answers
+        else NOTHING_YET,
     }
 
 
@@ -65,7 +70,7 @@ def believed_in_words(adapter: Any, env_id: str) -> str:
 def sentence(
     description: Description, points: np.ndarray, weights: np.ndarray, estimate: np.ndarray
 ) -> str:
-    """The posterior in words: points (n, 1 or 2), weights (n,), the estimate's point."""
+    """The posterior in words: points (n, 1 to 3), weights (n,), the estimate's point."""
     picture, words = description.picture, description.words
     if picture == "speed":
         return f"It believes that you want it to {_speed(description, points, weights, estimate)}."
@@ -80,6 +85,9 @@ def sentence(
             within = f"within about {far} of" if description.unit else "not far from"
             return f"It believes that you mean a place {within} where it begins."
         where = way(words, estimate)
+        beyond = estimate[2] if len(estimate) == 3 else 0.0
+        if abs(beyond) >= DEEP * distance:
+            where += f", {'farther from' if beyond > 0 else 'nearer to'} you"
         if description.unit:
             far, about = (_length(description, length) for length in (distance, radius))
             where += f", about {far} away, give or take {about}"
@@ -151,7 +159,7 @@ def _direction_sentence(
 
 
 def _points_of(model: Any, latents: np.ndarray, train_points: np.ndarray) -> np.ndarray:
-    """(m, 1 or 2) tasks of latents (m, d): the mean of the nearest training tasks', weighted."""
+    """(m, 1 to 3) tasks of latents (m, d): the mean of the nearest training tasks', weighted."""
     means, variances = model.train_tasks.latent_means, model.train_tasks.latent_variances
     spread = means.var(axis=0)
     # What training has left unused says nothing of the task; there the prior's spread would drown

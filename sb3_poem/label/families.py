@@ -118,14 +118,15 @@ def describe(env_id: str, task_dim: int | None = None) -> Description:
 
 def as_points(env_id: str, tasks: np.ndarray) -> np.ndarray:
     """Tasks (n, task_dim) as points that may be averaged: (n, 1) speeds, or (n, 2) places or unit
-    vectors, x to the right and y upwards in the films.
+    vectors, x to the right and y upwards in the films; of places in space (n, 3), the third of them
+    away from who looks.
     """
     description = describe(env_id, tasks.shape[1])
     picture, look = description.picture, description.look
     if picture == "speed":
         return tasks[:, :1]
     if description.origin is not None:
-        return (tasks - description.origin) @ np.array([look.right, look.up]).T
+        return (tasks - description.origin) @ look.axes.T
     if picture == "place" and tasks.shape[1] >= 2:
         points = tasks[:, :2]
     elif family_name(env_id) == "HalfCheetahFwdBack":

@@ -20,7 +20,9 @@ def adapter(latents: np.ndarray, weights: np.ndarray, tasks: np.ndarray, means: 
     latent.
     """
     inference = SimpleNamespace(
-        posterior=lambda: (latents, weights), estimate=lambda: weights @ latents
+        posterior=lambda: (latents, weights),
+        estimate=lambda: weights @ latents,
+        answers=["left"],
     )
     variances = np.full(means.shape, 0.01)
     variances[:, 1:] = 1.0  # what training has left unused keeps the prior's variance
@@ -40,6 +42,25 @@ def test_latents_are_drawn_as_the_tasks_that_they_stand_for() -> None:
     assert drawn["picture"] == "speed"
     np.testing.assert_allclose(np.array(drawn["points"])[:, 0], speeds, atol=0.1)
     assert drawn["estimate"][0] == pytest.approx(speeds.mean(), abs=0.1)
+
+
+def test_before_any_answer_nothing_is_known() -> None:
+    tasks = np.array([[0.0, 2.0], [0.1, 2.0]])
+    asked = adapter(np.zeros((1, 2)), np.ones(1), tasks, tasks)
+    assert "believes that you mean" in belief(asked, "poem/AntGoal-v0")["sentence"]
+    asked.inference.answers = []
+    drawn = belief(asked, "poem/AntGoal-v0")
+    assert drawn["sentence"] == "It knows nothing yet of what you want."
+    assert drawn["points"]  # the map stays
+
+
+def test_distances_in_space_are_told_not_those_in_the_picture() -> None:
+    tasks = np.array([[1.462, 0.669, 0.585]])  # the hand begins at 1.342, 0.749, 0.535
+    asked = adapter(np.zeros((1, 2)), np.ones(1), tasks, np.zeros((1, 2)))
+    drawn = belief(asked, "poem/FetchReach-v0")
+    assert len(drawn["points"][0]) == len(drawn["estimate"]) == 2
+    assert np.linalg.norm(drawn["estimate"]) < 0.1
+    assert "nearer to you, about 15 cm away" in drawn["sentence"]
 
 
 def test_directions_are_averaged_around_the_circle() -> None:
@@ -84,7 +105,8 @@ def test_places_are_drawn_as_the_films_camera_sees_them(
     forward, up = scene.camera[0].forward, scene.camera[0].up
     dim = 2 if env_id.startswith("poem/Ant") else 3
     offsets = np.random.default_rng(0).uniform(-0.15, 0.15, size=(20, 3)) * (np.arange(3) < dim)
-    expected = offsets @ np.stack([np.cross(forward, up), up], axis=1)
+    axes = [np.cross(forward, up), up, forward]
+    expected = offsets @ np.stack(axes[:dim], axis=1)
     places = (np.array(hand) + offsets)[:, :dim]
     np.testing.assert_allclose(as_points(env_id, places), expected, atol=2e-3)
 

@@ -925,7 +925,7 @@ def test_the_page_is_readable_for_all(
     page.click("text=Choose a robot")
     page.click(f"button[value={point_goal.name}]")
     page.wait_for_url("**/s/*")
-    assert page.get_by_role("img", name=re.compile("It believes")).count() == 1
+    assert page.get_by_role("img", name=re.compile("It knows nothing yet")).count() == 1
     page.wait_for_function(SHOWN)  # what waits is pale
     ratios = page.evaluate(
         """() => [...document.querySelectorAll('kbd, .note, .hint, figcaption')].map(element => {

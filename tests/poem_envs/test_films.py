@@ -4,12 +4,14 @@ must be in a picture is computed here from the family's ``look``, by a camera of
 
 from __future__ import annotations
 
+import re
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
 import poem_envs  # noqa: F401 (registers)
-from poem_envs.films import Filmed, Look
+from poem_envs.films import Filmed, FilmRenderer, Look
 from poem_envs.headless import can_draw
 
 pytestmark = pytest.mark.skipif(not can_draw(), reason="no off-screen OpenGL")
@@ -168,7 +170,21 @@ def test_a_humanoid_fills_a_third_of_the_picture() -> None:
         assert columns.min() > 0
         assert columns.max() < WIDTH - 1
         robot = columns < columns.min() + 20  # the rest is its way
-        assert np.ptp(rows[robot]) > HEIGHT / 4
+        assert np.ptp(rows[robot]) > HEIGHT / 3
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", ["poem/AntDir2D-v0", "poem/HumanoidDir2D-v0", "poem/AntGoal-v0"])
+def test_words_and_metres_are_in_sight(env_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    env, seen, marks = gym.make(env_id), [], FilmRenderer._add_marks
+    monkeypatch.setattr(
+        FilmRenderer, "_add_marks", lambda *args: seen.append(marks(*args)) or seen[-1]
+    )
+    for way in ((2.5, 0.5), (1.0, 2.5), (0.3, -2.7)):
+        env.unwrapped.film([walk(env, way)], [0], SIZE)
+        words = {text for text, _, _ in seen[-1]}
+        assert words > {"ahead", "left", "back", "right"}
+        assert any(re.fullmatch(r"[1-4] m", text) for text in words)
     env.close()
 
 

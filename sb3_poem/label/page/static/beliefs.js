@@ -100,19 +100,26 @@ function drawPlane(svg, belief) {
   svg.setAttribute("viewBox", "-110 -110 220 220");
   const scale = 100 / belief.extent;
   shape(svg, "rect", { x: -104, y: -104, width: 208, height: 208, rx: 10, class: "map" });
-  if (belief.picture === "place") {
-    shape(svg, "path", { d: "M-104 0H104M0 -104V104", class: "grid" });
-    shape(svg, "circle", { cx: 0, cy: 0, r: 3, class: "start" });
-    shape(svg, "text", { x: 6, y: 14, class: "small" }, "start");
-    name(svg, belief.words, 88);
-  }
+  const place = belief.picture === "place";
+  // Circles as in the films: at whole metres, where there is room.
+  const rings = [];
+  for (let r = 1; belief.unit === "m" && r < belief.extent; r += belief.extent > 4 ? 2 : 1) rings.push(r);
+  if (place) shape(svg, "path", { d: "M-104 0H104M0 -104V104", class: "grid" });
+  rings.forEach((r) => shape(svg, "circle", { cx: 0, cy: 0, r: r * scale, class: "grid" }));
   const heaviest = Math.max(...belief.weights);
   belief.points.forEach((point, i) => {
     const strength = belief.weights[i] / heaviest;
     if (strength < 0.01) return;
-    const place = { cx: point[0] * scale, cy: -point[1] * scale };
-    shape(svg, "circle", { ...place, r: 7, class: "cloud", "fill-opacity": 0.05 + 0.22 * strength });
+    const at = { cx: point[0] * scale, cy: -point[1] * scale };
+    shape(svg, "circle", { ...at, r: 7, class: "cloud", "fill-opacity": 0.05 + 0.22 * strength });
   });
+  if (place) { // above the dots, which would hide it
+    const words = shape(svg, "g", { class: "above" });
+    shape(words, "circle", { cx: 0, cy: 0, r: 3, class: "start" });
+    shape(words, "text", { x: -5, y: -6, class: "small end" }, "start");
+    rings.map((r) => [0.7 * r * scale, r]).forEach(([x, r]) => shape(words, "text", { x, y: x + 4, class: "small middle" }, `${r} m`));
+    name(words, belief.words, 88);
+  }
   const [x, y] = [belief.estimate[0] * scale, -belief.estimate[1] * scale];
   shape(svg, "circle", { cx: x, cy: y, r: 8, class: "ring" });
   shape(svg, "circle", { cx: x, cy: y, r: 2.5, class: "hub" });
