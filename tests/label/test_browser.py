@@ -393,37 +393,48 @@ def test_the_keyboard_alone(
         assert element.evaluate("element => element === document.activeElement")
 
 
-def test_five_answers_by_keys_and_by_clicks(
-    open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
+ANSWERS = {
+    "graded": [
+        ("1 Left much better", "much left", "1"),
+        ("2 Left a bit better", "left", "ArrowLeft"),
+        ("3 Can\u2019t tell", "equal", "3"),
+        ("4 Right a bit better", "right", None),
+        ("5 Right much better", "much right", None),
+    ],
+    "pair": [
+        ("\u2190 Left is better", "left", "ArrowLeft"),
+        ("2 Can\u2019t tell", "equal", None),
+        ("Right is better \u2192", "right", "3"),
+    ],
+}
+
+
+@pytest.mark.parametrize("question", [*ANSWERS])
+def test_all_answers_by_keys_and_by_clicks(
+    open_page: Callable[..., Any], point_goal: ModelInfo, tmp_path: Path, question: str
 ) -> None:
+    server = ForkedServer(tmp_path, point_goal, question=question)
     person = begin(open_page, server, point_goal, 1.0)
-    page = person.page
+    page, answers = person.page, ANSWERS[question]
     buttons = page.get_by_role("group", name="Your answer").get_by_role("button")
-    assert [" ".join(text.split()[1:]) for text in buttons.all_text_contents()] == [
-        "Left much better",
-        "Left a bit better",
-        "Can\u2019t tell",
-        "Right a bit better",
-        "Right much better",
-    ]
-    answers = {
-        "much left": lambda: page.keyboard.press("1"),
-        "left": lambda: page.keyboard.press("ArrowLeft"),
-        "equal": lambda: page.keyboard.press("3"),
-        "right": lambda: buttons.nth(3).click(),
-        "much right": lambda: buttons.nth(4).click(),
-    }
-    for number, answer in enumerate(answers.values()):
+    texts = [" ".join(text.split()) for text in buttons.all_text_contents()]
+    assert texts == [text for text, _, _ in answers]
+    for number, (_, _, key) in enumerate(answers):
         page.wait_for_function(SHOWN)
-        answer()
+        if key is None:
+            buttons.nth(number).click()
+        else:
+            page.keyboard.press(key)
         page.wait_for_function("n => view.answered === n", arg=number + 1)
     page.wait_for_function(SHOWN)
     record = page.request.get(f"{page.url}/answers.json").json()
-    assert [answer["preference"] for answer in record["answers"]] == person.stored() == [*answers]
-    assert {answer["question"] for answer in record["answers"]} == {"graded"}
+    given = [preference for _, preference, _ in answers]
+    assert [answer["preference"] for answer in record["answers"]] == person.stored() == given
+    assert {answer["question"] for answer in record["answers"]} == {question}
     page.click("#undo")
-    page.wait_for_function("() => view.answered === 4 && !busy")
-    assert person.stored() == [*answers][:4]
+    page.wait_for_function("n => view.answered === n && !busy", arg=len(given) - 1)
+    assert person.stored() == given[:-1]
+    server.kill()
 
 
 @pytest.fixture
@@ -555,6 +566,8 @@ def test_the_answers_stay_where_they_are(
     page.click(f"button[value={point_goal.name}]")
     page.wait_for_selector("#progress:visible")
     page.wait_for_function(SHOWN)
+    wish, films = (page.locator(part).bounding_box() for part in ("#wish", "#screens"))
+    assert wish["y"] + wish["height"] <= films["y"]  # one wishes before one looks
     person = Person(server, page, point_goal, 2.5)
     page.evaluate("() => showError('The server does not answer. '.repeat(9))")
     person.say("much right" if "left" in person.judge() else "much left")
@@ -943,6 +956,17 @@ def test_the_page_is_readable_for_all(
         })"""
     )
     assert min(ratios) >= 4.5
+    # The map's words are above its dots.
+    drawn = page.evaluate(
+        """() => {
+            drawBelief(byId('belief'), { picture: 'place', points: [[0, 0]], weights: [1], unit: 'm',
+                estimate: [1, 1], extent: 3.5, words: ['right', 'ahead', 'left', 'back'] });
+            const drawn = [...byId('belief').querySelectorAll('.cloud, text')];
+            return drawn.map(element => element.textContent || 'dot');
+        }"""
+    )
+    words = ["start", "1 m", "2 m", "3 m", "right", "ahead", "left", "back"]
+    assert drawn == ["dot", *words]
 
 
 def test_the_server_is_killed_in_the_middle(

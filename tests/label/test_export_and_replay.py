@@ -23,7 +23,7 @@ from sb3_poem.adaptation import HumanOracle, PreferenceAdapter, ReturnOracle
 from sb3_poem.adaptation.policy import AdaptedPolicy
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.label import LabelWidget, StoreRecorder, families
-from sb3_poem.label.export import FIELDS, export, records
+from sb3_poem.label.export import FIELDS, answer_record, export, records
 from sb3_poem.label.families import ModelInfo
 from sb3_poem.label.rendering import load_shown_model
 from sb3_poem.label.replay import replay
@@ -85,6 +85,14 @@ def test_both_formats_hold_the_same_answers(
     with_undone = list(records(store, undone=True))
     assert [record["undone"] for record in with_undone] == [True, False, False, False, False]
     assert set(with_undone[0]) == {*FIELDS, "left_latent", "right_latent"}
+
+
+def test_an_answer_takes_no_negative_time(answered: Session, store: Store) -> None:
+    row = dict(next(iter(store.records())))
+    row["shown"] = row["answered"] - 2.5
+    assert answer_record(row, store.videos)["seconds"] == 2.5
+    row["shown"] = row["answered"] + 60.0  # the clock was set back
+    assert answer_record(row, store.videos)["seconds"] == 0.0
 
 
 def test_minari_reads_the_episodes_with_preferences_and_latents(
