@@ -1,9 +1,15 @@
 """Makes the pictures of README, of the families' pages and of the page's choice of robots anew:
 ``python docs/pictures.py``.
 
-They are films of the models that ship, so they change with them. Needs off-screen rendering.
+They are films of the models that ship, so they change with them. Needs off-screen rendering, and
+playwright with Chromium for those of the page itself.
 """
 
+import io
+import re
+import shutil
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -70,6 +76,44 @@ def both(model: str, folder: Path) -> None:
     pictures[0].save(folder / f"{info.family}-loop.webp", save_all=True, **how)
 
 
+def page(model: str, wish: str, answers: list[str], folder: Path) -> None:
+    """The page after some answers, at the end of the films, on a desktop and on a phone."""
+    from playwright.sync_api import sync_playwright
+
+    screens = {
+        "desktop": {"viewport": {"width": 1280, "height": 800}},
+        "phone": {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True},
+    }
+    ready = "n => view?.answered === n && view.phase === 'question' && !busy"
+    to_the_end = "bar => { bar.value = bar.max; bar.dispatchEvent(new Event('input')); }"
+    with tempfile.TemporaryDirectory() as store, sync_playwright() as playwright:
+        command = [sys.executable, "-m", "sb3_poem", "label", "--model", model, "--store", store]
+        command += ["--port", "0", "--seed", "3"]
+        server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        try:
+            address = re.search(r"http://[\d.:]+", server.stdout.readline())[0]
+            for name, screen in screens.items():
+                shown = browser.new_page(reduced_motion="reduce", **screen)
+                shown.set_default_timeout(180_000)
+                shown.goto(address)
+                shown.click(f"button[value={model}]")
+                shown.fill("#wish", wish)
+                for number, answer in enumerate(answers):
+                    shown.wait_for_function(ready, arg=number)
+                    shown.click(f'[data-preference="{answer}"]')
+                shown.wait_for_function(ready, arg=len(answers))
+                shown.locator("#frame").evaluate(to_the_end)
+                shown.wait_for_timeout(1000)  # until the films are there
+                picture = Image.open(io.BytesIO(shown.screenshot()))
+                picture.quantize(256).save(folder / f"label-{name}.png", optimize=True)
+        finally:
+            browser.close()
+            server.terminate()
+            server.wait()
+
+
 def adapted(env: gym.Env) -> AdaptedPolicy:
     """The policy of the family's model after ten answers."""
     oracle = sb3_poem.ReturnOracle()
@@ -80,6 +124,7 @@ if __name__ == "__main__":
     ROBOTS.mkdir(exist_ok=True)
     for name in sorted(model.name for model in find_models()):
         both(name, ROBOTS)
+    page("AntGoal", "go back, to the right", ["left", "much right"], STATIC)
     before_and_after("AntGoal", STATIC / "before-and-after.webp", task="-2.1 -2")
     families = STATIC / "environments"
     families.mkdir(exist_ok=True)

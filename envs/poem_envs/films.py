@@ -33,7 +33,7 @@ LAYER = 0.004
 SLICES, MAX_SHAPES = 24, 2000
 # To either side, m: seen from cameras over a hundred away its end is at the horizon. One without an
 # end takes longer to draw.
-FLOOR_SIZE, FARTHEST = 2500.0, 3000.0
+FLOOR_SIZE, FARTHEST = 2000.0, 3000.0
 # Distances between marks, m, of which a picture takes the first that gives it few enough.
 MARK_DISTANCES, MOST_MARKS = (1, 2, 5, 10, 20, 50, 100), 8
 # Size, position and orientation of a shape that gets others.
@@ -247,8 +247,8 @@ class FilmRenderer(StateRenderer):
         aspect = self._viewport.width / self._viewport.height
         needed = np.maximum(np.abs(aside) / (half * aspect), np.abs(upwards) / half) - beyond
         camera.distance = max(look.distance, needed.max())
-        if look.follows:  # ways are as far below the middle as in a film of its own
-            camera.lookat[2] *= camera.distance / look.distance
+        if look.follows:  # there is room for heads above the ways
+            camera.lookat[2] *= (camera.distance / look.distance + 1) / 2
 
     def _image(
         self, paths: Sequence[np.ndarray], places: list[np.ndarray], shown: dict[int, int]
