@@ -21,12 +21,13 @@ from typing import Any
 
 from common import RESULTS, arguments, table, write
 
+from poem_envs.registration import family_name
 from sb3_poem import Bayes, BoltzmannOracle, MistakeOracle, ReturnOracle
 from sb3_poem.adaptation import ExactNoise, MistakeNoise, evaluate_adaptation, return_spread
 from sb3_poem.adaptation.preference import PLACES
 from sb3_poem.benchmark.provenance import commit
 from sb3_poem.common.vec_env import make_task_vec_env
-from sb3_poem.label.families import family_of, find_models
+from sb3_poem.label.families import find_models
 from sb3_poem.loading import load_model
 
 ORACLES = {
@@ -118,7 +119,7 @@ def main() -> None:
         answers = [n // len(PLACES[words[2]]) for n in FILMS]
         age = "ships" if cell["model"] in ships else "earlier"
         by_films = (values[ANSWERS.index(k)] for k in answers)
-        rows.append([family_of(words[0]), *words[1:], age, *values, *by_films])
+        rows.append([family_name(words[0]), *words[1:], age, *values, *by_films])
     head = ["family", "oracle", "question", "how it errs", "model"]
     head += [*(f"{n} answers" for n in ANSWERS), *(f"{n} films" for n in FILMS)]
     about = (
