@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from poem_envs import TaskFamily
-from sb3_poem.common.buffers import TaskBatch
+from sb3_poem.common.buffers import TaskBatch, TaskReplayBuffer
 from sb3_poem.pearl_sac.pearl_sac import PEARLSAC
 from sb3_poem.poem_sac.poem_sac import POEMSAC
 
@@ -44,9 +44,8 @@ def small(algorithm: type[Model], env: Any = POINT_GOAL, **arguments: Any) -> Mo
     return algorithm("MlpPolicy", env, **{**SMALL, **arguments})
 
 
-def experience_of(model: PEARLSAC, task: int) -> TaskBatch:
-    """All transitions of a training task, in the order of their slots, each (1, count, ...)."""
-    buffer = model.replay_buffer
+def experience_of(buffer: TaskReplayBuffer, task: int) -> TaskBatch:
+    """All transitions of a task, in the order of their slots, each (1, count, ...)."""
     slots = th.arange(int(buffer.counts[task]), device=buffer.device)[None]
     return buffer.at(th.full_like(slots, task), slots)
 

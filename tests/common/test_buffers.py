@@ -8,6 +8,7 @@ import torch as th
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from meta_toys import experience_of
 
 from sb3_poem.common.buffers import INITIAL_ROWS_PER_TASK, Segment, TaskBatch, TaskReplayBuffer
 
@@ -70,7 +71,7 @@ def numbers_in(batch: TaskBatch) -> np.ndarray:
 
 
 def stored_numbers(buffer: TaskReplayBuffer, task: int) -> list[float]:
-    return sorted(numbers_in(buffer.transitions(task))[0].tolist())
+    return sorted(numbers_in(experience_of(buffer, task))[0].tolist())
 
 
 class ListBuffer:

@@ -259,7 +259,9 @@ def test_gradient_steps_and_learning_starts(algorithm: type[PEARLSAC]) -> None:
         2 * EPOCH
     )  # the first epoch acts at random and learns nothing
     assert model._n_updates == 5
-    first_actions = th.cat([experience_of(model, task).actions[:, :25] for task in range(N_TASKS)])
+    first_actions = th.cat(
+        [experience_of(model.replay_buffer, task).actions[:, :25] for task in range(N_TASKS)]
+    )
     assert first_actions.abs().max() < 1.0
     assert abs(first_actions.mean().item()) < 0.1
     assert first_actions.std().item() == pytest.approx(1 / np.sqrt(3), rel=0.1)
@@ -272,7 +274,7 @@ def test_horizons_per_task_and_epoch(algorithm: type[PEARLSAC]) -> None:
     assert model.epoch_context.transitions.shape[:2] == (N_TASKS, 75)
     assert (model.replay_buffer.counts == 75).all()
     # contexts are the tasks' own
-    raw = experience_of(model, 4).rewards[0]
+    raw = experience_of(model.replay_buffer, 4).rewards[0]
     assert sorted(model.epoch_context.rewards[4].tolist()) == pytest.approx(
         sorted(raw.tolist()), abs=1e-5
     )

@@ -332,7 +332,7 @@ def test_poison_stops_training_before_the_weights(algorithm: type[PEARLSAC], wha
     assert not differing(seen[-1], parameters(model))  # as they were when the epoch began
     assert all(value.isfinite().all() for value in parameters(model).values())
     for task in range(model.replay_buffer.n_tasks):
-        assert all(part.isfinite().all() for part in experience_of(model, task))
+        assert all(part.isfinite().all() for part in experience_of(model.replay_buffer, task))
     # the environment is sane again: training can go on
     model.learn(120, reset_num_timesteps=False)
     assert all(value.isfinite().all() for value in parameters(model).values())
@@ -402,7 +402,7 @@ def test_each_task_is_measured_by_its_own_rewards(algorithm: type[PEARLSAC]) -> 
     model = small(algorithm, walks(4, Unequal), horizon=10, reward_scale="per-task").learn(200)
     scale = model.make_objective().reward_scale
     for task, factor in enumerate(scale.tolist()):
-        rewards = factor * experience_of(model, task).rewards.numpy()
+        rewards = factor * experience_of(model.replay_buffer, task).rewards.numpy()
         assert np.square(rewards).mean() == pytest.approx(1.0, rel=1e-4)
     assert scale.max() > 100 * scale.min()
 

@@ -160,7 +160,7 @@ def test_observations_beyond_the_bound_are_counted(
     model.set_logger(configure(str(tmp_path), ["json"]))
     model.learn(EPOCH)
     seen = np.concatenate(
-        [experience_of(model, task).observations for task in range(N_TASKS)]
+        [experience_of(model.replay_buffer, task).observations for task in range(N_TASKS)]
     ).reshape(-1, 2)
     share = (np.abs(seen) / 0.02 >= 10).any(axis=1).mean()
     assert 0.05 < share < 0.95
@@ -244,7 +244,7 @@ def test_monitors_episode_info(algorithm: type[PEARLSAC], tmp_path: Path) -> Non
     episodes = list(model.ep_info_buffer)
     assert [episode["l"] for episode in episodes] == [25] * N_TASKS
     # copies end together, in waves of three tasks
-    own = [experience_of(model, task).rewards.sum() for task in range(N_TASKS)]
+    own = [experience_of(model.replay_buffer, task).rewards.sum() for task in range(N_TASKS)]
     np.testing.assert_allclose([episode["r"] for episode in episodes], own, rtol=1e-4)
     assert len(list((tmp_path / "monitor").glob("*.monitor.csv"))) == 3
 

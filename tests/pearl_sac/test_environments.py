@@ -68,7 +68,7 @@ def test_any_number_of_environments(algorithm: type[PEARLSAC], make_env: Any) ->
     assert model._n_updates == 5
     # the stored transitions are the tasks' own
     for task in range(N_TASKS):
-        stored = experience_of(model, task)
+        stored = experience_of(model.replay_buffer, task)
         expected = model.family.compute_rewards(
             model.train_tasks.tasks[task], stored.features.numpy()
         )
@@ -163,7 +163,9 @@ def test_subprocesses(algorithm: type[PEARLSAC]) -> None:
 def test_early_ends_and_unsymmetric_actions(algorithm: type[PEARLSAC]) -> None:
     model = small(algorithm, walks(4, edge=0.4), horizon=10).learn(240)
     assert model.num_timesteps == 240
-    terminated = th.cat([experience_of(model, task).terminated for task in range(N_TASKS)], dim=1)
+    terminated = th.cat(
+        [experience_of(model.replay_buffer, task).terminated for task in range(N_TASKS)], dim=1
+    )
     assert 0 < terminated.sum() < terminated.numel()
     assert model._episode_num > 24
     actions, _ = model.predict(OBS, deterministic=False)

@@ -25,5 +25,7 @@ def test_pearl_learns_point_goal() -> None:
     assert foreign < blind
     # the decoder knows a reward to a tenth: rewards deviate by about 0.35, distances are about 1
     assert model.predicted_rewards_error < 0.2
-    rewards = th.cat([experience_of(model, task).rewards for task in range(len(tasks))], dim=1)
+    rewards = th.cat(
+        [experience_of(model.replay_buffer, task).rewards for task in range(len(tasks))], dim=1
+    )
     assert model.predicted_rewards_error < 0.5 * rewards.std().item()

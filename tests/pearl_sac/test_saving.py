@@ -79,7 +79,9 @@ def test_loaded_models_continue_with_any_number_of_copies(
     } <= set(changed)
     assert "policy.reward_norm.std" not in changed  # rewards keep the first epoch's
     assert (trained.policy.obs_norm.count, loaded.policy.obs_norm.count) == (2 * EPOCH, 3 * EPOCH)
-    third = th.cat([experience_of(loaded, task).observations for task in range(N_TASKS)])
+    third = th.cat(
+        [experience_of(loaded.replay_buffer, task).observations for task in range(N_TASKS)]
+    )
     mean = third.reshape(-1, 2).mean(dim=0)  # what the buffer, which is new, holds
     th.testing.assert_close(
         loaded.policy.obs_norm.mean,
@@ -219,8 +221,8 @@ def test_replay_buffer_saves_alone(algorithm: type[PEARLSAC], tmp_path: Path) ->
     other.load_replay_buffer(tmp_path / "buffer")
     for task in range(N_TASKS):
         stored = zip(
-            experience_of(other, task),
-            experience_of(model, task),
+            experience_of(other.replay_buffer, task),
+            experience_of(model.replay_buffer, task),
             strict=True,
         )
         assert all(th.equal(one, two) for one, two in stored)

@@ -17,6 +17,7 @@ from meta_toys import (
     TwoWalks,
     Walk,
     WindyWalk,
+    experience_of,
     parameters,
     small,
     walks,
@@ -36,7 +37,9 @@ def transitions_of(model: PEARLSAC, start: int, stop: int) -> TaskBatch:
     """Stored transitions of all tasks from slot ``start`` to ``stop``, fields (tasks, stop - start,
     ...).
     """
-    stored = [model.replay_buffer.transitions(task) for task in range(model.replay_buffer.n_tasks)]
+    stored = [
+        experience_of(model.replay_buffer, task) for task in range(model.replay_buffer.n_tasks)
+    ]
     return TaskBatch(*(th.cat(parts)[:, start:stop] for parts in zip(*stored, strict=True)))
 
 
@@ -308,7 +311,7 @@ def test_a_share_of_every_batch_is_relabelled(fraction: float, n_foreign: int) -
         batch.transitions.rewards.numpy(), truth, atol=1e-5
     )  # own or relabelled, all fit the task
     own = [
-        set(map(tuple, model.replay_buffer.transitions(int(task)).observations[0, :10].tolist()))
+        set(map(tuple, experience_of(model.replay_buffer, int(task)).observations[0, :10].tolist()))
         for task in batch.task_ids
     ]
     is_own = np.array(
