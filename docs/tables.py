@@ -7,7 +7,7 @@ A test compares, so that no figure stands there that no store has.
 import contextlib
 import json
 import re
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -195,13 +195,19 @@ def paper_rule() -> str:
     return "\n".join(table(head, rows))
 
 
+@cache
+def table3(family: str) -> list[dict[str, Any]]:
+    """What is known of a family's part of Table 3 after 1, 5 and 10 answers."""
+    store = Store(RESULTS / family / TABLE3_STORE, create=False)
+    found = json.loads(make_report(store, ["table3"], kind="json")[0])
+    return [one for one in found if one["queries"] in (1, 5, 10)]
+
+
 def methods(family: str) -> list[str]:
     """A family's part of Table 3: what every method earns, and whether `Bayes` is ahead of it; of
     nothing while baselines were not run.
     """
-    store = Store(RESULTS / family / TABLE3_STORE, create=False)
-    found = json.loads(make_report(store, ["table3"], kind="json")[0])
-    found = [one for one in found if one["queries"] in (1, 5, 10)]
+    found = table3(family)
     of_paper = {
         (one["method"], one["queries"]): one["paper_mean"]
         for one in found
@@ -240,9 +246,7 @@ def methods(family: str) -> list[str]:
 
 def parts(family: str) -> list[str]:
     """What `Bayes()` owes to what: other candidates, likelihoods, models."""
-    store = Store(RESULTS / family / TABLE3_STORE, create=False)
-    found = json.loads(make_report(store, ["table3"], kind="json")[0])
-    found = [one for one in found if one["entry"] == "parts" and one["queries"] in (1, 5, 10)]
+    found = [one for one in table3(family) if one["entry"] == "parts"]
     earned = {(one["method"], one["queries"]): one for one in found if one["kind"] == "method"}
     claims = {
         (one["against"], one["queries"]): SIGNS[one["claim"]]
@@ -356,8 +360,9 @@ answer `Bayes()` has after 1, 5 and 10:
 
 `sb3-poem benchmark run --suite shipped --families FAMILY --seeds N` trains and measures (with
 `--models pretrained --seeds 1` it measures what ships), `python docs/tables.py` writes this page
-from [its stores](../benchmarks/results/shipped/manifest.md). Pages of *revision 0* are of
-earlier and shorter trainings, and their figures are not comparable with those here.
+from [its stores](../benchmarks/results/shipped/manifest.md). Pages of *revision 0*
+of the [code](guides/benchmark.md#suites) are of earlier and shorter trainings, and their figures
+are not comparable with those here.
 
 **What was not measured.** All methods on eight of the paper's nine families, methods that are not
 told the noise on most, ablations and tolerances with the models that ship.
