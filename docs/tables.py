@@ -364,8 +364,8 @@ from [its stores](../benchmarks/results/shipped/manifest.md). Pages of *revision
 of the [code](guides/benchmark.md#suites) are of earlier and shorter trainings, and their figures
 are not comparable with those here.
 
-**What was not measured.** All methods on eight of the paper's nine families, methods that are not
-told the noise on most, ablations and tolerances with the models that ship.
+**What was not measured.** All methods on eight of the paper's nine families; methods that are not
+told the noise; ablations and tolerances with the models that ship.
 `sb3-poem benchmark run --suite table3 --seeds 3 --snapshots 1 --list` says what each would take.
 """
     return "\n".join([head, *(family_section(family) for family in FAMILIES)])
