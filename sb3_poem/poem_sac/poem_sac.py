@@ -110,8 +110,8 @@ class POEMSAC(PEARLSAC):
 
     Differences from the paper are those of SAC and PEARL: twin target critics, a learned entropy
     coefficient, a replay buffer that outlives the epoch, a critics' loss that trains the encoder.
-    Of the arguments of :class:`PEARLSAC` it lacks ``context_relabel_fraction`` (contexts are of the
-    task's own policy, eq. 8), and defaults of the losses' weights are others.
+    Of the arguments of :class:`PEARLSAC` it lacks ``context_relabel_fraction`` (``context`` says
+    whose transitions contexts hold), and defaults of the losses' weights are others.
 
     >>> model = POEMSAC("MlpPolicy", "poem/PointGoal-v0", n_train_tasks=4, gradient_steps=1, seed=0)
     >>> model = model.learn(200)  # two epochs of four episodes; a real one takes 500 times as many
@@ -124,7 +124,9 @@ class POEMSAC(PEARLSAC):
         cannot grow without end, and the tolerance of eq. 9 has a scale; "inner": <z_i, z_j>, the
         ablation of Proposition 1
     :param similarity_temperature: Of "cosine"
-    :param context: "optimal": (s, a, s', r, Q); "pearl": (s, a, s', r), the ablation
+    :param context: "optimal": (s, a, s', r, Q) of the task's own policy (eq. 8); "pearl", the
+        ablation: (s, a, s', r) as PEARL samples them, where tasks share their dynamics half of the
+        contexts by other tasks' policies, as in a new task's first rollouts
     :param preference_source: Where J[i, j] comes from. "relabel": task i's reward function on task
         j's trajectories; "rollout": task j's policy is run on task i, within random groups of
         tasks, and the steps are counted; what earlier epochs measured is forgotten bit by bit, 1 in
@@ -161,7 +163,7 @@ class POEMSAC(PEARLSAC):
         self.preference_source = preference_source
         self.preference_group_size = preference_group_size
         kwargs |= {"kl_coef": kl_coef, "reward_coef": reward_coef, "policy_coef": policy_coef}
-        kwargs["context_relabel_fraction"] = 0.0
+        kwargs["context_relabel_fraction"] = 0.0 if context == "optimal" else None
         super().__init__(policy, env, *args, **kwargs)
 
     def _check_arguments(self, given: Mapping[str, Any]) -> None:

@@ -393,7 +393,10 @@ def test_contexts_without_values() -> None:
     model = small(POEMSAC, context="pearl").learn(EPOCH)
     assert model.epoch_context.transitions.shape[-1] == 2 + 2 + 2 + 1
     assert model.policy.encoder.mlp.hidden[0].in_features == 7
-    assert small(POEMSAC).policy.encoder.mlp.hidden[0].in_features == 8
+    assert model.context_relabel_fraction == 0.5  # by other tasks' policies
+    optimal = small(POEMSAC)
+    assert optimal.policy.encoder.mlp.hidden[0].in_features == 8
+    assert optimal.context_relabel_fraction == 0.0
 
 
 def test_without_its_parts_poem_is_pearl(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -401,7 +404,7 @@ def test_without_its_parts_poem_is_pearl(monkeypatch: pytest.MonkeyPatch) -> Non
     the encoder.
     """
     arguments = {"kl_coef": 0.3, "reward_coef": 0.7, "policy_coef": 1.0}
-    pearl = small(PEARLSAC, context_relabel_fraction=0.0, **arguments)
+    pearl = small(PEARLSAC, **arguments)
     poem = small(POEMSAC, similarity="inner", context="pearl", preference_coef=0.0, **arguments)
     assert parameters(pearl).keys() == parameters(poem).keys()
     monkeypatch.setattr(
