@@ -26,6 +26,8 @@ FAMILIES = (*TABLE_3, "FetchReach", "PointGoal")
 ANSWERS = (0, 1, 2, 5, 10)
 #: The store of a family's part of Table 3, of the models that the suite ``shipped`` made
 TABLE3_STORE = "table3.sqlite"
+#: The same of the suite ``noise``
+NOISE_STORE = "noise.sqlite"
 #: Which row of each part of Table 3 the others are compared with, the first that there is
 OWN = {
     "prior": ("poem-bayes-prior-decoder", "poem-bayes-prior-similarity"),
@@ -40,6 +42,9 @@ candidates from the prior or from the training tasks' posteriors. `Bayes()` take
 they are far from the prior. The last columns say how `Bayes` and `Paper` with candidates of the
 same kind stand against the row: ahead (+) or behind (-) if mean, interquartile mean and the whole
 95 % interval of the paired difference say so, else not to be told apart (?)."""
+UNTOLD = """Answers with errors: `Bayes()` that is told how they err, and that is not
+(`noise_model="infer"`). The last columns say by how much of the range from no answer to the task
+known the latter is behind."""
 #: How tables write a claim
 SIGNS = {"ahead": "+", "behind": "-", "not distinguishable": "?"}
 #: What else is to be known of a family's figures
@@ -264,6 +269,29 @@ def parts(family: str) -> list[str]:
     return [*table(["method", "1", "5", "10", "`Bayes()`, 1", "5", "10"], rows), ""]
 
 
+def untold(family: str) -> list[str]:
+    """What it costs not to know how answers err."""
+    store = Store(RESULTS / family / NOISE_STORE, create=False)
+    found = {
+        (one["oracle"], one["method"], one["queries"]): one
+        for one in json.loads(make_report(store, ["noise"], kind="json")[0])
+        if one["kind"] == "method"
+    }
+    known = row(family, "known-task", kind="known")["mean"]
+    rows = []
+    for oracle in dict.fromkeys(oracle for oracle, _, _ in found):
+        told, inferred = (
+            [found[oracle, f"poem-bayes{name}", k] for k in (0, 1, 5, 10)]
+            for name in ("", "-untold")
+        )
+        rows.append([oracle, *(cell(one, "deviation") for one in (*told[1:], *inferred[1:]))])
+        for one, other in zip(told[1:], inferred[1:], strict=True):
+            lost = (one["mean"] - other["mean"]) / (known - told[0]["mean"])
+            rows[-1].append(f"{100 * lost:.0f} %")
+    head = ["answers", "told: 1", "5", "10", "not told: 1", "5", "10", "behind: 1", "5", "10"]
+    return [fill(UNTOLD, 120), "", *table(head, rows), ""]
+
+
 def by_manipulation(family: str) -> list[str]:
     """What seed 0 earns in each of a family's manipulations."""
     results = {
@@ -312,6 +340,8 @@ def family_section(family: str) -> str:
         if rows := methods(family):
             lines += [fill(METHODS, 120), "", *rows]
         lines += [fill(PARTS, 120), "", *parts(family)]
+    if (folder / NOISE_STORE).exists():
+        lines += untold(family)
     links = []
     for page, text in PAGES.items():
         if (folder / f"{page}.md").exists():
@@ -364,8 +394,8 @@ from [its stores](../benchmarks/results/shipped/manifest.md). Pages of *revision
 of the [code](guides/benchmark.md#suites) are of earlier and shorter trainings, and their figures
 are not comparable with those here.
 
-**What was not measured.** All methods on eight of the paper's nine families; methods that are not
-told the noise; ablations and tolerances with the models that ship.
+**What was not measured.** All methods on eight of the paper's nine families; with the models that
+ship answers with errors but for `Bayes()` where a table says so, ablations and tolerances.
 `sb3-poem benchmark run --suite table3 --seeds 3 --snapshots 1 --list` says what each would take.
 """
     return "\n".join([head, *(family_section(family) for family in FAMILIES)])
