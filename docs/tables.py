@@ -284,7 +284,8 @@ def untold(family: str) -> list[str]:
             [found[oracle, f"poem-bayes{name}", k] for k in (0, 1, 5, 10)]
             for name in ("", "-untold")
         )
-        rows.append([oracle, *(cell(one, "deviation") for one in (*told[1:], *inferred[1:]))])
+        label = oracle.removesuffix(" answers").replace(" of the answers", "")
+        rows.append([label, *(cell(one, "deviation") for one in (*told[1:], *inferred[1:]))])
         for one, other in zip(told[1:], inferred[1:], strict=True):
             lost = (one["mean"] - other["mean"]) / (known - told[0]["mean"])
             rows[-1].append(f"{100 * lost:.0f} %")
