@@ -47,7 +47,7 @@ class NoiseModel:
     kind: str
     rate = 0.0
 
-    def probability_above(self, difference: Values, error: Values, magnitude: Values) -> Any:
+    def probability_above(self, difference: Values, error: Values, magnitude: Values) -> np.ndarray:
         """P(the perceived difference is positive), in [0, 1]; arguments broadcast.
 
         :param difference: Predicted return of the left trajectory minus that of the right one.
@@ -56,7 +56,7 @@ class NoiseModel:
         """
         return _logistic(difference, PROBIT_SLOPE / np.maximum(error, 1e-12))
 
-    def probability_left(self, difference: Values, error: Values, magnitude: Values) -> Any:
+    def probability_left(self, difference: Values, error: Values, magnitude: Values) -> np.ndarray:
         """P(LEFT), given that the oracle says LEFT or RIGHT, in (0, 1)."""
         left = (1.0 - LAPSE) * self.probability_above(difference, error, magnitude) + LAPSE / 2
         return left if self.rate == 0.0 else self.rate + (1.0 - 2.0 * self.rate) * left
@@ -123,7 +123,7 @@ class BoltzmannNoise(NoiseModel):
         if self.beta is not None:
             check_number("beta", self.beta, above=0.0)
 
-    def probability_above(self, difference: Values, error: Values, magnitude: Values) -> Any:
+    def probability_above(self, difference: Values, error: Values, magnitude: Values) -> np.ndarray:
         beta = 1.0 / np.maximum(magnitude, 1e-12) if self.beta is None else self.beta
         shrink = np.sqrt(1.0 + np.pi / 8.0 * (beta * np.asarray(error)) ** 2)
         return _logistic(difference, beta / shrink)

@@ -40,7 +40,7 @@ class AdaptedPolicy:
     def __init__(
         self, model: MetaModel, latent: np.ndarray, n_answers: int = 0, env: VecEnv | None = None
     ) -> None:
-        self.model: Any = model
+        self.model = model
         self.n_answers = n_answers
         self.env = env
         self.latent = np.array(latent, dtype=np.float64)
@@ -77,7 +77,8 @@ class AdaptedPolicy:
         """The policy of one of this package's models as a safetensors file: the model, its
         configuration in the header, latent and number of answers. Nothing in it can run code.
         """
-        if type(self.model).__name__ not in BY_CLASS_NAME:
+        algorithm = BY_CLASS_NAME.get(type(self.model).__name__)
+        if algorithm is None or not isinstance(self.model, algorithm):
             known = " or ".join(BY_CLASS_NAME)
             raise TypeError(f"a policy of {describe_model(self.model)} has no file, as of {known}")
         config, tensors = model_contents(self.model)

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -93,7 +92,7 @@ class Query:
         return write_video(in_rows(clips, captions), path, fps)
 
 
-def check_shown(kind: str, shown: Sequence[Any]) -> None:
+def check_shown(kind: str, shown: Sequence[Trajectory]) -> None:
     """Refuse another number of trajectories than this kind of question shows."""
     if len(shown) != len(PLACES[kind]):
         raise ValueError(
@@ -102,7 +101,7 @@ def check_shown(kind: str, shown: Sequence[Any]) -> None:
         )
 
 
-def as_preference(answer: Any, kind: str = "pair") -> Preference:
+def as_preference(answer: object, kind: str = "pair") -> Preference:
     """Read the answer to a question of this kind: a :class:`Preference` that it has, or its word;
     else a ``ValueError`` or ``TypeError``. Numbers, whose meaning differs between programs, are
     refused.

@@ -24,6 +24,7 @@ from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.vec_env import make_shown_env, make_task_vec_env
 from sb3_poem.common.video import side_by_side, write_video
 from sb3_poem.loading import load_model
+from sb3_poem.pearl_sac import PEARLSAC
 
 # Copies that step in lockstep for one task, whose questions need but two of them.
 COPIES_FOR_ONE_TASK = 20
@@ -56,6 +57,7 @@ class Subject:
         with console.status("Reading the model"):
             if Path(arguments.model).suffix == POLICY_SUFFIX:
                 policy = AdaptedPolicy.load(arguments.model, arguments.device)
+                assert isinstance(policy.model, PEARLSAC)
                 self.model, self.latent = policy.model, policy.latent
             else:
                 self.model = load_model(arguments.model, arguments.device)
