@@ -3,7 +3,7 @@
 import contextlib
 import json
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,6 +14,7 @@ from tqdm import tqdm
 from sb3_poem.adaptation.bayes import Bayes
 from sb3_poem.adaptation.environments import Env, describe_model, model_and_env, warn_if_untrained
 from sb3_poem.adaptation.meta_model import MetaModel
+from sb3_poem.adaptation.oracles import HasNeedsFrames, Oracle
 from sb3_poem.adaptation.policy import AdaptedPolicy
 from sb3_poem.adaptation.preference import PLACES, Preference, Query, as_preference
 from sb3_poem.adaptation.rule import (
@@ -25,6 +26,7 @@ from sb3_poem.adaptation.rule import (
     inference_rng,
     latent_of,
     rollout_seed,
+    seen,
 )
 from sb3_poem.common.checks import check_whole
 from sb3_poem.common.family_view import FamilyView
@@ -34,8 +36,6 @@ from sb3_poem.common.trajectory import Trajectory, decode_array, encode_array
 from sb3_poem.loading import as_model
 
 FORMAT, FORMAT_VERSION = "sb3_poem.PreferenceAdapter", 3
-
-Oracle = Callable[..., Any]
 
 
 class OtherModelError(ValueError):
@@ -106,9 +106,8 @@ class PreferenceAdapter:
         self._chosen_rule = Bayes() if rule is None else as_rule(rule)
         self.rule = self._chosen_rule.answered_by(oracle)
         self.n_queries, self.seed = int(n_queries), int(seed)
-        self.deterministic, self.render = deterministic, render
-        frames = render or bool(getattr(oracle, "needs_frames", False))
-        self.model, self.env = model_and_env(model, env, 1, frames)
+        self.deterministic, self.render, self.oracle = deterministic, render, oracle
+        self.model, self.env = model_and_env(model, env, 1, bool(self._needs_frames))
         self._owns_env = isinstance(env, str)
         self.library = None if library is None else list(library)
         self._setting = Setting(self.n_queries, self.library, self.env, None, self._visibility)
@@ -180,7 +179,7 @@ class PreferenceAdapter:
         if number not in range(self.n_answers):
             known = f"that of an answer, from 0 to {self.n_answers - 1}"
             raise ValueError(f"`number` must be {known}, but is {number!r}")
-        self.pending = Query(self.answers[number].shown, self.rule.question)
+        self.pending = Query(seen(self.answers[number].shown), self.rule.question)
         return self.ask()
 
     def tell(self, preference: Preference | str) -> None:
@@ -255,8 +254,12 @@ class PreferenceAdapter:
             self.env.close()
 
     @property
+    def _looks(self) -> bool | int:
+        return isinstance(self.oracle, HasNeedsFrames) and self.oracle.needs_frames
+
+    @property
     def _needs_frames(self) -> bool | int:
-        return getattr(self.oracle, "needs_frames", False) or self.render
+        return self._looks or self.render
 
     def _check_unfinished(self) -> None:
         if self.done:
@@ -265,7 +268,7 @@ class PreferenceAdapter:
     def _take_oracle(self, oracle: Any) -> None:
         self.oracle = oracle
         #: Whether somebody looks at the questions, also while answers given before are told again
-        self._watched = getattr(oracle, "needs_frames", self.render and oracle is None)
+        self._watched = self._looks or (self.render and oracle is None)
         bind, env = getattr(oracle, "bind", None), getattr(oracle, "env", None)
         # Nor is one that another adapter lent it its own
         if bind is not None and (env is None or env is getattr(oracle, "lent_env", None)):
@@ -275,7 +278,7 @@ class PreferenceAdapter:
     def _number_of(self, query: Query) -> int:
         """Of the answer about the very trajectories of a question; else the next one's."""
         for number, answer in enumerate(self.answers):
-            pairs = zip(answer.shown, query.shown, strict=True)
+            pairs = zip(seen(answer.shown), query.shown, strict=True)
             if all(np.array_equal(old.observations, new.observations) for old, new in pairs):
                 return number
         return self.n_answers
@@ -312,8 +315,8 @@ class PreferenceAdapter:
         self._seen |= {(self.n_answers, clip.latent.tobytes()): clip for clip in rolled}
         if left.reward_features is None or right.reward_features is None:
             return 1.0
-        answered = [item for answer in self.answers for item in answer.shown]
-        features = [getattr(item, "reward_features", None) for item in (*answered, *rolled)]
+        shown = [*(item for answer in self.answers for item in answer.shown), *rolled]
+        features = [item.reward_features for item in shown if isinstance(item, Trajectory)]
         spread = np.concatenate([rows for rows in features if rows is not None]).std(axis=0)
         visible = family.visible_difference(left.reward_features, right.reward_features, spread)
         return min(1.0, visible)
@@ -336,7 +339,7 @@ class PreferenceAdapter:
             "deterministic": self.deterministic,
             "uses_library": self.library is not None,
             "answers": [
-                {"preference": answer.preference.value, **shown_to_dict(kind, answer.shown)}
+                {"preference": answer.preference.value, **shown_to_dict(kind, seen(answer.shown))}
                 for answer in self.inference.answers
             ],
             "pending": None if pending is None else shown_to_dict(kind, pending.shown),
@@ -431,7 +434,7 @@ def _complete() -> Iterator[None]:
         raise ValueError(f"a saved adaptation that is incomplete or broken: {error!r}") from error
 
 
-def shown_to_dict(kind: str, shown: Sequence[Any]) -> dict[str, Any]:
+def shown_to_dict(kind: str, shown: Sequence[Trajectory]) -> dict[str, Any]:
     """What a question of this kind shows, JSON-ready, by place: "left" and "right", say."""
     return {place: item.to_dict() for place, item in zip(PLACES[kind], shown, strict=True)}
 
@@ -441,7 +444,7 @@ def shown_from_dict(kind: str, data: dict[str, Any]) -> tuple[Trajectory, ...]:
     return tuple(Trajectory.from_dict(data[place]) for place in PLACES[kind])
 
 
-def _check_oracle(oracle: Any) -> None:
+def _check_oracle(oracle: object) -> None:
     if isinstance(oracle, type):
         name = oracle.__name__
         raise TypeError(f"`oracle` is the class {name}, but must be an object: {name}()")

@@ -4,7 +4,7 @@ they thin out.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from scipy.special import log_softmax, logsumexp
@@ -19,8 +19,10 @@ from sb3_poem.adaptation.noise import (
     ExactNoise,
     NoiseModel,
     People,
+    Values,
     noise_model_from_dict,
 )
+from sb3_poem.adaptation.oracles import HasNoiseModel, Oracle
 from sb3_poem.adaptation.particles import (
     WIDENING,
     Gaussian,
@@ -37,7 +39,7 @@ from sb3_poem.adaptation.preference import (
     preference_log_likelihood,
 )
 from sb3_poem.adaptation.priors import SOURCES, make_prior
-from sb3_poem.adaptation.rule import Answer, Inference, Rule, Setting, Shown, check_seen, latent_of
+from sb3_poem.adaptation.rule import Answer, Inference, Rule, Setting, Shown, latent_of, seen
 from sb3_poem.common.checks import check_choice, check_number, check_whole
 from sb3_poem.common.trajectory import Trajectory
 
@@ -149,11 +151,11 @@ class Bayes(Rule):
                 f"but is {self.noise_model!r}"
             )
 
-    def answered_by(self, oracle: Any) -> Self:
+    def answered_by(self, oracle: Oracle | None) -> Self:
         """See :class:`Rule`: with the oracle's own noise model, unless one was chosen."""
         super().answered_by(oracle)
-        noise_model = self.noise_model or getattr(oracle, "noise_model", None) or ExactNoise()
-        return replace(self, noise_model=noise_model)
+        own = oracle.noise_model if isinstance(oracle, HasNoiseModel) else None
+        return replace(self, noise_model=self.noise_model or own or ExactNoise())
 
     def check(self, model: MetaModel, setting: Setting) -> None:
         """See :class:`Rule`: the likelihood and the questions need what not all models have."""
@@ -196,7 +198,7 @@ class Bayes(Rule):
         """Which one is used with a model."""
         return self.likelihood or ("decoder" if _knows_its_decoder(model) else "similarity")
 
-    def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> Inference:
+    def start(self, model: MetaModel, rng: np.random.Generator, setting: Setting) -> Inference:
         return BayesInference(self, model, rng, setting)
 
 
@@ -205,15 +207,17 @@ class BayesInference(Inference):
 
     state: tuple[str, ...] = ("particles", "log_weights", "scale", "calibration", "thinning")
 
-    def __init__(self, rule: Bayes, model: Any, rng: np.random.Generator, setting: Setting) -> None:
+    def __init__(
+        self, rule: Bayes, model: MetaModel, rng: np.random.Generator, setting: Setting
+    ) -> None:
         super().__init__(rng)
         self.rule, self.model, self.visibility = rule, model, setting.visibility
         self.n_shown = len(PLACES[rule.question])
-        self.has_similarity = isinstance(model, HasSimilarity)
+        self.similarity = model if isinstance(model, HasSimilarity) else None
         self.likelihood = rule.likelihood_with(model)
-        noise: Any = rule.noise_model or ExactNoise()
+        noise = rule.noise_model or ExactNoise()
         #: How the oracle errs, if that is told
-        self.noise_model: NoiseModel | None = None if noise == INFER else noise
+        self.noise_model = noise if isinstance(noise, NoiseModel) else None
         told = self.noise_model is not None and rule.question == "pair"
         self.people = None if told else People(rule.question, self.noise_model)
         self.library = None if setting.library is None else list(setting.library)
@@ -268,7 +272,7 @@ class BayesInference(Inference):
         if len(particles) > QUERY_PARTICLES:
             particles = particles[systematic_resample(weights, QUERY_PARTICLES, self.rng)]
             weights = np.full(QUERY_PARTICLES, 1.0 / QUERY_PARTICLES)
-        similarities = self.model.similarities(particles, policies)
+        similarities = self._similarities(particles, list(policies))
         if self.rule.query_rule == "worst-case":
             return queries.worst_case_pair(similarities, self.rule.epsilon, weights)
         slope, magnitude, noise = self._return_unit()
@@ -277,7 +281,7 @@ class BayesInference(Inference):
 
     def _ask_about(self, library: list[Trajectory]) -> tuple[int, ...]:
         if self._library_returns is None:
-            decode = self.model.predicted_returns
+            decode = self._decoder.predicted_returns
             self._library_returns = decode(self.particles, library, DECODED_STEPS)
         returns = self._library_returns
         error = self._decoder_error(2.0 * float(np.mean([len(item) for item in library])))
@@ -289,8 +293,8 @@ class BayesInference(Inference):
         shown: Sequence[Shown],
         values: np.ndarray,
         weights: np.ndarray,
-        noise: Any,
-        unit: tuple[float, float, float],
+        noise: NoiseModel | None,
+        unit: tuple[Values, float, float],
     ) -> tuple[int, ...]:
         """Of what is shown, by its predicted fitness (m, n) under m latents of these weights.
 
@@ -302,6 +306,7 @@ class BayesInference(Inference):
             None if see is None else lambda first, second: see(shown[first], shown[second])
         )
         if self.people is None:
+            assert noise is not None
             differences = queries.pair_differences(values)
             probabilities = noise.probability_left(differences, *unit[:2])
             gains = queries.information_gains(probabilities, weights)
@@ -322,10 +327,8 @@ class BayesInference(Inference):
             return pair
         return queries.most_telling_set(pair, self.n_shown, values, weights, said)
 
-    def tell(self, preference: Preference, *shown: Any) -> None:
-        if self.likelihood == "decoder":
-            check_seen(shown)
-        answer = Answer(preference, shown)
+    def tell(self, preference: Preference, *shown: Shown) -> None:
+        answer = Answer(preference, seen(shown) if self.likelihood == "decoder" else shown)
         told = self._log_likelihoods(self.particles, [answer], new=True)
         if self.people is not None:
             before = self.people_log_shares.astype(np.float64)
@@ -338,9 +341,8 @@ class BayesInference(Inference):
             self._rejuvenate()
 
     def estimate(self) -> np.ndarray:
-        model = self.model if self.has_similarity else None
         known = self.model.task_latents, self._reference, self.prior.has_holes
-        return decide(self.rule.decision, model, self.particles, self.weights, *known)
+        return decide(self.rule.decision, self.similarity, self.particles, self.weights, *known)
 
     def agreements(self) -> np.ndarray:
         """(k, 2) how well each answer agrees with the others: P(better on its side, or EQUAL),
@@ -381,8 +383,7 @@ class BayesInference(Inference):
         """The answer that agrees least with all others, see :meth:`agreements`, if that is less
         than 0.2, and less than 0.5 given all. What was asked about twice is left alone.
         """
-        # by what was seen: fragments of one policy differ, and have one latent
-        asked = [[getattr(x, "observations", x).tobytes() for x in a.shown] for a in self.answers]
+        asked = [list(map(_identity, answer.shown)) for answer in self.answers]
         asked_twice = np.array([asked.count(shown) > 1 for shown in asked], dtype=bool)
         others, everything = self.agreements().T
         found = np.where(asked_twice | (everything >= BELIEVED), 1.0, others)
@@ -393,9 +394,9 @@ class BayesInference(Inference):
         the log-odds of being right about labels without errors; but once nearly all pairs are
         separated training scales S up without end, so it is at least a share of the spread.
         """
-        if not self.has_similarity:
+        if self.similarity is None:
             return np.ones(2)
-        similarities = self.model.similarities(self.particles, self.particles)
+        similarities = self.similarity.similarities(self.particles, self.particles)
         # Twice the variance within a row is the mean squared difference of two of its entries.
         spread = float(np.sqrt(2.0 * similarities.var(axis=1).mean()))
         unit = SIMILARITY_RESOLUTION * spread / PROBIT_SLOPE
@@ -405,7 +406,7 @@ class BayesInference(Inference):
     def _spread(self) -> float:
         return float(self.scale[0])
 
-    def _return_spread(self, shown: Sequence[Shown]) -> float:
+    def _return_spread(self, shown: Sequence[Trajectory]) -> float:
         """The family's spread of returns, for people, by the decoder: from S, once it is tied to
         returns, else from what was shown.
         """
@@ -415,7 +416,7 @@ class BayesInference(Inference):
         if self.library is None and cross > 0:
             return float(cross / square) * self._spread
         if self.library is None or self._library_spread is None:
-            returns = self.model.predicted_returns(
+            returns = self._decoder.predicted_returns(
                 self._reference[:SPREAD_LATENTS], self.library or shown, DECODED_STEPS
             )
             spread = float(np.sqrt(2.0 * returns.var(axis=1, ddof=1).mean()))
@@ -433,8 +434,13 @@ class BayesInference(Inference):
         fixed = isinstance(self.noise_model, BoltzmannNoise) and self.noise_model.beta is not None
         return 1.0, 2.0 * self._spread, ExactNoise() if fixed else self.noise_model
 
-    def _decoder_error(self, steps: Any) -> Any:
-        return self.model.predicted_rewards_error * np.sqrt(steps * ERROR_CORRELATION)
+    @property
+    def _decoder(self) -> HasRewardDecoder:
+        assert isinstance(self.model, HasRewardDecoder)
+        return self.model
+
+    def _decoder_error(self, steps: Values) -> np.ndarray:
+        return self._decoder.predicted_rewards_error * np.sqrt(steps * ERROR_CORRELATION)
 
     def _differences(
         self, latents: np.ndarray, answers: Sequence[Answer], new: bool = False
@@ -446,21 +452,22 @@ class BayesInference(Inference):
         shown = [item for answer in answers for item in answer.shown]
         grouped, shape = (-1, len(answers), self.n_shown), (len(latents), len(answers))
         if self.likelihood == "decoder":
-            values = self.model.predicted_returns(latents, shown, DECODED_STEPS)  # (m, k n)
-            steps = np.array([len(item) for item in shown], dtype=np.float64).reshape(grouped[1:])
+            clips = seen(shown)
+            values = self._decoder.predicted_returns(latents, clips, DECODED_STEPS)  # (m, k n)
+            steps = np.array([len(item) for item in clips], dtype=np.float64).reshape(grouped[1:])
             if new:
-                self.thinning = np.vstack([self.thinning, self._measure_thinning(shown, values)])
+                self.thinning = np.vstack([self.thinning, self._measure_thinning(clips, values)])
             fits = self.thinning[-len(answers) * (self.n_shown - 1) :]
             intercepts, slopes, errors = fits.T.reshape(3, len(answers), self.n_shown - 1)
             error = np.hypot(self._decoder_error(steps[:, :1] + steps[:, 1:]), errors).mean(axis=1)
             difference = first_to_others(values.reshape(grouped))
             difference = difference + intercepts + slopes * difference
-            if new and self.has_similarity:
+            if new and self.similarity is not None:
                 s = first_to_others(self._similarities(latents, shown)).ravel()
                 typical = 2.0 * np.abs(values).mean(axis=1).mean()
                 self.calibration += [s @ first_to_others(values).ravel(), s @ s, typical, 1.0]
             magnitude = 2.0 * np.abs(values).reshape(grouped).mean(axis=2)
-            return difference, np.broadcast_to(error, shape), magnitude, self._return_spread(shown)
+            return difference, np.broadcast_to(error, shape), magnitude, self._return_spread(clips)
         values = self._similarities(latents, shown)
         error = np.full(shape, self.scale[1] * PROBIT_SLOPE)
         magnitude = np.full(shape, 2.0 * self._spread)
@@ -490,18 +497,19 @@ class BayesInference(Inference):
         told = self._log_likelihoods(latents, self.answers)
         return told if self.people is None else logsumexp(told + self.people.log_prior, axis=1)
 
-    def _measure_thinning(self, shown: Sequence[Shown], thin: np.ndarray) -> np.ndarray:
+    def _measure_thinning(self, shown: Sequence[Trajectory], thin: np.ndarray) -> np.ndarray:
         """(n - 1, 3) of the first one's difference to each other."""
         if max(map(len, shown)) <= DECODED_STEPS:
             return np.zeros((len(shown) - 1, 3))
         quantiles = (np.arange(FULLY_DECODED) + 0.5) / FULLY_DECODED
         some = np.searchsorted(np.cumsum(self.weights), quantiles).clip(max=len(self.particles) - 1)
-        full = self.model.predicted_returns(self.particles[some], shown)
+        full = self._decoder.predicted_returns(self.particles[some], shown)
         pairs = zip(first_to_others(thin[some]).T, first_to_others(full).T, strict=True)
         return np.array([fit_thinning(*pair) for pair in pairs])
 
     def _similarities(self, latents: np.ndarray, shown: Sequence[Shown]) -> np.ndarray:
-        return self.model.similarities(latents, np.stack([latent_of(item) for item in shown]))
+        assert self.similarity is not None
+        return self.similarity.similarities(latents, np.stack(list(map(latent_of, shown))))
 
     def _query_policies(self) -> np.ndarray:
         """(n, d): half of them draws of the posterior, half of the prior."""
@@ -563,6 +571,11 @@ def fit_thinning(thin: np.ndarray, full: np.ndarray) -> tuple[float, float, floa
 def first_to_others(values: np.ndarray) -> np.ndarray:
     """(..., n - 1) the first one's value (..., n) minus each other."""
     return values[..., :1] - values[..., 1:]
+
+
+def _identity(shown: Shown) -> bytes:
+    """Fragments of one policy differ, and have one latent: they are told by what was seen."""
+    return (shown.observations if isinstance(shown, Trajectory) else shown).tobytes()
 
 
 def _knows_its_decoder(model: MetaModel) -> bool:

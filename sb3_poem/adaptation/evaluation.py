@@ -13,7 +13,7 @@ from tqdm import tqdm
 from sb3_poem.adaptation.bayes import Bayes
 from sb3_poem.adaptation.environments import Env, model_and_env, warn_if_untrained
 from sb3_poem.adaptation.meta_model import MetaModel
-from sb3_poem.adaptation.oracles import ReturnOracle
+from sb3_poem.adaptation.oracles import Oracle, ReturnOracle
 from sb3_poem.adaptation.preference import PLACES, Preference, as_preference
 from sb3_poem.adaptation.rule import Rule, Setting, as_rule, inference_rng, latent_of, rollout_seed
 from sb3_poem.common.checks import check_whole, check_whole_numbers
@@ -23,7 +23,7 @@ from sb3_poem.common.trajectory import Trajectory
 
 N_TEST_TASKS = 30
 
-OracleFactory = Callable[..., Callable[..., Any]]
+OracleFactory = Callable[..., Oracle]
 Library = Sequence[Trajectory] | Callable[[np.ndarray], Sequence[Trajectory]]
 
 

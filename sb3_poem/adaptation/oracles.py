@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Protocol, Self, TypeAlias, runtime_checkable
 
 import gymnasium as gym
 import numpy as np
@@ -16,6 +16,10 @@ from sb3_poem.adaptation.preference import ANSWERS, BEST_OF_FOUR, Preference, Qu
 from sb3_poem.common.checks import check_choice, check_number
 from sb3_poem.common.family_view import FamilyView, vectorised
 from sb3_poem.common.trajectory import Trajectory
+
+#: Any callable of the trajectories that a question shows; it gives a preference, or its word. What
+#: else it may say of itself is in the protocols below.
+Oracle: TypeAlias = Callable[..., Preference | str]
 
 ORACLE_STREAM = 8
 PROMPTS = {
@@ -35,6 +39,27 @@ WORDS = {
     **{"r": Preference.RIGHT, "rr": Preference.MUCH_RIGHT},
     **dict.fromkeys(("e", "=", "can't tell", "cant tell", "?"), Preference.EQUAL),
 }
+
+
+@runtime_checkable
+class HasQuestion(Protocol):
+    """An oracle that answers questions of one kind, see :class:`Query`."""
+
+    question: str
+
+
+@runtime_checkable
+class HasNoiseModel(Protocol):
+    """An oracle that says how it errs, for the Bayesian rule: "infer" that it does not know."""
+
+    noise_model: NoiseModel | str | None
+
+
+@runtime_checkable
+class HasNeedsFrames(Protocol):
+    """An oracle that says whether it looks at frames: at every one, or at every n-th."""
+
+    needs_frames: bool | int
 
 
 class TaskOracle(ABC):

@@ -1,7 +1,6 @@
 """The paper's own rule, Algorithm 2 of Xu & Zhu (2025)."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.special import log_expit
@@ -9,7 +8,7 @@ from scipy.special import log_expit
 from sb3_poem.adaptation import queries
 from sb3_poem.adaptation.meta_model import HasSimilarity, MetaModel
 from sb3_poem.adaptation.preference import SIGNS, Preference, preference_log_likelihood
-from sb3_poem.adaptation.priors import SOURCES, make_prior
+from sb3_poem.adaptation.priors import SOURCES, Prior, make_prior
 from sb3_poem.adaptation.queries import tolerance
 from sb3_poem.adaptation.rule import (
     Answer,
@@ -68,8 +67,9 @@ class Paper(Rule):
                 f"rule=Paper() needs a model with a similarity S; {type(model).__name__} has none"
             )
 
-    def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> Inference:
-        return PaperInference(self, model, rng)
+    def start(self, model: MetaModel, rng: np.random.Generator, setting: Setting) -> Inference:
+        assert isinstance(model, HasSimilarity)
+        return PaperInference(self, model, make_prior(model, self.candidates, rng), rng)
 
 
 class PaperInference(Inference):
@@ -77,11 +77,12 @@ class PaperInference(Inference):
 
     state = ("candidates", "fresh")
 
-    def __init__(self, rule: Paper, model: Any, rng: np.random.Generator) -> None:
+    def __init__(
+        self, rule: Paper, model: HasSimilarity, prior: Prior, rng: np.random.Generator
+    ) -> None:
         super().__init__(rng)
-        self.rule, self.model = rule, model
-        self.prior = make_prior(model, rule.candidates, rng)
-        self.candidates = self.prior.sample(rule.n_candidates, rng)
+        self.rule, self.model, self.prior = rule, model, prior
+        self.candidates = prior.sample(rule.n_candidates, rng)
         self.fresh = np.array([True])
 
     def ask(self) -> tuple[Shown, Shown]:
@@ -102,7 +103,7 @@ class PaperInference(Inference):
                 first, second = queries.best_pair(gains, n)
         return self.candidates[first].copy(), self.candidates[second].copy()
 
-    def tell(self, preference: Preference, *shown: Any) -> None:
+    def tell(self, preference: Preference, *shown: Shown) -> None:
         self.answers.append(Answer(preference, shown))
         self.fresh = np.array([False])
 

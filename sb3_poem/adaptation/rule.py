@@ -10,6 +10,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.adaptation.environments import check_model_fits
 from sb3_poem.adaptation.meta_model import MetaModel
+from sb3_poem.adaptation.noise import NoiseModel
+from sb3_poem.adaptation.oracles import HasQuestion, Oracle
 from sb3_poem.adaptation.preference import PLACES, Preference
 from sb3_poem.common.trajectory import Trajectory
 
@@ -31,7 +33,7 @@ class Answer:
     """
 
     preference: Preference
-    shown: tuple[Any, ...]
+    shown: tuple[Shown, ...]
 
 
 class Inference(ABC):
@@ -65,7 +67,7 @@ class Inference(ABC):
         return latents
 
     @abstractmethod
-    def tell(self, preference: Preference, *shown: Any) -> None:
+    def tell(self, preference: Preference, *shown: Shown) -> None:
         """Take an answer, see :class:`Answer`."""
 
     @abstractmethod
@@ -170,15 +172,14 @@ class Rule(ABC):
             raise ValueError(f"`library` must hold at least {needed} trajectories, {held}")
 
     @abstractmethod
-    def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> Inference:
+    def start(self, model: MetaModel, rng: np.random.Generator, setting: Setting) -> Inference:
         """Begin with a task, with what :meth:`check` has accepted."""
 
-    def answered_by(self, oracle: Any) -> Self:
+    def answered_by(self, oracle: Oracle | None) -> Self:
         """The rule for the answers of this oracle; a ``ValueError`` if it answers questions of
         another kind.
         """
-        kind = getattr(oracle, "question", self.question)
-        if kind != self.question:
+        if isinstance(oracle, HasQuestion) and (kind := oracle.question) != self.question:
             raise ValueError(
                 f'the oracle answers "{kind}" questions, but the rule asks "{self.question}" ones: '
                 'Bayes(question="graded") goes with ReturnOracle(thresholds=(20, 100)), and '
@@ -192,7 +193,7 @@ class Rule(ABC):
         for name, value in options.items():
             if isinstance(value, np.generic):  # JSON does not know NumPy's numbers
                 options[name] = value.item()
-            elif hasattr(value, "to_dict"):
+            elif isinstance(value, NoiseModel):
                 options[name] = value.to_dict()
         return {"name": type(self).__name__, "module": type(self).__module__, "options": options}
 
@@ -206,7 +207,7 @@ class Rule(ABC):
         return cls._known[name](**data["options"])
 
 
-def as_rule(rule: Any) -> Rule:
+def as_rule(rule: object) -> Rule:
     """A rule as it is; a ``TypeError`` that says what to write if it is none."""
     if isinstance(rule, Rule):
         return rule
@@ -214,7 +215,8 @@ def as_rule(rule: Any) -> Rule:
         name = rule.__name__
         raise TypeError(f"`rule` is the class {name}, but must be an object: {name}()")
     known = {name.lower(): name for name in Rule._known}
-    meant = f"; write rule={known[rule.lower()]}()" if str(rule).lower() in known else ""
+    word = str(rule).lower()
+    meant = f"; write rule={known[word]}()" if word in known else ""
     objects = "Bayes(), Paper(n_candidates=50) or ANOLE()"
     raise TypeError(f"`rule` must be an object as {objects}, but is {rule!r}{meant}")
 
@@ -229,10 +231,12 @@ def latent_of(shown: Shown) -> np.ndarray:
     return shown.latent if isinstance(shown, Trajectory) else np.asarray(shown, dtype=np.float64)
 
 
-def check_seen(shown: Sequence[Shown]) -> None:
-    """Refuse latents, for a rule that looks at what was done."""
-    if not all(isinstance(item, Trajectory) for item in shown):
+def seen(shown: Sequence[Shown]) -> tuple[Trajectory, ...]:
+    """What was shown, for a rule that looks at what was done; latents are refused."""
+    trajectories = tuple(item for item in shown if isinstance(item, Trajectory))
+    if len(trajectories) < len(shown):
         raise ValueError("this rule needs the trajectories that were shown, not their latents")
+    return trajectories
 
 
 def inference_rng(seed: int) -> np.random.Generator:

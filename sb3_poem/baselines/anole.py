@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from math import comb, floor
-from typing import Any
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from sb3_poem.adaptation.meta_model import HasRewardDecoder, MetaModel
 from sb3_poem.adaptation.preference import SIGNS, Preference
 from sb3_poem.adaptation.priors import SOURCES, make_prior
 from sb3_poem.adaptation.queries import random_set
-from sb3_poem.adaptation.rule import Shown, check_seen, equally_weighted
+from sb3_poem.adaptation.rule import Shown, equally_weighted, seen
 from sb3_poem.baselines.fragments import (
     check_shared_dynamics,
     default_fragment_length,
@@ -106,7 +105,7 @@ class ANOLE(Rule):
             "these show another world; pass a `library` from the new task",
         )
 
-    def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> Inference:
+    def start(self, model: MetaModel, rng: np.random.Generator, setting: Setting) -> Inference:
         return ANOLEInference(self, model, rng, setting)
 
 
@@ -116,10 +115,14 @@ class ANOLEInference(Inference):
     state = ("candidates", "priority", "contradictions", "alive")
     library: list[Trajectory]
 
-    def __init__(self, rule: ANOLE, model: Any, rng: np.random.Generator, setting: Setting) -> None:
+    def __init__(
+        self, rule: ANOLE, model: MetaModel, rng: np.random.Generator, setting: Setting
+    ) -> None:
         super().__init__(rng)
+        assert isinstance(model, HasRewardDecoder)
         self.rule, self.model, self.n_queries = rule, model, setting.n_queries
         if setting.library is None:
+            assert isinstance(model, PEARLSAC)
             length = rule.fragment_length or default_fragment_length(model.horizon)
             self.library = replay_fragments(model, 2 * rule.n_pairs, length, rng)
         else:
@@ -160,9 +163,8 @@ class ANOLEInference(Inference):
         left = max(0, self.n_queries - len(self.answers) - 1)
         return worst_case_volumes(differences, self.contradictions, left, self.budget)
 
-    def tell(self, preference: Preference, *shown: Any) -> None:
-        check_seen(shown)
-        returns = self.model.predicted_returns(self.candidates, shown)
+    def tell(self, preference: Preference, *shown: Shown) -> None:
+        returns = self.model.predicted_returns(self.candidates, seen(shown))
         contradicted = SIGNS[preference] * (returns[:, 0] - returns[:, 1]) < 0
         self.contradictions = self.contradictions + contradicted
         if np.any(self.alive & ~contradicted):

@@ -25,7 +25,7 @@ from torch.nn.utils.rnn import pad_sequence
 from sb3_poem.adaptation import Answer, Inference, Rule, Setting
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.preference import SIGNS, Preference
-from sb3_poem.adaptation.rule import Shown, check_seen
+from sb3_poem.adaptation.rule import Shown, seen
 from sb3_poem.baselines.fragments import (
     check_shared_dynamics,
     default_fragment_length,
@@ -192,7 +192,7 @@ class MetaReward:
         """
         if not answers:
             return self.parameters
-        shown = [one for answer in answers for one in answer.shown]
+        shown = [one for answer in answers for one in seen(answer.shown)]
         # (2 answers, longest, in_dim + 1)
         rows = pad_sequence([self.transitions(trajectory) for trajectory in shown], True)
         longest = rows.shape[1]
@@ -387,7 +387,8 @@ class MAMLReward(Rule):
         why = "MAML-reward's network was trained on what tasks say of each other's fragments"
         check_shared_dynamics(setting, why)
 
-    def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> Inference:
+    def start(self, model: MetaModel, rng: np.random.Generator, setting: Setting) -> Inference:
+        assert isinstance(model, MAMLRewardModel)
         return MAMLRewardInference(self, model, rng, setting.n_queries)
 
 
@@ -418,16 +419,15 @@ class MAMLRewardInference(Inference):
         """The current policy, whose number in the file was another."""
         return self.ask()
 
-    def tell(self, preference: Preference, *shown: Any) -> None:
-        check_seen(shown)
-        self.answers.append(Answer(preference, shown))
-        seen = [one for each in self.answers for one in each.shown]
+    def tell(self, preference: Preference, *shown: Shown) -> None:
+        self.answers.append(Answer(preference, seen(shown)))
+        clips = [one for each in self.answers for one in seen(each.shown)]
         parameters = self.model.reward.adapted(self.answers)
-        rewards = [self.model.reward.rewards(parameters, trajectory) for trajectory in seen]
+        rewards = [self.model.reward.rewards(parameters, trajectory) for trajectory in clips]
         # Preferences fix no unit; SAC's entropy needs one.
         scale = max(float(np.concatenate(rewards).std()), 1e-6)
         with _seeded(int(self.seed[0]) + len(self.answers)):
-            self._fill_buffer(seen, [row / scale for row in rewards])
+            self._fill_buffer(clips, [row / scale for row in rewards])
             self.sac.train(self.rule.gradient_steps, self.rule.batch_size)
         self.latent = self.model.add(self.sac.actor)
 

@@ -1,7 +1,6 @@
 """PEARL's own adaptation, which sees rewards at test time (Rakelly et al. 2019)."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch as th
@@ -10,7 +9,7 @@ from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.oracles import step_rewards
 from sb3_poem.adaptation.preference import Preference
 from sb3_poem.adaptation.priors import N_CENTRES, SOURCES
-from sb3_poem.adaptation.rule import Answer, Inference, Rule, Setting, Shown, check_seen
+from sb3_poem.adaptation.rule import Answer, Inference, Rule, Setting, Shown, seen
 from sb3_poem.baselines.fragments import transition_rows
 from sb3_poem.common.checks import check_choice
 from sb3_poem.common.family_view import FamilyView
@@ -68,7 +67,8 @@ class RewardOracle(Rule):
             raise ValueError("the reward oracle needs `env`, to read its rewards")
         FamilyView(setting.env)  # which refuses what is no family
 
-    def start(self, model: Any, rng: np.random.Generator, setting: Setting) -> Inference:
+    def start(self, model: MetaModel, rng: np.random.Generator, setting: Setting) -> Inference:
+        assert isinstance(model, PEARLSAC)
         inference = RewardInference(model, rng, setting)
         if self.candidates == "aggregate":
             latents = model.sample_latents(N_CENTRES, rng, source="aggregate")
@@ -81,7 +81,7 @@ class RewardInference(Inference):
 
     state = ("mean", "variance", "transitions")
 
-    def __init__(self, model: Any, rng: np.random.Generator, setting: Setting) -> None:
+    def __init__(self, model: PEARLSAC, rng: np.random.Generator, setting: Setting) -> None:
         super().__init__(rng)
         self.model, self._env, self._task = model, setting.env, setting.task
         self.mean, self.variance = np.zeros(model.latent_dim), np.ones(model.latent_dim)
@@ -93,10 +93,9 @@ class RewardInference(Inference):
         left, right = self.mean + np.sqrt(self.variance) * noise
         return left, right
 
-    def tell(self, preference: Preference, *shown: Any) -> None:
+    def tell(self, preference: Preference, *shown: Shown) -> None:
         """Looks at the rewards of both trajectories, not at the answer."""
-        check_seen(shown)
-        rows = np.concatenate([self._context_rows(item) for item in shown])
+        rows = np.concatenate([self._context_rows(item) for item in seen(shown)])
         self.answers.append(Answer(preference, shown))
         self.transitions = np.vstack([self.transitions.reshape(-1, rows.shape[1]), rows])
         n = min(self.model.context_size, len(self.transitions))
@@ -113,7 +112,9 @@ class RewardInference(Inference):
 
     def _context_rows(self, shown: Trajectory) -> np.ndarray:
         """(T, context_dim) standardised (s, a, s', r), as in training."""
+        statistics = self.model.context_reward_statistics
         assert self._env is not None
-        centre, deviation = self.model.context_reward_statistics
+        assert statistics is not None
+        centre, deviation = statistics
         rewards = (step_rewards(self._env, self._task, shown) - centre) / deviation
         return transition_rows(self.model.policy, shown, rewards).cpu().numpy()
