@@ -7,7 +7,9 @@ import json
 import os
 import time
 import warnings
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,15 +17,18 @@ import torch as th
 from meta_toys import EPOCH, N_TASKS, POINT_GOAL, differing, parameters, small, walks
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem import (
     PEARLSAC,
     POEMSAC,
     AdaptationEvalCallback,
     Paper,
+    ReturnOracle,
     RewardOracle,
     TrainingCheckpointCallback,
 )
+from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.pearl_sac.callbacks import EpochCallback
 
 
@@ -217,13 +222,33 @@ def test_a_resumed_run_goes_on_comparing_with_its_best_model(tmp_path: Path) -> 
     assert (tmp_path / "other" / "best_model.zip").exists()
 
 
+class Evaluations:
+    """Makes the oracles of evaluations, and notes their environments and tasks."""
+
+    def __init__(self) -> None:
+        self.envs: list[VecEnv] = []
+        self.tasks: list[float] = []
+
+    def __call__(self, env: VecEnv, task: np.ndarray, seed: int) -> ReturnOracle:
+        self.envs.append(env)
+        self.tasks += task.tolist()
+        return ReturnOracle(env, task, seed)
+
+
 def test_evaluation_of_a_finite_family_is_on_all_its_tasks() -> None:
-    callback = AdaptationEvalCallback(n_tasks=5, record_at=(1,), n_episodes=1)
-    model = small(POEMSAC, "poem/HalfCheetahFwdBack-v0", n_train_tasks=2)
-    callback.init_callback(model)
-    env, tasks = callback._make_env()
-    assert sorted(tasks.ravel()) == [-1.0, 1.0]
-    assert env.get_attr("spec")[0].id == "poem/HalfCheetahFwdBack-v0"
+    found = Evaluations()
+
+    def unanswered(**about: Any) -> Callable[..., None]:
+        found(**about)
+        return lambda left, right: None
+
+    how = {"n_tasks": 5, "record_at": (1,), "adaptation_kwargs": {"oracle_factory": unanswered}}
+    env = make_task_vec_env("poem/HalfCheetahFwdBack-v0", 2, max_episode_steps=5)
+    model = small(POEMSAC, env, n_train_tasks=2)
+    with pytest.raises(TypeError, match="the oracle returned nothing"):  # which ends it
+        model.learn(1, AdaptationEvalCallback(every=1, **how))
+    assert sorted(found.tasks) == [-1.0, 1.0]
+    assert found.envs[0].get_attr("spec")[0].id == "poem/HalfCheetahFwdBack-v0"
 
 
 def test_a_model_without_a_similarity_is_asked_at_random_unless_a_rule_is_named() -> None:
@@ -234,21 +259,18 @@ def test_a_model_without_a_similarity_is_asked_at_random_unless_a_rule_is_named(
 
 
 def test_evaluation_takes_the_training_environments_arguments() -> None:
-    from sb3_poem.common.vec_env import make_task_vec_env
-
-    callback = AdaptationEvalCallback(**QUICK)
-    callback.init_callback(
-        small(POEMSAC, make_task_vec_env(POINT_GOAL, 3, step_length=0.2, max_episode_steps=7))
-    )
-    env, tasks = callback._make_env()
+    found = Evaluations()
+    model = small(POEMSAC, make_task_vec_env(POINT_GOAL, 3, step_length=0.2, max_episode_steps=7))
+    how = {**QUICK, "adaptation_kwargs": {"oracle_factory": found}}
+    model.learn(2 * N_TASKS * 7, AdaptationEvalCallback(every=1, **how))
+    assert len(found.tasks) == 20
+    assert found.tasks[:10] == found.tasks[10:]
+    env = found.envs[0]
+    assert all(each is env for each in found.envs)
     assert env.num_envs == 20
-    assert tasks.shape == (10, 1)
     spec = env.get_attr("spec")[0]
     assert spec.kwargs["step_length"] == 0.2
     assert spec.max_episode_steps == 7
-    again = callback._make_env()
-    assert again[0] is env
-    assert np.array_equal(again[1], tasks)
 
 
 def test_what_cannot_be_evaluated_or_saved_is_refused_before_training(tmp_path: Path) -> None:

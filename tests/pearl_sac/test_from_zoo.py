@@ -37,10 +37,7 @@ def test_schedules_and_python_are_read_as_rl_zoo3_reads_them(algorithm: type[PEA
     expected: Any = ExperimentManager._preprocess_schedules(
         {"learning_rate": entry["learning_rate"]}
     )["learning_rate"]
-    model = algorithm.from_zoo(
-        f"poem_envs:{env_id}", n_envs=2, device="cpu", _init_setup_model=False
-    )
-    model._setup_lr_schedule()
+    model = algorithm.from_zoo(f"poem_envs:{env_id}", n_envs=2, device="cpu")
     for remaining in (1.0, 0.37, 0.0):
         assert model.lr_schedule(remaining) == pytest.approx(expected(remaining), rel=1e-12)
     with pytest.raises(ValueError, match="`learning_rate` must be a finite number, but is '1e-3'"):
