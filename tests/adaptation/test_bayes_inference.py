@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from scipy.special import ndtr, ndtri
-from worlds import HORIZON, STEP_WEIGHT, SpeedEnv, SpeedModel
+from worlds import HORIZON, STEP_WEIGHT, TOP_SPEED, SpeedEnv, SpeedModel
 
 from sb3_poem import set_task
 from sb3_poem.adaptation import MistakeOracle, PreferenceAdapter, ReturnOracle
@@ -31,7 +31,7 @@ from sb3_poem.adaptation.particles import (
 from sb3_poem.adaptation.preference import ANSWERS as ANSWERS_OF
 from sb3_poem.adaptation.preference import Preference, preference_log_likelihood
 from sb3_poem.adaptation.priors import AggregatePrior, GaussianPrior
-from sb3_poem.adaptation.rule import Answer, Setting
+from sb3_poem.adaptation.rule import Setting
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.common.vec_env import make_task_vec_env
@@ -51,6 +51,14 @@ def make(model=None, seed=0, library=None, **options):
     setting = Setting(library=library)
     rule.check(model, setting)
     return rule.start(model, np.random.default_rng(seed), setting)
+
+
+def crowd(inference, speed):
+    """Have most particles stand where the answers to come are likely: then none is moved, and the
+    weights alone change.
+    """
+    inference.particles[len(inference.particles) // 3 :] = ndtri(speed / TOP_SPEED)
+    return inference.particles.copy()
 
 
 def logistic(x):
@@ -80,9 +88,10 @@ ANSWERS = [(LEFT, 2.0, 1.0), (RIGHT, 2.6, 1.4), (EQUAL, 2.5, 1.3)]
 def test_the_decoders_likelihood_is_the_direct_formula(noise, probability):
     model = SpeedModel()
     inference = make(model, noise_model=noise, n_particles=50)
-    inference._rejuvenate = lambda: None  # the weights alone
+    particles = crowd(inference, 1.8)
     for preference, left, right in ANSWERS:
         inference.tell(preference, at_speed(model, left), at_speed(model, right))
+    np.testing.assert_array_equal(inference.particles, particles)
     error = model.predicted_rewards_error * math.sqrt(2 * HORIZON * ERROR_CORRELATION)
     for z, weight in zip(inference.particles, inference.log_weights, strict=True):
         goal, expected = 3 * ndtr(z[0]), 0.0
@@ -112,7 +121,7 @@ def test_latent_and_person_have_a_joint_posterior(question, noise, likelihood):
     model = SpeedModel()
     options = {"question": question, "noise_model": noise, "likelihood": likelihood}
     inference = make(model, n_particles=30, **options)
-    inference._rejuvenate = lambda: None  # the weights alone
+    particles = crowd(inference, 1.95)
     strongest = MUCH_LEFT if question == "graded" else LEFT
     told = [(strongest, 1.9, 0.3), (RIGHT, 2.6, 1.4), (EQUAL, 2.5, 1.9), (LEFT, 1.5, 2.9)]
     shown = []
@@ -120,7 +129,8 @@ def test_latent_and_person_have_a_joint_posterior(question, noise, likelihood):
         pair = [at_speed(model, v, np.full(5, ndtri(v / 3))) for v in speeds]
         inference.tell(preference, *pair)
         shown.append(pair)
-    people, spread = inference.people, inference._spread
+    np.testing.assert_array_equal(inference.particles, particles)
+    people, spread = inference.people, inference.scale[0]
     if likelihood == "decoder":
         cross, square = inference.calibration[:2]
         spread *= cross / square
@@ -181,7 +191,7 @@ def test_the_best_of_four_on_point_goal_against_enumeration(noise):
         adapter.tell(answer)
         values = model.predicted_returns(inference.particles, query.shown)
         cross, square = inference.calibration[:2]
-        spread = inference._spread * cross / square
+        spread = inference.scale[0] * cross / square
         error = model.predicted_rewards_error * math.sqrt(2 * 25 * ERROR_CORRELATION)
         if isinstance(noise, BoltzmannNoise):
             beta = 1 / (2 * np.abs(values).mean(axis=1, keepdims=True))
@@ -245,9 +255,10 @@ def test_the_probability_of_an_answer_given_the_others(question, noise):
     def told(answers):
         options = {"question": question, "noise_model": noise, "likelihood": "similarity"}
         inference = make(n_particles=40, **options)
-        inference._rejuvenate = lambda: None
+        particles = crowd(inference, 1.88)
         for preference, *sides in answers:
             inference.tell(preference, *(np.full(5, side) for side in sides))
+        np.testing.assert_array_equal(inference.particles, particles)
         return inference
 
     found = told(answers).agreements()
@@ -261,12 +272,8 @@ def test_the_probability_of_an_answer_given_the_others(question, noise):
         for each in side if others.people is None else (*side, EQUAL):
             if each not in ANSWERS_OF[question]:
                 continue
-            answer = Answer(each, tuple(np.full(5, side) for side in sides))
-            likelihood = np.exp(others._log_likelihoods(others.particles, [answer]))
-            if others.people is not None:
-                shares = np.exp(others.people_log_shares.astype(np.float64))
-                likelihood = np.sum(shares * likelihood, axis=1)
-            expected += others.weights @ likelihood
+            more = told([*answers[:i], *answers[i + 1 :], (each, *sides)])
+            expected += others.weights @ np.exp(more.log_weights - others.log_weights)
         assert found[i, 0] == pytest.approx(expected, rel=0.02)
 
 
@@ -341,14 +348,14 @@ def test_the_likelihood_from_s_is_the_direct_formula():
         np.mean([(row[i] - row[j]) ** 2 for row in s for i in range(50) for j in range(50)])
     )
     unit = max(1.0, SIMILARITY_RESOLUTION * spread / 1.702)
-    left, right = np.full(5, 0.4), np.full(5, -0.7)
+    left, right = np.full(5, -0.4), np.full(5, -1.7)
     expected = np.log(
         LAPSE / 2
         + (1 - LAPSE)
         * logistic((model.similarities(particles, np.stack([left, right])) @ [1, -1]) / unit)
     )
-    inference._rejuvenate = lambda: None
     inference.tell(LEFT, left, right)
+    np.testing.assert_array_equal(inference.particles, particles)
     np.testing.assert_allclose(inference.log_weights, expected, rtol=1e-9)
 
 
@@ -357,9 +364,9 @@ def test_error_free_answers_do_not_care_for_the_scale_of_s():
     weights = []
     for scale in (100.0, 10_000.0):
         inference = make(SpeedModel(scale=scale), likelihood="similarity")
-        inference._rejuvenate = lambda: None
-        inference.tell(LEFT, np.full(5, 0.4), np.full(5, -0.7))
+        inference.tell(LEFT, np.full(5, -0.4), np.full(5, -1.7))
         weights.append(inference.weights)
+    assert np.ptp(weights[0]) > 0  # as none was moved
     np.testing.assert_allclose(weights[0], weights[1], rtol=1e-6)
 
 
@@ -385,7 +392,13 @@ def test_the_posterior_agrees_with_a_grid(likelihood, candidates):
         if likelihood == "decoder":
             pair = [at_speed(model, model.speed(z), z) for z in pair]
         inference.tell(preference, *pair)
-    log_posterior = log_posterior + inference._answer_log_likelihoods(grid)
+        if likelihood == "decoder":
+            values = model.predicted_returns(grid, pair)
+            slope = 1.702 / (0.5 * math.sqrt(2 * HORIZON * ERROR_CORRELATION))
+        else:
+            values, slope = model.similarities(grid, np.stack(pair)), 1 / inference.scale[1]
+        better = values @ ([1, -1] if preference is LEFT else [-1, 1])
+        log_posterior += np.log(LAPSE / 2 + (1 - LAPSE) * logistic(slope * better))
     posterior = np.exp(log_posterior - log_posterior.max())
     posterior /= posterior.sum()
     mean = posterior @ grid[:, 0]
@@ -731,10 +744,7 @@ def test_what_some_steps_alone_mislead_to_is_put_right():
     for inference in (truth, misled, restored):
         inference.tell(RIGHT, left, right)
         np.testing.assert_allclose(inference.particles, truth.particles)
-        latents = truth.particles[:20]
-        np.testing.assert_allclose(
-            *(each._answer_log_likelihoods(latents) for each in (inference, truth))
-        )
+        np.testing.assert_allclose(inference.agreements(), truth.agreements())
     prior = make()
     assert (
         SpeedModel.speed(truth.estimate()) > SpeedModel.speed(prior.estimate()) + 0.2
