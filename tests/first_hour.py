@@ -6,6 +6,7 @@ import contextlib
 import functools
 import io
 import re
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -101,3 +102,38 @@ def check_words(message: str, words: str) -> None:
     """Whether a message says what is wrong, and what would be right."""
     missing = [word for word in words.split("...") if not re.search(word, message, re.DOTALL)]
     assert not missing, message
+
+
+def works(name: str, call: Callable[[Path], Any], outcome: Any = True) -> Any:
+    """A row.
+
+    :param name: Of the row
+    :param call: What is typed; gets an empty folder
+    :param outcome: What it gives, or a function that says whether that is right
+    """
+    return pytest.param(call, outcome, id=name)
+
+
+def check_outcome(value: Any, outcome: Any) -> None:
+    """Whether it is the outcome of a row."""
+    if callable(outcome) and not isinstance(outcome, type):
+        assert outcome(value), value
+    else:
+        assert value == outcome
+
+
+def check_works(call: Callable[[Path], Any], outcome: Any, folder: Path) -> None:
+    """Whether a row of :func:`works` does, without a warning."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        value = call(folder)
+    check_outcome(value, outcome)
+
+
+def names(folder: Path, pattern: str = "*") -> list[str]:
+    return sorted(path.name for path in folder.glob(pattern) if path.is_file())
+
+
+def runs(folder: Path) -> list[str]:
+    """Of TensorBoard."""
+    return [path.parent.name for path in folder.rglob("events.out.tfevents*")]

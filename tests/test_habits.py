@@ -1,4 +1,4 @@
-"""What people type who know SB3, Gymnasium and rl_zoo3: it works, or says what to type instead."""
+"""What people type who know SB3 and Gymnasium: it works, or says what to type instead."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ import functools
 import io
 import json
 import pickle
-import runpy
-import sys
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,7 +17,17 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from first_hour import ENTRY, Toy, check_words, config_file, made, refused, shell, trained
+from first_hour import (
+    Toy,
+    check_words,
+    check_works,
+    made,
+    names,
+    refused,
+    runs,
+    trained,
+    works,
+)
 from gymnasium import wrappers
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from meta_toys import EPOCH, N_TASKS, POINT_GOAL, SMALL, differing, parameters
@@ -56,20 +64,9 @@ from poem_envs import GoalFamily
 from sb3_poem import POEMSAC, AdaptationEvalCallback, PreferenceAdapter, ReturnOracle, TaskVecEnv
 from sb3_poem.adaptation import AdaptedPolicy
 from sb3_poem.poem_sac.policies import MlpPolicy
-from sb3_poem.resources import pretrained_names
 
 OBS = np.random.default_rng(0).normal(size=(6, 2))
 CHEETAH = "poem/HalfCheetahVel-v0"
-
-
-def works(name: str, call: Callable[[Path], Any], outcome: Any = True) -> Any:
-    """A row.
-
-    :param name: Of the row
-    :param call: What is typed; gets an empty folder
-    :param outcome: What it gives, or a function that says whether that is right
-    """
-    return pytest.param(call, outcome, id=name)
 
 
 def learned(**arguments: Any) -> POEMSAC:
@@ -85,15 +82,6 @@ def printed(call: Callable[[], Any]) -> str:
 
 def same(one: th.nn.Module, two: th.nn.Module) -> bool:
     return not differing(one.state_dict(), two.state_dict())
-
-
-def names(folder: Path, pattern: str = "*") -> list[str]:
-    return sorted(path.name for path in folder.glob(pattern) if path.is_file())
-
-
-def runs(folder: Path) -> list[str]:
-    """Of TensorBoard."""
-    return [path.parent.name for path in folder.rglob("events.out.tfevents*")]
 
 
 def point(**arguments: Any) -> gym.Env:
@@ -600,129 +588,6 @@ MISLEADING = [
     ),
 ]
 
-# ---------------------------------------------------------------- the command line
-
-
-def said(*arguments: object) -> str:
-    done = shell(*arguments)
-    assert done.status == 0, done.err
-    return " ".join((done.out + done.err).split())
-
-
-def train(folder: Path, *flags: object, env_id: str = POINT_GOAL) -> str:
-    given = ("-c", config_file(folder, env_id), "-f", folder / "logs", "--eval-freq", -1)
-    return said("train", "--env", env_id, *given, *flags)
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a training with many flags, whose outcomes are looked at one by one."""
-    folder = tmp_path_factory.mktemp("run")
-    flags = ["-params", "gamma:0.9", "policy_kwargs:dict(net_arch=[8])", "-n", 450, "--seed", 0]
-    flags += ["-P", "-tb", folder / "tb", "--save-freq", 150, "--eval-freq", 450]
-    flags += ["--eval-episodes", 1, "--env-kwargs", "step_length:0.1"]
-    (folder / "printed").write_text(train(folder, *flags))
-    return folder
-
-
-def first(folder: Path, number: int = 1) -> Path:
-    return folder / f"logs/poem_sac/poem-PointGoal-v0_{number}"
-
-
-def result(folder: Path, number: int = 1) -> POEMSAC:
-    return POEMSAC.load(first(folder, number) / "poem-PointGoal-v0.zip")
-
-
-FLAGS = [
-    works("-n", lambda run: result(run).num_timesteps, 450),
-    works(
-        "-params", lambda run: (result(run).gamma, result(run).policy.net_arch["pi"]), (0.9, [8])
-    ),
-    works("-c", lambda run: result(run).batch_size, ENTRY["batch_size"]),
-    works("--seed", lambda run: result(run).seed, 0),
-    works("--env-kwargs", lambda run: dict(result(run).env_kwargs), {"step_length": 0.1}),
-    works(
-        "--save-freq",
-        lambda run: names(first(run)),
-        {"checkpoint.zip", "rl_model_150_steps.zip"}.issubset,
-    ),
-    works("--eval-freq", lambda run: names(first(run), "best*"), ["best_model.zip"]),
-    works("-tb", lambda run: len(runs(run / "tb")), 1),
-    works("--progress", lambda run: "450/450" in (run / "printed").read_text()),
-]
-
-
-def trained_further(folder: Path) -> tuple[int, int]:
-    train(folder)
-    train(folder, "-i", first(folder) / "poem-PointGoal-v0.zip", "-n", 150)
-    return result(folder)._n_updates, result(folder, 2)._n_updates
-
-
-def searched(folder: Path) -> bool:
-    flags = ("--n-trials", 1, "--n-evaluations", 1, "--eval-episodes", 1, "--no-optim-plots")
-    train(folder, "-optimize", "-n", 50, "--seed", 38, "--sampler", "random", *flags)
-    (report,) = (folder / "logs/poem_sac").glob("report_*.csv")
-    return "COMPLETE" in report.read_text()
-
-
-def own_module(folder: Path) -> bool:
-    """In the working folder, as beside a user's own scripts."""
-    lines = ("import gymnasium", "import first_hour")
-    lines += ("gymnasium.register('Mine-v0', first_hour.Toy, max_episode_steps=10)",)
-    (folder / "my_families.py").write_text("\n".join(lines))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "path", [path for path in sys.path if path not in ("", ".")])
-        try:
-            train(folder, "--gym-packages", "my_families", "-n", 60, env_id="Mine-v0")
-        finally:
-            gym.registry.pop("Mine-v0", None)
-            sys.modules.pop("my_families", None)
-    return (folder / "logs/poem_sac/Mine-v0_1/Mine-v0.zip").is_file()
-
-
-def as_a_module(_: Path) -> Any:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["sb3-poem", "--version"])
-        with pytest.raises(SystemExit) as stop:
-            runpy.run_module("sb3_poem", run_name="__main__")
-    return stop.value.code
-
-
-def enjoyed(folder: Path, *flags: object) -> str:
-    train(folder)
-    return said("enjoy", "--env", POINT_GOAL, "-f", folder / "logs", "--no-render", *flags)
-
-
-def recorded(folder: Path) -> list[str]:
-    flags = ("--queries", 1, "--episodes", 1, "--out", folder / "a.gif")
-    said("record-video", "--model", "PointGoal", *flags)
-    return names(folder)
-
-
-ADAPT = ("adapt", "--model", "PointGoal", "--tasks", 2, "--queries", 1, "--episodes", 1)
-
-COMMANDS = [
-    works("train -i", trained_further, (6, 9)),
-    works("train -optimize", searched),
-    works("train --gym-packages", own_module),
-    works(
-        "train --algo",
-        lambda f: train(f, "--algo", "pearl_sac") and (f / "logs/pearl_sac").is_dir(),
-    ),
-    works("enjoy", lambda f: "answers" in enjoyed(f, "--queries", 2, "--episodes", 1)),
-    works("enjoy -n --exp-id", lambda f: len(enjoyed(f, "-n", 50, "--exp-id", 1)) > 0),
-    works(
-        "adapt",
-        lambda f: "task known" in said(*ADAPT, "--json", f / "a.json") and names(f),
-        ["a.json"],
-    ),
-    works("record-video", recorded, ["a.gif"]),
-    works(
-        "models", lambda _: [name for name in pretrained_names() if name not in said("models")], []
-    ),
-    works("python -m sb3_poem", as_a_module, 0),
-]
-
 # ---------------------------------------------------------------- the rows
 
 
@@ -731,28 +596,12 @@ def working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-def check(value: Any, outcome: Any) -> None:
-    if callable(outcome) and not isinstance(outcome, type):
-        assert outcome(value), value
-    else:
-        assert value == outcome
-
-
-WORKING = [*CONSTRUCTOR, *LEARN, *FILES, *PREDICT, *ENVIRONMENTS, *COMMANDS]
+WORKING = [*CONSTRUCTOR, *LEARN, *FILES, *PREDICT, *ENVIRONMENTS]
 
 
 @pytest.mark.parametrize(("call", "outcome"), WORKING)
 def test_works(call: Callable[[Path], Any], outcome: Any, tmp_path: Path) -> None:
-    """Without a warning."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", UserWarning)
-        value = call(tmp_path)
-    check(value, outcome)
-
-
-@pytest.mark.parametrize(("call", "outcome"), FLAGS)
-def test_flags_of_train(call: Callable[[Path], Any], outcome: Any, run: Path) -> None:
-    check(call(run), outcome)
+    check_works(call, outcome, tmp_path)
 
 
 @pytest.mark.parametrize(("call", "words", "error"), [*WITHOUT, *CHANGED])
