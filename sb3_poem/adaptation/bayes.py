@@ -39,7 +39,7 @@ from sb3_poem.adaptation.preference import (
     preference_log_likelihood,
 )
 from sb3_poem.adaptation.priors import SOURCES, make_prior
-from sb3_poem.adaptation.rule import Answer, Inference, Rule, Setting, Shown, latent_of, seen
+from sb3_poem.adaptation.rule import Answer, Inference, Rule, Setting, Shown, latents_of, seen
 from sb3_poem.common.checks import check_choice, check_number, check_whole
 from sb3_poem.common.trajectory import Trajectory
 
@@ -272,7 +272,7 @@ class BayesInference(Inference):
         if len(particles) > QUERY_PARTICLES:
             particles = particles[systematic_resample(weights, QUERY_PARTICLES, self.rng)]
             weights = np.full(QUERY_PARTICLES, 1.0 / QUERY_PARTICLES)
-        similarities = self._similarities(particles, list(policies))
+        similarities = self._similarities(particles, policies)
         if self.rule.query_rule == "worst-case":
             return queries.worst_case_pair(similarities, self.rule.epsilon, weights)
         slope, magnitude, noise = self._return_unit()
@@ -463,12 +463,12 @@ class BayesInference(Inference):
             difference = first_to_others(values.reshape(grouped))
             difference = difference + intercepts + slopes * difference
             if new and self.similarity is not None:
-                s = first_to_others(self._similarities(latents, shown)).ravel()
+                s = first_to_others(self._similarities(latents, latents_of(shown))).ravel()
                 typical = 2.0 * np.abs(values).mean(axis=1).mean()
                 self.calibration += [s @ first_to_others(values).ravel(), s @ s, typical, 1.0]
             magnitude = 2.0 * np.abs(values).reshape(grouped).mean(axis=2)
             return difference, np.broadcast_to(error, shape), magnitude, self._return_spread(clips)
-        values = self._similarities(latents, shown)
+        values = self._similarities(latents, latents_of(shown))
         error = np.full(shape, self.scale[1] * PROBIT_SLOPE)
         magnitude = np.full(shape, 2.0 * self._spread)
         return first_to_others(values.reshape(grouped)), error, magnitude, self._spread
@@ -507,9 +507,9 @@ class BayesInference(Inference):
         pairs = zip(first_to_others(thin[some]).T, first_to_others(full).T, strict=True)
         return np.array([fit_thinning(*pair) for pair in pairs])
 
-    def _similarities(self, latents: np.ndarray, shown: Sequence[Shown]) -> np.ndarray:
+    def _similarities(self, latents: np.ndarray, policies: np.ndarray) -> np.ndarray:
         assert self.similarity is not None
-        return self.similarity.similarities(latents, np.stack(list(map(latent_of, shown))))
+        return self.similarity.similarities(latents, policies)
 
     def _query_policies(self) -> np.ndarray:
         """(n, d): half of them draws of the posterior, half of the prior."""

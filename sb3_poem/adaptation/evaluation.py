@@ -15,7 +15,7 @@ from sb3_poem.adaptation.environments import Env, model_and_env, warn_if_untrain
 from sb3_poem.adaptation.meta_model import MetaModel
 from sb3_poem.adaptation.oracles import Oracle, ReturnOracle
 from sb3_poem.adaptation.preference import PLACES, Preference, as_preference
-from sb3_poem.adaptation.rule import Rule, Setting, as_rule, inference_rng, latent_of, rollout_seed
+from sb3_poem.adaptation.rule import Rule, Setting, as_rule, inference_rng, latents_of, rollout_seed
 from sb3_poem.common.checks import check_whole, check_whole_numbers
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.rollouts import rollout_latents, rollout_outcomes
@@ -124,7 +124,7 @@ def adapt_tasks(
                 own_seeds = [rollout_seed(number, query) for number, _ in numbered]
                 seeds = np.repeat(own_seeds, n_shown).tolist()
                 where = np.repeat(tasks, n_shown, axis=0)
-                policies = np.stack([latent_of(item) for item in asked])
+                policies = latents_of(asked)
                 shown = rollout_latents(model, vec_env, policies, where, seeds, by_mode)
             for i, (inference, oracle) in enumerate(zip(inferences, oracles, strict=True)):
                 own = shown[n_shown * i : n_shown * (i + 1)]

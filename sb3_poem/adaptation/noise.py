@@ -58,7 +58,8 @@ class NoiseModel:
 
     def probability_left(self, difference: Values, error: Values, magnitude: Values) -> np.ndarray:
         """P(LEFT), given that the oracle says LEFT or RIGHT, in (0, 1)."""
-        left = (1.0 - LAPSE) * self.probability_above(difference, error, magnitude) + LAPSE / 2
+        left = (1.0 - LAPSE) * self.probability_above(difference, error, magnitude)
+        left += LAPSE / 2
         return left if self.rate == 0.0 else self.rate + (1.0 - 2.0 * self.rate) * left
 
     def to_dict(self) -> dict[str, Any]:

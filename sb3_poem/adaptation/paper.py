@@ -17,7 +17,7 @@ from sb3_poem.adaptation.rule import (
     Setting,
     Shown,
     equally_weighted,
-    latent_of,
+    latents_of,
 )
 from sb3_poem.common.checks import check_choice, check_number, check_whole
 
@@ -129,7 +129,7 @@ class PaperInference(Inference):
     def _differences(self, latents: np.ndarray) -> np.ndarray:
         """(m, k) S(z, z_left) - S(z, z_right) of every answered question."""
         shown = [item for answer in self.answers for item in answer.shown]
-        similarities = self.model.similarities(latents, np.stack([latent_of(z) for z in shown]))
+        similarities = self.model.similarities(latents, latents_of(shown))
         return similarities[:, 0::2] - similarities[:, 1::2]
 
     def _satisfied(self, differences: np.ndarray) -> np.ndarray:

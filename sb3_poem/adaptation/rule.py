@@ -231,6 +231,11 @@ def latent_of(shown: Shown) -> np.ndarray:
     return shown.latent if isinstance(shown, Trajectory) else np.asarray(shown, dtype=np.float64)
 
 
+def latents_of(shown: Sequence[Shown]) -> np.ndarray:
+    """(n, d) the latents behind what was shown."""
+    return np.stack([latent_of(item) for item in shown])
+
+
 def seen(shown: Sequence[Shown]) -> tuple[Trajectory, ...]:
     """What was shown, for a rule that looks at what was done; latents are refused."""
     trajectories = tuple(item for item in shown if isinstance(item, Trajectory))
