@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from poem_envs.registration import did_you_mean
+from poem_envs.registration import did_you_mean, family_name
 from sb3_poem.hub import download, is_repository
 
 _PACKAGE = Path(__file__).resolve().parent
@@ -75,6 +75,9 @@ def find_folder(name: str | Path) -> Path:
     if path.exists():
         written = "as POEMSAC.load(file).save_pretrained(folder) writes it"
         raise FileNotFoundError(f"{name} is a file, but must be the folder of a model, {written}")
+    family = family_name(str(name))
+    if name == f"poem/{family}-v0" and family in pretrained_names():
+        raise FileNotFoundError(f"{name} is an environment; the model that ships is {family!r}")
     if is_repository(name):
         return download(str(name))
     if path.suffix == ".zip" or len(path.parts) > 1:

@@ -526,7 +526,6 @@ def test_the_policy_of_one_task_is_saved(model: tuple[POEMSAC, str], tmp_path: P
         (["--mistake-rate", 0.0], "--mistake-rate is for --oracle mistake, but that is return"),
         (["--beta", 2.0], "--beta is for --oracle boltzmann, but that is return"),
         (["--thresholds", 0.7, 0.1], "--thresholds 0.7 0.1: must be two shares"),
-        (["--oracle", "mistake", "--mistake-rate", 1.5], "1.5"),
         (["--oracle", "boltzmann", "--beta", -1.0], "-1.0"),
         (["--json", "a.txt"], "must end in .json"),
         (["--plot", "a.gif"], "must end in .png or"),

@@ -460,6 +460,7 @@ def test_files_that_ship_are_found_by_their_names_and_ones_own_come_first(tmp_pa
     [
         (("-params", "kl_coef:abc"), ("-params kl_coef:abc", "'abc'", "KEY:VALUE")),
         (("-params", "kl_coef"), ("-params kl_coef", "KEY:VALUE")),
+        (("-params", "kl_coef=0.1"), ("-params kl_coef=0.1", "did you mean kl_coef:0.1?")),
         (("-params", "kl_coef:'abc'"), ("kl_coef in -params must be a number, got 'abc'",)),
         (("-params", "kl_coef:'0.1'"), ("kl_coef in -params is the text '0.1'; write 0.1",)),
         (("-params", "batch_size:2.5"), ("batch_size in -params must be a whole number, got 2.5",)),
@@ -700,6 +701,8 @@ def test_a_second_interrupt_stops_at_once_and_loses_no_older_checkpoint(
         "Interrupted at 630 of 900 steps, before the first checkpoint; the same command begins "
         "again"
     )
+    assert train(*flags, "-n", 1200, "--resume") == 1
+    assert "goes on to its own 900 steps; leave -n out" in capfd.readouterr().err
     assert train(*flags, "--resume", "-params", "n_timesteps:900", "callback:None") == 0
     assert "after 600 steps" in capfd.readouterr().out
     assert not differing(parameters(trained(tmp_path, 3)), whole)

@@ -289,12 +289,17 @@ ALGORITHMS = [
     refused(
         "load_checkpoint",
         lambda s: POEMSAC.load_checkpoint(s / "poem.zip"),
-        "poem.zip...no checkpoint",
+        "poem.zip...is a model, no checkpoint: use POEMSAC.load",
     ),
     refused("load_replay_buffer", lambda s: made().load_replay_buffer(s / "bufer"), "bufer"),
     refused("save in file", lambda s: trained().save(s / "text.zip" / "m"), "text.zip"),
     refused(
         "from_pretrained", lambda _: POEMSAC.from_pretrained("PointGaol"), "PointGaol...PointGoal"
+    ),
+    refused(
+        "from_pretrained of an id",
+        lambda _: POEMSAC.from_pretrained("poem/PointGoal-v0"),
+        "is an environment; the model that ships is 'PointGoal'",
     ),
     refused(
         "from_pretrained of a zip", lambda s: POEMSAC.from_pretrained(s / "poem.zip"), r"\bload\b"
@@ -590,7 +595,9 @@ COMMANDS = [
     command("task...99", *ADAPT, "--task", 99.0),
     command("--task needs 1 number", *ADAPT, "--task", 1.0, 2.0),
     command("--record 6...--queries 1", *ADAPT, "--record", 6),
-    command("rate...1.5", *ADAPT, "--oracle", "mistake", "--mistake-rate", 1.5),
+    command(
+        "--mistake-rate...from 0 to 0.5...1.5", *ADAPT, "--oracle", "mistake", "--mistake-rate", 1.5
+    ),
     command("--env-kwargs nonsense...KEY:VALUE", *ADAPT, "--env-kwargs", "nonsense"),
     command("--gym-packages...nothing_like_it", *ADAPT, "--gym-packages", "nothing_like_it"),
     command("gpu...cuda", *ADAPT, "--device", "gpu"),
@@ -601,7 +608,7 @@ COMMANDS = [
     command("--host...--token", "label", "--host", "0.0.0.0"),
     command("PointGaol...PointGoal", "label", "--model", "PointGaol"),
     command("--seed...63...9999999999999999999", "label", "--seed", 10**19 - 1),
-    command("rate...2", "label", "--mistake-rate", 2),
+    command("--mistake-rate...from 0 to 0.5...2", "label", "--mistake-rate", 2),
     command("pairs...graded", "label", "--inference", "paper", "--question", "graded"),
     command("pairs...best-of-four", *ADAPT, "--inference", "paper", "--question", "best-of-four"),
     command(

@@ -170,9 +170,13 @@ class Bayes(Rule):
                 "model has been trained on tasks that share their dynamics"
             )
         if likelihood == "similarity" and not compares:
+            without = "which takes training on tasks that share their dynamics"
+            known = (
+                f", nor a decoder whose error is known, {without}" if not self.likelihood else ""
+            )
             raise ValueError(
-                f'likelihood="similarity" needs a model with `similarities` (POEMSAC); {name} has '
-                "none"
+                f'likelihood="similarity" needs a model with `similarities` (POEMSAC); this {name} '
+                f"has none{known}"
             )
         if likelihood == "similarity" and isinstance(noise, BoltzmannNoise) and noise.beta:
             raise ValueError(

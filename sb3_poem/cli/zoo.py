@@ -46,7 +46,10 @@ class CheckedPairs(StoreDict):
 
     def __call__(self, parser: Any, namespace: Any, values: Any, option_string: Any = None) -> None:
         for pair in values:
-            key, _, text = pair.partition(":")
+            key, colon, text = pair.partition(":")
+            if not colon:
+                meant = f"; did you mean {pair.replace('=', ':', 1)}?" * ("=" in pair)
+                raise ValueError(f"{option_string} {pair}: must have the form KEY:VALUE{meant}")
             try:
                 super().__call__(parser, namespace, [pair], option_string)
             except Exception as error:  # whatever the text raises
@@ -68,6 +71,7 @@ def parse(command: str, arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=-1)
     parser.add_argument("-f", "--log-folder", default="logs")
     parser.add_argument("-i", "--trained-agent")
+    parser.add_argument("-n", "--n-timesteps", type=int, default=-1)
     return parser.parse_known_args(arguments)[0]
 
 
@@ -79,7 +83,14 @@ def check_arguments(given: argparse.Namespace) -> None:
         if not given.trained_agent.endswith(".zip") or not Path(given.trained_agent).is_file():
             what = "there is no such file of a model, which ends in .zip"
             raise ValueError(f"-i {given.trained_agent}: {what}")
-        if given.algo in ALGORITHMS and not is_checkpoint(given.trained_agent):
+        if is_checkpoint(given.trained_agent):
+            total = facts_of(given.trained_agent)["_total_timesteps"]
+            if given.n_timesteps not in (-1, total):
+                raise ValueError(
+                    f"-n {given.n_timesteps}: {given.trained_agent} goes on to its own {total} "
+                    "steps; leave -n out, and train the finished model further with -i"
+                )
+        elif given.algo in ALGORITHMS:
             ALGORITHMS[given.algo].load(given.trained_agent, device="cpu")
     if given.env not in gym.registry:
         names = {name: env_id for env_id in gym.registry for name in (env_id, family_label(env_id))}

@@ -745,7 +745,10 @@ class PEARLSAC(SAC):
         :raises ValueError: If the file is truncated or foreign, or env of another family
         """
         if not saving.is_checkpoint(path):
-            raise ValueError(f"{path} is truncated, or no checkpoint of sb3_poem")
+            what = "is truncated, or no checkpoint of sb3_poem"
+            if saving.algorithm_of(path):
+                what = f"is a model, no checkpoint: use {cls.__name__}.load"
+            raise ValueError(f"{path} {what}")
         if (found := saving.algorithm_of(path)) != cls.__name__:
             raise ValueError(f"{path} holds a {found}; load it with {found}.load_checkpoint")
         with open(path, "rb") as file:

@@ -266,7 +266,6 @@ def test_replay_knows_a_model_by_its_folder_and_says_which_it_lacks(
         (["--auth", "ann:short"], "at least 12 characters"),
         (["--auth", "nobody"], "USER:PASSWORD"),
         (["--model", "Nobody"], "PointGoal"),
-        (["--mistake-rate", "0.7"], "`rate`"),
         (["--instructions", "gone.md"], "--instructions gone.md: must be a text in UTF-8 (No such"),
         (["--auth-file", "."], "--auth-file .: must be a text in UTF-8 (Is a directory)"),
         (

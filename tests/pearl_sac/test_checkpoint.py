@@ -326,7 +326,7 @@ def test_files_that_are_no_checkpoints(tmp_path: Path) -> None:
     assert len(files) > 15
     for name, path in files.items():
         with pytest.raises(
-            ValueError, match=r"truncated, or no checkpoint of|no checkpoint of this version"
+            ValueError, match=r"truncated, or no checkpoint of|is a model, no checkpoint: use POEM"
         ) as caught:
             POEMSAC.load_checkpoint(path)
         assert name in str(caught.value)
