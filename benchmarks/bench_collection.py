@@ -4,7 +4,7 @@ Every contender is stepped by the same loop with the same untrained policy (one 
 copies). "training" is what ``learn`` does: the same with relabelling features, checks, episode
 infos, callbacks and storage. The limit, which Meta-World does not have, is bare ``mujoco.rollout``
 on states and controls of "TaskVecEnv", with as many threads and nothing else. EnvPool (``pip
-install sb3_poem[bench]``) steps its own versions of these robots.
+install '.[bench]'``) steps its own versions of these robots.
 
     python benchmarks/bench_collection.py --env poem/AntVel-v0 poem/MetaWorldML1-v0
 """

@@ -6,7 +6,7 @@ python benchmarks/bench_gradient_step.py [--sizes entries paper] [--threads 2] [
 Contenders take turns within one run; a figure is the median of their turns. *plain* is the same
 mathematics in eager float32 (`plain_poem.py`; its losses are compared with ours first). *SAC* is
 Stable-Baselines3's own on as many transitions: it has no encoder, decoder, embeddings or
-preferences, and its actor learns in every step. *SBX* (`--sbx`; `pip install 'sb3_poem[sbx]'`) is
+preferences, and its actor learns in every step. *SBX* (`--sbx`; `pip install '.[sbx]'`) is
 SAC in JAX and float32; *SBX, delayed* trains its actor as seldom as we do. *products* is the time
 of `torch.mm` for every matrix product of our step, on operands of the same shapes, strides and
 type. What happens once an epoch (posteriors, the decoder's error) is timed on its own and
@@ -271,7 +271,7 @@ def main() -> None:
     if given.sbx and not on_cpu:
         raise SystemExit(f"--sbx is measured on the processor, but --device is {given.device}")
     if given.sbx and find_spec("sbx") is None:
-        raise SystemExit("--sbx: SBX is not installed; pip install 'sb3_poem[sbx]'")
+        raise SystemExit("--sbx: SBX is not installed; pip install '.[sbx]'")
     if given.sbx and {available_cores()} != set(given.threads):
         raise SystemExit(
             f"--sbx: JAX takes all {available_cores()} core(s) that this process may use, but "

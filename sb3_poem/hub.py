@@ -71,7 +71,9 @@ def _client(what: str) -> Any:
         import huggingface_hub
         import huggingface_hub.errors
     except ImportError as error:
-        raise ImportError(f"{what} needs huggingface_hub: pip install 'sb3_poem[hub]'") from error
+        raise ImportError(
+            f"{what} needs huggingface_hub: pip install '.[hub]' in a checkout"
+        ) from error
     return huggingface_hub
 
 

@@ -277,7 +277,9 @@ ALGORITHMS = [
     ),
     refused("load a SAC", lambda s: POEMSAC.load(s / "sac.zip"), "sac.zip...another algorithm"),
     refused(
-        "load PEARLSAC", lambda s: POEMSAC.load(s / "pearl.zip"), "pearl.zip...another algorithm"
+        "load PEARLSAC",
+        lambda s: POEMSAC.load(s / "pearl.zip"),
+        "pearl.zip...holds a PEARLSAC, not a POEMSAC",
     ),
     refused("load a checkpoint", lambda s: POEMSAC.load(s / "checkpoint.zip"), "load_checkpoint"),
     refused("load and misspell", lambda s: POEMSAC.load(s / "poem.zip", gama=0.5), "gama"),
@@ -571,6 +573,7 @@ COMMANDS = [
     command("'latent_dims'...'latent_dim'", *TRAIN, "-c", "stock/misspelt/my.yml"),
     command("'seed'...--seed", *TRAIN, "-c", "stock/seeded/my.yml"),
     command("learning_rate...write 0.001", *TRAIN, "-c", "stock/textual/my.yml"),
+    command("--env is missing", "train", "--seed", 0),
     command("missing.zip", *TRAIN, "-i", "missing.zip"),
     command("text.zip is truncated", *TRAIN, "-i", "stock/text.zip"),
     command("pearl.zip holds", *TRAIN, "-i", "stock/pearl.zip"),

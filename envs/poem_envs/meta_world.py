@@ -184,7 +184,7 @@ class MetaWorldML1Env(MetaWorldEnv):
     There is no early end. `gymnasium.make` truncates episodes after 200 steps.
 
     ## Arguments
-    The extra `metaworld` is needed: `pip install 'sb3_poem[metaworld]'`.
+    The extra `metaworld` is needed: `pip install '.[metaworld]'` in a checkout.
 
     ```python
     import gymnasium as gym

@@ -22,6 +22,7 @@ from sb3_poem.pearl_sac.saving import build_model, config_text, model_contents, 
 FORMAT = "sb3_poem adapted policy 2"
 LATENT = "latent"
 MODEL_PREFIX = "model."
+POLICY_SUFFIX = ".safetensors"
 
 
 class AdaptedPolicy:
@@ -87,15 +88,16 @@ class AdaptedPolicy:
         return save({**named, LATENT: th.as_tensor(self.latent)}, facts)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write :meth:`to_bytes` to a file, whose name should end in ``.safetensors``."""
-        write_atomically(Path(path), self.to_bytes())
+        """Write :meth:`to_bytes` to a file; a name without a suffix gets ``.safetensors``."""
+        write_atomically(_named(path), self.to_bytes())
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], device: str = "auto") -> Self:
         """Read what :meth:`save` wrote, or the page gives for download; see :meth:`from_bytes`."""
-        if not Path(path).is_file():
+        file = Path(path) if Path(path).is_file() else _named(path)
+        if not file.is_file():
             raise FileNotFoundError(f"{path}: there is no such file of an adapted policy")
-        return cls.from_bytes(Path(path).read_bytes(), device, os.fspath(path))
+        return cls.from_bytes(file.read_bytes(), device, os.fspath(file))
 
     @classmethod
     def from_bytes(cls, content: bytes, device: str = "auto", source: str = "the content") -> Self:
@@ -126,3 +128,8 @@ class AdaptedPolicy:
             return cls(model, latent, int(n_answers))
         except ValueError as error:
             raise ValueError(f"{source} is broken: {error}") from error
+
+
+def _named(path: str | os.PathLike[str]) -> Path:
+    file = Path(path)
+    return file if file.suffix else file.with_suffix(POLICY_SUFFIX)

@@ -46,7 +46,7 @@ def run_with_ray(
         import ray
     except ImportError as error:
         raise ValueError(
-            f"--backend ray needs Ray: pip install 'sb3_poem[ray]' ({error})"
+            f"--backend ray needs Ray: pip install '.[ray]' in a checkout ({error})"
         ) from error
     own = not ray.is_initialized()
     if own:

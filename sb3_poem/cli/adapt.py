@@ -25,13 +25,14 @@ from sb3_poem.adaptation import (
 from sb3_poem.adaptation.adapter import shown_from_dict
 from sb3_poem.adaptation.environments import COPIES
 from sb3_poem.adaptation.evaluation import evaluation_seed
+from sb3_poem.adaptation.policy import POLICY_SUFFIX
 from sb3_poem.adaptation.preference import BEST_OF_FOUR
 from sb3_poem.benchmark.cells import make_oracle_factory
 from sb3_poem.benchmark.suites import OracleSpec
 from sb3_poem.cli.arguments import DEFAULT_STORE
 from sb3_poem.cli.needs import check_output, say
 from sb3_poem.cli.report import row_text, write_report
-from sb3_poem.cli.subject import COPIES_FOR_ONE_TASK, POLICY_SUFFIX, Subject, after
+from sb3_poem.cli.subject import COPIES_FOR_ONE_TASK, Subject, after
 from sb3_poem.label import Store, StoreRecorder
 from sb3_poem.label.beliefs import believed_in_words
 

@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_poem.adaptation import AdaptedPolicy, KnownTaskReturn, Trajectory, known_task_return
 from sb3_poem.adaptation.evaluation import evaluation_seed
 from sb3_poem.adaptation.known_task import SELECTION_EPISODES
+from sb3_poem.adaptation.policy import POLICY_SUFFIX
 from sb3_poem.cli.needs import check_device, import_packages, parse_pairs, say
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.foreign import environment_of
@@ -28,7 +29,6 @@ from sb3_poem.pearl_sac import PEARLSAC
 
 # Copies that step in lockstep for one task, whose questions need but two of them.
 COPIES_FOR_ONE_TASK = 20
-POLICY_SUFFIX = ".safetensors"
 
 
 def describe_task(task: Sequence[float] | np.ndarray) -> str:
@@ -61,6 +61,10 @@ class Subject:
                 self.model, self.latent = policy.model, policy.latent
             else:
                 self.model = load_model(arguments.model, arguments.device)
+        done, total = self.model.num_timesteps, self.model._total_timesteps
+        if done < total:
+            what = f"its training stopped at {done:,} of {total:,} steps"
+            say(f"{arguments.model}: {what}; one that went on has a newer folder")
         given = parse_pairs("--env-kwargs", arguments.env_kwargs)
         self.env_id, self.env_kwargs = environment_of(
             arguments.model, self.model.env_id, self.model.env_kwargs, arguments.env, given

@@ -65,14 +65,17 @@ def parse(command: str, arguments: Sequence[str]) -> argparse.Namespace:
     for flags in (("-params", "--hyperparams"), ("--env-kwargs",), ("--eval-env-kwargs",)):
         parser.add_argument(*flags, nargs="+", action=CheckedPairs)
     parser.add_argument("--gym-packages", nargs="+", default=[])
-    parser.add_argument("--env", default="CartPole-v1")
+    parser.add_argument("--env")
     parser.add_argument("--algo", default="poem_sac")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--seed", type=int, default=-1)
     parser.add_argument("-f", "--log-folder", default="logs")
     parser.add_argument("-i", "--trained-agent")
     parser.add_argument("-n", "--n-timesteps", type=int, default=-1)
-    return parser.parse_known_args(arguments)[0]
+    given = parser.parse_known_args(arguments)[0]
+    if given.env is None:
+        raise ValueError("--env is missing: --env poem/PointGoal-v0, say")
+    return given
 
 
 def check_arguments(given: argparse.Namespace) -> None:
@@ -166,11 +169,12 @@ def run_zoo(command: str, arguments: Sequence[str]) -> None:
     if asks_help:
         print(f"Defaults here: {' '.join(DEFAULTS[command])}\n{RESUME * trains}\n")
     given = [*DEFAULTS[command], *arguments]
-    if trains and "--resume" in arguments:
+    if trains and "--resume" in arguments and not asks_help:
         if (continued := resumed(parse(command, given), given)) is None:
             return
         given = continued
-    check_arguments(parse(command, given))
+    if not asks_help:
+        check_arguments(parse(command, given))
     try:
         with (  # what rl_zoo3's programs read, and what they make
             mock.patch.object(sys, "argv", [f"sb3-poem {command}", *given]),

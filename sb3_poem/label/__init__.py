@@ -14,6 +14,6 @@ def __getattr__(name: str) -> Any:
     try:
         from sb3_poem.label.widget import LabelWidget
     except ModuleNotFoundError as error:
-        needs = "LabelWidget needs the extra: pip install 'sb3_poem[label]'"
+        needs = "LabelWidget needs the extra: pip install '.[label]' in a checkout"
         raise ModuleNotFoundError(f"{needs} ({error})", name=error.name) from error
     return LabelWidget

@@ -42,7 +42,9 @@ def export_minari(store: Store, name: str, undone: bool = False) -> dict[str, Pa
         import h5py  # noqa: F401
         from minari.storage import get_dataset_path
     except ImportError as error:
-        raise ImportError(f"Minari is missing: pip install 'sb3_poem[minari]' ({error})") from error
+        raise ImportError(
+            f"Minari is missing: pip install '.[minari]' in a checkout ({error})"
+        ) from error
     if NAME.fullmatch(name) is None:
         raise ValueError(f"a Minari data set's name must be like answers-v0, but is {name!r}")
     rows = [row for row in store.records() if undone or row["undone"] is None]

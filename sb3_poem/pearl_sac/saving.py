@@ -90,8 +90,9 @@ def check_archive(
     except (zipfile.BadZipFile, RuntimeError, EOFError, ValueError) as error:
         name = algorithm.__name__
         raise ValueError(f"{path} is truncated, or no model saved by {name}: {error}") from error
-    if data.get("algorithm") != algorithm.__name__:
-        raise ValueError(f"{path} holds a model of another algorithm, not of {algorithm.__name__}")
+    if (found := data.get("algorithm")) != algorithm.__name__:
+        what = f"{path} holds a {found or 'model of another algorithm'}"
+        raise ValueError(f"{what}, not a {algorithm.__name__}")
     if isinstance(path, io.BufferedIOBase):
         path.seek(0)
     found = {**data, "n_train_tasks": len(data["train_tasks"])}

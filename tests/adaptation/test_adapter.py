@@ -13,6 +13,7 @@ from worlds import Blinded, SpeedModel
 
 from sb3_poem import Bayes, Paper
 from sb3_poem.adaptation import (
+    AdaptedPolicy,
     BoltzmannOracle,
     HumanOracle,
     Inference,
@@ -116,6 +117,13 @@ def test_without_a_seed_one_is_drawn_and_kept():
     answer(second, 2)
     np.testing.assert_array_equal(first.policy().latent, second.policy().latent)
     assert adapter(seed=None).seed != first.seed
+
+
+def test_a_file_without_a_suffix_gets_one(point_goal, tmp_path):
+    policy = PreferenceAdapter(point_goal, point_goal.env_id, seed=0).policy()
+    policy.save(tmp_path / "mine")
+    assert [file.name for file in tmp_path.iterdir()] == ["mine.safetensors"]
+    assert np.array_equal(AdaptedPolicy.load(tmp_path / "mine").latent, policy.latent)
 
 
 def test_a_policy_knows_by_whose_answers_it_was_adapted(point_goal):

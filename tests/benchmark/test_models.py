@@ -210,7 +210,7 @@ def test_families_whose_extra_is_missing_are_left_out_unless_named(
 ) -> None:
     def facts(name: str) -> FamilyFacts:
         if "MetaWorld" in name:
-            raise ImportError("pip install 'sb3_poem[metaworld]'")
+            raise ImportError("pip install '.[metaworld]'")
         return FamilyFacts(family_id(name), 200, 120, True)
 
     monkeypatch.setattr("sb3_poem.benchmark.running.family_facts", facts)
@@ -218,9 +218,9 @@ def test_families_whose_extra_is_missing_are_left_out_unless_named(
     plan = plan_for(library, "table3", None)
     assert "poem/AntVel-v0" in {cell.env_id for cell in plan.todo}
     assert {reason for cell, reason in plan.skipped if cell.family.startswith("MetaWorld")} == {
-        f"MetaWorld{name}: pip install 'sb3_poem[metaworld]'" for name in ("ML1", "ML10")
+        f"MetaWorld{name}: pip install '.[metaworld]'" for name in ("ML1", "ML10")
     }
-    with pytest.raises(ValueError, match=r"--families MetaWorldML1: pip install 'sb3_poem\["):
+    with pytest.raises(ValueError, match=r"--families MetaWorldML1: pip install '.\[metaworld"):
         plan_for(library, "table3", ["MetaWorldML1"])
 
 
