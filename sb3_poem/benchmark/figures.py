@@ -11,12 +11,14 @@ from matplotlib.figure import Figure
 
 from sb3_poem.benchmark.methods import INFERENCE_LABELS, METHODS
 from sb3_poem.benchmark.results import Condition, Selection, Series
-from sb3_poem.benchmark.suites import Entry, OracleSpec
+from sb3_poem.benchmark.suites import TABLE_METHODS, Entry, OracleSpec
 
 PANEL_WIDTH, PANEL_HEIGHT = 4.2, 3.0
 TOLERANCE = "tolerance"
 COLOURS = 10  # of Matplotlib
 MARKERS = "osD^vPX*"
+#: Words of a method's name that leave its looks as they are
+CONDITIONS = ("aggregate", "prior", "decoder", "untold")
 
 
 def write_figures(selection: Selection, folder: Path) -> list[Path]:
@@ -129,13 +131,17 @@ def _draw(
 
 
 def _style(entry: Entry, series: Series) -> dict[str, Any]:
-    """With a row for each inference rule the same change looks the same in both."""
+    """A method of Table 3 looks the same wherever its candidates come from; with a row for each
+    inference rule the same change looks the same in both.
+    """
 
     def change(method: str) -> str:
         words = method.split("-")
-        return "-".join(w for w in words if not entry.by_inference or w not in INFERENCE_LABELS)
+        dropped = tuple(INFERENCE_LABELS) if entry.by_inference else CONDITIONS
+        return "-".join(word for word in words if word not in dropped)
 
-    place = list(dict.fromkeys(map(change, entry.methods))).index(change(series.method))
+    known = () if entry.by_inference else (*TABLE_METHODS, "anole-rollouts")
+    place = list(dict.fromkeys([*known, *map(change, entry.methods)])).index(change(series.method))
     return {"color": f"C{place % COLOURS}", "marker": MARKERS[place % len(MARKERS)]}
 
 
