@@ -511,7 +511,7 @@ def test_the_policy_of_one_task_is_saved(model: tuple[POEMSAC, str], tmp_path: P
         (["--env", "Pendulum-v1"], "no task family"),
         (["--env", "poem/Nothing-v0"], "Nothing"),
         (["--task", 1.0, 2.0], "--task needs 1 numbers"),
-        (["--task", 99.0, "--episodes", 1], "99"),
+        (["--task", 99.0, "--episodes", 1], "--task 99 is outside of the tasks, Box(0"),
         (["--task", 1.0, "--tasks", 3], "--task is one task"),
         (["--oracle", "human", "--tasks", 3], "one task"),
         (["--queries", 5, "--record", 0, 6], "--record 6 is more than --queries 5"),

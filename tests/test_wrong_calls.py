@@ -611,6 +611,7 @@ COMMANDS = [
     command("--host...--token", "label", "--host", "0.0.0.0"),
     command("PointGaol...PointGoal", "label", "--model", "PointGaol"),
     command("--seed...63...9999999999999999999", "label", "--seed", 10**19 - 1),
+    command("--store...text.zip/answers", "label", "--store", "stock/text.zip/answers"),
     command("--mistake-rate...from 0 to 0.5...2", "label", "--mistake-rate", 2),
     command("pairs...graded", "label", "--inference", "paper", "--question", "graded"),
     command("pairs...best-of-four", *ADAPT, "--inference", "paper", "--question", "best-of-four"),

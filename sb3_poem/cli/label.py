@@ -58,7 +58,10 @@ def run_page(arguments: argparse.Namespace) -> None:
             make_env(info.env_id, **dict(info.env_kwargs)).close()
     listener = bind(arguments.host, arguments.port)
     port = listener.getsockname()[1]
-    store = Store(arguments.store)
+    try:
+        store = Store(arguments.store)
+    except OSError as error:
+        raise OSError(f"--store {arguments.store}: {error.strerror or error}") from error
     store.remove_orphans()
     queue = RenderQueue(workers, lambda: process_pool(workers, models, packages))
     limits = (arguments.queries, arguments.max_sessions, arguments.seed)

@@ -81,6 +81,9 @@ class Subject:
             raise ValueError(f"--task needs {width} numbers for {self.env_id}, got {len(task)}")
         #: (n_tasks, task_dim)
         self.tasks = np.array([task], dtype=np.float64)
+        space = self.family.task_space
+        if task is not None and not space.contains(self.tasks[0].astype(space.dtype)):
+            raise ValueError(f"--task {describe_task(task)} is outside of the tasks, {space}")
         if task is None:
             self.tasks = self.family.test_tasks(n_tasks, self.seed)
 
