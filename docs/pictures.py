@@ -44,7 +44,7 @@ def before_and_after(model: str, path: Path, task: str, width: int = 640, every:
     first.save(path, save_all=True, append_images=others, duration=50 * every, loop=0, quality=60)
 
 
-def still(env_id: str, path: Path, size: int = 360, steps: int = 60) -> None:
+def still(env_id: str, path: Path, size: int = 360, steps: int = 50) -> None:
     """A family's robot at work: adapted if a model ships, moving at random otherwise."""
     env = gym.make(env_id, render_mode="rgb_array", width=size, height=size)
     obs, _ = env.reset(seed=2)
