@@ -731,6 +731,15 @@ def test_folders_that_are_no_runs_are_passed_over(tmp_path: Path) -> None:
     assert last_run(tmp_path, "poem-PointGoal-v0", -1) == tmp_path / "poem-PointGoal-v0_10"
 
 
+def test_a_model_of_another_family_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    POEMSAC("MlpPolicy", "poem/PointGoal-v0", n_train_tasks=2).save(tmp_path / "m.zip")
+    other = ("train", "--env", "poem/HalfCheetahVel-v0", "-f", tmp_path, "-i", tmp_path / "m.zip")
+    assert cli.main([*map(str, other)]) == 1
+    assert "m.zip does not fit --env poem/HalfCheetahVel-v0: " in capsys.readouterr().err
+
+
 def test_resume_finds_the_checkpoint_itself(capsys: pytest.CaptureFixture[str]) -> None:
     assert train("--resume", "-i", "model.zip") != 0
     assert "leave out either --resume or -i" in capsys.readouterr().err

@@ -166,9 +166,14 @@ class PoemExperiment(FamilyExperiment):
         }
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> Any:
-        if not is_checkpoint(self.trained_agent):
-            return super()._load_pretrained_agent(hyperparams, env)
-        model = ALGORITHMS[self.algo].load_checkpoint(self.trained_agent, env, device=self.device)
+        file, algorithm = self.trained_agent, ALGORITHMS[self.algo]
+        try:
+            if not is_checkpoint(file):
+                return super()._load_pretrained_agent(hyperparams, env)
+            model = algorithm.load_checkpoint(file, env, device=self.device)
+        except ValueError as error:
+            what = f"-i {file} does not fit --env {self.env_name.gym_id}"
+            raise ValueError(f"{what}: {error}") from error
         model.tensorboard_log, model.verbose = self.tensorboard_log, self.verbose
         self.resumes, steps = True, model.num_timesteps
         print(f"Resuming {self.trained_agent} after {steps} steps, with its own hyperparameters")
