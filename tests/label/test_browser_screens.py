@@ -23,6 +23,7 @@ from browser_world import (
 )
 from PIL import Image
 
+from poem_envs.films import PATH_COLOURS
 from sb3_poem.label.families import ModelInfo, find_models
 from sb3_poem.label.server import ROBOTS
 
@@ -130,6 +131,9 @@ def coloured(page: Any, side: str) -> dict[str, int]:
     )
 
 
+BACKGROUND = "element => getComputedStyle(element).backgroundColor"
+
+
 def test_both_robots_in_one_picture(
     open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
 ) -> None:
@@ -144,7 +148,17 @@ def test_both_robots_in_one_picture(
     page.evaluate("() => player.seek(player.frames - 1)")
     page.wait_for_function("() => player.drawn === player.frames - 1")
     assert min(coloured(page, "race").values()) > 20
+    assert page.inner_text("#race-figure figcaption") == "Blue Orange"
+    # All that names a side has the colour of its robot.
+    for side, colour in zip(("left", "right"), PATH_COLOURS, strict=False):
+        shade = f"rgb({', '.join(str(round(255 * part)) for part in colour)})"
+        captions = page.locator(f".side.{side}").all()
+        much, bit = (page.locator(f'[data-preference="{w}{side}"]') for w in ("much ", ""))
+        assert {seen.evaluate(BACKGROUND) for seen in (*captions, much)} == {shade}
+        assert bit.evaluate("button => getComputedStyle(button).borderColor") == shade
     page.keyboard.press("r")
+    assert page.inner_text("#left-figure figcaption") == "Left"
+    assert page.inner_text("#right-figure figcaption") == "Right"
     assert seen() == [True, True, False]
     person.answer(1)  # and it stays so, in the next question and when they come back
     assert seen() == [True, True, False]
@@ -291,7 +305,7 @@ def test_the_page_is_readable_for_all(
     assert page.get_by_role("img", name=re.compile("It knows nothing yet")).count() == 1
     page.wait_for_function(SHOWN)  # what waits is pale
     ratios = page.evaluate(
-        """() => [...document.querySelectorAll('kbd, .note, .hint, figcaption')].map(element => {
+        """() => [...document.querySelectorAll('kbd, .note, .hint, .side, .answer')].map(element => {
             const light = colour => colour.match(/[\\d.]+/g).slice(0, 3).map(Number)
                 .map(c => (c /= 255) <= .04045 ? c / 12.92 : ((c + .055) / 1.055) ** 2.4)
                 .reduce((sum, c, i) => sum + c * [.2126, .7152, .0722][i], 0);

@@ -205,7 +205,7 @@ function showPast(answers) {
     again.textContent = "Show again";
     again.setAttribute("aria-label", `Show again: ${what.toLowerCase()} ${index + 1}`);
     again.addEventListener("click", () => lookBack(given, index));
-    item.append(`${inWords(given.preference)} `, again);
+    item.append(...inWords(given.preference), " ", again);
     return item;
   }));
 }
@@ -213,7 +213,7 @@ function showPast(answers) {
 function inWords(preference) {
   const words = document.querySelector(`[data-preference="${preference}"]`).cloneNode(true);
   words.querySelector("kbd")?.remove();
-  return words.textContent.trim();
+  return words.childNodes;
 }
 
 async function lookBack(given, index) {
@@ -232,8 +232,8 @@ async function lookBack(given, index) {
   screens[0].setAttribute("aria-label", firstLabel);
   showRace();
   byId("task").textContent = `${what} ${index + 1}, as you saw it.`;
-  byId("then-text").textContent = `You said: ${inWords(given.preference)}.`;
-  say(`${what} ${index + 1} again. ${byId("then-text").textContent}`);
+  byId("then-text").replaceChildren("You said: ", ...inWords(given.preference), ".");
+  say(`${what} ${index + 1} again. ${byId("then-text").innerText}`);
   byId("back").focus();
   byId("stage").scrollIntoView(); // the films, above the list
 }
@@ -257,13 +257,13 @@ function showDoubt() {
 byId("again").addEventListener("click", () => act("/again", { question: view.turn.id }));
 
 // Both robots in one picture, instead of the two, where the video has one and it is wanted.
-let wantsRace = (storage.getItem("race") ?? byId("board").dataset.race) === "on";
+let wantsRace = !four && (storage.getItem("race") ?? byId("board").dataset.race) === "on";
 
 function showRace() {
   const has = player.parts === 3;
   byId("race").hidden = !has;
   byId("race").setAttribute("aria-pressed", String(wantsRace));
-  byId("board").classList.toggle("racing", has && wantsRace);
+  byId("board").classList.toggle("racing", wantsRace && player.parts !== 2); // a result is one: the names stay
 }
 
 function race() {
@@ -271,7 +271,7 @@ function race() {
   wantsRace = !wantsRace;
   storage.setItem("race", wantsRace ? "on" : "off");
   showRace();
-  say(wantsRace ? "Both in one picture." : "Two pictures.");
+  say(wantsRace ? "Both in one picture, blue and orange." : "Two pictures, left and right.");
 }
 byId("race").addEventListener("click", race);
 showRace(); // the first films find their place kept, and move nothing
