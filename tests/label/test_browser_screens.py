@@ -320,17 +320,25 @@ def test_the_page_is_readable_for_all(
         })"""
     )
     assert min(ratios) >= 4.5
-    # The map's words are above its dots.
+    # The map's words are above its dots, those of directions around it.
     drawn = page.evaluate(
         """() => {
             drawBelief(byId('belief'), { picture: 'place', points: [[0, 0]], weights: [1], unit: 'm',
                 estimate: [1, 1], extent: 3.5, words: ['right', 'ahead', 'left', 'back'] });
-            const drawn = [...byId('belief').querySelectorAll('.cloud, text')];
-            return drawn.map(element => element.textContent || 'dot');
+            const map = document.querySelector('#belief .map').getBoundingClientRect();
+            const all = byId('belief').getBoundingClientRect();
+            return [...byId('belief').querySelectorAll('.cloud, text')].map(element => {
+                const box = element.getBoundingClientRect();
+                const beside = box.right < map.left || box.left > map.right
+                    || box.bottom < map.top || box.top > map.bottom;
+                const within = box.left >= all.left && box.right <= all.right
+                    && box.top >= all.top && box.bottom <= all.bottom;
+                return [element.textContent || 'dot', beside, within];
+            });
         }"""
     )
-    words = ["start", "1 m", "2 m", "3 m", "right", "ahead", "left", "back"]
-    assert drawn == ["dot", *words]
+    inside, around = ["dot", "start", "1 m", "2 m", "3 m"], ["right", "ahead", "left", "back"]
+    assert drawn == [[name, name in around, True] for name in inside + around]
 
 
 PIXELS = """name => {

@@ -89,18 +89,16 @@ function drawDirection(svg, belief) {
 
 // The words for right, upwards, left and downwards, as far from the middle; the films have the same directions.
 function name(svg, words, far) {
-  const inside = far < 90; // the words at the sides end there
-  [[far, 5], [0, 4 - far], [-far, 5], [0, far + 8]].forEach(([x, y], i) => {
-    const anchor = x === 0 ? "middle" : (x > 0) === inside ? "end" : "start";
-    shape(svg, "text", { x, y: x && inside ? y - 9 : y, class: `tick ${anchor}` }, words[i]);
+  [[far, 5, "start"], [0, 2 - far, "middle"], [-far, 5, "end"], [0, far + 8, "middle"]].forEach(([x, y, anchor], i) => {
+    shape(svg, "text", { x, y, class: `tick ${anchor}` }, words[i]);
   });
 }
 
 function drawPlane(svg, belief) {
-  svg.setAttribute("viewBox", "-110 -110 220 220");
+  const place = belief.picture === "place";
+  svg.setAttribute("viewBox", place ? "-146 -121 292 244" : "-110 -110 220 220"); // with room for words around it
   const scale = 100 / belief.extent;
   shape(svg, "rect", { x: -104, y: -104, width: 208, height: 208, rx: 10, class: "map" });
-  const place = belief.picture === "place";
   // Circles as in the films: at whole metres, where there is room.
   const rings = [];
   for (let r = 1; belief.unit === "m" && r < belief.extent; r += belief.extent > 4 ? 2 : 1) rings.push(r);
@@ -118,7 +116,7 @@ function drawPlane(svg, belief) {
     shape(words, "circle", { cx: 0, cy: 0, r: 3, class: "start" });
     shape(words, "text", { x: -5, y: -6, class: "small end" }, "start");
     rings.map((r) => [0.7 * r * scale, r]).forEach(([x, r]) => shape(words, "text", { x, y: x + 4, class: "small middle" }, `${r} m`));
-    name(words, belief.words, 88);
+    name(svg, belief.words, 110);
   }
   const [x, y] = [belief.estimate[0] * scale, -belief.estimate[1] * scale];
   shape(svg, "circle", { cx: x, cy: y, r: 8, class: "ring" });
