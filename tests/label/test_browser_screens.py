@@ -156,6 +156,10 @@ def test_both_robots_in_one_picture(
         much, bit = (page.locator(f'[data-preference="{w}{side}"]') for w in ("much ", ""))
         assert {seen.evaluate(BACKGROUND) for seen in (*captions, much)} == {shade}
         assert bit.evaluate("button => getComputedStyle(button).borderColor") == shade
+    page.evaluate("() => { waitingSince = -1e5; showProgress(true, 1, false); }")
+    film, words = (page.locator(box).bounding_box() for box in ("#race-screen", "#progress-text"))
+    assert film["x"] < words["x"] < words["x"] + words["width"] < film["x"] + film["width"]
+    page.evaluate("() => showProgress(false, 1, false)")
     page.keyboard.press("r")
     assert page.inner_text("#left-figure figcaption") == "Left"
     assert page.inner_text("#right-figure figcaption") == "Right"

@@ -256,8 +256,9 @@ function showDoubt() {
 }
 byId("again").addEventListener("click", () => act("/again", { question: view.turn.id }));
 
-// Both robots in one picture, instead of the two, where the video has one and it is wanted.
-let wantsRace = !four && (storage.getItem("race") ?? byId("board").dataset.race) === "on";
+// Both robots in one picture, instead of the two, where the video has one and it is wanted for this robot.
+const raceKey = `race ${byId("board").dataset.robot}`;
+let wantsRace = !four && (storage.getItem(raceKey) ?? byId("board").dataset.race) === "on";
 
 function showRace() {
   const has = player.parts === 3;
@@ -269,11 +270,12 @@ function showRace() {
 function race() {
   if (player.parts !== 3) return;
   wantsRace = !wantsRace;
-  storage.setItem("race", wantsRace ? "on" : "off");
+  storage.setItem(raceKey, wantsRace ? "on" : "off");
   showRace();
   say(wantsRace ? "Both in one picture, blue and orange." : "Two pictures, left and right.");
 }
 byId("race").addEventListener("click", race);
+if (!wantsRace) player.parts = 2; // until a film says otherwise: who wants a race has seen that there is one
 showRace(); // the first films find their place kept, and move nothing
 
 // Films and answers alone, as large as the screen.
@@ -295,7 +297,8 @@ function showProgress(waiting, answered, result) {
   byId("progress").hidden = !waiting;
   const slow = waiting && performance.now() - waitingSince > SLOW_AFTER_MILLISECONDS;
   const what = result ? "Filming what it learned" : `Preparing the ${answered === 0 ? "first" : "next"} ${films} videos`;
-  byId("progress-text").textContent = slow ? `${what}. Your answers are safe; this takes a few seconds…` : `${what}…`;
+  const calm = `${answered === 0 ? "This" : "Your answers are safe; this"} takes a few seconds…`;
+  byId("progress-text").textContent = slow ? `${what}. ${calm}` : `${what}…`;
 }
 
 function showCount(answered, target, result) {
