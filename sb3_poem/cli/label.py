@@ -60,8 +60,8 @@ def run_page(arguments: argparse.Namespace) -> None:
     port = listener.getsockname()[1]
     try:
         store = Store(arguments.store)
-    except OSError as error:
-        raise OSError(f"--store {arguments.store}: {error.strerror or error}") from error
+    except (FileExistsError, FileNotFoundError, NotADirectoryError, PermissionError) as error:
+        raise OSError(f"--store {arguments.store}: {error.strerror}") from error
     store.remove_orphans()
     queue = RenderQueue(workers, lambda: process_pool(workers, models, packages))
     limits = (arguments.queries, arguments.max_sessions, arguments.seed)
