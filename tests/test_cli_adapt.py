@@ -12,6 +12,7 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 from rl_zoo3.utils import SimpleLinearSchedule
+from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 
 from sb3_poem import (
     PEARLSAC,
@@ -539,6 +540,18 @@ def test_what_does_not_fit_is_refused(
 ) -> None:
     assert adapt(model[1], *flags) == 1
     assert words in capsys.readouterr().err
+
+
+def test_a_model_of_a_part_of_its_training_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = POEMSAC("MlpPolicy", ENV_ID, **SMALL)
+    stop = StopTrainingOnMaxEpisodes(1)
+    model.learn(1200, callback=stop).save(tmp_path / "part.zip")
+    assert 0 < model.num_timesteps < 1200
+    assert adapt(str(tmp_path / "part.zip"), "--tasks", 1, "--queries", 1, "--episodes", 1) == 0
+    part = f"part.zip is of {model.num_timesteps} of the 1,200 steps of its training"
+    assert part in capsys.readouterr().out
 
 
 def test_a_folder_that_cannot_be_written_is_refused(

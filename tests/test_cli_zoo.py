@@ -737,7 +737,10 @@ def test_a_model_of_another_family_is_named(
     POEMSAC("MlpPolicy", "poem/PointGoal-v0", n_train_tasks=2).save(tmp_path / "m.zip")
     other = ("train", "--env", "poem/HalfCheetahVel-v0", "-f", tmp_path, "-i", tmp_path / "m.zip")
     assert cli.main([*map(str, other)]) == 1
-    assert "m.zip does not fit --env poem/HalfCheetahVel-v0: " in capsys.readouterr().err
+    assert (
+        "m.zip, --env poem/HalfCheetahVel-v0: Observation spaces do not match"
+        in capsys.readouterr().err
+    )
 
 
 def test_resume_finds_the_checkpoint_itself(capsys: pytest.CaptureFixture[str]) -> None:

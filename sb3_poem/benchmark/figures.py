@@ -131,8 +131,8 @@ def _draw(
 
 
 def _style(entry: Entry, series: Series) -> dict[str, Any]:
-    """A method of Table 3 looks the same wherever its candidates come from; with a row for each
-    inference rule the same change looks the same in both.
+    """A method of Table 3 looks the same in each entry, unless that compares its candidates; with a
+    row for each inference rule the same change looks the same in both.
     """
 
     def change(method: str) -> str:
@@ -140,8 +140,13 @@ def _style(entry: Entry, series: Series) -> dict[str, Any]:
         dropped = tuple(INFERENCE_LABELS) if entry.by_inference else CONDITIONS
         return "-".join(word for word in words if word not in dropped)
 
-    known = () if entry.by_inference else (*TABLE_METHODS, "anole-rollouts")
-    place = list(dict.fromkeys([*known, *map(change, entry.methods)])).index(change(series.method))
+    names, known = list(map(change, entry.methods)), [*TABLE_METHODS, "anole-rollouts"]
+    if entry.by_inference:
+        known = []
+    elif len(set(names)) < len(names):
+        names, known = list(entry.methods), []
+    mine = names[entry.methods.index(series.method)]
+    place = list(dict.fromkeys([*known, *names])).index(mine)
     return {"color": f"C{place % COLOURS}", "marker": MARKERS[place % len(MARKERS)]}
 
 

@@ -172,8 +172,7 @@ class PoemExperiment(FamilyExperiment):
                 return super()._load_pretrained_agent(hyperparams, env)
             model = algorithm.load_checkpoint(file, env, device=self.device)
         except ValueError as error:
-            what = f"-i {file} does not fit --env {self.env_name.gym_id}"
-            raise ValueError(f"{what}: {error}") from error
+            raise ValueError(f"-i {file}, --env {self.env_name.gym_id}: {error}") from error
         model.tensorboard_log, model.verbose = self.tensorboard_log, self.verbose
         self.resumes, steps = True, model.num_timesteps
         print(f"Resuming {self.trained_agent} after {steps} steps, with its own hyperparameters")

@@ -63,8 +63,7 @@ class Subject:
                 self.model = load_model(arguments.model, arguments.device)
         done, total = self.model.num_timesteps, self.model._total_timesteps
         if done < total:
-            what = f"its training stopped at {done:,} of {total:,} steps"
-            say(f"{arguments.model}: {what}; one that went on has a newer folder")
+            say(f"{arguments.model} is of {done:,} of the {total:,} steps of its training")
         given = parse_pairs("--env-kwargs", arguments.env_kwargs)
         self.env_id, self.env_kwargs = environment_of(
             arguments.model, self.model.env_id, self.model.env_kwargs, arguments.env, given

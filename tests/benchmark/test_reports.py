@@ -369,6 +369,22 @@ def test_lines_show_the_values_of_the_store(tmp_path: Path) -> None:
     np.testing.assert_allclose(line.get_xydata(), [[s, -10.0] for s in (200, 400, 600, 800, 1000)])
 
 
+def test_a_method_looks_the_same_in_all_figures_and_like_no_other(tmp_path: Path) -> None:
+    from sb3_poem.benchmark.figures import suite_figures
+
+    store = fill(tmp_path / "store.sqlite", snapshots=1)
+    looks: dict[str, dict[str, tuple[str, str]]] = {}
+    for name, figure in suite_figures(Selection(SUITES["table3"], store.records())).items():
+        lines = [line for line in figure.axes[0].get_lines() if line.get_marker() != "None"]
+        looks[name] = {line.get_label(): (line.get_color(), line.get_marker()) for line in lines}
+        assert len(set(looks[name].values())) == len(lines)
+    assert len(looks["table3-parts-queries"]) > 10
+    for label in ("ANOLE", "reward oracle"):
+        assert looks["table3-methods-queries"][label] == looks["table3-prior-queries"][label]
+        informed = looks["table3-informed-queries"][f"{label}, training tasks"]
+        assert informed == looks["table3-methods-queries"][label]
+
+
 def test_a_store_without_the_suite_is_refused(tmp_path: Path) -> None:
     store = fill(tmp_path / "store.sqlite", "epsilon", seeds=1, methods=["poem-paper-epsilon-0.4"])
     with pytest.raises(ValueError, match=r"--suite smoke: .* holds no finished cell of it"):
