@@ -59,7 +59,7 @@ def environment_pages(_app: object) -> None:
             facts += f"[its results]({results}#{spec.name.lower()})."
         else:
             facts += f"Untrained: no model ships. `sb3-poem train --env {spec.id}` makes one,\n"
-            facts += "and no record says what it earns."
+            facts += "and [the results](../results.md) have none."
         page = folder / f"{spec.name}.md"
         content = f"# {spec.name}\n\n{facts}\n\n{shown}{text}\n"
         if not page.exists() or page.read_text() != content:

@@ -16,7 +16,9 @@ import gymnasium as gym
 import numpy as np
 
 import poem_envs  # noqa: F401
+from sb3_poem.benchmark.results import compare
 from sb3_poem.benchmark.store import Store
+from sb3_poem.benchmark.suites import OracleSpec
 from sb3_poem.benchmark.tables import TABLE_3, make_report
 from sb3_poem.pearl_sac.model_card import model_card
 
@@ -41,10 +43,11 @@ METHODS = """All methods, by the same test tasks and seeds, each with as many up
 candidates from the prior or from the training tasks' posteriors. `Bayes()` takes the latter where
 they are far from the prior. The last columns say how `Bayes` and `Paper` with candidates of the
 same kind stand against the row: ahead (+) or behind (-) if mean, interquartile mean and the whole
-95 % interval of the paired difference say so, else not to be told apart (?)."""
+95 % interval of the paired difference say so, else not distinguishable (?)."""
 UNTOLD = """Answers with errors: `Bayes()` that is told how they err, and that is not
 (`noise_model="infer"`). The last columns say by how much of the range from no answer to the task
-known the latter is behind."""
+known the latter is behind (negative: ahead). A difference is distinguishable if mean, interquartile
+mean and the whole 95 % interval of the paired difference agree: {claim}."""
 #: How tables write a claim
 SIGNS = {"ahead": "+", "behind": "-", "not distinguishable": "?"}
 #: What else is to be known of a family's figures
@@ -188,6 +191,19 @@ def share(family: str, queries: int) -> str:
     )
 
 
+def returns_by_seed(store: Store, family: str) -> dict[tuple[str, str, int], np.ndarray]:
+    """(n_seeds, n_tasks) of each oracle, method and number of answers."""
+    found: dict[tuple[str, str, int], list[np.ndarray]] = {}
+    for one in sorted(store.records(), key=lambda one: one.seed):
+        if one.family == family and one.method.startswith("poem"):
+            oracle = OracleSpec(**one.identity["oracle"]).label
+            for k, returns in zip(
+                one.result["queries"], np.array(one.result["task_returns"]).T, strict=True
+            ):
+                found.setdefault((oracle, one.method, k), []).append(returns)
+    return {key: np.stack(returns) for key, returns in found.items()}
+
+
 def paper_rule() -> str:
     """What `Paper()` earns with the models that ship, a row a family."""
     rows = []
@@ -195,8 +211,17 @@ def paper_rule() -> str:
         if poem := TABLE_3.get(family, {}).get("POEM"):
             ours = [row(family, "poem-paper", k) for k in (1, 5, 10)]
             figures = [*(f"{mean:,}" for mean, _ in poem), *map(cell, ours)]
-            rows.append([family, str(ours[0]["n_seeds"]), *figures])
+            returns = returns_by_seed(SHIPPED, family)
+            claims = [
+                compare(
+                    *(returns["exact answers", f"poem-{rule}", k] for rule in ("bayes", "paper"))
+                )
+                for k in (1, 5, 10)
+            ]
+            signs = ["" if one.n_seeds < 2 else SIGNS[one.claim] for one in claims]
+            rows.append([family, str(ours[0]["n_seeds"]), *figures, *signs])
     head = ["family", "seeds", "the paper: 1", "5", "10", "`Paper()`: 1", "5", "10"]
+    head += ["`Bayes()`: 1", "5", "10"]
     return "\n".join(table(head, rows))
 
 
@@ -272,13 +297,14 @@ def parts(family: str) -> list[str]:
 def untold(family: str) -> list[str]:
     """What it costs not to know how answers err."""
     store = Store(RESULTS / family / NOISE_STORE, create=False)
+    returns = returns_by_seed(store, family)
     found = {
         (one["oracle"], one["method"], one["queries"]): one
         for one in json.loads(make_report(store, ["noise"], kind="json")[0])
         if one["kind"] == "method"
     }
     known = row(family, "known-task", kind="known")["mean"]
-    rows = []
+    rows, claims = [], []
     for oracle in dict.fromkeys(oracle for oracle, _, _ in found):
         told, inferred = (
             [found[oracle, f"poem-bayes{name}", k] for k in (0, 1, 5, 10)]
@@ -289,8 +315,14 @@ def untold(family: str) -> list[str]:
         for one, other in zip(told[1:], inferred[1:], strict=True):
             lost = (one["mean"] - other["mean"]) / (known - told[0]["mean"])
             rows[-1].append(f"{100 * lost:.0f} %")
+        claims += [
+            compare(*(returns[oracle, f"poem-bayes{name}", k] for name in ("-untold", ""))).claim
+            for k in (1, 5, 10)
+        ]
+    told_apart = sum(claim != "not distinguishable" for claim in claims)
+    claim = f"{told_apart or 'none'} of these {len(claims)}"
     head = ["answers", "told: 1", "5", "10", "not told: 1", "5", "10", "behind: 1", "5", "10"]
-    return [fill(UNTOLD, 120), "", *table(head, rows), ""]
+    return [fill(UNTOLD.format(claim=claim), 120), "", *table(head, rows), ""]
 
 
 def by_manipulation(family: str) -> list[str]:
@@ -360,16 +392,19 @@ def results_page() -> str:
     """The page docs/results.md."""
     head = f"""# Results
 
-**The paper's claim.** It has POEM 20 to 50 % ahead of all baselines. With its own rule, `Paper()`,
-and its own candidates that does not appear where all methods were measured. On HalfCheetahVel it is
-not to be told apart from ANOLE and ANOLE-greedy after one answer, and after ten ahead of ANOLE and
-not to be told apart from ANOLE-greedy. With candidates from the training tasks for all of them it
-is behind them after one answer, and ahead after five and ten. On PointGoal, which is small, it is
-13 to 15 % ahead of all three ANOLEs after one answer, and later not to be told apart from them.
+**The paper's claim.** The paper has POEM 20 to 50 % ahead of the best baseline. By models of these
+entries all methods were measured on HalfCheetahVel and on PointGoal, which is small. There the
+paper's own rule, `Paper()`, with candidates from the prior, does not show that. On HalfCheetahVel
+it is not distinguishable from ANOLE and ANOLE-greedy after one answer; after ten it is ahead of
+ANOLE and not distinguishable from ANOLE-greedy. With candidates from the training tasks for all
+methods it is behind these two after one answer, and ahead of both after five and ten. On PointGoal
+it is 12 to 14 % ahead of all three ANOLEs after one answer, and not distinguishable from them after
+five and ten. With shorter trainings (revision 0, three seeds) it is ahead of every baseline on
+HalfCheetahFwdBack after one answer, and behind ANOLE and ANOLE-greedy after ten.
 
 **The models that ship.** Mean return over 30 test tasks, 10 episodes each, after exact answers. No
 training saw the test tasks, but those of the two FwdBack families: these have two tasks, forward
-and backward, and training has both. Of *seeds* trainings seed 0 ships.
+and backward, and training has both. The column *seeds* counts trainings; the model of seed 0 ships.
 
 - *paper*: Table 3 of [Xu & Zhu 2025](https://proceedings.mlr.press/v267/); *baseline* is the best
   of its baselines after so many answers.
@@ -384,8 +419,8 @@ Each model is what the family's entry in `zoo_configs/` makes, in one run from n
 
 {summary()}
 
-What stands behind the figures after ten answers, and how much of what the limit gains over no
-answer `Bayes()` has after 1, 5 and 10:
+What stands behind the figures after ten answers: the deviation over seeds, the standard error over
+tasks, and how much of what the limit gains over no answer `Bayes()` has after 1, 5 and 10:
 
 {spreads()}
 
@@ -395,8 +430,8 @@ from [its stores](../benchmarks/results/shipped/manifest.md). Pages of *revision
 of the [code](guides/benchmark.md#suites) are of earlier and shorter trainings, and their figures
 are not comparable with those here.
 
-**What was not measured.** All methods on eight of the paper's nine families; with the models that
-ship answers with errors but for `Bayes()` where a table says so, ablations and tolerances.
+**What was not measured.** With the models that ship: all methods on eight of the paper's nine
+families; answers with errors, but for `Bayes()` where a table says so; ablations and tolerances.
 `sb3-poem benchmark run --suite table3 --seeds 3 --snapshots 1 --list` says what each would take.
 """
     return "\n".join([head, *(family_section(family) for family in FAMILIES)])

@@ -179,7 +179,11 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
         return None if self._task is None else self._task.copy()
 
     def set_task(self, task: npt.ArrayLike) -> None:
-        """Choose the task, ``(task_dim,)``, of :attr:`task_space`, from the next reset on."""
+        """Choose the task, ``(task_dim,)``, of :attr:`task_space`, from the next reset on.
+
+        :raises ValueError: If it has another shape, is not finite or lies outside of the space, or
+            is none of a finite family's
+        """
         self._next_task = self._checked_tasks(task, self.task_space.shape, "task")
 
     def reset(
@@ -210,6 +214,7 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
         a wrapper's), info.
 
         :param action: Inside ``action_space``, or refused; a tiny excess (1e-6) is clipped
+        :raises ValueError: If the action has another shape or lies outside
         :raises gymnasium.error.ResetNeeded: Before the first reset
         """
         if self._task is None:
@@ -272,6 +277,8 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
 
         A pure function: ``step`` returns exactly this for its own task and features, so that a
         trajectory logged in one task can be relabelled for any other.
+
+        :raises ValueError: If a last dimension does not fit
         """
         tasks = np.asarray(tasks, dtype=np.float64)
         features = np.asarray(features, dtype=np.float64)

@@ -50,7 +50,7 @@ COMPASS = (("ahead", 0.5, 0.95), ("left", 0.07, 0.5), ("back", 0.5, 0.05), ("rig
 
 @dataclass(frozen=True)
 class Look:
-    """How a robot is filmed, so that it is seen what its tasks are about."""
+    """How a robot is filmed, so that it is seen what its tasks are about; degrees, metres."""
 
     azimuth: float = 90.0
     elevation: float = -20.0

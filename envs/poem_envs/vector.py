@@ -29,7 +29,9 @@ class BatchFamily(TaskFamily):
     """A family whose simulator steps any number of copies at once. By itself it is an environment
     of one copy; :class:`TaskFamilyVector` makes room for more.
 
-    A subclass defines the methods below, and ``_reward``. It sets what :class:`TaskFamily` asks for
+    A subclass defines ``_allocate(n)``, ``_begin_episodes(copies, rngs)``, ``_advance(actions)``
+    (features ``(n, reward_feature_dim)`` and early ends ``(n,)``), ``_observations()``
+    (``(n, obs_dim)``) and ``_reward``. It sets what :class:`TaskFamily` asks for
     in its class, in the constructor, which hands all that it does not know to ``super().__init__``,
     or, as a dataclass whose fields are its arguments, in ``__post_init__``.
 

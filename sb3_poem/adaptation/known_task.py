@@ -153,7 +153,8 @@ def known_task_return(
 
 def return_spread(model: MetaModel | str | Path, env: Env, seed: int = 0) -> float:
     """The family's spread of returns: the root mean square difference of the returns of two random
-    policies of a model on a random task. For ``model`` and ``env`` see :func:`adapt_tasks`.
+    policies of a model on a random task, in units of return. For ``model`` and ``env`` see
+    :func:`adapt_tasks`.
     """
     model, vec_env = model_and_env(model, env)
     tasks = choose_test_tasks(model, vec_env, SPREAD_TASKS, seed)

@@ -188,6 +188,8 @@ class BoltzmannOracle(TaskOracle):
 
     >>> BoltzmannOracle(beta=0.5).noise_model
     BoltzmannNoise(beta=0.5)
+
+    :param beta: Per unit of return, above 0; None is the paper's.
     """
 
     def __init__(self, beta: float | None = None, *args: Any, **kwargs: Any) -> None:
@@ -210,6 +212,8 @@ class MistakeOracle(TaskOracle):
 
     >>> MistakeOracle(0.1).noise_model
     MistakeNoise(rate=0.1)
+
+    :param rate: In [0, 1]; the noise model has at most 0.5.
     """
 
     def __init__(self, rate: float = 0.2, *args: Any, **kwargs: Any) -> None:
@@ -266,7 +270,9 @@ class HumanOracle:
     >>> policy = adapter.adapt()
     Query 1: preference_queries/query-001.gif
 
+    :param folder: Of the videos; made if it is missing.
     :param video_format: "gif" (any viewer plays it) or "mp4" (smaller).
+    :param fps: Frames a second.
     :param mistake_rate: How often a person is taken to err, for the Bayesian rule; None lets it
         infer how they do.
     :param question: "pair", "graded" or "best-of-four", as the rule's.

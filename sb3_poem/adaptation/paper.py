@@ -44,6 +44,7 @@ class Paper(Rule):
     :param candidates: Where they come from: "prior" (the paper's N(0, I)) or "aggregate" (the
         training tasks' posteriors).
     :param query_rule: "worst-case" (the paper's), "information-gain" or "random".
+    :raises ValueError: If an option is out of its range.
     """
 
     n_candidates: int = 100

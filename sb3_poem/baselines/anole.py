@@ -49,6 +49,7 @@ class ANOLE(Rule):
     :param fragment_length: Steps of a fragment from the replay buffer; None takes 50, or an episode
         that is shorter.
     :param candidates: Where candidates come from: "prior" or "aggregate".
+    :raises ValueError: If an option is out of its range.
     """
 
     strategy: str = "berlekamp"
@@ -71,6 +72,7 @@ class ANOLE(Rule):
         return floor(self.mistake_rate * n_queries + 1e-9)
 
     def total_candidates(self, n_queries: int) -> int:
+        """How many candidates are drawn for so many questions."""
         if self.strategy == "greedy":
             return 2**n_queries
         return max(self.n_candidates, n_distinguishable(n_queries, self.budget(n_queries)))

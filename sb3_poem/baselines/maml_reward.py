@@ -225,6 +225,7 @@ def meta_train_reward(
     :param n_fragments: Fragments that pairs are drawn from.
     :param fragment_length: Their steps; None takes 50, or an episode that is shorter.
     :param arguments: Of :class:`MetaReward`.
+    :raises ValueError: If dynamics are not shared, or the replay buffer is empty.
     """
     if not model.family.shared_dynamics:
         raise ValueError(
@@ -345,7 +346,7 @@ class MAMLRewardModel(MetaModel):
 
 @dataclass(frozen=True, repr=False)
 class MAMLReward(Rule):
-    """MAML-reward (Hejna & Sadigh 2023): a meta-trained reward is adapted to the answers, and SB3's
+    """MAML-reward (Hejna & Sadigh 2022): a meta-trained reward is adapted to the answers, and SB3's
     SAC learns the policy on it from the trajectories that were shown. The model is a
     :class:`MAMLRewardModel`, the options are SAC's.
 
@@ -360,6 +361,12 @@ class MAMLReward(Rule):
     >>> rule = MAMLReward(gradient_steps=1)
     >>> adapter = PreferenceAdapter(model, env_id, rule=rule, oracle=ReturnOracle(), n_queries=1)
     >>> policy = adapter.adapt()
+
+    :param gradient_steps: SAC's steps after each answer, at least 1.
+    :param batch_size: Transitions in such a step.
+    :param learning_rate: Of SAC's networks.
+    :param gamma: SAC's discount factor, in [0, 1].
+    :raises ValueError: If an option is out of its range.
     """
 
     gradient_steps: int = 200

@@ -6,7 +6,7 @@ from typing import Any
 from sb3_poem.resources import pretrained_folder, pretrained_names
 
 HEADER = ("name", "environment", "algorithm", "steps", "return after 0 and 10 answers")
-FOOTER = "Returns are means over 30 unseen tasks by the rule `bayes`; cards have all figures."
+FOOTER = "Returns are means over 30 test tasks by the rule `bayes`; cards have all figures."
 
 
 def run_models(_: Any) -> None:

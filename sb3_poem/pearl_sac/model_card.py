@@ -86,7 +86,7 @@ def _results(card: dict[str, Any]) -> str:
     return f"""
 ## Results
 
-Mean return after k exact answers, {what}.
+Mean return after k exact answers, {what.replace("unseen", "test")}.
 
 {table}
 """

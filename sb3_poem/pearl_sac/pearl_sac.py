@@ -320,6 +320,7 @@ class PEARLSAC(SAC):
         :param total_timesteps: None takes those of the entry that :meth:`from_zoo` read
         :param log_interval: Epochs between two dumps of the log; None never dumps
         :param tb_log_name: None is the algorithm's name
+        :raises ValueError: If no number of steps is known
         """
         steps = self._checked_steps(total_timesteps, callback)
         self.env_id, self.env_kwargs = self.family.env_id, self.family.env_kwargs
