@@ -334,7 +334,7 @@ def test_a_person_says_which_of_four_is_best_and_goes_on_later(
     assert cli.main([*label, "replay", "--model", model[1]]) == 0
     assert " of 2" in capsys.readouterr().out
     assert cli.main([*label, "replay", "--model", model[1], "--inference", "paper"]) == 1
-    assert "session 1 asks which of four is best" in capsys.readouterr().err
+    assert "Session 1 asks which of four is best" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("oracle", ["return", "mistake", "boltzmann"])
@@ -409,6 +409,27 @@ def test_a_person_who_stops_goes_on_later_as_if_they_had_not(
         "right",
         "left",
     ]
+
+
+def test_no_policy_and_no_answer_of_another_is_passed_over(
+    model: tuple[POEMSAC, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    flags = ["--oracle", "human", "--seed", 2, *TINY]
+    answer_by(monkeypatch, tmp_path / "here", "l\n")
+    assert adapt(model[1], *flags, "--queries", 2) == 0
+    assert "--save policy-1.safetensors" in capsys.readouterr().out
+    answer_by(monkeypatch, tmp_path / "here", "r\n")
+    assert adapt(model[1], *flags, "--queries", 3, "--resume") == 1
+    words = "session 1 has 1 of 2 answers, but was begun with n_queries 2, not 3"
+    assert words in capsys.readouterr().err
+    assert [session.id for session in Store("label_data").sessions()] == [1]
+    Path("policy.safetensors").write_bytes(b"of somebody")
+    assert adapt(model[1], *flags, "--queries", 2, "--save", "policy.safetensors") == 1
+    assert "--save policy.safetensors: a policy is kept there already" in capsys.readouterr().err
+    assert Path("policy.safetensors").read_bytes() == b"of somebody"
 
 
 def interrupt(*_: object, **__: object) -> str:

@@ -334,7 +334,10 @@ BROKEN = [
     (TaskInTheFeatures, "reward features must not depend on the task"),
     (TaskInTheEnd, "end must not depend on the task"),
     (RewardOfItsOwnState, "must return exactly compute_rewards.* with no state of the environment"),
-    (FeaturesThatAreReused, "return new arrays of features"),
+    (
+        FeaturesThatAreReused,
+        "of step 0: those of all steps are alike: return new arrays of features",
+    ),
     (RewardThatDoesNotBroadcast, "compute_rewards must broadcast"),
     (RewardThatRounds, "exactly as one after another"),
     (PotentialThatDoesNotBroadcast, "compute_potential must broadcast"),

@@ -52,6 +52,10 @@ CHEETAH = "poem/HalfCheetahVel-v0"
 QUICK = 5.0  # seconds of the processor
 
 
+class Boundless(Walk):
+    task_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+
+
 def argument(make: Callable[..., Any], name: str, value: Any, words: str = "") -> Any:
     """A row: an argument with a value that it cannot have, both of which the error names."""
     more = words and f"...{words}"
@@ -241,6 +245,17 @@ ALGORITHMS = [
     ),
     refused("learn a text", lambda _: made().learn("1000"), "total_timesteps...1000"),
     refused("learn misspelt", lambda _: made().learn(1, callbacks=[]), "callbacks"),
+    refused("callback=3", lambda _: made().learn(1, callback=3), "callback must be...not 3"),
+    refused("an environment", lambda _: POEMSAC.from_zoo(gym.make(POINT_GOAL)), "env_id...by env="),
+    refused(
+        "steps in words", lambda _: POEMSAC.from_zoo(POINT_GOAL, n_timesteps="many"), "n_timesteps"
+    ),
+    refused("steps below 0", lambda _: POEMSAC.from_zoo(POINT_GOAL, n_timesteps=-4), "n_timesteps"),
+    refused(
+        "tasks without bounds",
+        lambda _: made(walks(2, Boundless), horizon=10),
+        "task_space must be bounded",
+    ),
     refused(
         "a callback's class",
         lambda _: made().learn(1, CheckpointCallback),

@@ -335,6 +335,11 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
     def _draw_tasks(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draw from an infinite family: uniformly on ``task_space`` unless overridden."""
         space = self.task_space
+        if not space.is_bounded():
+            raise ValueError(
+                "task_space must be bounded, since tasks are drawn uniformly from it, or "
+                f"_draw_tasks overridden; it is {space}"
+            )
         return rng.uniform(space.low, space.high, size=(n, *space.shape))
 
     def _checked_tasks(self, tasks: npt.ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:

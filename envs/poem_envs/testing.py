@@ -235,11 +235,18 @@ def check_relabelling(case: Case) -> None:
     for task, (_, rewards, features) in zip(case.tasks, case.episodes, strict=True):
         for source, name in ((case.player, "this"), (other, "another")):
             given = np.array([float(source.compute_rewards(task, row)) for row in features])
-            assert np.array_equal(given, rewards), (
+            wrong = np.flatnonzero(given != rewards)
+            same = len(features) > 1 and not np.ptp(features, axis=0).any()
+            assert not len(wrong), (
                 "step must return exactly compute_rewards(task, info['reward_features']), but "
-                f"{name} environment's gives {given.tolist()} for the rewards {rewards.tolist()}: "
-                "compute the reward in _reward alone, from its arguments alone, with no state of "
-                "the environment, and return new arrays of features"
+                f"{name} environment's gives {given[wrong[0]]} for the reward {rewards[wrong[0]]} "
+                f"of step {wrong[0]}: "
+                + (
+                    "those of all steps are alike: return new arrays of features"
+                    if same
+                    else "compute the reward in _reward alone, from its arguments alone, with no "
+                    "state of the environment"
+                )
             )
     features = case.episodes[0][2]
     together, one_by_one = _both_ways(case.player, other, "compute_rewards", case.tasks, features)

@@ -45,6 +45,9 @@ def run_adapt(arguments: argparse.Namespace) -> int:
     check_output("--plot", arguments.plot, (".png", ".pdf", ".svg"))
     check_output("--video", arguments.video, (".mp4", ".gif"))
     check_output("--save", arguments.save, (POLICY_SUFFIX,))
+    if arguments.save is not None and arguments.save.exists() and not arguments.resume:
+        other = "choose another name, or remove it"
+        raise ValueError(f"--save {arguments.save}: a policy is kept there already; {other}")
     human = arguments.oracle == "human"
     n_tasks = _check_tasks(arguments)
     subject = Subject(arguments, Console(), n_tasks, COPIES_FOR_ONE_TASK if human else COPIES)
@@ -163,6 +166,8 @@ class Adaptation:
         how: dict[str, Any] = {"oracle": oracle, "n_queries": n_queries, "seed": subject.seed}
         adapter = PreferenceAdapter(subject.model, env, rule=self.rule, **how)
         latents, stopped = [adapter.policy().latent], ""
+        if not adapter.done:
+            say("Answer by your own wish. Ctrl-C stops; what was answered is kept.")
         try:
             while not adapter.done:
                 oracle.n_asked = adapter.n_answers
@@ -219,7 +224,8 @@ class Adaptation:
         if not adapter.done:
             say(f"  answer the rest:  {again}")
         if arguments.save is None:
-            say(f"  keep the policy:  {again} --save policy{POLICY_SUFFIX}")
+            own = f"policy-{recorder.session.id}{POLICY_SUFFIX}"
+            say(f"  keep the policy:  {again} --save {own}")
         else:
             film = ["sb3-poem", "record-video", "--model", str(arguments.save)]
             if arguments.gym_packages:

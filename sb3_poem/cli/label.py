@@ -164,6 +164,7 @@ def run_replay(arguments: argparse.Namespace) -> None:
     # A model that rl_zoo3 trained may hold its schedules.
     import rl_zoo3  # noqa: F401
 
+    from sb3_poem.adaptation.preference import BEST_OF_FOUR
     from sb3_poem.common.files import write_json_atomically
     from sb3_poem.label.replay import replay
     from sb3_poem.loading import load_model
@@ -177,6 +178,10 @@ def run_replay(arguments: argparse.Namespace) -> None:
         raise ValueError(f"--store {arguments.store} holds no answers")
     results: list[dict[str, Any]] = []
     for session in answered:
+        if session.question == BEST_OF_FOUR and arguments.inference == "paper":
+            read = "asks which of four is best, which --inference bayes alone reads"
+            say(f"Session {session.id} {read}: left out")
+            continue
         try:
             # a store may come from anybody: it names no file to unpickle
             model = load_model(given or pretrained_folder(session.model))
@@ -191,13 +196,11 @@ def run_replay(arguments: argparse.Namespace) -> None:
         with Console().status(f"Session {session.id}"):
             results.append(replay(store, session, model, options, arguments.seed or 0, is_own))
         say(
-            "Session {session} ({model}): foretold {foretold} of {decided} answers. "
+            "Session {session} ({model}): foretold {foretold} of {decided} answers that decide. "
             "{sentence}".format_map(results[-1])
         )
     if not results:
-        raise ValueError(
-            "no session could be replayed: name the model that they were recorded with by --model"
-        )
+        raise ValueError("no session could be replayed, for the reasons above")
     if arguments.json is not None:
         content = {"model": given, "options": options, "sessions": results}
         write_json_atomically(arguments.json, content)

@@ -77,7 +77,8 @@ class Subject:
             raise ValueError(f"--env {self.env_id}, but {trained}: {error}") from error
         task, width = arguments.task, self.family.task_dim
         if task is not None and len(task) != width:
-            raise ValueError(f"--task needs {width} numbers for {self.env_id}, got {len(task)}")
+            numbers = f"{width} number{'s' * (width != 1)}"
+            raise ValueError(f"--task needs {numbers} for {self.env_id}, got {len(task)}")
         #: (n_tasks, task_dim)
         self.tasks = np.array([task], dtype=np.float64)
         space = self.family.task_space

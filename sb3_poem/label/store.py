@@ -446,6 +446,8 @@ class StoreRecorder:
     :param n_queries: How many answers there will be at most.
     :param resume: Whether to go on with the last terminal session that has answers and agrees in
         all of this, if there is one. The adapter must be told first what :meth:`kept` gives.
+    :raises ValueError: If there is none to resume, but an unfinished one of this model and
+        environment, begun with other arguments.
     """
 
     def __init__(
@@ -463,6 +465,8 @@ class StoreRecorder:
         about = (model, env_id, seed, options or {}, n_queries)
         found = [one for one in store.sessions() if resume and self._agrees(one, about)]
         self.resumed = bool(found)
+        if resume and not found:
+            self._refuse_other(about)
         self.session = found[-1] if found else store.create_session(*about, source="terminal")[0]
         if wish:
             store.set_wish(self.session.id, wish)
@@ -470,6 +474,19 @@ class StoreRecorder:
     def _agrees(self, one: Session, about: tuple[Any, ...]) -> bool:
         facts = (one.source, one.model, one.env_id, one.seed, one.options, one.step)
         return facts == ("terminal", *about) and bool(self.store.answers(one.id))
+
+    def _refuse_other(self, about: tuple[Any, ...]) -> None:
+        """Of unfinished sessions one may be meant that was begun a little otherwise."""
+        for one in reversed(self.store.sessions()):
+            n = len(self.store.answers(one.id))
+            if (one.source, one.model, one.env_id) == ("terminal", *about[:2]) and 0 < n < one.step:
+                names = ("seed", "options", "n_queries")
+                own = zip(names, (one.seed, one.options, one.step), about[2:], strict=True)
+                others = [f"{name} {was}, not {now}" for name, was, now in own if was != now]
+                raise ValueError(
+                    f"nothing to resume: session {one.id} has {n} of {one.step} answers, but was "
+                    f"begun with {'; '.join(others)}. Give the same, or begin anew without resume"
+                )
 
     def kept(self) -> list[dict[str, Any]]:
         """The session's answers so far, see :meth:`Store.adapter_answers`."""

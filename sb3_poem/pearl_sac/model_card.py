@@ -15,7 +15,9 @@ def model_card(config: dict[str, Any], name: str | None = None) -> str:
     :param name: By which the model is loaded; None is its family's, as of a shipped one
     """
     card, algorithm, env_id = config["card"], config["algorithm"], config["env_id"]
-    name = name or family_name(str(env_id))
+    ships = str(env_id).startswith("poem/") or name is not None
+    name = name or (family_name(str(env_id)) if ships else "path/of/this/folder")
+    registered = "" if ships else "  # after an import of the module that registers it"
     return f"""---
 library_name: sb3_poem
 license: {card.get("license", "mit")}
@@ -34,8 +36,8 @@ import gymnasium as gym
 
 import sb3_poem
 
-model = sb3_poem.{algorithm}.from_pretrained("{name}")  # or the path of this folder
-env = gym.make("{env_id}")
+model = sb3_poem.{algorithm}.from_pretrained("{name}"){"  # or the path of this folder" * ships}
+env = gym.make("{env_id}"){registered}
 adapter = sb3_poem.PreferenceAdapter(model, env, oracle=sb3_poem.ReturnOracle())
 policy = adapter.adapt()
 ```
@@ -71,7 +73,7 @@ def _training(config: dict[str, Any]) -> str:
 
 def _results(card: dict[str, Any]) -> str:
     results = card.get("results", {})
-    what = next((name for name in results if name.startswith("adaptation to ")), None)
+    what = next((name for name in results if name.startswith("adaptation to ")), "")
     measured = [one for one in results.get(what, ()) if one["inference"] in RULES]
     if not measured:
         return ""

@@ -286,7 +286,11 @@ class PEARLSAC(SAC):
             environment) and ``n_timesteps``. With ``env``, another family is trained by this entry
         :raises ValueError: If its file has no entry for it, nor a default one
         """
+        if not isinstance(env_id, str):
+            given = f"is {env_id!r}: pass an environment by env=, beside the id of an entry"
+            raise TypeError(f'env_id must be an id as "poem/AntGoal-v0", but {given}')
         entry = zoo_entry(config_file(cls.zoo_name), plain_id(env_id), **arguments)
+        check_number("n_timesteps", entry["n_timesteps"], above=0)
         timesteps, n_envs = int(entry.pop("n_timesteps")), entry.pop("n_envs", None)
         entry.setdefault("env", env_id)
         rate = entry.get("learning_rate")
@@ -323,6 +327,13 @@ class PEARLSAC(SAC):
         :raises ValueError: If no number of steps is known
         """
         steps = self._checked_steps(total_timesteps, callback)
+        if steps <= self.epoch_steps and self.lr_schedule(0.0) == 0.0:
+            warnings.warn(
+                "`learning_rate` falls to 0 at the end of the run, and a run of one epoch trains "
+                f"there: nothing is learned. Learn for more than {self.epoch_steps:,} steps, or "
+                "pass a constant learning_rate",
+                stacklevel=2,
+            )
         self.env_id, self.env_kwargs = self.family.env_id, self.family.env_kwargs
         total_timesteps, callback = self._setup_learn(
             steps, callback, reset_num_timesteps, tb_log_name or self.algorithm, progress_bar
@@ -359,10 +370,15 @@ class PEARLSAC(SAC):
         if isinstance(callback, type):
             name = callback.__name__
             raise TypeError(f"callback is the class {name}, but must be an object: {name}(...)")
+        if not (
+            callback is None or isinstance(callback, BaseCallback | list) or callable(callback)
+        ):
+            raise TypeError(f"callback must be a callback, a function or a list, not {callback!r}")
         if self.verbose > 0:
             epoch, updates = self.epoch_steps, self.gradient_steps
+            n = int(-(-total // epoch))
             print(
-                f"Training for {total:,.0f} steps in {-(-total // epoch):,.0f} epochs: each has "
+                f"Training for {total:,.0f} steps in {n:,} epoch{'s' * (n != 1)}: each has "
                 f"{epoch:,} environment steps, then {updates if updates >= 0 else epoch:,} "
                 "gradient steps"
             )

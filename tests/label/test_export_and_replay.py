@@ -310,7 +310,11 @@ def test_the_terminals_answers_are_in_the_same_store(
 
 
 def test_the_best_of_four_is_exported_beside_pairs_and_replayed(
-    answered: Session, store: Store, point_goal: ModelInfo, tmp_path: Path
+    answered: Session,
+    store: Store,
+    point_goal: ModelInfo,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     from pyarrow import parquet
 
@@ -351,6 +355,13 @@ def test_the_best_of_four_is_exported_beside_pairs_and_replayed(
     assert other["action_error"] < 0.2
     with pytest.raises(ValueError, match=r'which of four is best, which only inference="bayes"'):
         replay(store, recorder.session, model, {"inference": "paper"})
+    result = tmp_path / "paper.json"
+    command = ["label", "replay", "--store", str(store.folder), "--inference", "paper"]
+    assert cli.main([*command, "--json", str(result)]) == 0
+    words = f"Session {recorder.session.id} asks which of four is best, which --inference bayes"
+    assert words in capsys.readouterr().out
+    (replayed,) = json.loads(result.read_text())["sessions"]
+    assert replayed["session"] == answered.id
 
 
 def test_the_widget_moves_the_adapter(point_goal: ModelInfo, tmp_path: Path) -> None:

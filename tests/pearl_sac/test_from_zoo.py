@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 import torch as th
 import yaml
 from meta_toys import EPOCH, POINT_GOAL, Walk, differing, parameters, small
+from torch.nn.utils import parameters_to_vector
 
 from sb3_poem import PEARLSAC, POEMSAC
 from sb3_poem.common.vec_env import make_task_vec_env
@@ -143,3 +145,17 @@ def test_the_names_are_those_of_the_command_line() -> None:
     assert {name: kind.zoo_name for name, kind in ALGORITHMS.items()} == {
         name: name for name in ALGORITHMS
     }
+
+
+def test_a_run_of_one_epoch_says_that_a_falling_rate_is_0_in_it() -> None:
+    few = {"seed": 0, "n_train_tasks": 4, "gradient_steps": 2}
+    model = POEMSAC.from_zoo(POINT_GOAL, n_envs=4, **few)
+    before = parameters_to_vector(model.policy.actor.parameters())
+    with pytest.warns(UserWarning, match="`learning_rate` falls to 0.*more than 100 steps"):
+        model.learn(100)
+    assert th.equal(parameters_to_vector(model.policy.actor.parameters()), before)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.learn(200)
+        assert not th.equal(parameters_to_vector(model.policy.actor.parameters()), before)
+        POEMSAC("MlpPolicy", POINT_GOAL, **few).learn(100)
