@@ -353,7 +353,7 @@ def _check_shapes(model: Any, tensors: dict[str, th.Tensor]) -> None:
     """Refuse tensors of other shapes than the configured networks', of which an outline is made."""
     model._complete_policy_kwargs()
     # a fused optimiser does not take outlines
-    arguments = {**model.policy_kwargs, "optimizer_kwargs": {}}
+    arguments = {**model.policy_kwargs, "optimizer_class": th.optim.SGD, "optimizer_kwargs": {}}
     policy_class, action_space = model.policy_class, model.action_space
     with th.device("meta"):
         outline = policy_class(model.observation_space, action_space, lambda _: 0.0, **arguments)

@@ -37,6 +37,7 @@ from poem_envs import TaskFamily
 from poem_envs.testing import check_task_family
 from sb3_poem import PEARLSAC, POEMSAC
 from sb3_poem.common.buffers import TaskBatch
+from sb3_poem.pearl_sac import updater
 from sb3_poem.pearl_sac.arguments import UNSUPPORTED
 from sb3_poem.pearl_sac.policies import LatentPolicy
 
@@ -347,6 +348,22 @@ def test_a_loss_that_is_not_finite_changes_no_weight(algorithm: type[PEARLSAC]) 
         match=r"loss or its gradient is not finite at update 5; no network was changed by it",
     ):
         model.train(3, 16)
+    assert not differing(before, parameters(model))
+
+
+def test_an_optimiser_that_takes_every_gradient_waits_for_it(
+    algorithm: type[PEARLSAC], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a GPU, for which this processor stands in."""
+    kwargs = {"net_arch": ARCH, "optimizer_class": th.optim.SGD, "optimizer_kwargs": {}}
+    model = small(algorithm, policy_kwargs=kwargs, ent_coef=0.1).learn(300)
+    before = parameters(model)
+    model.epoch_context.transitions[:] = float("nan")
+    [batch] = model.make_sampler().sample(1, 16)
+    monkeypatch.setattr(type(model.policy), "device", th.device("cuda"))
+    monkeypatch.setattr(updater, "GraphedStep", lambda step: step)
+    with pytest.raises(ValueError, match="not finite at update 5; no network was changed by it"):
+        model.make_updater().step(batch)
     assert not differing(before, parameters(model))
 
 
