@@ -731,6 +731,20 @@ def test_folders_that_are_no_runs_are_passed_over(tmp_path: Path) -> None:
     assert last_run(tmp_path, "poem-PointGoal-v0", -1) == tmp_path / "poem-PointGoal-v0_10"
 
 
+def test_a_model_that_is_trained_further_is_read_once(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    how = {"n_train_tasks": SMALL["n_train_tasks"], "meta_batch_size": 2}
+    POEMSAC("MlpPolicy", "poem/PointGoal-v0", **how).save(tmp_path / "m.zip")
+    load, files = th.load, []
+    monkeypatch.setattr(
+        th, "load", lambda file, **how: files.append(file.name) or load(file, **how)
+    )
+    flags = ("-c", config, "-f", tmp_path / "logs", "--eval-freq", -1, "-n", 1)
+    assert train(*flags, "-i", tmp_path / "m.zip") == 0
+    assert files.count("policy.pth") == 1
+
+
 def test_a_model_of_another_family_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
