@@ -242,8 +242,8 @@ def test_epochs_are_counted_with_the_rollouts_that_compare_policies(
     saved = []
     monkeypatch.setattr(POEMSAC, "save_checkpoint", lambda self, _: saved.append(self.epoch))
     flags = ["-c", windy_config, "-f", tmp_path / "logs", "--eval-freq", -1]
-    # 6 tasks in groups of 2: 12 rollouts of 10 steps
-    flags += ["--save-freq", 120, "-params", "n_timesteps:360", "preference_group_size:2"]
+    # 6 tasks in one group: 6 * 6 rollouts of 10 steps
+    flags += ["--save-freq", 360, "-params", "n_timesteps:1080"]
     assert train("--env", "Windy-v0", *flags) == 0
     assert saved == [1, 2, 3]
 

@@ -38,7 +38,12 @@ from sb3_poem.pearl_sac.arguments import (
     vectorise,
     warn_of_idle_callbacks,
 )
-from sb3_poem.pearl_sac.collector import CollectionStoppedError, EpochCollector, concatenate
+from sb3_poem.pearl_sac.collector import (
+    CollectionStoppedError,
+    EpochCollector,
+    concatenate,
+    in_whole_waves,
+)
 from sb3_poem.pearl_sac.objective import Objective, rows
 from sb3_poem.pearl_sac.policies import OBSERVATION_CLIP, LatentPolicy, MlpPolicy
 from sb3_poem.pearl_sac.sampler import MetaBatchSampler
@@ -618,8 +623,7 @@ class PEARLSAC(SAC):
 
     def _steps_of(self, rollouts: int) -> int:
         """Environment steps of so many rollouts, all copies of the environment at a time."""
-        n_envs = self.family.num_envs
-        return -(-rollouts // n_envs) * n_envs * self.family.horizon
+        return in_whole_waves(rollouts, self.family.num_envs) * self.family.horizon
 
     # ------------------------------------------------------------------ what adaptation asks
 

@@ -106,14 +106,8 @@ def test_arguments_of_both(
             "similarity must be one of 'two-encoder', 'cosine', 'inner', got 'dot'",
         ),
         ("context", "rewards", "context must be one of 'optimal', 'pearl', got 'rewards'"),
-        (
-            "preference_source",
-            "human",
-            "preference_source must be one of 'auto', 'relabel', 'rollout', got 'human'",
-        ),
         ("preference_coef", -1.0, r"`preference_coef` must be at least 0, but is -1\.0"),
         ("preference_coef", NAN, "`preference_coef` must be a finite number, but is nan"),
-        ("preference_group_size", 1, "`preference_group_size` must be at least 2, but is 1"),
     ],
 )
 def test_arguments_of_poem(argument: str, value: Any, message: str) -> None:
@@ -283,10 +277,6 @@ def test_relabelling_needs_shared_dynamics(algorithm: type[PEARLSAC]) -> None:
         ValueError, match=r"`context_relabel_fraction` must be at most 1, but is 1\.5"
     ):
         small(PEARLSAC, walks(2), horizon=10, context_relabel_fraction=1.5)
-    with pytest.raises(
-        ValueError, match=r'preference_source must be "rollout" or "auto": .* do not share dynamics'
-    ):
-        small(POEMSAC, walks(2, WindyWalk), horizon=10, preference_source="relabel")
 
 
 def test_a_family_without_a_time_limit(algorithm: type[PEARLSAC]) -> None:
