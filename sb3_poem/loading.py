@@ -14,15 +14,14 @@ ALGORITHMS: dict[str, type[PEARLSAC]] = {"poem_sac": POEMSAC, "pearl_sac": PEARL
 BY_CLASS_NAME = {algorithm.__name__: algorithm for algorithm in ALGORITHMS.values()}
 
 
-def as_model(model: Any, device: th.device | str = "auto") -> Any:
+def as_model(model: Any) -> Any:
     """A model as it is, or the one that a name stands for.
 
     :param model: A model with latents, of whichever class, or what :func:`load_model` takes
-    :param device: For a model that is loaded
     :raises TypeError: If it is neither
     """
     if isinstance(model, (str, Path)):
-        return load_model(model, device)
+        return load_model(model)
     if hasattr(model, "latent_dim") and not isinstance(model, type):
         return model
     is_class = isinstance(model, type)

@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import softplus
 
 from sb3_poem.common.buffers import Segment
-from sb3_poem.common.checks import check_number
+from sb3_poem.common.checks import check_choice, check_number
 from sb3_poem.pearl_sac.arguments import GivenEnv, refuse_unknown, with_arguments_of
 from sb3_poem.pearl_sac.collector import EpochCollector, in_waves, relabelled_returns
 from sb3_poem.pearl_sac.objective import Metrics, Objective, TaskEmbeddings
@@ -162,10 +162,7 @@ class POEMSAC(PEARLSAC):
         check_number("preference_coef", self.preference_coef, 0.0)
         check_number("similarity_temperature", self.similarity_temperature, 1e-6)
         for name, known in CHOICES.items():
-            value = getattr(self, name)
-            if value not in known:
-                names = ", ".join(map(repr, known))
-                raise ValueError(f"{name} must be one of {names}, got {value!r}")
+            check_choice(name, getattr(self, name), known)
 
     def _complete_policy_kwargs(self) -> None:
         super()._complete_policy_kwargs()

@@ -84,7 +84,11 @@ FRACTIONS = ("gamma", "tau", "relabel_fraction", "shaping_coef")
             ("reward_scale", value, "reward_scale must be a positive number, ")
             for value in (0, -1.0, NAN, "big", None)
         ],
-        ("precision", "fp16", "precision must be one of 'auto', 'bf16', 'fp32', got 'fp16'"),
+        (
+            "precision",
+            "fp16",
+            r"`precision` must be one of \('auto', 'bf16', 'fp32'\), but is 'fp16'",
+        ),
         ("horizon", 30, "horizon is 30, but the environment ends episodes after 25 steps"),
         ("policy_kwargs", {"net_arch": {"critic": [3]}}, "net_arch has unknown keys"),
         ("device", "tpu7", "[Dd]evice|tpu"),
@@ -103,9 +107,13 @@ def test_arguments_of_both(
         (
             "similarity",
             "dot",
-            "similarity must be one of 'two-encoder', 'cosine', 'inner', got 'dot'",
+            r"`similarity` must be one of \('two-encoder', 'cosine', 'inner'\), but is 'dot'",
         ),
-        ("context", "rewards", "context must be one of 'optimal', 'pearl', got 'rewards'"),
+        (
+            "context",
+            "rewards",
+            r"`context` must be one of \('optimal', 'pearl'\), but is 'rewards'",
+        ),
         ("preference_coef", -1.0, r"`preference_coef` must be at least 0, but is -1\.0"),
         ("preference_coef", NAN, "`preference_coef` must be a finite number, but is nan"),
     ],
@@ -380,7 +388,7 @@ def test_a_reward_that_overflows_changes_no_weight(algorithm: type[PEARLSAC]) ->
 def test_sample_latents_and_sources(algorithm: type[PEARLSAC]) -> None:
     model = small(algorithm)
     with pytest.raises(
-        ValueError, match='source must be "prior" or "aggregate", got \'posterior\''
+        ValueError, match=r"`source` must be one of \('prior', 'aggregate'\), but is 'posterior'"
     ):
         model.sample_latents(3, np.random.default_rng(0), "posterior")
 
