@@ -82,7 +82,7 @@ def kept_arguments(algorithm: type) -> list[str]:
 
 
 #: What reading a damaged file raises
-BROKEN: tuple[type[Exception], ...] = (
+BROKEN = (
     *(zipfile.BadZipFile, EOFError, RuntimeError, pickle.UnpicklingError),
     *(UnicodeDecodeError, json.JSONDecodeError),
 )
@@ -93,7 +93,7 @@ def reading(path: str | Path | io.BufferedIOBase, algorithm: type) -> Iterator[N
     """Say which file it is that cannot be read."""
     try:
         yield
-    except (ValueError, *BROKEN) as error:
+    except Exception as error:
         # SB3 raises a ValueError from that of a zip
         broken = isinstance(error, BROKEN) or isinstance(error.__cause__, BROKEN)
         if not broken or isinstance(error, th.OutOfMemoryError):
