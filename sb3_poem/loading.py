@@ -6,7 +6,7 @@ from typing import Any
 import torch as th
 
 from sb3_poem.pearl_sac import PEARLSAC
-from sb3_poem.pearl_sac.saving import algorithm_of, is_checkpoint, read_config
+from sb3_poem.pearl_sac.saving import facts_of, read_config
 from sb3_poem.poem_sac import POEMSAC
 from sb3_poem.resources import find_folder, pretrained_names
 
@@ -14,15 +14,14 @@ ALGORITHMS: dict[str, type[PEARLSAC]] = {"poem_sac": POEMSAC, "pearl_sac": PEARL
 BY_CLASS_NAME = {algorithm.__name__: algorithm for algorithm in ALGORITHMS.values()}
 
 
-def as_model(model: Any, device: th.device | str = "auto") -> Any:
+def as_model(model: Any) -> Any:
     """A model as it is, or the one that a name stands for.
 
     :param model: A model with latents, of whichever class, or what :func:`load_model` takes
-    :param device: For a model that is loaded
     :raises TypeError: If it is neither
     """
     if isinstance(model, (str, Path)):
-        return load_model(model, device)
+        return load_model(model)
     if hasattr(model, "latent_dim") and not isinstance(model, type):
         return model
     is_class = isinstance(model, type)
@@ -53,8 +52,9 @@ def load_model(name: str | Path, device: th.device | str = "auto") -> PEARLSAC:
         raise ValueError(f"{name} holds no whole model: {instead}")
     if archive.is_file():
         # where that cannot be told, POEMSAC.load says what is wrong with the file
-        kind = BY_CLASS_NAME.get(algorithm_of(archive), POEMSAC)
-        read = kind.load_checkpoint if is_checkpoint(archive) else kind.load
+        facts = facts_of(archive)
+        kind = BY_CLASS_NAME.get(str(facts.get("algorithm")), POEMSAC)
+        read = kind.load_checkpoint if facts.get("keeps_experience") else kind.load
         return read(archive, device=device)
     path = find_folder(name)
     found = read_config(path)["algorithm"]

@@ -57,7 +57,7 @@ VARIANTS: dict[str, tuple[type[PEARLSAC], str, dict[str, Any]]] = {
     "POEMSAC PointGoal": (POEMSAC, POINT_GOAL, {}),
     "POEMSAC PointGoal fp32": (POEMSAC, POINT_GOAL, {"precision": "fp32", "policy_delay": 2}),
     "POEMSAC PointGoal n_steps": (POEMSAC, POINT_GOAL, {"n_steps": 1, "relabel_fraction": 0.2}),
-    "POEMSAC PointGoal rollouts": (POEMSAC, POINT_GOAL, {"preference_source": "rollout"}),
+    "POEMSAC PointGoal rollouts": (POEMSAC, POINT_GOAL, {}),
     "POEMSAC PointGoal ablations": (
         POEMSAC,
         POINT_GOAL,
@@ -102,6 +102,8 @@ def trained(name: str) -> PEARLSAC:
     """One of :data:`VARIANTS` after three epochs."""
     algorithm, env_id, arguments = VARIANTS[name]
     model = algorithm("MlpPolicy", env_id, **SMALL, **arguments)
+    if name.endswith("rollouts"):
+        model.family.shared_dynamics = False
     return model.learn(EPOCHS * SMALL["n_train_tasks"] * STEPS[env_id])
 
 

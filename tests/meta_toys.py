@@ -150,6 +150,12 @@ def walks(n: int, family: type[Walk] = Walk, steps: int = 10, **kwargs: Any) -> 
     return DummyVecEnv([lambda: gym.wrappers.TimeLimit(family(**kwargs), steps) for _ in range(n)])
 
 
+def apart(model: Model) -> Model:
+    """A model that is told that its tasks differ in their dynamics: policies are run on them."""
+    model.family.shared_dynamics = False
+    return model
+
+
 def parameters(model: PEARLSAC) -> dict[str, th.Tensor]:
     """Copies of all that training changes in the networks and their optimisers."""
     result = {f"policy.{name}": value.clone() for name, value in model.policy.state_dict().items()}

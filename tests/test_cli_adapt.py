@@ -511,7 +511,7 @@ def test_an_interrupt_keeps_what_was_measured(
 def test_an_interrupt_before_anything_was_measured(
     model: tuple[POEMSAC, str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("sb3_poem.adaptation.evaluation.rollout_outcomes", interrupt)
+    monkeypatch.setattr("sb3_poem.adaptation.evaluation.rollout_episodes", interrupt)
     assert adapt(model[1]) == 130
     assert capsys.readouterr().err.endswith("Interrupted.\n")
 

@@ -242,8 +242,8 @@ def test_epochs_are_counted_with_the_rollouts_that_compare_policies(
     saved = []
     monkeypatch.setattr(POEMSAC, "save_checkpoint", lambda self, _: saved.append(self.epoch))
     flags = ["-c", windy_config, "-f", tmp_path / "logs", "--eval-freq", -1]
-    # 6 tasks in groups of 2: 12 rollouts of 10 steps
-    flags += ["--save-freq", 120, "-params", "n_timesteps:360", "preference_group_size:2"]
+    # 6 tasks in one group: 6 * 6 rollouts of 10 steps
+    flags += ["--save-freq", 360, "-params", "n_timesteps:1080"]
     assert train("--env", "Windy-v0", *flags) == 0
     assert saved == [1, 2, 3]
 
@@ -729,6 +729,20 @@ def test_folders_that_are_no_runs_are_passed_over(tmp_path: Path) -> None:
         (tmp_path / f"poem-PointGoal-v0_{name}").mkdir()
         (tmp_path / f"poem-PointGoal-v0_{name}" / "checkpoint.zip").touch()
     assert last_run(tmp_path, "poem-PointGoal-v0", -1) == tmp_path / "poem-PointGoal-v0_10"
+
+
+def test_a_model_that_is_trained_further_is_read_once(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    how = {"n_train_tasks": SMALL["n_train_tasks"], "meta_batch_size": 2}
+    POEMSAC("MlpPolicy", "poem/PointGoal-v0", **how).save(tmp_path / "m.zip")
+    load, files = th.load, []
+    monkeypatch.setattr(
+        th, "load", lambda file, **how: files.append(file.name) or load(file, **how)
+    )
+    flags = ("-c", config, "-f", tmp_path / "logs", "--eval-freq", -1, "-n", 1)
+    assert train(*flags, "-i", tmp_path / "m.zip") == 0
+    assert files.count("policy.pth") == 1
 
 
 def test_a_model_of_another_family_is_named(

@@ -273,7 +273,7 @@ class MetaWorldML10Env(MetaWorldEnv):
     Meta-World's own (version 2), between 0 and 10, and its `success` in the info. The tasks have
     different dynamics: `shared_dynamics` is False, and the one reward feature is the reward of the
     task that was played, which says nothing about other tasks. POEM measures what one task's policy
-    earns in another by running it there (`preference_source="rollout"`).
+    earns in another by running it there.
 
     ## Arguments
     `split`, and those of :class:`MetaWorldML1Env` but `env_name`.

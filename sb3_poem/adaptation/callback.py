@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.adaptation.bayes import Bayes
 from sb3_poem.adaptation.environments import check_model_fits
-from sb3_poem.adaptation.evaluation import evaluate_adaptation, evaluate_episodes
+from sb3_poem.adaptation.evaluation import evaluate_adaptation
 from sb3_poem.adaptation.known_task import known_task_return, preference_order
 from sb3_poem.adaptation.meta_model import HasSimilarity
 from sb3_poem.adaptation.rule import as_rule
@@ -27,10 +27,9 @@ class AdaptationEvalCallback(EpochCallback):
     and keeps the best model. Training is the same with it and without it.
 
     Logs ``eval/return_after_<k>_queries`` for each k, ``eval/known_task_return`` (the best of many
-    latents for each task), ``eval/preference_accuracy`` and ``eval/kendall_tau`` of Property 1,
-    ``eval/coverage_loss`` (the return that is lost by replacing each training task's latent by the
-    nearest of 1,000 prior draws), and for a family that says what a success is
-    ``eval/success_rate_after_<k>_queries`` and ``eval/known_task_success_rate``.
+    latents for each task), ``eval/preference_accuracy`` and ``eval/kendall_tau`` of Property 1, and
+    for a family that says what a success is ``eval/success_rate_after_<k>_queries`` and
+    ``eval/known_task_success_rate``.
 
     >>> from sb3_poem import POEMSAC
     >>> model = POEMSAC("MlpPolicy", "poem/PointGoal-v0", n_train_tasks=4, gradient_steps=1)
@@ -120,7 +119,6 @@ class AdaptationEvalCallback(EpochCallback):
             rates = zip(result.record_at, result.success_rates.tolist(), strict=True)
             metrics |= {f"success_rate_after_{k}_queries": rate for k, rate in rates}
             metrics["known_task_success_rate"] = known.success_rate
-        metrics["coverage_loss"] = self._coverage_loss(env)
         if isinstance(self.model, HasSimilarity):
             accuracy, tau = preference_order(self.model, known)
             metrics |= {"preference_accuracy": accuracy, "kendall_tau": tau}
@@ -135,20 +133,6 @@ class AdaptationEvalCallback(EpochCallback):
             self.best_return = self.model.best_adapted_return = score
             if self._best_model is not None:
                 self.model.save(self._best_model)
-
-    def _coverage_loss(self, env: VecEnv) -> float:
-        """How far the prior is from what the policy was trained on, in return."""
-        rng = np.random.default_rng(self.seed)
-        count = min(self.n_tasks, len(self.model.train_tasks))
-        chosen = rng.choice(len(self.model.train_tasks), size=count, replace=False)
-        own, tasks = self.model.task_latents[chosen], self.model.train_tasks.tasks[chosen]
-        draws = rng.standard_normal((1000, self.model.latent_dim))
-        nearest = draws[((own[:, None, :] - draws[None, :, :]) ** 2).sum(axis=2).argmin(axis=1)]
-        of_own, of_nearest = (
-            evaluate_episodes(self.model, env, latents, tasks, 1, self.seed).returns.mean()
-            for latents in (own, nearest)
-        )
-        return float(of_own - of_nearest)
 
     def _on_training_end(self) -> None:
         super()._on_training_end()

@@ -17,8 +17,8 @@ from sb3_poem.adaptation.oracles import Oracle, ReturnOracle
 from sb3_poem.adaptation.preference import PLACES, Preference, as_preference
 from sb3_poem.adaptation.rule import Rule, Setting, as_rule, inference_rng, latents_of, rollout_seed
 from sb3_poem.common.checks import check_whole, check_whole_numbers
-from sb3_poem.common.family_view import FamilyView
-from sb3_poem.common.rollouts import rollout_latents, rollout_outcomes
+from sb3_poem.common.family_view import FamilyView, demanded
+from sb3_poem.common.rollouts import rollout_episodes, rollout_latents
 from sb3_poem.common.trajectory import Trajectory
 
 N_TEST_TASKS = 30
@@ -206,14 +206,14 @@ def evaluate_episodes(
     check_whole("n_episodes", n_episodes, 1)
     shape, family = (n_episodes, len(latents)), FamilyView(vec_env)
     every, of = np.tile(latents, (n_episodes, 1)), np.tile(tasks, (n_episodes, 1))
-    outcomes = rollout_outcomes(model, vec_env, every, of, seed, deterministic)
-    returns = [
-        float(np.sum(family.compute_rewards(task, outcome.reward_features)))
-        for task, outcome in zip(of, outcomes, strict=True)
+    episodes = rollout_episodes(model, vec_env, every, of, seed, deterministic)
+    found = [
+        (family.compute_rewards(task, demanded(seen.reward_features)).sum(), success)
+        for task, (seen, success) in zip(of, episodes, strict=True)
     ]
-    flags = np.array([outcome.success for outcome in outcomes]).reshape(shape).T
-    successes = None if None in flags else flags.astype(bool)
-    return EpisodeOutcomes(np.array(returns).reshape(shape).T, successes)
+    returns = np.array([paid for paid, _ in found]).reshape(shape).T
+    flags = np.array([success for _, success in found]).reshape(shape).T
+    return EpisodeOutcomes(returns, None if None in flags else flags.astype(bool))
 
 
 @dataclass(frozen=True, eq=False)

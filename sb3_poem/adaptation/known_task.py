@@ -17,8 +17,8 @@ from sb3_poem.adaptation.limits import AnswerLimits
 from sb3_poem.adaptation.meta_model import HasSimilarity, MetaModel
 from sb3_poem.adaptation.noise import NoiseModel
 from sb3_poem.common.checks import check_whole
-from sb3_poem.common.family_view import FamilyView
-from sb3_poem.common.rollouts import rollout_outcomes
+from sb3_poem.common.family_view import FamilyView, demanded
+from sb3_poem.common.rollouts import rollout_episodes
 
 # Latents to try for each task, where every one must be rolled out in every task, and where one
 # rollout serves all of them.
@@ -190,8 +190,8 @@ def return_matrix(
     # The task in effect does not matter, and it must be one that every copy accepts.
     some_task = np.repeat(tasks[:1], n_episodes * shape[1], axis=0)
     every = np.tile(latents, (n_episodes, 1))
-    outcomes = rollout_outcomes(model, vec_env, every, some_task, seed, deterministic)
-    features = [outcome.reward_features[None] for outcome in outcomes]
+    episodes = rollout_episodes(model, vec_env, every, some_task, seed, deterministic)
+    features = [demanded(seen.reward_features)[None] for seen, _ in episodes]
     totals = [family.compute_rewards(tasks[:, None], each).sum(axis=1) for each in features]
     return np.stack(totals, axis=1).reshape(shape[0], n_episodes, shape[1]).mean(axis=1)
 

@@ -10,6 +10,8 @@ import numpy as np
 # A slice's reference Gaussian is this much wider than the particles, so that the ratio of target to
 # reference does not grow in the tails.
 WIDENING = 1.3
+# A kernel's, as a share of the particles' spread.
+WIDTH = 0.3
 
 
 def systematic_resample(weights: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
@@ -51,7 +53,6 @@ def kernel_neighbours(
     fitted: Gaussian,
     log_prior: Callable[[np.ndarray], np.ndarray] | None,
     rng: np.random.Generator,
-    width: float = 0.3,
 ) -> np.ndarray:
     """A neighbour of each particle (n, d), without a look at the likelihood.
 
@@ -60,10 +61,9 @@ def kernel_neighbours(
     should lie there: a step is taken with the ratio of the prior's densities.
 
     :param log_prior: Maps (m, d) to (m,), up to a constant; None where the prior has no holes.
-    :param width: Of the kernel, as a share of the particles' spread, in (0, 1).
     """
     mean, noise = fitted.mean, rng.standard_normal(particles.shape) @ fitted.factor.T
-    proposals = mean + np.sqrt(1.0 - width**2) * (particles - mean) + width * noise
+    proposals = mean + np.sqrt(1.0 - WIDTH**2) * (particles - mean) + WIDTH * noise
     if log_prior is None:
         return proposals
     ratio = log_prior(proposals) - log_prior(particles)

@@ -29,8 +29,9 @@ def commit() -> str | None:
     if COMMIT_VARIABLE in os.environ:
         return os.environ[COMMIT_VARIABLE]
     folder = Path(__file__).resolve().parents[2]
-    head = _git(folder, "rev-parse", "--short", "HEAD")
-    if head is None or not (folder / "sb3_poem" / "benchmark").is_dir():
+    # an installed package may lie inside another project's checkout
+    head = _git(folder, "rev-parse", "--short", "HEAD") if (folder / ".git").exists() else None
+    if head is None:
         return None
     changed = _git(folder, "status", "--porcelain", "--untracked-files=no", "--", *CODE)
     return head + ("+" if changed else "")

@@ -11,8 +11,7 @@ import json
 import logging
 import shutil
 import uuid
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,24 +22,21 @@ from sb3_poem.benchmark.store import Record, Store
 from sb3_poem.benchmark.suites import Cell, ModelKey
 
 
-@dataclass(frozen=True)
-class RayOptions:
-    """How to use Ray: an address of None is the cluster that this process is connected to, or else
-    one on this machine; ``cpus`` and ``gpus`` of a trial, which is tried again ``max_failures``
-    times when it fails or its worker is lost.
-    """
-
-    address: str | None = None
-    cpus: float = 1.0
-    gpus: float = 0.0
-    max_failures: int = 3
-
-
 def run_with_ray(
-    plan: Plan, library: ModelLibrary, store: Store, options: RayOptions, say: Say = print
+    plan: Plan,
+    library: ModelLibrary,
+    store: Store,
+    address: str | None,
+    resources: Mapping[str, float],
+    max_failures: int,
+    say: Say,
 ) -> list[str]:
     """Run a plan as Tune trials; what failed, a line each. The library's folders must be the same
     on all machines.
+
+    :param address: None is the cluster that this process is connected to, or one on this machine
+    :param resources: How many "cpu" and "gpu" a trial reserves
+    :param max_failures: How often a trial is tried again that fails or whose worker is lost
     """
     try:
         import ray
@@ -51,14 +47,15 @@ def run_with_ray(
     own = not ray.is_initialized()
     if own:
         quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
-        ray.init(address=options.address, include_dashboard=False, **quiet)
+        ray.init(address=address, include_dashboard=False, **quiet)
     models = [key for key in plan.models if library.state(key) in ("missing", "interrupted")]
     derived = [key for key in models if key.base is not None]
     trained = [key for key in models if key.base is None]
     failures: list[str] = []
     try:
         for jobs in (trained, derived, plan.todo):  # what is made from others comes after them
-            failures += _run_trials(jobs, library.workplace, store.path.absolute(), options, say)
+            where = library.workplace, store.path.absolute()
+            failures += _run_trials(jobs, *where, resources, max_failures, say)
     finally:
         if own:
             ray.shutdown()
@@ -69,7 +66,8 @@ def _run_trials(
     jobs: Sequence[ModelKey | Cell],
     workplace: Workplace,
     store: Path,
-    options: RayOptions,
+    resources: Mapping[str, float],
+    max_failures: int,
     say: Say,
 ) -> list[str]:
     """One Tune experiment; returns what failed."""
@@ -97,11 +95,11 @@ def _run_trials(
     storage.mkdir(parents=True)
     run = tune.with_parameters(_run_trial, jobs=list(jobs), workplace=workplace)
     tuner = tune.Tuner(
-        tune.with_resources(run, {"cpu": options.cpus, "gpu": options.gpus}),
+        tune.with_resources(run, dict(resources)),
         param_space={"number": tune.grid_search(list(range(len(jobs))))},
         run_config=tune.RunConfig(
             storage_path=str(storage),
-            failure_config=tune.FailureConfig(max_failures=options.max_failures),
+            failure_config=tune.FailureConfig(max_failures=max_failures),
             callbacks=[KeepRecords()],
             verbose=0,
         ),

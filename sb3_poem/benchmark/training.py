@@ -26,6 +26,8 @@ from sb3_poem.benchmark.methods import VARIANTS
 from sb3_poem.benchmark.suites import ModelKey, family_id
 from sb3_poem.common.family_view import FamilyView, vectorised
 from sb3_poem.common.files import write_json_atomically
+from sb3_poem.pearl_sac.arguments import default_copies
+from sb3_poem.pearl_sac.collector import in_whole_waves
 from sb3_poem.pearl_sac.saving import CHECKPOINT
 from sb3_poem.pearl_sac.train_tasks import default_train_tasks
 from sb3_poem.poem_sac.poem_sac import comparing_rollouts
@@ -112,9 +114,10 @@ def training_plan(key: ModelKey) -> TrainingPlan:
     for name, number in (("n_train_tasks", tasks), ("trajectories_per_task", each)):
         if not isinstance(number, int) or number < 1:
             raise ValueError(f"{name} must be a whole number of at least 1, got {number!r}")
-    rollouts = tasks * each
+    copies = int(hyperparameters.get("n_envs") or default_copies(facts.env_id, tasks, each))
+    rollouts = in_whole_waves(tasks * each, copies)
     if variant.algorithm == "poem_sac" and not facts.shared_dynamics:
-        rollouts += comparing_rollouts(tasks, hyperparameters.get("preference_group_size", 4))
+        rollouts += in_whole_waves(comparing_rollouts(tasks), copies)
     epoch_steps = rollouts * facts.horizon
     per_epoch = int(hyperparameters.get("gradient_steps", 1000))
     updates = -(-timesteps // epoch_steps) * (epoch_steps if per_epoch < 0 else per_epoch)

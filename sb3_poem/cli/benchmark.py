@@ -4,14 +4,15 @@ import argparse
 from collections.abc import Sequence
 from os.path import abspath
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from sb3_poem.benchmark.cells import find_record, verify_cell
+from sb3_poem.benchmark.models import ModelLibrary, Workplace, model_folder
+from sb3_poem.benchmark.ray_backend import run_with_ray
+from sb3_poem.benchmark.running import Plan, describe, export_model, make_plan, run_cells
+from sb3_poem.benchmark.store import Store
 from sb3_poem.benchmark.suites import SUITES, Budget, Training, family_id, family_label, hashable
+from sb3_poem.benchmark.tables import make_report
 from sb3_poem.cli.needs import check_device, check_writable, import_packages, parse_pairs, say
-
-if TYPE_CHECKING:
-    from sb3_poem.benchmark.models import ModelLibrary
-    from sb3_poem.benchmark.running import Plan
 
 
 def run_benchmark(arguments: argparse.Namespace) -> int:
@@ -20,10 +21,6 @@ def run_benchmark(arguments: argparse.Namespace) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from sb3_poem.benchmark.models import model_folder
-    from sb3_poem.benchmark.running import describe, export_model, make_plan, run_cells
-    from sb3_poem.benchmark.store import Store
-
     check_device(arguments.device)
     import_packages(arguments.gym_packages)
     suite = SUITES[arguments.suite]
@@ -49,11 +46,9 @@ def _run(arguments: argparse.Namespace) -> int:
     store = store or Store(arguments.store)
     say(f"{plan}; results in {arguments.store}")
     if arguments.backend == "ray":
-        from sb3_poem.benchmark.ray_backend import RayOptions, run_with_ray
-
-        resources = (arguments.cpus_per_trial, arguments.gpus_per_trial, arguments.max_failures)
-        options = RayOptions(arguments.address, *resources)
-        failures = run_with_ray(plan, library, store, options, say)
+        trial = {"cpu": arguments.cpus_per_trial, "gpu": arguments.gpus_per_trial}
+        how = (arguments.address, trial, arguments.max_failures)
+        failures = run_with_ray(plan, library, store, *how, say)
     else:
         failures = run_cells(plan.todo, library, store, say)
     for failure in failures:
@@ -70,7 +65,7 @@ def _run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _check_models(given: Sequence[str], library: "ModelLibrary", plan: "Plan") -> None:
+def _check_models(given: Sequence[str], library: ModelLibrary, plan: Plan) -> None:
     """Refuse what would quietly be trained instead of being taken."""
     cells = [*plan.todo, *plan.done, *(cell for cell, _ in plan.skipped)]
     keys = {cell.model_key.base or cell.model_key for cell in cells}
@@ -88,9 +83,6 @@ def _check_models(given: Sequence[str], library: "ModelLibrary", plan: "Plan") -
 
 
 def _report(arguments: argparse.Namespace) -> int:
-    from sb3_poem.benchmark.store import Store
-    from sb3_poem.benchmark.tables import make_report
-
     store, what = Store(arguments.store, create=False), (arguments.suite, arguments.families)
     if arguments.out is not None:
         check_writable(arguments.out)
@@ -103,9 +95,6 @@ def _report(arguments: argparse.Namespace) -> int:
 
 
 def _verify(arguments: argparse.Namespace) -> int:
-    from sb3_poem.benchmark.cells import find_record, verify_cell
-    from sb3_poem.benchmark.store import Store
-
     import_packages(arguments.gym_packages)
     store = Store(arguments.store, create=False)
     if arguments.cell is None:
@@ -122,9 +111,7 @@ def _verify(arguments: argparse.Namespace) -> int:
     return 1 if differences else 0
 
 
-def _library(arguments: argparse.Namespace, device: str, num_threads: int) -> "ModelLibrary":
-    from sb3_poem.benchmark.models import ModelLibrary, Workplace
-
+def _library(arguments: argparse.Namespace, device: str, num_threads: int) -> ModelLibrary:
     for folder in arguments.models:
         if not Path(folder).is_dir():
             raise ValueError(f"--models {folder}: there is no such folder")

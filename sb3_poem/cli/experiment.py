@@ -30,7 +30,7 @@ from sb3_poem.loading import ALGORITHMS
 from sb3_poem.pearl_sac import PEARLSAC
 from sb3_poem.pearl_sac.arguments import default_copies
 from sb3_poem.pearl_sac.callbacks import TrainingCheckpointCallback
-from sb3_poem.pearl_sac.saving import CHECKPOINT, is_checkpoint
+from sb3_poem.pearl_sac.saving import CHECKPOINT, facts_of
 from sb3_poem.resources import config_file
 
 
@@ -168,7 +168,7 @@ class PoemExperiment(FamilyExperiment):
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> Any:
         file, algorithm = self.trained_agent, ALGORITHMS[self.algo]
         try:
-            if not is_checkpoint(file):
+            if not facts_of(file).get("keeps_experience"):
                 return super()._load_pretrained_agent(hyperparams, env)
             model = algorithm.load_checkpoint(file, env, device=self.device)
         except ValueError as error:

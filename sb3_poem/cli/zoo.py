@@ -23,7 +23,7 @@ from sb3_poem.cli.experiment import TrainingInterrupted, make_experiment
 from sb3_poem.cli.hyperparams import SAMPLERS, convert_params
 from sb3_poem.cli.needs import check_device, import_packages
 from sb3_poem.loading import ALGORITHMS
-from sb3_poem.pearl_sac.saving import CHECKPOINT, facts_of, is_checkpoint
+from sb3_poem.pearl_sac.saving import CHECKPOINT, check_archive, facts_of
 
 # Those of our own that differ from rl_zoo3's; what the user gives comes later, and wins.
 DEFAULTS = {
@@ -86,15 +86,16 @@ def check_arguments(given: argparse.Namespace) -> None:
         if not given.trained_agent.endswith(".zip") or not Path(given.trained_agent).is_file():
             what = "there is no such file of a model, which ends in .zip"
             raise ValueError(f"-i {given.trained_agent}: {what}")
-        if is_checkpoint(given.trained_agent):
-            total = facts_of(given.trained_agent)["_total_timesteps"]
+        facts = facts_of(given.trained_agent)
+        if facts.get("keeps_experience"):
+            total = facts["_total_timesteps"]
             if given.n_timesteps not in (-1, total):
                 raise ValueError(
                     f"-n {given.n_timesteps}: {given.trained_agent} goes on to its own {total} "
                     "steps; leave -n out, and train the finished model further with -i"
                 )
         elif given.algo in ALGORITHMS:
-            ALGORITHMS[given.algo].load(given.trained_agent, device="cpu")
+            check_archive(given.trained_agent, ALGORITHMS[given.algo], {})
     if given.env not in gym.registry:
         names = {name: env_id for env_id in gym.registry for name in (env_id, family_label(env_id))}
         hint = "name the module that registers it by --gym-packages"

@@ -16,18 +16,16 @@ from torch import nn
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import linear
 
+from sb3_poem.common.checks import check_choice
 from sb3_poem.common.networks import MLP, Normalised
 
-PRECISIONS = ("auto", "bf16", "fp32")
 ALIGNMENT = 16
 LAYER_NORM_EPS = 1e-5  # of torch's layer_norm
 
 
 def hidden_dtype(precision: str, device_type: str) -> th.dtype:
     """Type of the hidden layers' arithmetic on a device, "cpu" or "cuda"."""
-    if precision not in PRECISIONS:
-        known = ", ".join(map(repr, PRECISIONS))
-        raise ValueError(f"precision must be one of {known}, got {precision!r}")
+    check_choice("precision", precision, ("auto", "bf16", "fp32"))
     if precision == "auto":
         on_gpu = device_type == "cuda"
         has = th.cuda.is_bf16_supported if on_gpu else th.cpu._is_avx512_bf16_supported

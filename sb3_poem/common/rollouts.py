@@ -1,14 +1,14 @@
 """Roll out many latent-conditioned policies in lockstep on one vector environment."""
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.common.checks import check_whole
-from sb3_poem.common.family_view import FamilyView, demanded, reward_features, seed_copies
+from sb3_poem.common.family_view import FamilyView, reward_features, seed_copies
 from sb3_poem.common.trajectory import Trajectory
 
 
@@ -43,42 +43,22 @@ def rollout_latents(
     :raises ValueError: On wrong shapes, and if an observation or an action is not finite.
     """
     how = (seed, deterministic, frames, max_steps)
-    return [seen for seen, _ in _episodes(model, vec_env, latents, tasks, *how)]
+    return [seen for seen, _ in rollout_episodes(model, vec_env, latents, tasks, *how)]
 
 
-class Outcome(NamedTuple):
-    """What evaluation needs to know of an episode."""
-
-    #: (T, feat_dim)
-    reward_features: np.ndarray
-    #: Whether any of its steps was a success; None where infos do not say (``"is_success"``)
-    success: bool | None
-
-
-def rollout_outcomes(
+def rollout_episodes(
     model: Any,
     vec_env: VecEnv,
     latents: np.ndarray,
     tasks: np.ndarray | None = None,
     seed: int | Sequence[int] = 0,
     deterministic: bool = True,
-) -> list[Outcome]:
-    """As :func:`rollout_latents`, but outcomes only: observations may take up all memory."""
-    episodes = _episodes(model, vec_env, latents, tasks, seed, deterministic)
-    return [Outcome(demanded(seen.reward_features), success) for seen, success in episodes]
-
-
-def _episodes(
-    model: Any,
-    vec_env: VecEnv,
-    latents: np.ndarray,
-    tasks: np.ndarray | None,
-    seed: int | Sequence[int],
-    deterministic: bool,
     frames: int = 0,
     max_steps: int | None = None,
 ) -> Iterator[tuple[Trajectory, bool | None]]:
-    """Of every latent, and whether it was a success."""
+    """As :func:`rollout_latents`, whose observations may take up all memory, one after another; and
+    whether any step was a success, None where infos do not say (``"is_success"``).
+    """
     latents = np.asarray(latents, dtype=np.float64)
     n, copies = len(latents), vec_env.num_envs
     if latents.ndim != 2:

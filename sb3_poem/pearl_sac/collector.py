@@ -114,9 +114,14 @@ class EpochCollector:
         return act(obs, noise)
 
 
+def in_whole_waves(n: int, n_envs: int) -> int:
+    """How many rollouts are made where ``n`` are wanted: every copy makes one in each wave."""
+    return -(-n // n_envs) * n_envs
+
+
 def in_waves(rows: np.ndarray, n_envs: int) -> np.ndarray:
     """Rows in order, (waves, n_envs, ...): the last wave is filled up from the start."""
-    count = -(-len(rows) // n_envs) * n_envs
+    count = in_whole_waves(len(rows), n_envs)
     return rows[np.arange(count) % len(rows)].reshape(-1, n_envs, *rows.shape[1:])
 
 

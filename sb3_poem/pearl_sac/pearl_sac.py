@@ -38,7 +38,12 @@ from sb3_poem.pearl_sac.arguments import (
     vectorise,
     warn_of_idle_callbacks,
 )
-from sb3_poem.pearl_sac.collector import CollectionStoppedError, EpochCollector, concatenate
+from sb3_poem.pearl_sac.collector import (
+    CollectionStoppedError,
+    EpochCollector,
+    concatenate,
+    in_whole_waves,
+)
 from sb3_poem.pearl_sac.objective import Objective, rows
 from sb3_poem.pearl_sac.policies import OBSERVATION_CLIP, LatentPolicy, MlpPolicy
 from sb3_poem.pearl_sac.sampler import MetaBatchSampler
@@ -634,8 +639,7 @@ class PEARLSAC(SAC):
 
     def _steps_of(self, rollouts: int) -> int:
         """Environment steps of so many rollouts, all copies of the environment at a time."""
-        n_envs = self.family.num_envs
-        return -(-rollouts // n_envs) * n_envs * self.family.horizon
+        return in_whole_waves(rollouts, self.family.num_envs) * self.family.horizon
 
     # ------------------------------------------------------------------ what adaptation asks
 
@@ -731,7 +735,8 @@ class PEARLSAC(SAC):
         """
         refuse_unknown(kwargs.keys() - inspect.signature(cls).parameters.keys(), cls)
         saving.check_archive(path, cls, kwargs)
-        model = super().load(path, None, device, custom_objects, print_system_info, **kwargs)
+        with saving.reading(path, cls):
+            model = super().load(path, None, device, custom_objects, print_system_info, **kwargs)
         model._check_arguments(vars(model))
         if env is not None:
             model.set_env(env, force_reset)
@@ -761,12 +766,14 @@ class PEARLSAC(SAC):
 
         :raises ValueError: If the file is truncated or foreign, or env of another family
         """
-        if not saving.is_checkpoint(path):
+        facts = saving.facts_of(path)
+        found = facts.get("algorithm")
+        if not facts.get("keeps_experience"):
             what = "is truncated, or no checkpoint of sb3_poem"
-            if saving.algorithm_of(path):
+            if found:
                 what = f"is a model, no checkpoint: use {cls.__name__}.load"
             raise ValueError(f"{path} {what}")
-        if (found := saving.algorithm_of(path)) != cls.__name__:
+        if found != cls.__name__:
             raise ValueError(f"{path} holds a {found}; load it with {found}.load_checkpoint")
         with open(path, "rb") as file:
             model = cls.load(file, env, device)

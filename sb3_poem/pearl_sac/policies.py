@@ -59,7 +59,7 @@ class LatentPolicy(SACPolicy):
     :param context_has_value: Whether a context transition carries Q(s, a)
     :param n_critics: Number of critics
     :param optimizer_class: Optimiser of all networks
-    :param optimizer_kwargs: Its arguments
+    :param optimizer_kwargs: Its arguments; Adam is fused unless they say otherwise
     """
 
     observation_space: spaces.Box
@@ -85,8 +85,10 @@ class LatentPolicy(SACPolicy):
     ) -> None:
         if not (isinstance(activation_fn, type) and issubclass(activation_fn, nn.Module)):
             raise TypeError(f"activation_fn must be a class, as nn.ReLU, but is {activation_fn!r}")
-        if optimizer_kwargs is None and optimizer_class is th.optim.Adam:
-            optimizer_kwargs = {"fused": True}
+        optimizer_kwargs = optimizer_kwargs or {}
+        others = {"foreach", "differentiable"} & optimizer_kwargs.keys()
+        if optimizer_class is th.optim.Adam and not others:
+            optimizer_kwargs = {"fused": True, **optimizer_kwargs}
         BasePolicy.__init__(
             self,
             observation_space,

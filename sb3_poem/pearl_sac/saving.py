@@ -2,13 +2,15 @@
 and pretrained folders, in which nothing can run code.
 """
 
+import contextlib
 import inspect
 import io
 import itertools
 import json
 import math
+import pickle
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,7 +19,7 @@ import torch as th
 from gymnasium import spaces
 from safetensors.torch import save as tensors_to_bytes
 from stable_baselines3 import SAC
-from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.save_util import json_to_data
 from torch import nn
 
 from sb3_poem.common.buffers import ContextStore
@@ -64,6 +66,8 @@ LARGEST = {
     "buffer_size": 100_000_000,
 }
 LARGEST_OF_OTHERS = 1_000_000
+#: What older files say of arguments that are gone: as every model is trained now
+RETIRED = {"preference_source": "auto", "preference_group_size": 4}
 
 Model = TypeVar("Model", bound=SAC)
 
@@ -77,24 +81,44 @@ def kept_arguments(algorithm: type) -> list[str]:
 # ---------------------------------------------------------------------- SB3's zip
 
 
+#: What reading a damaged file raises
+BROKEN = (
+    *(zipfile.BadZipFile, EOFError, RuntimeError, pickle.UnpicklingError),
+    *(UnicodeDecodeError, json.JSONDecodeError),
+)
+
+
+@contextlib.contextmanager
+def reading(path: str | Path | io.BufferedIOBase, algorithm: type) -> Iterator[None]:
+    """Say which file it is that cannot be read."""
+    try:
+        yield
+    except Exception as error:
+        # SB3 raises a ValueError from that of a zip
+        broken = isinstance(error, BROKEN) or isinstance(error.__cause__, BROKEN)
+        if not broken or isinstance(error, th.OutOfMemoryError):
+            raise
+        what = f"{path} is truncated, or no model saved by {algorithm.__name__}"
+        raise ValueError(f"{what}: {error}") from error
+
+
 def check_archive(
     path: str | Path | io.BufferedIOBase, algorithm: type, changes: Mapping[str, Any]
 ) -> None:
-    """Refuse a zip of which ``load`` cannot make the model with these changes of arguments."""
+    """Refuse a zip of which ``load`` cannot make the model with these changes of arguments, from
+    all that it holds but tensors.
+    """
+    file = path
     if not isinstance(path, io.BufferedIOBase):
         _check_is_file(Path(path), algorithm.__name__)
-    try:
-        data, _, _ = load_from_zip_file(path, device="cpu", load_data=True)
-        if data is None:
-            raise ValueError("it holds no data of a model")
-    except (zipfile.BadZipFile, RuntimeError, EOFError, ValueError) as error:
-        name = algorithm.__name__
-        raise ValueError(f"{path} is truncated, or no model saved by {name}: {error}") from error
+        file = path if Path(path).is_file() else f"{path}.zip"
+    with reading(path, algorithm), zipfile.ZipFile(file) as archive:
+        if "data" not in archive.namelist():
+            raise zipfile.BadZipFile("it holds no data of a model")
+        data = json_to_data(archive.read("data").decode())
     if (found := data.get("algorithm")) != algorithm.__name__:
         what = f"{path} holds a {found or 'model of another algorithm'}"
         raise ValueError(f"{what}, not a {algorithm.__name__}")
-    if isinstance(path, io.BufferedIOBase):
-        path.seek(0)
     found = {**data, "n_train_tasks": len(data["train_tasks"])}
     for name, value in changes.items():
         fixed, why = name in FIXED or (name == "n_train_tasks" and value is not None), ""
@@ -105,18 +129,10 @@ def check_archive(
             raise ValueError(f"{name} is {kept!r} in {path}, and cannot become {value!r}{why}")
 
 
-def algorithm_of(path: str | Path) -> str:
-    """Name of the class whose model a zip holds; empty where it says none."""
-    return str(facts_of(path).get("algorithm", ""))
-
-
-def is_checkpoint(path: str | Path) -> bool:
-    """Whether a file is a checkpoint of a training run, rather than a model that ``save`` wrote."""
-    return bool(facts_of(path).get("keeps_experience"))
-
-
 def facts_of(path: str | Path) -> dict[str, Any]:
-    """What a zip says of its model in plain JSON; nothing where it is none of ours."""
+    """What a zip says of its model in plain JSON; nothing where it is none of ours. A checkpoint of
+    a training run, unlike a model that ``save`` wrote, ``keeps_experience``.
+    """
     try:
         with zipfile.ZipFile(path) as archive:
             return dict(json.loads(archive.read("data")))
@@ -127,7 +143,7 @@ def facts_of(path: str | Path) -> dict[str, Any]:
 def _check_is_file(path: Path, algorithm: str) -> None:
     """Refuse what another method reads."""
     what, method = "the name of a model that ships", "from_pretrained"
-    if path.is_file() and is_checkpoint(path):
+    if path.is_file() and facts_of(path).get("keeps_experience"):
         what, method = "a checkpoint", "load_checkpoint"
     elif path.is_dir():
         what = "a folder"
@@ -285,6 +301,9 @@ def build_model(
 
     :raises ValueError: If something is missing or does not fit; the message names ``source``
     """
+    given = config["arguments"].items()
+    arguments = {name: value for name, value in given if (name, value) not in RETIRED.items()}
+    config = {**config, "arguments": arguments}
     try:
         _check_numbers(algorithm, config, tensors)
         arguments = {**config["arguments"], "device": device, "_init_setup_model": False}
@@ -353,7 +372,7 @@ def _check_shapes(model: Any, tensors: dict[str, th.Tensor]) -> None:
     """Refuse tensors of other shapes than the configured networks', of which an outline is made."""
     model._complete_policy_kwargs()
     # a fused optimiser does not take outlines
-    arguments = {**model.policy_kwargs, "optimizer_kwargs": {}}
+    arguments = {**model.policy_kwargs, "optimizer_class": th.optim.SGD, "optimizer_kwargs": {}}
     policy_class, action_space = model.policy_class, model.action_space
     with th.device("meta"):
         outline = policy_class(model.observation_space, action_space, lambda _: 0.0, **arguments)

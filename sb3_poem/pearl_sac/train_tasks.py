@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sb3_poem.common.checks import check_choice
 from sb3_poem.common.family_view import FamilyView
 
 DEFAULT_TRAIN_TASKS = 120
@@ -57,11 +58,10 @@ class TrainTasks:
         :param source: "prior": N(0, I). "aggregate": the training tasks' posteriors, and what lies
             between a task and its nearest neighbours
         """
+        check_choice("source", source, ("prior", "aggregate"))
         means = self.latent_means
         if source == "prior":
             return rng.standard_normal((n, means.shape[1]))
-        if source != "aggregate":
-            raise ValueError(f'source must be "prior" or "aggregate", got {source!r}')
         chosen = rng.integers(len(means), size=n)
         draws = means[chosen]
         # few tasks have nothing in between

@@ -62,7 +62,10 @@ class Updater:
         #: By whether everything learns
         self._steps: dict[bool, Callable[[MetaBatch], Metrics]]
         self._steps = {whole: partial(self._step, whole) for whole in (True, False)}
-        if on_gpu and self.target_update_interval == 1:
+        fused = all(group.get("fused") for group in policy.optimizer.param_groups)
+        #: For the gradient's norm, before the step: only fused optimisers leave a bad one out
+        self.waits = not (on_gpu and fused)
+        if not self.waits and self.target_update_interval == 1:
             self._steps = {whole: GraphedStep(step) for whole, step in self._steps.items()}
 
     def step(self, batch: MetaBatch) -> Metrics:
@@ -93,7 +96,7 @@ class Updater:
         gradients = [p.grad for group in groups for p in group["params"] if p.grad is not None]
         # the loss is looked at as well, because a ReLU may turn NaN to 0 on the way to the gradient
         norm = nn.utils.get_total_norm(gradients, foreach=True) + 0.0 * loss.detach()
-        if self.policy.device.type == "cpu":
+        if self.waits:
             self.check_finite([norm], self.n_updates)
         else:  # nobody waits for the device: it leaves out the step, and the block's end tells
             optimizer.found_inf = (~th.isfinite(norm)).float()

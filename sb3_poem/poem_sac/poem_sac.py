@@ -11,8 +11,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import softplus
 
 from sb3_poem.common.buffers import Segment
-from sb3_poem.common.checks import check_number, check_whole
-from sb3_poem.common.family_view import FamilyView
+from sb3_poem.common.checks import check_choice, check_number
 from sb3_poem.pearl_sac.arguments import GivenEnv, refuse_unknown, with_arguments_of
 from sb3_poem.pearl_sac.collector import EpochCollector, in_waves, relabelled_returns
 from sb3_poem.pearl_sac.objective import Metrics, Objective, TaskEmbeddings
@@ -24,8 +23,9 @@ from sb3_poem.poem_sac.policies import MlpPolicy, POEMPolicy
 CHOICES = {
     "similarity": ("two-encoder", "cosine", "inner"),
     "context": ("optimal", "pearl"),
-    "preference_source": ("auto", "relabel", "rollout"),
 }
+#: About how many tasks' policies are run on each other where tasks do not share dynamics
+GROUP_SIZE = 4
 #: Share of the returns by rollouts that the next epoch still knows, where it measures no newer one
 REMEMBERED = 0.95
 
@@ -87,14 +87,14 @@ class _PreferenceLoss(th.autograd.Function):
         return ctx.gradient * of_loss, None
 
 
-def preference_groups(tasks: np.ndarray, size: int) -> list[np.ndarray]:
-    """Groups of about so many tasks, whose policies are run on each other's."""
-    return np.array_split(tasks, max(1, len(tasks) // size))
+def preference_groups(tasks: np.ndarray) -> list[np.ndarray]:
+    """Groups of about :data:`GROUP_SIZE` tasks, whose policies are run on each other's."""
+    return np.array_split(tasks, max(1, len(tasks) // GROUP_SIZE))
 
 
-def comparing_rollouts(n_tasks: int, group_size: int) -> int:
+def comparing_rollouts(n_tasks: int) -> int:
     """How many rollouts of an epoch run a policy on another task of its group."""
-    groups = preference_groups(np.arange(n_tasks), group_size)
+    groups = preference_groups(np.arange(n_tasks))
     return sum(len(group) * (len(group) - 1) for group in groups)
 
 
@@ -127,11 +127,6 @@ class POEMSAC(PEARLSAC):
     :param context: "optimal": (s, a, s', r, Q) of the task's own policy (eq. 8); "pearl", the
         ablation: (s, a, s', r) as PEARL samples them, where tasks share their dynamics half of the
         contexts by other tasks' policies, as in a new task's first rollouts
-    :param preference_source: Where J[i, j] comes from. "relabel": task i's reward function on task
-        j's trajectories; "rollout": task j's policy is run on task i, within random groups of
-        tasks, and the steps are counted; what earlier epochs measured is forgotten bit by bit, 1 in
-        20 an epoch; "auto": relabel where the family shares dynamics
-    :param preference_group_size: Tasks whose policies are run on each other with "rollout"
     """
 
     zoo_name: ClassVar[str] = "poem_sac"
@@ -151,8 +146,6 @@ class POEMSAC(PEARLSAC):
         similarity: str = "two-encoder",
         similarity_temperature: float = 0.1,
         context: str = "optimal",
-        preference_source: str = "auto",
-        preference_group_size: int = 4,
         **kwargs: Any,
     ) -> None:
         refuse_unknown(kwargs.keys() & {"context_relabel_fraction"}, type(self))
@@ -160,8 +153,6 @@ class POEMSAC(PEARLSAC):
         self.similarity = similarity
         self.similarity_temperature = similarity_temperature
         self.context = context
-        self.preference_source = preference_source
-        self.preference_group_size = preference_group_size
         kwargs |= {"kl_coef": kl_coef, "reward_coef": reward_coef, "policy_coef": policy_coef}
         kwargs["context_relabel_fraction"] = 0.0 if context == "optimal" else None
         super().__init__(policy, env, *args, **kwargs)
@@ -170,12 +161,8 @@ class POEMSAC(PEARLSAC):
         super()._check_arguments(given)
         check_number("preference_coef", self.preference_coef, 0.0)
         check_number("similarity_temperature", self.similarity_temperature, 1e-6)
-        check_whole("preference_group_size", self.preference_group_size, 2)
         for name, known in CHOICES.items():
-            value = getattr(self, name)
-            if value not in known:
-                names = ", ".join(map(repr, known))
-                raise ValueError(f"{name} must be one of {names}, got {value!r}")
+            check_choice(name, getattr(self, name), known)
 
     def _complete_policy_kwargs(self) -> None:
         super()._complete_policy_kwargs()
@@ -183,14 +170,6 @@ class POEMSAC(PEARLSAC):
         cosine = self.similarity == "cosine"
         self.policy_kwargs["temperature"] = self.similarity_temperature if cosine else None
         self.policy_kwargs["context_has_value"] = self.context == "optimal"
-
-    def _check_family(self, family: FamilyView) -> None:
-        super()._check_family(family)
-        if self.preference_source == "relabel" and not family.shared_dynamics:
-            raise ValueError(
-                f'preference_source must be "rollout" or "auto": the tasks of {family.env_id} do '
-                "not share dynamics, so a trajectory of one cannot be relabelled for another"
-            )
 
     def similarities(self, task_latents: np.ndarray, policy_latents: np.ndarray) -> np.ndarray:
         """S(z_i, z_j) (eq. 3), how well policy j fits task i: (m, latent_dim), (n, latent_dim) ->
@@ -202,33 +181,27 @@ class POEMSAC(PEARLSAC):
             return self.policy.similarity(tasks, policies).double().cpu().numpy()
 
     @property
-    def relabels(self) -> bool:
-        """Whether J[i, j] comes from relabelling."""
-        if self.preference_source == "auto":
-            return self.family.shared_dynamics
-        return self.preference_source == "relabel"
-
-    @property
     def epoch_steps(self) -> int:
         """Environment steps of an epoch's collection, those that compare policies included."""
-        if self.relabels:
+        if self.family.shared_dynamics:
             return super().epoch_steps
-        rollouts = comparing_rollouts(len(self.train_tasks), self.preference_group_size)
-        return super().epoch_steps + self._steps_of(rollouts)
+        return super().epoch_steps + self._steps_of(comparing_rollouts(len(self.train_tasks)))
 
     def measure_returns(self, epoch: Segment, collector: EpochCollector) -> np.ndarray:
-        """J[i, j] by relabelling or, within random groups of tasks, by running the policies; then
-        with most of what the epochs before measured.
+        """J[i, j] by task i's reward function on task j's trajectories where tasks share dynamics;
+        else by running task j's policy on task i, within random groups of tasks: what earlier
+        epochs measured is forgotten bit by bit, 1 in 20 an epoch.
         """
         family, tasks, n_tasks = self.family, self.train_tasks.tasks, len(self.train_tasks)
-        if self.relabels:
+        if family.shared_dynamics:
             steps = (epoch.features, epoch.first_episode)
             relabelled = relabelled_returns(family.compute_rewards, tasks, *steps)
             return relabelled.reshape(n_tasks, n_tasks, -1).mean(axis=2)
         returns = super().measure_returns(epoch, collector)
         shuffled = self.generators.numpy.permutation(n_tasks)
-        groups = preference_groups(shuffled, self.preference_group_size)
-        pairs = [(i, j) for group in groups for i in group for j in group if i != j]
+        pairs = [
+            (i, j) for group in preference_groups(shuffled) for i in group for j in group if i != j
+        ]
         own_latents = epoch.latents.reshape(n_tasks, -1, self.latent_dim)[:, 0]
         for wave in in_waves(np.array(pairs, dtype=np.int64).reshape(-1, 2), family.num_envs):
             task_ids, policy_ids = wave.T

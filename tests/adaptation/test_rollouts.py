@@ -9,7 +9,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 from worlds import HORIZON, Blinded, SpeedEnv, SpeedModel, SpeedVecEnv
 
 from sb3_poem import TaskVecEnv
-from sb3_poem.common.rollouts import rollout_latents, rollout_outcomes
+from sb3_poem.adaptation import evaluate_episodes
+from sb3_poem.common.rollouts import rollout_episodes, rollout_latents
 from sb3_poem.common.vec_env import make_task_vec_env
 
 MODEL = SpeedModel()
@@ -25,7 +26,7 @@ class Still:
 
 
 def rollout_features(*arguments, **options):
-    return [outcome.reward_features for outcome in rollout_outcomes(*arguments, **options)]
+    return [seen.reward_features for seen, _ in rollout_episodes(*arguments, **options)]
 
 
 LATENTS = np.random.default_rng(0).standard_normal((7, 5))
@@ -139,7 +140,7 @@ def test_without_reward_features():
     env = DummyVecEnv([lambda: Blinded(SpeedEnv())])
     assert rollout_latents(MODEL, env, LATENTS[:1])[0].reward_features is None
     with pytest.raises(ValueError, match="reward_features"):
-        rollout_features(MODEL, env, LATENTS[:1])
+        evaluate_episodes(MODEL, env, LATENTS[:1], np.ones((1, 1)), 1)
 
 
 class FastFeatures(VecEnvWrapper):

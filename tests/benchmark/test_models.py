@@ -54,6 +54,11 @@ def test_the_training_plan_follows_the_hyperparameter_file(
     shorter = training_plan(ModelKey(POINT, "pearl", 0, Training(3000, (("gradient_steps", 7),))))
     assert (shorter.timesteps, shorter.updates) == (3000, 7)
     assert shorter.overrides == {"gradient_steps": 7}
+    # 150 rollouts by 120 copies, which are as many as training takes: all make two
+    how = Training(8000, (("n_train_tasks", 50), ("trajectories_per_task", 3)))
+    assert training_plan(ModelKey(POINT, "poem", 0, how)).epoch_steps == 240 * 25
+    few = Training(8000, (*how.hyperparameters, ("n_envs", 40)))
+    assert training_plan(ModelKey(POINT, "poem", 0, few)).epoch_steps == 160 * 25
 
 
 def test_shipped_models_are_taken_for_their_own_seed_alone() -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from sb3_poem.benchmark.models import ModelLibrary, Workplace
-from sb3_poem.benchmark.ray_backend import RayOptions, run_with_ray
+from sb3_poem.benchmark.ray_backend import run_with_ray
 from sb3_poem.benchmark.running import make_plan
 from sb3_poem.benchmark.store import Store
 from sb3_poem.benchmark.suites import SUITES, Budget, Entry, Suite, Training
@@ -79,7 +79,8 @@ def test_a_lost_worker_costs_no_cell_and_counts_none_twice(tmp_path: Path) -> No
     watcher.start()
     lines: list[str] = []
     try:
-        failures = run_with_ray(plan, library, store, RayOptions(), lines.append)
+        trial = {"cpu": 1.0, "gpu": 0.0}
+        failures = run_with_ray(plan, library, store, None, trial, 3, lines.append)
     finally:
         over.set()
         watcher.join()

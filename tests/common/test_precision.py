@@ -28,7 +28,9 @@ def test_auto_asks_the_processor(
 
 @pytest.mark.parametrize("name", ["fp16", "float32", "", None])
 def test_another_name_is_refused(name: str) -> None:
-    with pytest.raises(ValueError, match=r"precision must be one of 'auto', 'bf16', 'fp32', got"):
+    with pytest.raises(
+        ValueError, match=r"`precision` must be one of \('auto', 'bf16', 'fp32'\), but is"
+    ):
         hidden_dtype(name, "cpu")
 
 

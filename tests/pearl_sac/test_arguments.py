@@ -145,6 +145,25 @@ def test_another_optimizer(algorithm: type[PEARLSAC]) -> None:
     assert model.policy.optimizer.param_groups[0]["momentum"] == 0.9
 
 
+@one_is_enough
+@pytest.mark.parametrize(
+    ("given", "fused"),
+    [
+        (None, True),
+        ({"betas": (0.9, 0.99), "eps": 1e-7}, True),
+        ({"fused": False}, False),
+        ({"foreach": True}, None),
+    ],
+)
+def test_adam_is_fused_unless_told(algorithm: type[PEARLSAC], given: Any, fused: Any) -> None:
+    """Which is what leaves out a bad step on a GPU, without waiting for it."""
+    kwargs = {"net_arch": ARCH, "optimizer_kwargs": given}
+    model = small(algorithm, policy_kwargs=kwargs).learn(EPOCH)
+    [group] = model.policy.optimizer.param_groups
+    assert group["fused"] is fused
+    assert {name: group[name] for name in given or {}} == (given or {})
+
+
 class Record(BaseCallback):
     """Notes a value at the start of every epoch and at the end."""
 

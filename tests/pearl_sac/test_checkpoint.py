@@ -9,6 +9,8 @@ import os
 import resource
 import subprocess
 import sys
+import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_poem import PEARLSAC, POEMSAC, TrainingCheckpointCallback
+from sb3_poem.loading import load_model
 
 TESTS = Path(__file__).parents[1]
 
@@ -113,6 +116,22 @@ def test_a_resumed_run_ends_as_the_uninterrupted_one(variant: str, tmp_path: Pat
     assert resumed.num_timesteps >= total
     # a finished run has nothing left
     assert resumed.resume().num_timesteps == whole.num_timesteps
+
+
+@pytest.mark.parametrize("read", [POEMSAC.load_checkpoint, load_model])
+def test_a_checkpoint_is_read_once(
+    read: Callable[[Path], PEARLSAC], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It may hold gigabytes of experience."""
+    small(POEMSAC).learn(EPOCH).save_checkpoint(tmp_path / "c.zip")
+    load, files = th.load, []
+    monkeypatch.setattr(
+        th, "load", lambda file, **how: files.append(file.name) or load(file, **how)
+    )
+    read(tmp_path / "c.zip")
+    with zipfile.ZipFile(tmp_path / "c.zip") as archive:
+        assert sorted(files) == sorted(n for n in archive.namelist() if n.endswith(".pth"))
+    assert "experience.pth" in files
 
 
 def test_resuming_twice(tmp_path: Path) -> None:

@@ -163,7 +163,7 @@ def test_a_full_disk_ends_training_only_where_checkpoints_were_asked_for(
 # ---------------------------------------------------------------- evaluation
 
 QUICK = {"n_tasks": 10, "record_at": (0, 2), "n_episodes": 1}
-METRICS = {"return_after_0_queries", "return_after_2_queries", "known_task_return", "coverage_loss"}
+METRICS = {"return_after_0_queries", "return_after_2_queries", "known_task_return"}
 POEM_METRICS = {"preference_accuracy", "kendall_tau"}
 
 
@@ -189,7 +189,7 @@ def test_evaluation_is_logged_and_changes_nothing(
     assert evaluated == [2 * EPOCH, 3 * EPOCH]
     for line in lines[1:]:
         assert metrics == {name.removeprefix("eval/") for name in line if name.startswith("eval/")}
-        for name in metrics - {"coverage_loss", "preference_accuracy", "kendall_tau"}:
+        for name in metrics - {"preference_accuracy", "kendall_tau"}:
             assert -60.0 < line[f"eval/{name}"] < 0.0
     if algorithm is POEMSAC:
         assert 0.0 <= callback.last_evaluation["preference_accuracy"] <= 1.0

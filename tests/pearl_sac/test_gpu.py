@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
-from meta_toys import EPOCH, POINT_GOAL, small
+from meta_toys import ARCH, EPOCH, POINT_GOAL, small
 
 from sb3_poem import PEARLSAC, POEMSAC, PreferenceAdapter, ReturnOracle
 from sb3_poem.adaptation import named_rule
@@ -66,8 +66,20 @@ def test_a_step_waits_for_nothing(
     on_gpu(algorithm).learn(EPOCH)
 
 
-def test_a_loss_that_is_not_finite_changes_no_weight(algorithm: type[PEARLSAC]) -> None:
-    model = on_gpu(algorithm).learn(EPOCH)
+@pytest.mark.parametrize(
+    "optimizer",
+    [
+        {},
+        {"optimizer_kwargs": {"betas": (0.9, 0.999), "eps": 1e-8}},
+        {"optimizer_kwargs": {"foreach": True}},
+        {"optimizer_class": th.optim.SGD, "optimizer_kwargs": {"momentum": 0.9}},
+        {"optimizer_class": th.optim.AdamW, "optimizer_kwargs": {"fused": True}},
+    ],
+)
+def test_a_loss_that_is_not_finite_changes_no_weight(
+    algorithm: type[PEARLSAC], optimizer: dict[str, Any]
+) -> None:
+    model = on_gpu(algorithm, policy_kwargs={"net_arch": ARCH, **optimizer}).learn(EPOCH)
     model.epoch_context.transitions[:] = float("nan")
     before = weights(model)
     with pytest.raises(ValueError, match="loss or its gradient is not finite at update 5"):

@@ -193,7 +193,7 @@ VARIANTS = {
     "fixed-entropy": ({"ent_coef": 0.3, "target_update_interval": 2}, POINT_GOAL),
     "schedule": ({"learning_rate": lambda remaining: 1e-3 * remaining}, POINT_GOAL),
     "ablations": ({"similarity": "inner", "context": "pearl", "latent_dim": 3}, POINT_GOAL),
-    "own-dynamics": ({"horizon": 10, "preference_group_size": 3}, lambda: walks(2, WindyWalk)),
+    "own-dynamics": ({"horizon": 10}, lambda: walks(2, WindyWalk)),
 }
 
 
@@ -210,7 +210,6 @@ def test_every_kind_of_model(variant: str, tmp_path: Path) -> None:
     for name in (
         "similarity",
         "context",
-        "preference_group_size",
         "target_update_interval",
         "gamma",
         "tau",
@@ -222,6 +221,20 @@ def test_every_kind_of_model(variant: str, tmp_path: Path) -> None:
         assert loaded.ent_coef_optimizer is None
         assert loaded.entropy_coefficient.value.item() == pytest.approx(0.3)
     loaded.learn(1)
+
+
+def test_arguments_of_an_older_version(tmp_path: Path) -> None:
+    model = small(POEMSAC)
+    model.save_pretrained(tmp_path / "m")
+    file = tmp_path / "m" / "config.json"
+    config = json.loads(file.read_text())
+    config["arguments"] |= {"preference_source": "auto", "preference_group_size": 4}
+    file.write_text(json.dumps(config))
+    assert_same_predictions(model, POEMSAC.from_pretrained(tmp_path / "m"))
+    config["arguments"]["preference_source"] = "rollout"
+    file.write_text(json.dumps(config))
+    with pytest.raises(ValueError, match="`preference_source` is no argument that a model is"):
+        POEMSAC.from_pretrained(tmp_path / "m")
 
 
 def test_an_activation_that_cannot_be_named_is_refused(tmp_path: Path) -> None:

@@ -302,7 +302,6 @@ def test_arguments_of_a_model_that_is_loaded(
         ("batch_size", 0),
         ("reward_scale", float("inf")),
         ("preference_coef", -1.0),
-        ("preference_source", "human"),
     ],
 )
 def test_an_argument_outside_its_range(

@@ -62,8 +62,6 @@ def test_preferences_of_ml10_are_measured_by_rollouts_that_count(monkeypatch):
     assert model.num_timesteps == 16 * HORIZON
     expected = np.array([[returns[i, j] for j in range(4)] for i in range(4)])
     assert model.epoch_context.returns.numpy() == pytest.approx(expected, rel=1e-5)
-    with pytest.raises(ValueError, match='preference_source must be "rollout" or "auto"'):
-        POEMSAC("MlpPolicy", model.env, n_train_tasks=4, preference_source="relabel")
 
 
 @pytest.mark.metaworld

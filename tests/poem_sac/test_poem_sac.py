@@ -17,6 +17,7 @@ from meta_toys import (
     TwoWalks,
     Walk,
     WindyWalk,
+    apart,
     experience_of,
     parameters,
     small,
@@ -98,21 +99,16 @@ def sources() -> dict[str, tuple[POEMSAC, Spy]]:
     result = {}
     for source in ("relabel", "rollout"):
         env = make_task_vec_env(POINT_GOAL, 4, reset_noise_scale=0.0)
-        model = small(
-            POEMSAC,
-            env,
-            preference_source=source,
-            gradient_steps=0,
-            n_train_tasks=6,
-            preference_group_size=3,
-        )
+        model = small(POEMSAC, env, gradient_steps=0, n_train_tasks=8)
+        if source == "rollout":
+            apart(model)
         spy = Spy(nearly_deterministic(model))
         result[source] = model.learn(1), spy
         model.learn(1, reset_num_timesteps=False)
     return result
 
 
-@pytest.mark.parametrize(("source", "n_new"), [("relabel", 36), ("rollout", 6 + 2 * 3 * 2)])
+@pytest.mark.parametrize(("source", "n_new"), [("relabel", 64), ("rollout", 8 + 2 * 4 * 3)])
 def test_returns_are_those_of_environments_of_every_task(
     sources: dict, source: str, n_new: int
 ) -> None:
@@ -141,20 +137,20 @@ def test_measured_returns_equal_relabelled_ones(sources: dict) -> None:
 def test_returns_are_measured_within_groups_and_counted(sources: dict) -> None:
     model, spy = sources["rollout"]
     known = np.isfinite(spy.returns[0])
-    assert known.sum(axis=1).tolist() == [3] * 6  # two groups of three
+    assert known.sum(axis=1).tolist() == [4] * 8  # two groups of four
     assert np.array_equal(known @ known, known)  # who share one task share all
-    # an epoch: 6 tasks in waves of 4, and 2 groups of 3 * 2 pairs in waves of 4; all steps count,
+    # an epoch: 8 tasks in waves of 4, and 2 groups of 4 * 3 pairs in waves of 4; all steps count,
     # and fill the tasks' buffers
-    assert model.num_timesteps == 2 * (2 + 3) * 4 * 25
+    assert model.num_timesteps == 2 * (2 + 6) * 4 * 25
     assert model.replay_buffer.counts.sum() == model.num_timesteps
-    assert model.replay_buffer.counts.min() >= 2 * (1 + 2) * 25
+    assert model.replay_buffer.counts.min() >= 2 * (1 + 3) * 25
     assert (
         sources["relabel"][0].num_timesteps == 2 * 2 * 4 * 25
     )  # not a step beyond the collection's own
 
 
 def test_returns_by_rollouts_are_forgotten_bit_by_bit() -> None:
-    model = small(POEMSAC, preference_source="rollout", n_train_tasks=40, gradient_steps=0)
+    model = apart(small(POEMSAC, n_train_tasks=40, gradient_steps=0))
     spy = Spy(model)
     model.learn(1)
     model.learn(1, reset_num_timesteps=False)
@@ -170,28 +166,26 @@ def test_returns_by_rollouts_are_forgotten_bit_by_bit() -> None:
     assert np.array_equal(batch.returns.numpy(), rows, equal_nan=True)
 
 
-def test_auto_relabels_where_it_can() -> None:
-    assert small(POEMSAC).relabels
+def test_returns_are_relabelled_where_dynamics_agree() -> None:
+    assert small(POEMSAC).learn(1).epoch_context.returns.isfinite().all()
     windy = small(POEMSAC, walks(4, WindyWalk), horizon=10)
-    assert not windy.relabels
     windy.learn(1)
     assert not windy.epoch_context.returns.isfinite().all()
     # The decoder knows no rewards for what others' policies do, so adaptation goes by S.
     assert np.isnan(windy.predicted_rewards_error)
     assert Bayes().likelihood_with(windy) == "similarity"
-    assert small(POEMSAC, walks(4), horizon=10, preference_source="rollout").relabels is False
 
 
 def test_returns_of_tasks_with_their_own_dynamics() -> None:
     """The wind blows a policy elsewhere on another task, which only running it there tells."""
-    arguments = {"gradient_steps": 0, "n_train_tasks": 6, "preference_group_size": 3}
+    arguments = {"gradient_steps": 0, "n_train_tasks": 8}
     model = nearly_deterministic(small(POEMSAC, walks(4, StillWindyWalk), horizon=10, **arguments))
     spy = Spy(model)
-    model.learn(5 * 4 * 10)
+    model.learn(1)
     truth = policy_returns(model, gym.wrappers.TimeLimit(StillWindyWalk(), 10), spy.latents[0])
     returns = spy.returns[0]
     known = np.isfinite(returns)
-    assert known.sum() == 2 * 9
+    assert known.sum() == 2 * 16
     np.testing.assert_allclose(returns[known], truth[known], atol=1e-3)
 
 
@@ -581,25 +575,23 @@ def test_predicted_returns_are_sums_of_decoded_rewards(layer_norm: bool) -> None
 # ---------------------------------------------------------------- two tasks
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [{}, {"meta_batch_size": 1}, {"preference_source": "rollout"}, {"similarity": "inner"}],
-)
-def test_a_family_of_two_tasks_trains_without_nan(arguments: dict[str, Any]) -> None:
-    model = small(POEMSAC, walks(2, TwoWalks), horizon=10, n_train_tasks=None, **arguments).learn(
-        100
-    )
-    assert model._n_updates == 25 or arguments.get("preference_source") == "rollout"
+@pytest.mark.parametrize("own_dynamics", [False, True])
+@pytest.mark.parametrize("arguments", [{}, {"meta_batch_size": 1}, {"similarity": "inner"}])
+def test_a_family_of_two_tasks_trains_without_nan(
+    arguments: dict[str, Any], own_dynamics: bool
+) -> None:
+    model = small(POEMSAC, walks(2, TwoWalks), horizon=10, n_train_tasks=None, **arguments)
+    (apart(model) if own_dynamics else model).learn(100)
+    assert model._n_updates == (15 if own_dynamics else 25)
     assert all(value.isfinite().all() for value in parameters(model).values())
     assert np.isfinite(model.train_tasks.latent_means).all()
     assert np.isfinite(model.similarities(model.task_latents, model.task_latents)).all()
 
 
 def test_one_task_is_a_family_too() -> None:
-    for source in ("relabel", "rollout"):
-        model = small(
-            POEMSAC, walks(2), horizon=10, n_train_tasks=1, preference_source=source
-        ).learn(60)
+    for own_dynamics in (False, True):
+        model = small(POEMSAC, walks(2), horizon=10, n_train_tasks=1)
+        (apart(model) if own_dynamics else model).learn(60)
         assert all(value.isfinite().all() for value in parameters(model).values())
 
 
@@ -618,12 +610,8 @@ def test_half_cheetah_forwards_and_backwards(algorithm: type[PEARLSAC]) -> None:
 
 def test_environments_of_one_copy_and_many_tasks() -> None:
     env = DummyVecEnv([lambda: gym.wrappers.TimeLimit(Walk(), 10)])
-    assert (
-        small(POEMSAC, env, horizon=10, preference_source="rollout", n_train_tasks=4)
-        .learn(1)
-        .num_timesteps
-        == 160
-    )
+    model = apart(small(POEMSAC, env, horizon=10, n_train_tasks=4))
+    assert model.learn(1).num_timesteps == 160
 
 
 def test_an_id_becomes_as_many_copies_as_an_epoch_has_trajectories() -> None:
