@@ -232,7 +232,7 @@ def test_what_ships_is_exported_with_what_it_earns(
         assert one["limit"][:2] == records["known-task"]["limits"]["codebooks"][:2]
     assert results["property 1"]["env_steps"] == 300
     shown = (tmp_path / "out/PointGoal/README.md").read_text()
-    assert "adaptation to 2 unseen tasks" in shown
+    assert "adaptation to 2 test tasks" in shown
     assert f"| `Bayes()` | default | {earned[0]['mean_return'][0]:.1f} |" in shown
     assert main([*words, "--suite", "smoke"]) != 0
     assert "--export is for --suite shipped" in capsys.readouterr().err
