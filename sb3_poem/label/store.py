@@ -456,7 +456,6 @@ class StoreRecorder:
         seed: int,
         options: dict[str, Any] | None = None,
         n_queries: int = 10,
-        wish: str = "",
         resume: bool = False,
     ) -> None:
         self.store = store
@@ -464,8 +463,6 @@ class StoreRecorder:
         found = [one for one in store.sessions() if resume and self._agrees(one, about)]
         self.resumed = bool(found)
         self.session = found[-1] if found else store.create_session(*about, source="terminal")[0]
-        if wish:
-            store.set_wish(self.session.id, wish)
 
     def _agrees(self, one: Session, about: tuple[Any, ...]) -> bool:
         facts = (one.source, one.model, one.env_id, one.seed, one.options, one.step)
