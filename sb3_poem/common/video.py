@@ -14,8 +14,6 @@ from sb3_poem.common.files import write_atomically
 Frame = np.ndarray  # (height, width, 3) uint8
 #: White pixels between two clips
 GAP = 4
-
-
 # Frames between which a player can start: seeking decodes at most so many.
 KEYFRAME_DISTANCE = 10
 ENCODER = [
