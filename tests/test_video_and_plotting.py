@@ -32,6 +32,7 @@ def test_written_frames_are_read_back(tmp_path: Path, suffix: str) -> None:
         (clip(2), "a.avi", r"\.mp4 or \.gif"),
         (clip(1) + clip(1, height=20), "a.gif", "one size"),
         ([np.zeros((4, 4), np.uint8)], "a.gif", "height, width, 3"),
+        ([np.zeros((4, 4, 3))], "a.mp4", "uint8"),
     ],
 )
 def test_bad_frames_are_refused(tmp_path: Path, frames: list, name: str, words: str) -> None:

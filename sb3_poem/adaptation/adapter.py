@@ -73,8 +73,8 @@ class PreferenceAdapter:
     :param seed: Makes everything reproducible; None draws one, kept in ``seed``.
     :param deterministic: Whether policies act by their mode.
     :param library: Trajectories to ask about instead of rolling out new ones, for a rule that can.
-    :param render: Whether questions carry frames, for :meth:`Query.to_video`. An ``env`` that is no
-        id must have been made with ``render_mode="rgb_array"``.
+    :param render: Whether questions carry frames, for :meth:`Query.to_video`: of every step, or of
+        every n-th. An ``env`` that is no id must have been made with ``render_mode="rgb_array"``.
     :raises ValueError: If an argument is out of its range, the model belongs to another
         environment, or the rule cannot run with them.
     :raises TypeError: If an argument is of another kind.
@@ -96,7 +96,7 @@ class PreferenceAdapter:
         seed: int | None = None,
         deterministic: bool = True,
         library: Sequence[Trajectory] | None = None,
-        render: bool = False,
+        render: bool | int = False,
     ) -> None:
         check_whole("n_queries", n_queries, 1)
         if seed is None:
@@ -355,7 +355,7 @@ class PreferenceAdapter:
         *,
         oracle: Oracle | None = None,
         library: Sequence[Trajectory] | None = None,
-        render: bool = False,
+        render: bool | int = False,
     ) -> Self:
         """Continue where :meth:`to_dict` stood: the same answers lead to the same policy as without
         the interruption. Model, task and library must be the same (an id's task is drawn again);

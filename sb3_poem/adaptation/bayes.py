@@ -197,6 +197,12 @@ class Bayes(Rule):
                 'query_rule="worst-case" compares candidates by S; with a library use '
                 '"information-gain"'
             )
+        elif self.query_rule != "random" and not _knows_its_decoder(model):
+            raise ValueError(
+                f'query_rule="{self.query_rule}" with a `library` needs a finite '
+                f"`predicted_rewards_error`, which is {model.predicted_rewards_error} for this "
+                f'{name}; choose query_rule="random", or leave the library out'
+            )
 
     def likelihood_with(self, model: MetaModel) -> str:
         """Which one is used with a model."""

@@ -300,7 +300,7 @@ class MAMLRewardModel(MetaModel):
         self.reward = reward
         self.observation_space, self.action_space = model.observation_space, model.action_space
         self.horizon, self.env_id = model.horizon or 0, model.env_id
-        self.actors: list[Any] = []
+        self.actors: dict[str, Any] = {}
 
     def __repr__(self) -> str:
         return f"MAMLRewardModel({self.env_id})"
@@ -313,9 +313,11 @@ class MAMLRewardModel(MetaModel):
         raise NotImplementedError("a MAMLRewardModel has no policies before the first answer")
 
     def add(self, actor: Any) -> np.ndarray:
-        """Keep a copy of an actor, and give its latent (2,)."""
-        self.actors.append(copy.deepcopy(actor).eval())
-        return np.array([len(self.actors) - 1, 1.0])
+        """Keep a copy of an actor, unless there is one, and give its latent (2,)."""
+        digest = digest_of(actor.state_dict())
+        if digest not in self.actors:
+            self.actors[digest] = copy.deepcopy(actor).eval()
+        return np.array([list(self.actors).index(digest), 1.0])
 
     def predict(
         self,
@@ -331,10 +333,10 @@ class MAMLRewardModel(MetaModel):
         actions = np.empty((len(obs), *self.action_space.shape), dtype=np.float32)
         with th.no_grad():
             inputs = policy.standardise(th.as_tensor(obs, device=policy.device))
-            noise = th.randn(actions.shape)
+            noise, actors = th.randn(actions.shape), list(self.actors.values())
             for number in np.unique(latents[:, 0]).astype(int):
                 rows = np.flatnonzero(latents[:, 0] == number)
-                mean, log_std, _ = self.actors[number].get_action_dist_params(inputs[rows].cpu())
+                mean, log_std, _ = actors[number].get_action_dist_params(inputs[rows].cpu())
                 if not deterministic:
                     sign = th.as_tensor(latents[rows, 1:], dtype=th.float32)
                     mean = mean + sign * log_std.exp() * noise[rows]

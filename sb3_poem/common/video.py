@@ -1,46 +1,80 @@
 """Frames to a file, and two clips side by side."""
 
+import contextlib
+import subprocess
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sb3_poem.common.files import write_atomically
+
 Frame = np.ndarray  # (height, width, 3) uint8
 #: White pixels between two clips
 GAP = 4
-
-
-def _even(frame: Frame) -> Frame:
-    """H.264 with 4:2:0 colour needs even sides; repeat the last row or column where one is odd."""
-    height, width = frame.shape[:2]
-    return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+# Frames between which a player can start: seeking decodes at most so many.
+KEYFRAME_DISTANCE = 10
+ENCODER = [
+    *("-an", "-c:v", "libx264", "-pix_fmt", "yuv420p"),
+    *("-preset", "ultrafast", "-crf", "24", "-bf", "0", "-threads", "1"),
+    *("-g", str(KEYFRAME_DISTANCE), "-movflags", "+faststart"),
+]
 
 
 def write_video(frames: Sequence[Frame], path: str | Path, fps: float = 20.0) -> Path:
-    """Write frames, (height, width, 3) uint8 of one size, as MP4 (H.264) or GIF, by the suffix."""
-    import imageio.v2 as imageio
-
+    """Write frames, (height, width, 3) uint8 of one size, as MP4 (H.264) or GIF, by the suffix;
+    completely or not at all.
+    """
     path = Path(path)
     if path.suffix not in (".mp4", ".gif"):
         raise ValueError(f"path must end in .mp4 or .gif, got {str(path)!r}")
     if len(frames) == 0:
         raise ValueError(f"no frames to write to {str(path)!r}")
-    shapes = {np.shape(frame) for frame in frames}
-    if len(shapes) > 1 or any(len(shape) != 3 or shape[2] != 3 for shape in shapes):
-        raise ValueError(f"frames must all be (height, width, 3) of one size, got {sorted(shapes)}")
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix == ".gif":
-        # Delays are whole hundredths of a second, two at least in browsers: leave frames out.
-        step = int(np.ceil(fps / 50))
-        kept: list[Any] = [np.asarray(frame) for frame in frames[::step]]
-        ends = np.round(100.0 * step * np.arange(len(kept) + 1) / fps)
-        imageio.mimwrite(path, kept, duration=(10.0 * np.diff(ends)).tolist(), loop=0)
-    else:
-        even: list[Any] = [_even(frame) for frame in frames]
-        imageio.mimwrite(path, even, fps=fps, codec="libx264", macro_block_size=2)
+    kinds = {(np.shape(frame), str(np.asarray(frame).dtype)) for frame in frames}
+    (shape, kind), *others = kinds
+    if others or len(shape) != 3 or shape[2] != 3 or kind != "uint8":
+        alike = "(height, width, 3) uint8 of one size"
+        raise ValueError(f"frames must all be {alike}, got {sorted(kinds)}")
+    write_atomically(path, _gif(frames, fps) if path.suffix == ".gif" else _mp4(frames, path, fps))
     return path
+
+
+def _gif(frames: Sequence[Frame], fps: float) -> bytes:
+    import imageio.v2 as imageio
+
+    # Delays are whole hundredths of a second, two at least in browsers: leave frames out.
+    step = int(np.ceil(fps / 50))
+    kept: list[Any] = [np.asarray(frame) for frame in frames[::step]]
+    ends = np.round(100.0 * step * np.arange(len(kept) + 1) / fps)
+    delays = (10.0 * np.diff(ends)).tolist()
+    content: Any = imageio.mimwrite("<bytes>", kept, "gif", duration=delays, loop=0)
+    return content
+
+
+def _mp4(frames: Sequence[Frame], path: Path, fps: float) -> bytes:
+    from imageio_ffmpeg import get_ffmpeg_exe
+
+    (height, width), rate = np.shape(frames[0])[:2], f"{fps:.02f}"
+    # H.264 with 4:2:0 colour needs even sides; the last row or column is repeated.
+    odd = ((0, height % 2), (0, width % 2), (0, 0))
+    size = f"{width + width % 2}x{height + height % 2}"
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", rate, "-i", "-"]
+    with tempfile.NamedTemporaryFile(suffix=".mp4") as file:
+        # Not imageio's writer, which takes no notice when ffmpeg fails at the end.
+        command = [get_ffmpeg_exe(), "-y", "-v", "error", *source, *ENCODER, file.name]
+        # Not communicate(), which hands frames over in pieces of 4 kB.
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
+            assert ffmpeg.stdin is not None
+            with contextlib.suppress(BrokenPipeError):  # its status says why it ended
+                for frame in frames:
+                    ffmpeg.stdin.write(np.pad(frame, odd, mode="edge").tobytes())
+            words = ffmpeg.communicate()[1].decode(errors="replace").partition("\n")[0]
+        if ffmpeg.returncode != 0:
+            ended = f"ffmpeg ended with status {ffmpeg.returncode} {words}"
+            raise OSError(f"{path} cannot be written: {ended}")
+        return file.read()
 
 
 def _with_captions(clips: Sequence[Sequence[Frame]], captions: Sequence[str]) -> list[list[Frame]]:
@@ -80,8 +114,7 @@ def side_by_side(
     if captions is not None:
         left, right = _with_captions((left, right), captions)
     bar = np.full((left[0].shape[0], GAP, 3), 255, dtype=np.uint8)
-    lefts, rights = as_long((left, right))
-    return [np.concatenate([a, bar, b], axis=1) for a, b in zip(lefts, rights, strict=True)]
+    return joined([left, [bar], right], axis=1)
 
 
 def in_rows(clips: Sequence[Sequence[Frame]], captions: Sequence[str]) -> list[Frame]:
@@ -90,10 +123,12 @@ def in_rows(clips: Sequence[Sequence[Frame]], captions: Sequence[str]) -> list[F
         side_by_side(clips[i], clips[i + 1], (captions[i], captions[i + 1]))
         for i in range(0, len(clips), 2)
     ]
-    return [np.concatenate(frames) for frames in zip(*as_long(rows), strict=True)]
+    return joined(rows, axis=0)
 
 
-def as_long(clips: Sequence[Sequence[Frame]]) -> list[list[Frame]]:
-    """All as long as the longest one."""
-    longest = max(map(len, clips))
-    return [[*clip, *[clip[-1]] * (longest - len(clip))] for clip in clips]
+def joined(clips: Sequence[Sequence[Frame]], axis: int) -> list[Frame]:
+    """Clips below (axis 0) or beside each other (1) in one, in which they cannot fall out of step.
+    What is shorter than the longest one holds its last frame.
+    """
+    longest = range(max(map(len, clips)))
+    return [np.concatenate([clip[min(i, len(clip) - 1)] for clip in clips], axis) for i in longest]

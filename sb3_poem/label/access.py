@@ -2,6 +2,7 @@
 
 import asyncio
 import base64
+import contextlib
 import hmac
 import ipaddress
 import re
@@ -79,7 +80,7 @@ def is_loopback(host: str) -> bool:
 
 
 class AccessMiddleware:
-    """ASGI middleware in front of everything, which reads bodies up to a limit."""
+    """ASGI middleware in front of everything."""
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self.app = app
@@ -99,22 +100,14 @@ class AccessMiddleware:
                     outgoing.setdefault(name, value)
             await send(message)
 
-        request = Request(scope, receive)
+        request, answer = Request(scope), self.app
         try:
-            outcome = await self._admit(request) or await _body(request)
-        except ClientDisconnect:
-            return
+            answer = await self._admit(request) or self.app
+            _check_length(request)
         except HTTPException as error:
-            outcome = PlainTextResponse(f"{error.detail}\n", error.status_code, error.headers)
-        if isinstance(outcome, Response):
-            await outcome(scope, receive, send_with_headers)
-            return
-        messages: list[Message] = [{"type": "http.request", "body": outcome, "more_body": False}]
-
-        async def receive_body() -> Message:
-            return messages.pop() if messages else await receive()
-
-        await self.app(scope, receive_body, send_with_headers)
+            answer = PlainTextResponse(f"{error.detail}\n", error.status_code, error.headers)
+        with contextlib.suppress(ClientDisconnect):  # before the whole body was there
+            await answer(scope, receive, send_with_headers)
 
     async def _admit(self, request: Request) -> Response | None:
         """None lets a request in; a redirect takes the token out of its address."""
@@ -153,19 +146,13 @@ class AccessMiddleware:
         raise HTTPException(401, needs, None if access.password is None else asks)
 
 
-async def _body(request: Request) -> bytes:
-    if request.method in ("GET", "HEAD"):
-        return b""
-    too_large = HTTPException(413, f"a request may hold {MAX_BODY} bytes at most")
+def _check_length(request: Request) -> None:
+    """Refuse a body that is too long, or does not say how long it is."""
     length = request.headers.get("content-length", "0")
+    if "transfer-encoding" in request.headers:
+        raise HTTPException(411, "a request must say how long it is, by Content-Length")
     if not re.fullmatch("[0-9]{1,9}", length) or int(length) > MAX_BODY:
-        raise too_large
-    body = b""
-    async for part in request.stream():
-        body += part
-        if len(body) > MAX_BODY:
-            raise too_large
-    return body
+        raise HTTPException(413, f"a request may hold {MAX_BODY} bytes at most")
 
 
 def _host_name(host: str) -> str:

@@ -4,8 +4,6 @@ Any process may compute any turn of any session, ahead of time or again, bit for
 """
 
 import contextlib
-import subprocess
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -19,14 +17,12 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 from sb3_poem.adaptation.adapter import PreferenceAdapter
 from sb3_poem.adaptation.named_rule import named_rule
 from sb3_poem.adaptation.noise import INFER
-from sb3_poem.adaptation.preference import Preference
 from sb3_poem.adaptation.rule import Rule, rollout_seed
 from sb3_poem.common.family_view import FamilyView
-from sb3_poem.common.files import write_atomically
 from sb3_poem.common.rollouts import rollout_latents
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.common.vec_env import make_shown_env
-from sb3_poem.common.video import as_long
+from sb3_poem.common.video import joined, write_video
 from sb3_poem.label.beliefs import belief
 from sb3_poem.label.families import ModelInfo
 from sb3_poem.loading import BY_CLASS_NAME
@@ -48,13 +44,6 @@ MAX_RENDERERS = 4
 #: What an adapter's dictionary holds of its conversation; the rest is the ``state`` of a turn.
 CONVERSATION = ("answers", "pending")
 WIDTH, HEIGHT = 320, 240
-# Frames between which a player can start: seeking decodes at most so many.
-KEYFRAME_DISTANCE = 10
-ENCODER = [
-    *("-an", "-c:v", "libx264", "-pix_fmt", "yuv420p"),
-    *("-preset", "ultrafast", "-crf", "24", "-bf", "0", "-threads", "1"),
-    *("-g", str(KEYFRAME_DISTANCE), "-movflags", "+faststart"),
-]
 
 
 class StorageError(OSError):
@@ -85,7 +74,7 @@ class TurnRequest:
 
     @property
     def marker(self) -> Path:
-        """A file that may be kept while the turn is wanted: its end is the work's."""
+        """A file that is kept while the turn is wanted: its end is the work's."""
         return self.video.with_suffix(".wanted")
 
 
@@ -102,16 +91,6 @@ class Turn:
     latent: list[float] | None  # (d,) of the policy that would be taken now
     fps: float
     frames: int
-
-
-class _Watches:
-    """Stands for the person where the adapter asks who answers: somebody who needs to see."""
-
-    def __init__(self, film_every: int) -> None:
-        self.needs_frames = film_every
-
-    def __call__(self, *shown: Trajectory) -> Preference:
-        raise RuntimeError("a person answers on the page; adapt() cannot ask")
 
 
 class FilmedVecEnv(VecEnvWrapper):
@@ -171,7 +150,8 @@ class Renderer:
         self.fps = family.render_fps
 
     def turn(self, request: TurnRequest) -> Turn:
-        """Make a turn, and write its video."""
+        """Make a turn, and write its video, while it is wanted."""
+        self.env.marker = request.marker
         every, fps = film_rate(self.fps, self.model.horizon, request.film_every)
         adapter = self._adapter(request, every)
         if request.preference is not None:
@@ -187,7 +167,10 @@ class Renderer:
             about = (self.model, self.env, latent[None], None, seeds, adapter.deterministic)
             clips = rollout_latents(*about, frames=every)
         frames = self.env.films(*clips)
-        write_clip(frames, request.video, fps)
+        try:
+            write_video(frames, request.video, fps)
+        except OSError as error:
+            raise StorageError(str(error)) from error
         data = adapter.to_dict()
         state = {name: value for name, value in data.items() if name not in CONVERSATION}
         return Turn(state, data["pending"], believed, latent.tolist(), fps, len(frames))
@@ -201,14 +184,14 @@ class Renderer:
 
     def _adapter(self, request: TurnRequest, every: int) -> PreferenceAdapter:
         """The adapter as it was before the answer."""
-        model, env, oracle = self.model, self.env, _Watches(every)
+        model, env = self.model, self.env
         # The session counts the questions; the adapter must only be ready for one more.
         more: dict[str, Any] = {"n_queries": len(request.answers) + 2}
         if request.state is None:
             more |= {"rule": session_rule(request.options), "seed": request.seed}
-            return PreferenceAdapter(model, env, oracle=oracle, **more)
+            return PreferenceAdapter(model, env, render=every, **more)
         more |= {"answers": list(request.answers), "pending": request.pending}
-        return PreferenceAdapter.from_dict({**request.state, **more}, model, env, oracle=oracle)
+        return PreferenceAdapter.from_dict({**request.state, **more}, model, env, render=every)
 
 
 def film_rate(fps: float, horizon: int, wanted: int) -> tuple[int, float]:
@@ -234,9 +217,8 @@ def session_rule(options: dict[str, Any]) -> Rule:
 
 
 def make_turn(request: TurnRequest) -> Turn:
-    """Make a turn, by models and environments that the process keeps, while it is wanted."""
+    """Make a turn, by models and environments that the process keeps."""
     renderer = renderer_of(request.model)
-    renderer.env.marker = request.marker if request.marker.exists() else None
     family = FamilyView(renderer.env)
     family.set_tasks(family.sample_tasks(1, np.random.default_rng([TASK_STREAM, request.seed])))
     return renderer.turn(request)
@@ -264,38 +246,10 @@ def make_env(env_id: str, **env_kwargs: Any) -> gym.Env:
     return make_shown_env(env_id, "rgb_array", **env_kwargs)
 
 
-def write_clip(frames: Sequence[np.ndarray], path: Path, fps: float) -> None:
-    """Write frames, (height, width, 3) uint8, as MP4 (H.264), completely or not at all."""
-    from imageio_ffmpeg import get_ffmpeg_exe
-
-    height, width = frames[0].shape[:2]
-    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
-    try:
-        with tempfile.NamedTemporaryFile(suffix=".mp4") as file:
-            # Not imageio's writer, which takes no notice when ffmpeg fails at the end.
-            command = [get_ffmpeg_exe(), "-y", "-v", "error", *source, "-r", f"{fps:.02f}"]
-            command += ["-i", "-", *ENCODER, file.name]
-            # Not communicate(), which hands frames over in pieces of 4 kB.
-            with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
-                assert ffmpeg.stdin is not None
-                with contextlib.suppress(BrokenPipeError):  # its status says why it ended
-                    for frame in frames:
-                        ffmpeg.stdin.write(frame.tobytes())
-                words = ffmpeg.communicate()[1].decode(errors="replace").partition("\n")[0]
-            if ffmpeg.returncode != 0:
-                raise OSError(f"ffmpeg ended with status {ffmpeg.returncode} {words}")
-            write_atomically(path, file.read())
-    except OSError as error:
-        raise StorageError(f"{path} cannot be written: {error}") from error
-
-
 def beside(first: int, *clips: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Clips of one size beside each other, as long as so many first ones: in one file they cannot
-    fall out of step. What is shorter holds its last frame.
-    """
+    """Clips of one size beside each other, as long as so many first ones."""
     longest = max(map(len, clips[:first]))
-    held = as_long([clip[:longest] for clip in clips])
-    return [np.concatenate(frames, axis=1) for frames in zip(*held, strict=True)]
+    return joined([clip[:longest] for clip in clips], axis=1)
 
 
 def fit(frame: np.ndarray) -> np.ndarray:

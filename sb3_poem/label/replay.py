@@ -43,7 +43,7 @@ def replay(
     """
     options, kind = dict(options or {}), session.question
     if options.get("inference", "bayes") == "bayes":
-        options["question"] = kind
+        options |= {"question": kind, "query_rule": "random"}  # which asks nothing of the model
     elif kind == BEST_OF_FOUR:
         only = f'which only inference="bayes" reads, but inference is {options["inference"]!r}'
         raise ValueError(f"session {session.id} asks which of four is best, {only}")

@@ -58,6 +58,7 @@ class _Active:
 
     seen: float
     jobs: dict[_Key, Job] = field(default_factory=dict)
+    kept: tuple[int | None, _Key | None] | None = None
     task: asyncio.Task[None] | None = None
     failed: Exception | None = None
     retry_at: float = 0.0
@@ -74,7 +75,6 @@ class SessionManager:
     :param max_sessions: How many people may be at work at once.
     :param seed: The next session's seed; None draws each.
     :param load: Loads a chosen model, for the download of its adapted policy.
-    :param render_ahead: Whether what follows from each answer is made while the person watches.
     """
 
     store: Store
@@ -85,7 +85,6 @@ class SessionManager:
     max_sessions: int = 16
     seed: int | None = None
     load: Callable[[ModelInfo], Any] = load_shown_model
-    render_ahead: bool = True
     _active: dict[int, _Active] = field(default_factory=dict, init=False)
 
     def model(self, name: str) -> ModelInfo | None:
@@ -147,8 +146,8 @@ class SessionManager:
         view["phase"] = kind
         about = ("id", "fps", "frames", "verdict", "repeats")
         view["turn"] = {name: turn[name] for name in about}
-        if kind == "question" and self.render_ahead:
-            self._render_ahead(session, answered, turn["id"])
+        if kind == "question":
+            await self._render_ahead(session, answered, turn["id"])
         return view
 
     def video(self, session: Session, turn: int) -> Path | None:
@@ -159,7 +158,13 @@ class SessionManager:
         path = self.store.videos / row["video"]
         return path if path.is_file() else None
 
-    def _request(self, session: Session, key: _Key) -> TurnRequest:
+    async def _before(self, question: int | None) -> dict[str, Any]:
+        """The conversation up to a question's turn."""
+        if question is None:
+            return {}
+        return await asyncio.to_thread(self.store.adapter_data, question)
+
+    def _request(self, session: Session, key: _Key, before: dict[str, Any]) -> TurnRequest:
         """What a turn is made from; refuses a session whose model is not this server's."""
         info = self.model(session.model)
         if info is None or info.env_id != session.env_id:
@@ -168,13 +173,12 @@ class SessionManager:
                 f"this session needs {needs}, which this server was not started with"
             )
         since = time.monotonic() - AT_WORK_SECONDS
-        at_work = sum(active.seen > since for active in list(self._active.values()))
+        at_work = sum(active.seen > since for active in self._active.values())
         film_every = CROWDED_FILM_EVERY if at_work > self.queue.n_workers else 1
         video = self.store.videos / f"{session.id}-{secrets.token_hex(12)}.mp4"
         about = (info, session.seed, session.options, key.kind, video)
-        before = {} if key.question is None else self.store.adapter_data(key.question)
-        before |= {"preference": key.preference, "repeats": key.repeats}
-        return TurnRequest(*about, **before, film_every=film_every)
+        follows = {**before, "preference": key.preference, "repeats": key.repeats}
+        return TurnRequest(*about, **follows, film_every=film_every)
 
     def _look(self, number: int) -> tuple[Session, list[Any], str, Any, Any]:
         """The session, its answers, the kind of the turn that is due, the turn itself, if there is
@@ -225,7 +229,7 @@ class SessionManager:
             self._keep_only(active, key.question, key)
             job = active.jobs.get(key)
             if job is None or _has_failed(job):
-                request = await asyncio.to_thread(self._request, session, key)
+                request = self._request(session, key, await self._before(key.question))
                 job = active.jobs[key] = self.queue.submit(request, Priority.WAITED_FOR)
             job.priority = Priority.WAITED_FOR
             made, video = await asyncio.shield(job.done), job.request.video
@@ -242,24 +246,31 @@ class SessionManager:
             _logger.error(words, session.id, kind, answered, error, exc_info=trace)
             active.failed, active.retry_at = error, time.monotonic() + RETRY_SECONDS
 
-    def _render_ahead(self, session: Session, answered: int, question: int) -> None:
+    async def _render_ahead(self, session: Session, answered: int, question: int) -> None:
         """Begin what follows from each of the question's answers."""
         active = self._active[session.id]
         kind = "result" if answered + 1 >= session.target else "question"
         self._keep_only(active, question)
-        for preference in reversed(ANSWERS[session.question]):
-            key = _Key(question, preference.value, kind)
+        answers = ANSWERS[session.question][::-1]
+        if all(_Key(question, answer.value, kind) in active.jobs for answer in answers):
+            return
+        before = await self._before(question)
+        if active.kept != (question, None):  # it has been answered meanwhile
+            return
+        for answer in answers:
+            key = _Key(question, answer.value, kind)
             if key in active.jobs:
                 continue
             try:
-                request = self._request(session, key)
+                request = self._request(session, key, before)
             except RefusedError:  # the page says so when the turn is due
                 return
-            priority = Priority.POSSIBLE if preference in UNLIKELY else Priority.LIKELY
+            priority = Priority.POSSIBLE if answer in UNLIKELY else Priority.LIKELY
             active.jobs[key] = self.queue.submit(request, priority)
 
     def _keep_only(self, active: _Active, question: int | None, due: _Key | None = None) -> None:
         """Drop jobs that follow from other questions or, once it is known, from other answers."""
+        active.kept = question, due
         for key in list(active.jobs):
             if key.question != question or due not in (None, key):
                 self.queue.cancel(active.jobs.pop(key))

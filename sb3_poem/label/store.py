@@ -458,7 +458,6 @@ class StoreRecorder:
         seed: int,
         options: dict[str, Any] | None = None,
         n_queries: int = 10,
-        wish: str = "",
         resume: bool = False,
     ) -> None:
         self.store = store
@@ -468,8 +467,6 @@ class StoreRecorder:
         if resume and not found:
             self._refuse_other(about)
         self.session = found[-1] if found else store.create_session(*about, source="terminal")[0]
-        if wish:
-            store.set_wish(self.session.id, wish)
 
     def _agrees(self, one: Session, about: tuple[Any, ...]) -> bool:
         facts = (one.source, one.model, one.env_id, one.seed, one.options, one.step)

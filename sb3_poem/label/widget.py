@@ -57,6 +57,10 @@ class LabelWidget:
             raise ValueError("`adapter` has been asked already; give the widget a fresh one")
         if adapter.library is not None:
             raise ValueError("`adapter` asks from a library; the page shows new rollouts")
+        if not all(hasattr(adapter.model, name) for name in ("reward_feature_dim", "train_tasks")):
+            kind, takes = type(adapter.model).__name__, "as a POEMSAC or PEARLSAC has them"
+            needs = f"the page needs `reward_feature_dim` and `train_tasks`, {takes}"
+            raise ValueError(f"`adapter` has a model of type {kind}, but {needs}")
         self.adapter, self.height = adapter, height
         env_id = getattr(adapter.model, "env_id", None) or "?"
         data = adapter.to_dict()

@@ -171,11 +171,24 @@ def test_the_likelihood_follows_what_the_model_has():
         (SpeedModel(), {"library": []}, "`library` must hold at least 2"),
         (SpeedModel(), {"library": [1, 2], "query_rule": "worst-case"}, "worst-case"),
         (NoDecoder(), {"library": [1, 2]}, "`library` needs a model with a reward decoder"),
+        (
+            SpeedModel(error=float("nan")),
+            {"library": [1, 2]},
+            "with a `library` needs a finite `predicted_rewards_error`, which is nan",
+        ),
     ],
 )
 def test_bad_options(model, arguments, message):
     with pytest.raises(ValueError, match=message):
         make(model, **arguments)
+
+
+def test_a_library_is_asked_about_at_random_where_the_decoders_error_is_not_known():
+    model = SpeedModel(error=float("nan"))
+    library = [at_speed(model, speed) for speed in np.linspace(0, 3, 13)]
+    inference = make(model, library=library, query_rule="random")
+    asked = {tuple(id(shown) for shown in inference.ask()) for _ in range(20)}
+    assert len(asked) > 10
 
 
 def test_the_decoder_needs_trajectories_and_s_latents():

@@ -82,6 +82,18 @@ def test_the_state_resumes_and_the_generators_stay(model):
     assert np.abs(first - start).max() > 1e-3
 
 
+def test_answers_that_are_taken_back_and_given_again_keep_nothing_more(model):
+    adapter = PreferenceAdapter(model, walks(1), n_queries=3, seed=0, rule=FAST)
+    adapter.ask()
+    adapter.tell("left")
+    told, kept = adapter.policy(), len(model.actors)
+    for _ in range(2):
+        adapter.undo()
+        adapter.tell("left")
+    assert len(model.actors) == kept
+    np.testing.assert_array_equal(adapter.policy().latent, told.latent)
+
+
 def test_a_pending_question_is_shown_again_by_a_model_that_was_made_anew(model, monkeypatch):
     shown = PreferenceAdapter(model, walks(1), n_queries=3, seed=0, rule=FAST)
     shown.ask()

@@ -8,9 +8,21 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from sb3_poem.label.families import ModelInfo
-from sb3_poem.label.render_queue import RenderQueue
+from sb3_poem.label.render_queue import Job, Priority, RenderQueue
+from sb3_poem.label.rendering import TurnRequest
 from sb3_poem.label.sessions import SessionManager
 from sb3_poem.label.store import Session, Store
+
+
+class OnlyWaitedFor(RenderQueue):
+    """Makes nothing ahead of time, as one that has no time for it."""
+
+    def submit(self, request: TurnRequest, priority: Priority) -> Job:
+        if priority is Priority.WAITED_FOR:
+            return super().submit(request, priority)
+        job = Job(request, priority)
+        job.done.cancel()
+        return job
 
 
 def make_sessions(
@@ -19,8 +31,8 @@ def make_sessions(
     """A server's sessions; rendering ahead, which triples the work, is for the tests that ask for
     it.
     """
-    queue = RenderQueue(1, lambda: ThreadPoolExecutor(1))
-    return SessionManager(store, queue, [info], seed=5, render_ahead=render_ahead, **options)
+    queue = (RenderQueue if render_ahead else OnlyWaitedFor)(1, lambda: ThreadPoolExecutor(1))
+    return SessionManager(store, queue, [info], seed=5, **options)
 
 
 async def settled(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -175,6 +175,34 @@ def test_both_robots_in_one_picture(
     page.wait_for_selector("#result:visible")
     assert seen() == [True, False, False]  # a result is one robot
     assert page.is_hidden("#race")
+
+
+@pytest.fixture
+def of_a_hand(tmp_path: Path) -> Iterator[ForkedServer]:
+    server = ForkedServer(tmp_path, find_models("FetchReach")[0])
+    yield server
+    server.kill()
+
+
+def test_where_one_picture_tells_less_two_films_are_shown_at_first(
+    open_page: Callable[..., Any], of_a_hand: ForkedServer
+) -> None:
+    page = open_page(of_a_hand.url)
+    page.click("button[value=FetchReach]")
+    page.wait_for_function(SHOWN)
+
+    def seen() -> list[bool]:
+        return [page.is_visible(f"#{side}-screen") for side in ("left", "right", "race")]
+
+    assert seen() == [True, True, False]  # a hand moves in space
+    assert page.get_attribute("#race", "aria-pressed") == "false"
+    assert page.get_by_role("button", name="Left is better").is_visible()  # no colours
+    page.evaluate("() => player.seek(player.frames - 1)")
+    page.wait_for_function("() => player.drawn === player.frames - 1")
+    left, right = (coloured(page, side) for side in ("left", "right"))
+    assert min(left["blue"], right["orange"]) > 20
+    page.keyboard.press("r")  # who wants it sees both in one
+    assert seen() == [False, False, True]
 
 
 @pytest.mark.parametrize("viewport", [DESKTOP, PHONE, LANDSCAPE])

@@ -29,10 +29,10 @@ from starlette.testclient import TestClient
 
 from sb3_poem import cli
 from sb3_poem.cli.label import read_password
+from sb3_poem.common.video import write_video
 from sb3_poem.label import sessions
 from sb3_poem.label.access import MAX_BODY, MAX_OF_ADDRESS, Access, network_of
 from sb3_poem.label.families import ModelInfo
-from sb3_poem.label.rendering import StorageError, write_clip
 from sb3_poem.label.server import DISK_FULL, BackgroundServer, bind, link_host, make_app
 from sb3_poem.label.store import Store
 
@@ -262,7 +262,7 @@ def test_a_body_that_goes_wrong_after_the_answer_ends_the_connection(serve: Serv
     port = serve()
     large = b"%x\r\n" % (2 * MAX_BODY) + b"x" * (2 * MAX_BODY)
     connection = connect(port, POST + b"Transfer-Encoding: chunked\r\n\r\n" + large)
-    assert connection.recv(65536).startswith(b"HTTP/1.1 413 ")
+    assert connection.recv(65536).startswith(b"HTTP/1.1 411 ")
     connection.sendall(b"\r\n-1\r\n")
     read_all(connection, seconds=3.0)
     assert status(port) == 200
@@ -336,18 +336,21 @@ def test_a_full_disk_is_a_sentence_and_what_was_answered_stays(
     assert "disk I/O error" in caplog.text  # whoever runs the page reads what SQLite says
 
 
-def test_a_film_that_does_not_fit_on_the_disk_is_no_film(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("a.mp4", "a.mp4 cannot be written: ffmpeg ended"), ("a.gif", "could not write .*a.gif")],
+)
+def test_a_film_that_does_not_fit_on_the_disk_is_no_film(
+    tmp_path: Path, name: str, words: str
+) -> None:
     noise = np.random.default_rng(0).integers(0, 255, (10, 24, 64, 3), dtype=np.uint8)
-    frames = list(noise.repeat(10, axis=1).repeat(10, axis=2))
-    write_clip(frames, tmp_path / "whole.mp4", 20.0)
-    size = (tmp_path / "whole.mp4").stat().st_size
-    for room in (0, 4096, size // 2, size - 1):
-        with (
-            full_disk(room),
-            pytest.raises(StorageError, match=r"cut.mp4 cannot be written: ffmpeg ended"),
-        ):
-            write_clip(frames, tmp_path / "cut.mp4", 20.0)
-        assert [file.name for file in tmp_path.iterdir()] == ["whole.mp4"]
+    frames, path = list(noise.repeat(10, axis=1).repeat(10, axis=2)), tmp_path / name
+    whole = write_video(frames, path, 20.0).read_bytes()
+    for room in (0, 4096, len(whole) // 2, len(whole) - 1):
+        with full_disk(room), pytest.raises(OSError, match=words):
+            write_video(frames, path, 20.0)
+        assert [file.name for file in tmp_path.iterdir()] == [name]
+        assert path.read_bytes() == whole
 
 
 @pytest.mark.parametrize(

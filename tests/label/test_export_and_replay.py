@@ -17,8 +17,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from label_world import settled
+from worlds import SpeedEnv, SpeedModel
 
-from sb3_poem import POEMSAC, Bayes, cli
+from sb3_poem import PEARLSAC, POEMSAC, Bayes, cli
 from sb3_poem.adaptation import HumanOracle, PreferenceAdapter, ReturnOracle
 from sb3_poem.adaptation.policy import AdaptedPolicy
 from sb3_poem.common.trajectory import Trajectory
@@ -189,6 +190,18 @@ def test_replay_to_the_same_rule_ends_where_the_session_ended(
         assert last > first
 
 
+def test_answers_are_replayed_to_a_model_without_similarity(
+    answered: Session, store: Store, point_goal: ModelInfo
+) -> None:
+    small = {"n_train_tasks": 4, "learning_starts": 100, "gradient_steps": 4, "seed": 0}
+    model = PEARLSAC("MlpPolicy", point_goal.env_id, **small).learn(400)
+    result = replay(store, answered, model, {"decision": "posterior-mean"}, is_own=False)
+    assert len({tuple(latent) for latent in result["latents"]}) == 5  # each answer tells something
+    model.predicted_rewards_error = float("nan")
+    with pytest.raises(ValueError, match="nor a decoder whose error is known"):
+        replay(store, answered, model, is_own=False)
+
+
 def _return(model: Any, env: gym.Env, latent: np.ndarray) -> float:
     observation, _ = env.reset(seed=1, options={"task": TASK})
     total, over = 0.0, False
@@ -292,7 +305,8 @@ def test_the_terminals_answers_are_in_the_same_store(
     store: Store, point_goal: ModelInfo, tmp_path: Path
 ) -> None:
     replies = iter(["l", "nonsense", "e"])
-    recorder = StoreRecorder(store, "PointGoal", point_goal.env_id, seed=3, wish="left")
+    recorder = StoreRecorder(store, "PointGoal", point_goal.env_id, seed=3)
+    store.set_wish(recorder.session.id, "left")
     oracle = HumanOracle(
         tmp_path / "gifs", read=lambda _: next(replies), write=lambda _: None, record=recorder
     )
@@ -396,6 +410,8 @@ def test_the_widget_moves_the_adapter(point_goal: ModelInfo, tmp_path: Path) -> 
         LabelWidget(alone)
     with pytest.raises(ValueError, match="rgb_array"):
         LabelWidget(PreferenceAdapter(model, point_goal.env_id))
+    with pytest.raises(ValueError, match=r"SpeedModel, but the page needs .* and `train_tasks`"):
+        LabelWidget(PreferenceAdapter(SpeedModel(), SpeedEnv(render_mode="rgb_array")))
 
 
 def _wait(url: str, phase: str) -> dict[str, Any]:

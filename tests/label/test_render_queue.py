@@ -126,7 +126,11 @@ def test_a_worker_leaves_a_turn_whose_marker_goes(
         make_turn(wanted)
     assert images == 3
     assert not list(tmp_path.iterdir())
-    turn = make_turn(wanted)  # nobody keeps a marker: made to the end, in the same environment
+    with pytest.raises(RenderCancelledError):  # nor does it begin one that has none any more
+        make_turn(wanted)
+    assert images == 4
+    wanted.marker.touch()
+    turn = make_turn(wanted)  # made to the end, in the same environment
     assert cast(int, turn.frames) > 3
     assert wanted.video.is_file()
 

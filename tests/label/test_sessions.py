@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -222,6 +223,28 @@ def test_the_likely_next_pairs_are_rendered_ahead(
         assert [path for path in ahead if path.exists()] == [used]
 
     run_server(life, render_ahead=True)
+
+
+def test_what_follows_from_all_answers_is_read_once_and_keeps_nobody_waiting(
+    run_server: Callable[..., Any], store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read, threads = store.adapter_data, []
+
+    def recorded(turn: int) -> dict[str, Any]:
+        threads.append(threading.get_ident())
+        return read(turn)
+
+    monkeypatch.setattr(store, "adapter_data", recorded)
+
+    async def life(sessions: SessionManager) -> int:
+        session, _ = await begin(sessions)
+        for _ in range(3):
+            await settled(sessions, session)
+        return threading.get_ident()
+
+    loop = run_server(life, render_ahead=True)
+    assert len(threads) == 1
+    assert loop not in threads
 
 
 def test_after_the_last_answer_comes_the_result_and_not_quite_asks_more(
