@@ -282,7 +282,7 @@ ALGORITHMS = [
         r"observation...\(2,\)...dictionary",
     ),
     refused("predict NaN", lambda _: trained().predict(OBS * NAN), "observation 0 holds NaN"),
-    refused("load nothing", lambda s: POEMSAC.load(s / "peom.zip"), "peom"),
+    refused("load nothing", lambda s: POEMSAC.load(s / "peom.zip"), r"no file.*peom\.zip$"),
     refused("load a folder", lambda s: POEMSAC.load(s / "poem"), "from_pretrained"),
     refused("load a name", lambda _: POEMSAC.load("PointGoal"), "from_pretrained"),
     refused(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
-from poem_envs.registration import family_name
+from poem_envs.registration import did_you_mean, family_name
 from sb3_poem.benchmark.methods import EPSILONS, METHODS, QUERY_RULES, VARIANTS, Method
 
 #: Those of Table 3, the quickest to train first
@@ -296,7 +296,7 @@ class Suite:
             if name not in self.methods:
                 raise ValueError(
                     f"--methods {name}: it is not in the suite {self.name!r}, which has: "
-                    f"{', '.join(self.methods)}"
+                    f"{', '.join(self.methods)}{did_you_mean(name, self.methods)}"
                 )
         parts = snapshots or self.snapshots
         shares = [round(part / parts, 4) for part in range(1, parts)]

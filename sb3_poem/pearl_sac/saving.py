@@ -112,6 +112,9 @@ def check_archive(
     if not isinstance(path, io.BufferedIOBase):
         _check_is_file(Path(path), algorithm.__name__)
         file = path if Path(path).is_file() else f"{path}.zip"
+        if not Path(file).is_file():
+            also = "" if Path(path).suffix == ".zip" else f", nor {file}"
+            raise FileNotFoundError(f"there is no file {path}{also}")
     with reading(path, algorithm), zipfile.ZipFile(file) as archive:
         if "data" not in archive.namelist():
             raise zipfile.BadZipFile("it holds no data of a model")
