@@ -457,9 +457,7 @@ def test_a_session_of_another_model_of_that_name_is_not_gone_on_with(
         tmp_path / "model.zip"
     )
     answer_by(monkeypatch, tmp_path, "l\n")
-    assert (
-        adapt("model.zip", *flags, "--resume", "--candidates", "prior") == 0
-    )  # other options, so another session
+    assert adapt("model.zip", *flags, "--candidates", "prior") == 0  # another session
     capsys.readouterr()
     assert adapt(model[1], *flags, "--resume", "--candidates", "prior") == 1
     assert "question 1 of session 2 was another one" in capsys.readouterr().err
@@ -532,7 +530,7 @@ def test_the_policy_of_one_task_is_saved(model: tuple[POEMSAC, str], tmp_path: P
         (["--env", "poem/HalfCheetahVel-v0"], "PointGoal"),
         (["--env", "Pendulum-v1"], "no task family"),
         (["--env", "poem/Nothing-v0"], "Nothing"),
-        (["--task", 1.0, 2.0], "--task needs 1 numbers"),
+        (["--task", 1.0, 2.0], "--task needs 1 number for"),
         (["--task", 99.0, "--episodes", 1], "--task 99 is outside of the tasks, Box(0"),
         (["--task", 1.0, "--tasks", 3], "--task is one task"),
         (["--oracle", "human", "--tasks", 3], "one task"),

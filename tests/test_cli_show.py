@@ -175,7 +175,7 @@ def test_record_video_films_before_and_after_or_one_policy(
         ),
         (
             ["record-video", "--model", "PointGoal", "--out", "a.gif", "--task", 1, 2],
-            "--task needs 1 numbers",
+            "--task needs 1 number for",
         ),
     ],
 )
