@@ -58,8 +58,8 @@ def environment_pages(_app: object) -> None:
             facts += f"A trained model ships: [its card]({card}),\n"
             facts += f"[its results]({results}#{spec.name.lower()})."
         else:
-            facts += f"Untrained: no model ships. `sb3-poem train --env {spec.id}` makes one,\n"
-            facts += "and [the results](../results.md) have none."
+            facts += f"Untrained: no model ships. `sb3-poem train --env {spec.id}` makes one.\n"
+            facts += "[The results](../results.md) do not have it."
         page = folder / f"{spec.name}.md"
         content = f"# {spec.name}\n\n{facts}\n\n{shown}{text}\n"
         if not page.exists() or page.read_text() != content:
