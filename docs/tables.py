@@ -16,7 +16,8 @@ import gymnasium as gym
 import numpy as np
 
 import poem_envs  # noqa: F401
-from sb3_poem.benchmark.results import compare
+from sb3_poem.benchmark.methods import METHODS
+from sb3_poem.benchmark.results import compare, summarise
 from sb3_poem.benchmark.store import Store
 from sb3_poem.benchmark.suites import OracleSpec
 from sb3_poem.benchmark.tables import TABLE_3, make_report
@@ -30,6 +31,8 @@ ANSWERS = (0, 1, 2, 5, 10)
 TABLE3_STORE = "table3.sqlite"
 #: The same of the suite ``noise``
 NOISE_STORE = "noise.sqlite"
+#: The same of the suite ``answers``
+ANSWERS_STORE = "answers.sqlite"
 #: Which row of each part of Table 3 the others are compared with, the first that there is
 OWN = {
     "prior": ("poem-bayes-prior-decoder", "poem-bayes-prior-similarity"),
@@ -39,7 +42,7 @@ PAPERS = {"prior": "poem-paper", "informed": "poem-paper-aggregate"}
 SOURCES = {"prior": "prior", "informed": "training tasks"}
 PARTS = """What `Bayes()` owes to its parts: rule, candidates, likelihood (S or decoder), POEM's
 model, its preference loss. The last columns say how `Bayes()` as it is stands against the row."""
-METHODS = """All methods, by the same test tasks and seeds, each with as many updates, with
+TABLE = """All methods, by the same test tasks and seeds, each with as many updates, with
 candidates from the prior or from the training tasks' posteriors. `Bayes()` takes the latter where
 they are far from the prior. The last columns say how `Bayes` and `Paper` with candidates of the
 same kind stand against the row: ahead (+) or behind (-) if mean, interquartile mean and the whole
@@ -48,6 +51,10 @@ UNTOLD = """Answers with errors: `Bayes()` that is told how they err, and that i
 (`noise_model="infer"`). The last columns say by how much of the range from no answer to the task
 known the latter is behind (negative: ahead). A difference is distinguishable if mean, interquartile
 mean and the whole 95 % interval of the paired difference agree: {claim}."""
+KINDS = """Kinds of questions: a pair, a graded pair (much better, too), and the best of four, which
+shows twice as many films as either. `Bayes()` is told how answers err, or not
+(`noise_model="infer"`). The last column says whether five answers are ahead (+) or behind (-) of
+ten to pairs, by the same rule and on the same tasks, or not distinguishable (?)."""
 #: How tables write a claim
 SIGNS = {"ahead": "+", "behind": "-", "not distinguishable": "?"}
 #: What else is to be known of a family's figures
@@ -65,6 +72,7 @@ CAPTIONS = {
 PAGES = {
     "table3": "all methods, with intervals",
     "noise": "under answers with errors",
+    "answers": "kinds of questions",
     "ablation": "ablations",
     "epsilon": "tolerances of eq. 9",
     "smoke": "all methods",
@@ -197,7 +205,7 @@ def returns_by_seed(store: Store) -> dict[tuple[str, str, str, int], np.ndarray]
     found: dict[tuple[str, str, str, int], list[np.ndarray]] = {}
     for one in sorted(store.records(), key=lambda one: one.seed):
         if one.method.startswith("poem"):
-            oracle = OracleSpec(**one.identity["oracle"]).label
+            oracle = OracleSpec.of_identity(one.identity["oracle"]).label
             for k, returns in zip(
                 one.result["queries"], np.array(one.result["task_returns"]).T, strict=True
             ):
@@ -325,6 +333,31 @@ def untold(family: str) -> list[str]:
     return [fill(UNTOLD.format(claim=claim), 120), "", *table(head, rows), ""]
 
 
+def questions(family: str) -> list[str]:
+    """What is earned by kinds of questions and by who answers."""
+    store = Store(RESULTS / family / ANSWERS_STORE, create=False)
+    returns, rows = returns_by_seed(store), []
+    for one in json.loads(make_report(store, ["answers"], [family], kind="json")[0]):
+        if one["kind"] != "method" or one["queries"] != 1:
+            continue
+        oracle, method = one["oracle"], METHODS[one["method"]]
+        told = "no" if "noise_model" in method.options else "yes"
+        if ", told as " in oracle:
+            oracle, _, told = oracle.partition(", told as ")
+            told = f"as {told}"
+        about = [oracle.removesuffix(" answers"), method.question.replace("-", " "), told]
+        mine = {k: returns[family, one["oracle"], method.name, k] for k in ANSWERS}
+        earned = [summarise(mine[k]) for k in ANSWERS[1:]]
+        sign, pairs = "", method.name.replace(f"-{method.question}", "")
+        if pairs != method.name:
+            usual = one["oracle"].partition(", graded from ")[0]
+            versus = compare(mine[5], returns[family, usual, pairs, 10])
+            sign = SIGNS[versus.claim] if versus.n_seeds > 1 else ""
+        rows.append([*about, *(cell(vars(each), "deviation") for each in earned), sign])
+    head = ["answers", "question", "told", *(f"k = {k}" for k in ANSWERS[1:])]
+    return [fill(KINDS, 120), "", *table([*head, "five against ten pairs"], rows), ""]
+
+
 def by_manipulation(family: str) -> list[str]:
     """What seed 0 earns in each of a family's manipulations."""
     results = {
@@ -371,10 +404,12 @@ def family_section(family: str) -> str:
         lines += [fill(MANIPULATIONS, 120), "", *by_manipulation(family), ""]
     if (folder / TABLE3_STORE).exists():
         if rows := methods(family):
-            lines += [fill(METHODS, 120), "", *rows]
+            lines += [fill(TABLE, 120), "", *rows]
         lines += [fill(PARTS, 120), "", *parts(family)]
     if (folder / NOISE_STORE).exists():
         lines += untold(family)
+    if (folder / ANSWERS_STORE).exists():
+        lines += questions(family)
     links = []
     for page, text in PAGES.items():
         if (folder / f"{page}.md").exists():

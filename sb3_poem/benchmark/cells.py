@@ -3,7 +3,6 @@
 import textwrap
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,8 +11,14 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_poem.adaptation import BoltzmannOracle, MistakeOracle, ReturnOracle, TaskOracle
 from sb3_poem.adaptation.evaluation import Library, evaluate_adaptation
-from sb3_poem.adaptation.known_task import SELECTION_EPISODES, known_task_return, preference_order
+from sb3_poem.adaptation.known_task import (
+    SELECTION_EPISODES,
+    known_task_return,
+    preference_order,
+    return_spread,
+)
 from sb3_poem.adaptation.meta_model import HasSimilarity
+from sb3_poem.adaptation.preference import Preference
 from sb3_poem.baselines import ANOLE, MAMLRewardModel, rollout_fragments
 from sb3_poem.baselines.anole import has_experience
 from sb3_poem.baselines.fragments import default_fragment_length
@@ -28,6 +33,8 @@ from sb3_poem.common.vec_env import make_task_vec_env
 
 SEED_STRIDE = 10_000
 DIGITS = 4  # of returns in the store
+#: How a result writes answers
+LETTERS = dict(zip(Preference, "LlerR1234", strict=True))
 #: What a result holds that is another at each run
 TIMES = ("seconds", "training_seconds", "training_cpu_seconds")
 
@@ -60,12 +67,24 @@ def run_cell(cell: Cell, library: ModelLibrary, say: Say = print) -> Record:
     return Record(*which, result, {**about, "model": training})
 
 
-def make_oracle_factory(spec: OracleSpec) -> Callable[..., TaskOracle]:
-    """A function of ``env``, ``task`` and ``seed``."""
-    if spec.kind == "return":
-        return ReturnOracle
+def make_oracle_factory(
+    spec: OracleSpec, question: str = "pair", spread: float | None = None
+) -> Callable[..., TaskOracle]:
+    """A function of ``env``, ``task`` and ``seed``. With the family's spread of returns, which
+    graded answers need (:func:`~sb3_poem.adaptation.return_spread`), it has thresholds.
+    """
     kinds: dict[str, Any] = {"boltzmann": BoltzmannOracle, "mistake": MistakeOracle}
-    return partial(kinds[spec.kind], spec.value)
+    own = () if spec.kind == "return" else (spec.value,)
+    thresholds = None if spread is None else tuple(spread * share for share in spec.thresholds)
+
+    def make(*given: Any, **named: Any) -> TaskOracle:
+        how = {"question": question, "thresholds": thresholds}
+        oracle: TaskOracle = kinds.get(spec.kind, ReturnOracle)(*own, *given, **how, **named)
+        if spec.told is not None:
+            oracle.noise_model = make_oracle_factory(spec.told)().noise_model
+        return oracle
+
+    return make
 
 
 def _episode_seed(cell: Cell) -> int:
@@ -98,16 +117,18 @@ def _measure_adaptation(cell: Cell, model: Any, env: VecEnv, tasks: np.ndarray) 
         rolled_out = 0  # on the new tasks
     how: dict[str, Any] = {"rule": rule, "record_at": budget.record_at, "library": fragments}
     how |= {"n_episodes": budget.episodes, "seed": _episode_seed(cell)}
-    oracles = make_oracle_factory(cell.oracle)
+    question, films = cell.definition.question, cell.definition.films
+    spread = return_spread(model, env) if question == "graded" else None
+    oracles = make_oracle_factory(cell.oracle, question, spread)
     evaluation = evaluate_adaptation(model, env, tasks, oracles, **how)
-    answers = [[answer.value for answer in row] for row in evaluation.preferences]
+    answers = ["".join(map(LETTERS.__getitem__, row)) for row in evaluation.preferences]
     data: dict[str, Any] = {
         "queries": list(evaluation.record_at),
         "tasks": _rounded(tasks),
         "task_returns": _rounded(evaluation.task_returns),
         "task_deviations": _rounded(evaluation.returns.std(axis=2)),
-        "answers": ["".join(answer[0] for answer in row) for row in answers],
-        "adaptation_trajectories": rolled_out if shown else 2 * sum(map(len, answers)),
+        "answers": answers,
+        "adaptation_trajectories": rolled_out if shown else films * sum(map(len, answers)),
         **shown,
     }
     if evaluation.successes is not None:

@@ -77,10 +77,11 @@ def _queries_figure(
 
 
 def _draw_yardsticks(axes: Axes, reference: Series, entry: Entry, oracle: OracleSpec) -> None:
-    measured = [reference.limits(k, oracle) for k in entry.record_at]
-    limits = [np.nan if values is None else float(values.mean()) for values in measured]
     looks: dict[str, Any] = {"color": "0.25", "linestyle": "--", "label": "limit (POEM's policies)"}
-    axes.plot(entry.record_at, limits, linewidth=1.2, **looks)
+    if not entry.films:
+        measured = [reference.limits(k, oracle) for k in entry.record_at]
+        limits = [np.nan if values is None else float(values.mean()) for values in measured]
+        axes.plot(entry.record_at, limits, linewidth=1.2, **looks)
     looks = {"color": "0.5", "linestyle": ":", "label": "task known (POEM's policies)"}
     axes.axhline(float(reference.returns.mean(axis=1).mean()), linewidth=1.2, **looks)
 

@@ -81,6 +81,16 @@ class Method:
     paper_row: str | None = None
     library: bool = False
 
+    @property
+    def question(self) -> str:
+        """The kind of its questions."""
+        return str(self.options.get("question", "pair"))
+
+    @property
+    def films(self) -> int:
+        """How many trajectories a question shows."""
+        return 4 if self.question == "best-of-four" else 2
+
     def objection(self, shared_dynamics: bool) -> str | None:
         """Why the method cannot run on a family; None if it can."""
         reason = SHARED_DYNAMICS_REASONS.get(self.rule or "")
@@ -138,6 +148,12 @@ def _methods() -> Iterator[Method]:
         yield Method(name, label, "pearl", "Bayes", options, library=True)
         name, label = f"poem-bayes-untold{suffix}", f"POEM (Bayes), not told the noise{of}"
         yield Method(name, label, "poem", "Bayes", {"noise_model": "infer", **own})
+    for question in ("graded", "best-of-four"):
+        label = f"POEM (Bayes), {question.replace('-', ' ')}"
+        yield Method(f"poem-bayes-{question}", label, "poem", "Bayes", {"question": question})
+        options = {"question": question, "noise_model": "infer"}
+        name, label = f"poem-bayes-{question}-untold", f"{label}, not told the noise"
+        yield Method(name, label, "poem", "Bayes", options)
     yield Method("maml-reward", "MAML-reward", "maml-reward", "MAMLReward", paper_row="MAML-reward")
     yield Method("known-task", "task known (POEM's policies)", "poem")
     yield Method("known-task-pearl", "task known (PEARL's policies)", "pearl")

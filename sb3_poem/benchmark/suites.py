@@ -58,6 +58,12 @@ UNTOLD_METHODS = (
     *("poem-bayes-untold", "poem-bayes-untold-aggregate", "poem-paper", "poem-paper-aggregate"),
     *("anole", "anole-aggregate", "anole-rollouts-aggregate", "maml-reward"),
 )
+#: Kinds of questions, each told how answers err, and not
+QUESTIONS = tuple(
+    f"poem-bayes{kind}{told}"
+    for told in ("", "-untold")
+    for kind in ("", "-graded", "-best-of-four")
+)
 TABLE_REFERENCES = ("known-task", "known-task-pearl")
 # MAML-reward trains a reward only, so its return does not depend on how long a policy was trained;
 # greedy search takes as long as all the others together, and lies beside ANOLE.
@@ -68,22 +74,55 @@ FILE = "file "
 
 @dataclass(frozen=True)
 class OracleSpec:
-    """Who answers: "return", "boltzmann" with a beta (None: the paper's), "mistake" with a rate."""
+    """Who answers: "return", "boltzmann" with a beta (None: the paper's), "mistake" with a rate.
+
+    :param told: As whom rules take it that are told how answers err; None: as it is
+    :param thresholds: From what differences on graded answers say better and much better, as shares
+        of the family's spread of returns
+    """
 
     kind: str = "return"
     value: float | None = None
+    told: Self | None = None
+    thresholds: tuple[float, float] = (0.12, 1.0)
 
     @property
     def label(self) -> str:
-        if self.kind == "return":
-            return "exact answers"
-        if self.kind == "mistake":
-            return f"{100 * (self.value or 0):g} % of the answers flipped"
-        return "Boltzmann answers" + ("" if self.value is None else f", beta = {self.value:g}")
+        words = "Boltzmann answers" + ("" if self.value is None else f", beta = {self.value:g}")
+        if self.kind != "boltzmann":
+            flipped = f"{100 * (self.value or 0):g} % of the answers flipped"
+            words = "exact answers" if self.kind == "return" else flipped
+        if self.told is not None:
+            words += f", told as {self.told.label}"
+        if self.thresholds != OracleSpec.thresholds:
+            words += ", graded from {:g} and {:g} of the spread on".format(*self.thresholds)
+        return words
+
+    def recorded(self, question: str) -> dict[str, Any]:
+        """What a cell's identity says of it, who is asked questions of this kind."""
+        own: dict[str, Any] = {"kind": self.kind, "value": self.value}
+        if self.told is not None:
+            own["told"] = self.told.recorded("pair")
+        return own | ({"thresholds": list(self.thresholds)} if question == "graded" else {})
+
+    @classmethod
+    def of_identity(cls, data: dict[str, Any] | None) -> Self:
+        """The one of a record."""
+        own = dict(data or {})
+        if "told" in own:
+            own["told"] = cls.of_identity(own["told"])
+        if "thresholds" in own:
+            own["thresholds"] = tuple(own["thresholds"])
+        return cls(**own)
 
 
 EXACT, BOLTZMANN = OracleSpec(), OracleSpec("boltzmann")
 NOISES = (BOLTZMANN, OracleSpec("mistake", 0.1), OracleSpec("mistake", 0.2))
+#: Whom rules that are told how answers err are told wrongly
+MISJUDGED = (
+    OracleSpec("mistake", 0.2, told=OracleSpec("mistake", 0.1)),
+    OracleSpec("boltzmann", told=EXACT),
+)
 
 
 @dataclass(frozen=True)
@@ -184,7 +223,7 @@ class Cell:
             **method.recorded(dict(self.overrides)),
             "seed": self.seed,
             # What a model's policies could earn does not depend on who answers.
-            "oracle": None if known else {"kind": self.oracle.kind, "value": self.oracle.value},
+            "oracle": None if known else self.oracle.recorded(method.question),
             "record_at": None if known else list(self.budget.record_at),
             "tasks": self.budget.tasks,
             "episodes": self.budget.episodes,
@@ -207,7 +246,7 @@ class Cell:
         }
         return cls(
             method=method,
-            oracle=OracleSpec(**identity["oracle"] or {}),
+            oracle=OracleSpec.of_identity(identity["oracle"]),
             budget=Budget(**sizes, record_at=record_at),
             training=Training.from_dict(identity["training"]),
             overrides=tuple(sorted(one for one in options if one not in usual.items())),
@@ -239,6 +278,8 @@ class Entry:
     :param by_task: Tables show standard errors over tasks and success rates, and no interquartile
         means
     :param compared: Methods whose differences from all others tables show
+    :param films: Tables also show returns after so many films watched, as questions of one kind
+        show more than those of another, and no limits, which are of pairs
     """
 
     name: str
@@ -251,6 +292,7 @@ class Entry:
     shown: tuple[int, ...] = (1, 5, 10, 20)
     by_task: bool = False
     compared: tuple[str, ...] = POEMS
+    films: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -369,6 +411,29 @@ _INFORMED = Entry(
     INFORMED_METHODS,
     compared=tuple(f"{name}-aggregate" for name in POEMS),
 )
+_QUESTIONS = Entry(
+    "questions",
+    "Kinds of questions",
+    QUESTIONS,
+    (EXACT, *NOISES),
+    compared=QUESTIONS,
+    films=(4, 20),
+)
+_GRADED = tuple(name for name in QUESTIONS if METHODS[name].question == "graded")
+_THRESHOLDS = replace(
+    _QUESTIONS,
+    name="thresholds",
+    title="Other thresholds",
+    methods=_GRADED,
+    oracles=(OracleSpec(thresholds=(0.3, 1.6)),),
+)
+_MISJUDGED = replace(
+    _QUESTIONS,
+    name="misjudged",
+    title="Rules told wrongly",
+    methods=("poem-bayes", "poem-bayes-graded"),
+    oracles=MISJUDGED,
+)
 _UNTOLD = Entry(
     "untold",
     "Methods that are not told the noise",
@@ -401,6 +466,14 @@ SUITES = {
             PAPER_FAMILIES,
             (replace(_TABLE, oracles=NOISES, curves=(BOLTZMANN,)), _UNTOLD),
             TABLE_REFERENCES,
+        ),
+        Suite(
+            "answers",
+            "Kinds of questions, and who answers them",
+            ("HalfCheetahVel", "AntGoal", "AntDir2D", "FetchReach", "MetaWorldML1"),
+            (_QUESTIONS, _THRESHOLDS, _MISJUDGED),
+            ("known-task",),
+            snapshots=1,
         ),
         Suite(
             "ablation",

@@ -220,7 +220,7 @@ def _rows(
             continue
         of = {**place, "method": reference.method}
         limit = reference.label.replace("task known", "limit")
-        for queries in entry.record_at:
+        for queries in () if entry.films else entry.record_at:
             measured = reference.limits(queries, oracle)
             if measured is not None:
                 values = _over_seeds(measured)
@@ -262,17 +262,22 @@ def _comparison(entry: Entry, rows: Sequence[Row]) -> Table:
     header = ["method", "seeds"]
     for k in queries:
         header += [_after(k), beside, *(["paper"] if has_paper else [])]
+    header += [f"{n} films" for n in entry.films]
     body = []
     final = [row for row in rows if row.snapshot is None]
     for kind in ("method", "limit"):
         for label in dict.fromkeys(row.label for row in final if row.kind == kind):
             mine = {row.queries: row for row in final if row.label == label and row.kind == kind}
-            cells = [label, str(next(iter(mine.values())).n_seeds)]
+            first = next(iter(mine.values()))
+            cells = [label, str(first.n_seeds)]
             for row in map(mine.__getitem__, queries):
                 interval = (row.iqm_low, row.iqm_high)
                 spread = _number(row.task_error) if entry.by_task else _number(row.iqm, *interval)
                 cells += [_number(row.mean, row.deviation), spread]
                 cells += [_number(row.paper_mean, row.paper_deviation)] * has_paper
+            for n in entry.films:
+                row = mine[n // METHODS[first.method].films]
+                cells.append(_number(row.mean, row.deviation))
             body.append(tuple(cells))
     notes = [f"Mean and standard deviation over seeds; {also}."]
     notes += [

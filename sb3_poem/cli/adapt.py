@@ -3,7 +3,6 @@
 import argparse
 import shlex
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,6 @@ from sb3_poem.adaptation.adapter import shown_from_dict
 from sb3_poem.adaptation.environments import COPIES
 from sb3_poem.adaptation.evaluation import evaluation_seed
 from sb3_poem.adaptation.policy import POLICY_SUFFIX
-from sb3_poem.adaptation.preference import BEST_OF_FOUR
 from sb3_poem.benchmark.cells import make_oracle_factory
 from sb3_poem.benchmark.suites import OracleSpec
 from sb3_poem.cli.arguments import DEFAULT_STORE
@@ -98,7 +96,8 @@ class Adaptation:
         rate = arguments.mistake_rate
         values = {"mistake": DEFAULT_MISTAKE_RATE if rate is None else rate}
         values["boltzmann"] = arguments.beta
-        self.oracle = OracleSpec(arguments.oracle, values.get(arguments.oracle))
+        value, thresholds = values.get(arguments.oracle), tuple(arguments.thresholds)
+        self.oracle = OracleSpec(arguments.oracle, value, thresholds=thresholds)
         names = ("inference", "query_rule", "candidates", "n_candidates", "question")
         chosen = {name: getattr(arguments, name) for name in names}
         chosen["noise_model"] = "infer" if arguments.infer_noise else None
@@ -110,13 +109,10 @@ class Adaptation:
     def ask_oracle(self) -> int:
         """Let a program that knows the tasks answer, and say each measurement as it comes."""
         arguments, subject = self.arguments, self.subject
-        factory = make_oracle_factory(self.oracle)
-        if self.rule.question == BEST_OF_FOUR:
-            factory = partial(factory, question=BEST_OF_FOUR)
-        elif self.rule.question == "graded":
+        spread = None
+        if self.rule.question == "graded":
             spread = return_spread(subject.model, subject.env, subject.seed)
-            equal, much = arguments.thresholds
-            factory = partial(factory, thresholds=(equal * spread, much * spread))
+        factory = make_oracle_factory(self.oracle, self.rule.question, spread)
         measured: list[AdaptationEvaluation] = []
         record_at = tuple(sorted({*(arguments.record or range(arguments.queries + 1))}))
 

@@ -105,6 +105,33 @@ def test_a_claim_needs_mean_interquartile_mean_and_interval() -> None:
     assert found.probability == pytest.approx(0.1, abs=0.05)
 
 
+def test_kinds_of_questions_are_compared_by_films(tmp_path: Path) -> None:
+    """A best of four shows twice as many films as a pair, graded or not."""
+    with fill(tmp_path / "store.sqlite", "answers") as store:
+        selection = Selection(SUITES["answers"], store.records())
+        tables = {table.title.partition("; ")[2]: table for table in suite_tables(selection)}
+    for oracle in (
+        "exact answers",
+        "Boltzmann answers",
+        "10 % of the answers flipped",
+        "20 % of the answers flipped",
+    ):
+        table = tables[f"kinds of questions, {oracle}"]
+        after = {row[0]: dict(zip(table.header, row, strict=True)) for row in table.rows}
+        assert len(after) == 6  # and no limit, which is of pairs
+        for label in ("", ", graded", ", best of four"):
+            for untold in ("", ", not told the noise"):
+                row = after[f"POEM (Bayes){label}{untold}"]
+                films = 4 if "four" in label else 2
+                assert row["4 films"] == f"{-20 + 4 / films:.1f} ± 5.0"
+                assert row["20 films"] == f"{-20 + 20 / films:.1f} ± 5.0"
+    about = "exact answers, graded from 0.3 and 1.6 of the spread on"
+    assert len(tables[f"other thresholds, {about}"].rows) == 2
+    for oracle in ("Boltzmann answers, told as exact answers", "20 % of the answers flipped"):
+        told = ", told as 10 % of the answers flipped" * oracle.startswith("20")
+        assert len(tables[f"rules told wrongly, {oracle}{told}"].rows) == 2
+
+
 def test_differences_are_paired_by_seed(tmp_path: Path) -> None:
     def returns(cell: Cell, k: int) -> np.ndarray:
         return ladder(cell, k) + (1.0 if cell.method == "poem-bayes" else 0.0)

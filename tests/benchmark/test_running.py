@@ -21,6 +21,8 @@ import pytest
 from meta_toys import small
 
 from sb3_poem import PEARLSAC, POEMSAC
+from sb3_poem.adaptation import MistakeNoise
+from sb3_poem.benchmark.cells import make_oracle_factory
 from sb3_poem.benchmark.models import ModelLibrary, Workplace, locked
 from sb3_poem.benchmark.results import Selection
 from sb3_poem.benchmark.running import make_plan, run_cells
@@ -28,12 +30,14 @@ from sb3_poem.benchmark.store import Store
 from sb3_poem.benchmark.suites import (
     BOLTZMANN,
     EXACT,
+    SUITES,
     TABLE_METHODS,
     TABLE_REFERENCES,
     Budget,
     Cell,
     Entry,
     ModelKey,
+    OracleSpec,
     Suite,
     Training,
 )
@@ -128,6 +132,43 @@ def test_methods_that_know_more_run_and_are_recorded(tmp_path: Path, handed_over
         asked = "rollouts of the new task" if method in methods[:2] else None
         assert record.result.get("fragments") == asked
         assert record.identity.get("library") == (None if asked is None else "rollouts")
+
+
+def test_every_kind_of_question_is_asked_and_recorded(tmp_path: Path, handed_over: Path) -> None:
+    questions, *others = (replace(one, record_at=(0, 2)) for one in SUITES["answers"].entries)
+    entries = (replace(questions, oracles=(BOLTZMANN,)), *others)
+    library, store = library_of(tmp_path, handed_over / "all")
+    few = {"Bayes": (("n_particles", 20),)}
+    suite = replace(SUITES["answers"], entries=entries, references=(), overrides=few)
+    given = (["PointGoal"], None, range(1), BUDGET, Training(), 1)
+    plan = make_plan(suite, library, store, *given)
+    assert run_cells(plan.todo, library, store) == []
+    records = list(store.records())
+    assert len(records) == 6 + 2 + 2 * 2
+    for record in records:
+        kind, graded = record.identity["options"].get("question", "pair"), {"thresholds"}
+        films = 2 + 2 * (kind == "best-of-four")
+        letters = {"pair": "ler", "graded": "LlerR", "best-of-four": "1234e"}[kind]
+        assert record.result["adaptation_trajectories"] == 2 * 2 * films  # of tasks and questions
+        assert set("".join(record.result["answers"])) <= set(letters)
+        other = record.identity["oracle"].keys() - {"kind", "value", "told"}
+        assert other == (graded if kind == "graded" else set())
+        assert Cell.of_identity(record.method, record.identity).key == record.key
+
+
+def test_who_answers_may_err_otherwise_than_rules_are_told() -> None:
+    ten, twenty = OracleSpec("mistake", 0.1), OracleSpec("mistake", 0.2)
+    rates = []
+    for spec in (ten, twenty, replace(twenty, told=ten)):
+        oracle = make_oracle_factory(spec)(None, np.zeros(2), 0)
+        flips = sum((oracle._perceive(np.array([0.0, 1.0])) == [1.0, 0.0]).all() for _ in range(99))
+        rates.append((oracle.noise_model, flips))
+    assert [noise for noise, _ in rates] == [
+        MistakeNoise(0.1),
+        MistakeNoise(0.2),
+        MistakeNoise(0.1),
+    ]
+    assert rates[0][1] < rates[1][1] == rates[2][1]
 
 
 def test_a_finished_cell_is_verified(
