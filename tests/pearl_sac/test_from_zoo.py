@@ -31,19 +31,19 @@ def test_arguments_are_those_of_the_entry(algorithm: type[PEARLSAC]) -> None:
     assert model.policy.net_arch["pi"] == [64, 64]
 
 
-def test_schedules_and_python_are_read_as_rl_zoo3_reads_them(algorithm: type[PEARLSAC]) -> None:
+def test_schedules_and_python_are_read_as_rl_zoo3_reads_them() -> None:
     from rl_zoo3.exp_manager import ExperimentManager
 
     env_id = "poem/PointGoal-v0"
-    entry = yaml.safe_load(config_file(algorithm.zoo_name).read_text())[env_id]
+    entry = yaml.safe_load(config_file(POEMSAC.zoo_name).read_text())[env_id]
     expected: Any = ExperimentManager._preprocess_schedules(
         {"learning_rate": entry["learning_rate"]}
     )["learning_rate"]
-    model = algorithm.from_zoo(f"poem_envs:{env_id}", n_envs=2, device="cpu")
+    model = POEMSAC.from_zoo(f"poem_envs:{env_id}", n_envs=2, device="cpu")
     for remaining in (1.0, 0.37, 0.0):
         assert model.lr_schedule(remaining) == pytest.approx(expected(remaining), rel=1e-12)
     with pytest.raises(ValueError, match="`learning_rate` must be a finite number, but is '1e-3'"):
-        algorithm.from_zoo(env_id, n_envs=2, learning_rate="1e-3")
+        POEMSAC.from_zoo(env_id, n_envs=2, learning_rate="1e-3")
     assert model.policy_kwargs.items() >= eval(entry["policy_kwargs"], {"nn": th.nn}).items()
 
 
@@ -63,34 +63,32 @@ def test_every_entry_makes_a_model(algorithm: type[PEARLSAC]) -> None:
     ],
 )
 def test_an_epoch_s_rollouts_have_a_copy_each(
-    algorithm: type[PEARLSAC], env_id: str, arguments: dict[str, Any], n_envs: int
+    env_id: str, arguments: dict[str, Any], n_envs: int
 ) -> None:
-    model = algorithm.from_zoo(env_id, device="cpu", **arguments)
+    model = POEMSAC.from_zoo(env_id, device="cpu", **arguments)
     assert model.n_envs == n_envs
     if n_envs != 3:
         rollouts = len(model.train_tasks) * model.trajectories_per_task
         assert model.epoch_steps == rollouts * model.horizon
 
 
-def test_learn_takes_the_entrys_steps(algorithm: type[PEARLSAC], tmp_path: Path) -> None:
-    model = algorithm.from_zoo(
+def test_learn_takes_the_entrys_steps(tmp_path: Path) -> None:
+    model = POEMSAC.from_zoo(
         POINT_GOAL, seed=0, n_timesteps=3000, gradient_steps=1, device="cpu"
     ).learn()
     assert model.num_timesteps == 3000  # an epoch of 120 tasks and 25 steps
     model.save(tmp_path / "model")
     assert (
-        algorithm.load(tmp_path / "model", POINT_GOAL)
-        .learn(reset_num_timesteps=False)
-        .num_timesteps
+        POEMSAC.load(tmp_path / "model", POINT_GOAL).learn(reset_num_timesteps=False).num_timesteps
         == 6000
     )
     assert model.learn(6000).num_timesteps == 6000
 
 
-def test_learn_does_not_guess_how_long(algorithm: type[PEARLSAC]) -> None:
+def test_learn_does_not_guess_how_long() -> None:
     message = f"total_timesteps is missing, which only a model that from_zoo made knows: .* an epoch has {EPOCH}"
     with pytest.raises(ValueError, match=message):
-        small(algorithm).learn()
+        small(POEMSAC).learn()
 
 
 def test_another_family_by_an_entry() -> None:
