@@ -118,6 +118,13 @@ class OtherWalk(Walk):
     task_space = spaces.Box(-3.0, 3.0, (1,), np.float64)
 
 
+class Shaped(Walk):
+    """A walk that says how good it is to be somewhere, in a way that nobody would guess."""
+
+    def _potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
+        return 3.0 * np.sin(observations[..., 0]) * tasks[..., 0] + 1.0
+
+
 class Poisoned(gym.Wrapper):
     """Returns NaN once: in place of ``what``, at a step (from 0) of an episode (from 0)."""
 

@@ -1,7 +1,7 @@
 """Fixtures of PEARLSAC's tests, most of which run POEMSAC too."""
 
+import first_hour
 import pytest
-from meta_toys import EPOCH, small
 
 from sb3_poem import PEARLSAC, POEMSAC
 
@@ -12,7 +12,13 @@ def algorithm(request: pytest.FixtureRequest) -> type[PEARLSAC]:
     return request.param
 
 
-@pytest.fixture(scope="session", params=[PEARLSAC, POEMSAC])
+@pytest.fixture(params=[PEARLSAC, POEMSAC])
 def trained(request: pytest.FixtureRequest) -> PEARLSAC:
     """A model after two epochs; tests leave it as it is."""
-    return small(request.param).learn(2 * EPOCH)
+    return first_hour.trained(request.param)
+
+
+@pytest.fixture
+def poem() -> POEMSAC:
+    """The same of POEMSAC alone, for what is one code in both."""
+    return first_hour.trained()

@@ -8,20 +8,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from meta_toys import Walk, small, walks
+from meta_toys import Shaped, Walk, small, walks
 
 from poem_envs import TaskFamilyVector
 from sb3_poem import PEARLSAC
 from sb3_poem.common.vec_env import make_task_vec_env
 
 GAMMA = 0.9
-
-
-class Shaped(Walk):
-    """A walk that says how good it is to be somewhere, in a way that nobody would guess."""
-
-    def _potential(self, tasks: np.ndarray, observations: np.ndarray) -> np.ndarray:
-        return 3.0 * np.sin(observations[..., 0]) * tasks[..., 0] + 1.0
 
 
 def targets(shaping_coef: float, n_steps: int) -> tuple[PEARLSAC, Any]:
@@ -40,7 +33,7 @@ def targets(shaping_coef: float, n_steps: int) -> tuple[PEARLSAC, Any]:
     return model, model.make_sampler().sample(1, 60)[0]
 
 
-@pytest.mark.parametrize("n_steps", [1, 3, 20])
+@pytest.mark.parametrize("n_steps", [1, 3])
 def test_targets_are_the_plain_ones_and_the_difference_of_potentials(n_steps: int) -> None:
     model, batch = targets(0.5, n_steps)
     plain_model, plain = targets(0.0, n_steps)
