@@ -92,15 +92,12 @@ class OwnVec(VecEnvWrapper):
         (wrappers.ClipAction, "ClipAction"),
         (wrappers.TimeAwareObservation, "TimeAwareObservation"),
         (functools.partial(wrappers.RepeatAction, num_repeats=2), "RepeatAction"),
-        (Wet, r"ActionWrapper \(it is in: Monitor, Wet, \w*TimeLimit, "),
+        (Wet, r"ActionWrapper \(it is in: Wet, Monitor, \w*TimeLimit, "),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-@pytest.mark.parametrize("monitor", [True, False])
-def test_known_wrappers_are_refused_by_name(wrap: Wrap, name: str, monitor: bool) -> None:
-    env = wrap(Monitor(gym.make(POINT_GOAL)) if monitor else gym.make(POINT_GOAL))
-    if monitor:
-        name = name.replace("Monitor, Wet", "Wet, Monitor")
+def test_known_wrappers_are_refused_by_name(wrap: Wrap, name: str) -> None:
+    env = wrap(Monitor(gym.make(POINT_GOAL)))
     with pytest.raises(ValueError, match=f"env must not be wrapped in {name}.*the family itself"):
         small(POEMSAC, env)
 

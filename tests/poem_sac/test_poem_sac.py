@@ -29,6 +29,7 @@ from sb3_poem import PEARLSAC, POEMSAC
 from sb3_poem.adaptation import Bayes
 from sb3_poem.common.buffers import Segment, TaskBatch
 from sb3_poem.common.vec_env import make_task_vec_env
+from sb3_poem.pearl_sac.arguments import default_copies
 from sb3_poem.pearl_sac.collector import EpochCollector
 from sb3_poem.pearl_sac.objective import TaskEmbeddings, kl_to_prior
 from sb3_poem.poem_sac.poem_sac import POEMObjective
@@ -576,7 +577,7 @@ def test_predicted_returns_are_sums_of_decoded_rewards(layer_norm: bool) -> None
 
 
 @pytest.mark.parametrize("own_dynamics", [False, True])
-@pytest.mark.parametrize("arguments", [{}, {"meta_batch_size": 1}, {"similarity": "inner"}])
+@pytest.mark.parametrize("arguments", [{}, {"meta_batch_size": 1}])
 def test_a_family_of_two_tasks_trains_without_nan(
     arguments: dict[str, Any], own_dynamics: bool
 ) -> None:
@@ -588,24 +589,19 @@ def test_a_family_of_two_tasks_trains_without_nan(
     assert np.isfinite(model.similarities(model.task_latents, model.task_latents)).all()
 
 
-def test_one_task_is_a_family_too() -> None:
-    for own_dynamics in (False, True):
-        model = small(POEMSAC, walks(2), horizon=10, n_train_tasks=1)
-        (apart(model) if own_dynamics else model).learn(60)
-        assert all(value.isfinite().all() for value in parameters(model).values())
+def test_one_task_with_dynamics_of_its_own_is_a_family_too() -> None:
+    """Of which there is no other to compare policies with."""
+    model = apart(small(POEMSAC, walks(2), horizon=10, n_train_tasks=1)).learn(60)
+    assert all(value.isfinite().all() for value in parameters(model).values())
 
 
-@pytest.mark.parametrize("algorithm", [PEARLSAC, POEMSAC])
-def test_half_cheetah_forwards_and_backwards(algorithm: type[PEARLSAC]) -> None:
-    """Two tasks on the real simulator, from the id alone."""
+def test_half_cheetah_forwards_and_backwards() -> None:
+    """Two tasks on the real simulator."""
     env = make_task_vec_env("poem/HalfCheetahFwdBack-v0", 2, max_episode_steps=20)
-    model = small(algorithm, env, n_train_tasks=None).learn(80)
+    model = small(POEMSAC, env, n_train_tasks=None).learn(80)
     assert sorted(model.train_tasks.tasks.ravel()) == [-1.0, 1.0]
     assert all(value.isfinite().all() for value in parameters(model).values())
-    if isinstance(
-        model, POEMSAC
-    ):  # what forwards earns, backwards pays for, but for the control cost
-        assert model.epoch_context.returns.isfinite().all()
+    assert model.epoch_context.returns.isfinite().all()
 
 
 def test_environments_of_one_copy_and_many_tasks() -> None:
@@ -616,9 +612,7 @@ def test_environments_of_one_copy_and_many_tasks() -> None:
 
 def test_an_id_becomes_as_many_copies_as_an_epoch_has_trajectories() -> None:
     finite = "poem/HalfCheetahFwdBack-v0"
-    assert POEMSAC("MlpPolicy", finite).n_envs == 2
-    assert POEMSAC("MlpPolicy", finite, trajectories_per_task=100).n_envs == 120  # in two waves
-    assert POEMSAC("MlpPolicy", POINT_GOAL, n_train_tasks=7, trajectories_per_task=2).n_envs == 14
-    assert (
-        POEMSAC("MlpPolicy", POINT_GOAL, n_train_tasks=130, trajectories_per_task=2).n_envs == 130
-    )
+    assert default_copies(finite, None, 1) == 2
+    assert default_copies(finite, None, 100) == 120  # in two waves
+    assert default_copies(POINT_GOAL, 130, 2) == 130
+    assert small(POEMSAC, n_train_tasks=7, trajectories_per_task=2).n_envs == 14
