@@ -79,15 +79,15 @@ def make_vec(n: int, **kwargs: Any) -> gym.vector.VectorEnv:
 @pytest.mark.parametrize("mode", ["vector_entry_point", "sync"])
 def test_gymnasiums_vectorised_environment(mode: str) -> None:
     """A family's own, and copies that are stepped one after another."""
-    arguments = {"vectorization_mode": mode, "max_episode_steps": 12}
-    model = small(POEMSAC, make_vec(3, step_length=0.2, **arguments)).learn(N_TASKS * 12)
+    arguments = {"vectorization_mode": mode, "max_episode_steps": 5}
+    model = small(POEMSAC, make_vec(3, step_length=0.2, **arguments)).learn(N_TASKS * 5)
     same = small(
         POEMSAC,
-        make_vec_env(POINT_GOAL, 3, env_kwargs={"step_length": 0.2, "max_episode_steps": 12}),
+        make_vec_env(POINT_GOAL, 3, env_kwargs={"step_length": 0.2, "max_episode_steps": 5}),
     )
-    assert_same_model(model, same.learn(N_TASKS * 12))
+    assert_same_model(model, same.learn(N_TASKS * 5))
     assert isinstance(model.env, TaskVecEnv if mode == "vector_entry_point" else DummyVecEnv)
-    assert model.horizon == 12
+    assert model.horizon == 5
     assert model.env_kwargs["step_length"] == 0.2
     callback = AdaptationEvalCallback(n_tasks=2, record_at=(1,), n_episodes=1)
     model.learn(1, callback)  # makes copies of it
