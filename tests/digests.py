@@ -110,30 +110,9 @@ def trained(name: str) -> PEARLSAC:
 def killed_and_resumed() -> str:
     """A run that is killed after an epoch's checkpoint and continued by another process."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [
-            sys.executable,
-            "-m",
-            "sb3_poem",
-            "train",
-            "--env",
-            POINT_GOAL,
-            "--seed",
-            "3",
-            "-f",
-            folder,
-        ]
-        command += [
-            "--eval-freq",
-            "-1",
-            "--save-freq",
-            "1500",
-            "-n",
-            "9000",
-            "--num-threads",
-            "1",
-            "--resume",
-        ]
-        command += ["-params", "gradient_steps:20", "--device", "cpu"]
+        flags = "--seed 3 --eval-freq -1 --save-freq 1500 -n 9000 --num-threads 1 --resume"
+        command = [sys.executable, "-m", "sb3_poem", "train", "--env", POINT_GOAL, "-f", folder]
+        command += [*flags.split(), "-params", "gradient_steps:20", "--device", "cpu"]
         quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         first = subprocess.Popen(command, **quiet)
         while not list(Path(folder).glob("*/*/checkpoint.zip")):

@@ -153,21 +153,20 @@ def test_actions_that_are_not_finite_do_not_reach_the_environment() -> None:
 # ---------------------------------------------------------------- relabelling
 
 
-def true_returns(make_env, tasks: np.ndarray, actions: np.ndarray, seeds: list[int]) -> np.ndarray:  # type: ignore[no-untyped-def]
-    """(tasks, trajectories): what the first episode earns when an environment of each task is
-    stepped.
-    """
+def true_returns(
+    env: gym.Env, tasks: np.ndarray, actions: np.ndarray, seeds: list[int]
+) -> np.ndarray:
+    """(tasks, trajectories): what the first episode earns when each task is stepped."""
     returns = np.zeros((len(tasks), len(actions)))
     for i, task in enumerate(tasks):
         for j, trajectory in enumerate(actions):
-            env = make_env()
             env.reset(seed=seeds[j], options={"task": task})
             for action in trajectory:
                 _, reward, terminated, truncated, _ = env.step(action)
                 returns[i, j] += reward
                 if terminated or truncated:
                     break
-            env.close()
+    env.close()
     return returns
 
 
@@ -184,9 +183,7 @@ def test_relabelled_returns_are_what_the_other_tasks_environments_return(
     relabelled = relabelled_returns(
         FamilyView(env).compute_rewards, tasks, segment.features, segment.first_episode
     )
-    truth = true_returns(
-        lambda: gym.make(env_id, **kwargs), tasks, unscaled(segment, env), [11, 12, 13]
-    )
+    truth = true_returns(gym.make(env_id, **kwargs), tasks, unscaled(segment, env), [11, 12, 13])
     assert segment.first_episode.all() == (env_id == POINT_GOAL)  # the others fall
     assert np.ptp(truth, axis=0).min() > 1e-3  # the tasks do differ
     np.testing.assert_allclose(relabelled, truth, rtol=1e-6, atol=1e-6)
@@ -201,6 +198,6 @@ def test_relabelling_counts_the_marked_steps_only() -> None:
     rewards_of = FamilyView(env).compute_rewards
     relabelled = relabelled_returns(rewards_of, tasks, segment.features, segment.first_episode)
     truth = true_returns(
-        lambda: gym.wrappers.TimeLimit(Walk(edge=0.35), 8), tasks, unscaled(segment, env), [3, 4, 5]
+        gym.wrappers.TimeLimit(Walk(edge=0.35), 8), tasks, unscaled(segment, env), [3, 4, 5]
     )
     np.testing.assert_allclose(relabelled, truth, rtol=1e-6)

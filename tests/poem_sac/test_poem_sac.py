@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from meta_toys import (
     Walk,
     WindyWalk,
     apart,
+    differing,
     experience_of,
     parameters,
     small,
@@ -60,18 +63,22 @@ def nearly_deterministic(model: PEARLSAC) -> PEARLSAC:
 # ---------------------------------------------------------------- J
 
 
-def policy_returns(model: PEARLSAC, env: gym.Env, latents: np.ndarray) -> np.ndarray:
-    """(tasks, policies): returns of the mean actions, by stepping one environment in each task."""
+def policy_returns(
+    model: PEARLSAC, make_env: Callable[[], gym.Env], latents: np.ndarray
+) -> np.ndarray:
+    """(tasks, policies): returns of the mean actions, by stepping an environment of each policy in
+    each task.
+    """
+    envs = [make_env() for _ in latents]
     returns = np.zeros((len(model.train_tasks), len(latents)))
     for i, task in enumerate(model.train_tasks.tasks):
-        for j, latent in enumerate(latents):
-            obs, _ = env.reset(seed=0, options={"task": task})
-            done = False
-            while not done:
-                action, _ = model.predict(obs, state=latent, deterministic=True)
-                obs, reward, terminated, truncated, _ = env.step(action)
-                returns[i, j] += reward
-                done = terminated or truncated
+        obs = [env.reset(seed=0, options={"task": task})[0] for env in envs]
+        for _ in range(model.horizon):
+            actions, _ = model.predict(np.stack(obs), state=latents, deterministic=True)
+            steps = [env.step(action) for env, action in zip(envs, actions, strict=True)]
+            obs = [step[0] for step in steps]
+            returns[i] += [step[1] for step in steps]
+        assert all(truncated for _, _, _, truncated, _ in steps)
     return returns
 
 
@@ -114,8 +121,8 @@ def test_returns_are_those_of_environments_of_every_task(
     sources: dict, source: str, n_new: int
 ) -> None:
     model, spy = sources[source]
-    env = gym.make(POINT_GOAL, reset_noise_scale=0.0)
-    before, truth = (policy_returns(model, env, latents) for latents in spy.latents)
+    make = functools.partial(gym.make, POINT_GOAL, reset_noise_scale=0.0)
+    before, truth = (policy_returns(model, make, latents) for latents in spy.latents)
     assert np.ptp(truth) > 1.0
     found = spy.returns[1]
     new = np.isclose(found, truth, atol=1e-3)
@@ -183,7 +190,9 @@ def test_returns_of_tasks_with_their_own_dynamics() -> None:
     model = nearly_deterministic(small(POEMSAC, walks(4, StillWindyWalk), horizon=10, **arguments))
     spy = Spy(model)
     model.learn(1)
-    truth = policy_returns(model, gym.wrappers.TimeLimit(StillWindyWalk(), 10), spy.latents[0])
+    truth = policy_returns(
+        model, lambda: gym.wrappers.TimeLimit(StillWindyWalk(), 10), spy.latents[0]
+    )
     returns = spy.returns[0]
     known = np.isfinite(returns)
     assert known.sum() == 2 * 16
@@ -206,9 +215,8 @@ def test_trajectories_of_a_task_are_averaged() -> None:
     )
     spy = Spy(model)
     model.learn(2 * 3 * 3 * 25)
-    truth = policy_returns(
-        model, gym.make(POINT_GOAL, reset_noise_scale=0.0), spy.latents[1]
-    )  # (4, 8)
+    make = functools.partial(gym.make, POINT_GOAL, reset_noise_scale=0.0)
+    truth = policy_returns(model, make, spy.latents[1])  # (4, 8)
     np.testing.assert_allclose(spy.returns[1], truth.reshape(4, 4, 2).mean(axis=2), atol=1e-3)
 
 
@@ -409,7 +417,7 @@ def test_without_its_parts_poem_is_pearl(monkeypatch: pytest.MonkeyPatch) -> Non
     )
     pearl.learn(2 * EPOCH)
     poem.learn(2 * EPOCH)
-    assert all(th.equal(value, parameters(pearl)[name]) for name, value in parameters(poem).items())
+    assert not differing(parameters(pearl), parameters(poem))
 
 
 # ---------------------------------------------------------------- gradients
