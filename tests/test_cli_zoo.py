@@ -171,6 +171,10 @@ def test_train_then_enjoy(
     assert "there is no run 7 of poem_sac on poem/PointGoal-v0" in capsys.readouterr().err
 
 
+#: Episodes of which an evaluation runs hundreds
+SHORT = ("--env-kwargs", "max_episode_steps:5")
+
+
 def test_evaluation_is_by_adaptation_and_keeps_the_best(
     config: Path,
     tmp_path: Path,
@@ -187,8 +191,9 @@ def test_evaluation_is_by_adaptation_and_keeps_the_best(
     monkeypatch.setattr(
         experiment, "AdaptationEvalCallback", partial(experiment.AdaptationEvalCallback, n_tasks=2)
     )
-    flags = ["-c", config, "-f", tmp_path / "logs", "--eval-freq", 150, "--eval-episodes", 1]
-    flags += ["--eval-env-kwargs", "step_length:0.2"]
+    flags = ["-c", config, "-f", tmp_path / "logs", "--eval-freq", 30, "--eval-episodes", 1]
+    # epochs of six episodes of five steps
+    flags += ["-n", 60, *SHORT, "--eval-env-kwargs", "step_length:0.2"]
     assert train(*flags, "--log-interval", 1, "--verbose", 1) == 0
     assert [arguments.get("step_length") for arguments in made] == [0.2]
     shown = capsys.readouterr().out
@@ -202,7 +207,7 @@ def test_evaluation_is_by_adaptation_and_keeps_the_best(
         assert name in shown
     assert POEMSAC.load(
         tmp_path / "logs/poem_sac/poem-PointGoal-v0_1/best_model.zip"
-    ).num_timesteps in (150, 300)
+    ).num_timesteps in (30, 60)
 
 
 @pytest.fixture
@@ -269,7 +274,7 @@ def test_hyperparameters_are_searched_around_the_entry_which_comes_first(
     )
     entry = {"gamma": 0.9, "learning_rate": "lin_2e-3", "kl_coef": 0.2, "relabel_fraction": 0.5}
     entry |= {"reward_coef": 0.3, "policy_coef": 0.5, "preference_coef": 3.0}
-    write_entry(config, n_timesteps=150, **entry)
+    write_entry(config, n_timesteps=30, **entry)
     flags = [
         "-optimize",
         "--n-trials",
@@ -280,7 +285,7 @@ def test_hyperparameters_are_searched_around_the_entry_which_comes_first(
         1,
         "--no-optim-plots",
     ]
-    assert train("-c", config, "-f", tmp_path / "logs", *flags) == 0
+    assert train("-c", config, "-f", tmp_path / "logs", *SHORT, *flags) == 0
     (report,) = (tmp_path / "logs" / "poem_sac").glob("report_*.csv")
     first, second = (
         pd.read_csv(report)
