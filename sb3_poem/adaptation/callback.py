@@ -85,8 +85,9 @@ class AdaptationEvalCallback(EpochCallback):
         self._make_env()
         if self._best_model is not None:
             self._best_model.parent.mkdir(parents=True, exist_ok=True)
-            if self._best_model.exists():  # a run that goes on
-                self.best_return = self.model.best_adapted_return
+        # that of a run that goes on, if the model that earned it is still there
+        is_lost = self._best_model is not None and not self._best_model.exists()
+        self.best_return = -np.inf if is_lost else self.model.best_adapted_return
 
     def _make_env(self) -> tuple[VecEnv, np.ndarray]:
         if self._env is None:
@@ -107,11 +108,10 @@ class AdaptationEvalCallback(EpochCallback):
     def _on_epoch(self) -> None:
         env, tasks = self._make_env()
         options: dict[str, Any] = {"seed": self.seed, "n_episodes": self.n_episodes}
-        if not isinstance(self.model, HasSimilarity) and self.adaptation_kwargs.get("rule") is None:
-            self.adaptation_kwargs["rule"] = Bayes(query_rule="random")
-        result = evaluate_adaptation(
-            self.model, env, tasks, record_at=self.record_at, **options, **self.adaptation_kwargs
-        )
+        how = {"record_at": self.record_at, **options, **self.adaptation_kwargs}
+        if not isinstance(self.model, HasSimilarity) and how.get("rule") is None:
+            how["rule"] = Bayes(query_rule="random")
+        result = evaluate_adaptation(self.model, env, tasks, **how)
         known = known_task_return(self.model, env, tasks, limits=False, **options)
         metrics = {f"return_after_{k}_queries": result.after(k) for k in self.record_at}
         metrics["known_task_return"] = known.mean_return

@@ -312,3 +312,20 @@ def test_a_baseline_evaluates_a_model_without_a_similarity() -> None:
     callback = AdaptationEvalCallback(every=1, **evaluation)
     small(PEARLSAC, short()).learn(1, callback)
     assert np.isfinite(callback.last_evaluation["return_after_1_queries"])
+
+
+def test_one_callback_serves_one_model_after_another() -> None:
+    """What it takes for a model without a similarity, and the best of that, are not the next's."""
+    given: dict[str, Any] = {}
+    callback = AdaptationEvalCallback(
+        every=1, n_tasks=2, n_episodes=1, record_at=(0, 1), adaptation_kwargs=given
+    )
+    returns = []
+    for algorithm in (PEARLSAC, POEMSAC):
+        model = small(algorithm, short()).learn(1, callback)
+        assert model.best_adapted_return == callback.best_return
+        returns.append(callback.last_evaluation)
+        callback.best_return = 0.0  # which nothing exceeds
+    alone = AdaptationEvalCallback(every=1, n_tasks=2, n_episodes=1, record_at=(0, 1))
+    small(POEMSAC, short()).learn(1, alone)
+    np.testing.assert_equal(returns[1], alone.last_evaluation)
