@@ -12,8 +12,9 @@ from benchmark_records import finished
 from scipy.stats import mannwhitneyu
 
 from sb3_poem.adaptation import AnswerLimits
+from sb3_poem.benchmark.figures import suite_figures
 from sb3_poem.benchmark.results import Selection, compare, summarise
-from sb3_poem.benchmark.store import Store
+from sb3_poem.benchmark.store import Record, Store
 from sb3_poem.benchmark.suites import (
     BOLTZMANN,
     SUITES,
@@ -50,11 +51,20 @@ def matrix(cell: Cell) -> dict:
     return {"limits": {name: np.array(value).tolist() for name, value in vars(limits).items()}}
 
 
+def records_of(suite: str = "table3", seeds: int = 3, **arguments: object) -> list[Record]:
+    cells = SUITES[suite].cells([VEL], range(seeds), budget=FOUR, **arguments)
+    yardsticks = [matrix(cell) if cell.definition.rule is None else {} for cell in cells]
+    return [finished(cell, ladder, **more) for cell, more in zip(cells, yardsticks, strict=True)]
+
+
+def selection_of(suite: str = "table3", seeds: int = 3, **arguments: object) -> Selection:
+    return Selection(SUITES[suite], records_of(suite, seeds, **arguments))
+
+
 def fill(path: Path, suite: str = "table3", seeds: int = 3, **arguments: object) -> Store:
     store = Store(path)
-    for cell in SUITES[suite].cells([VEL], range(seeds), budget=FOUR, **arguments):
-        extra = matrix(cell) if cell.definition.rule is None else {}
-        store.add(finished(cell, ladder, **extra))
+    for record in records_of(suite, seeds, **arguments):
+        store.add(record)
     return store
 
 
@@ -105,11 +115,10 @@ def test_a_claim_needs_mean_interquartile_mean_and_interval() -> None:
     assert found.probability == pytest.approx(0.1, abs=0.05)
 
 
-def test_kinds_of_questions_are_compared_by_films(tmp_path: Path) -> None:
+def test_kinds_of_questions_are_compared_by_films() -> None:
     """A best of four shows twice as many films as a pair, graded or not."""
-    with fill(tmp_path / "store.sqlite", "answers") as store:
-        selection = Selection(SUITES["answers"], store.records())
-        tables = {table.title.partition("; ")[2]: table for table in suite_tables(selection)}
+    tables = suite_tables(selection_of("answers"))
+    tables = {table.title.partition("; ")[2]: table for table in tables}
     for oracle in (
         "exact answers",
         "Boltzmann answers",
@@ -162,10 +171,9 @@ def test_differences_are_paired_by_seed(tmp_path: Path) -> None:
     assert "| POEM (paper) | ANOLE | 2 | 0.0 [0.0, 0.0] |" in text
 
 
-def test_rows_of_table_3(tmp_path: Path) -> None:
-    selection = Selection(SUITES["table3"], fill(tmp_path / "store.sqlite").records())
-    rows = suite_rows(selection)
-    rows = [row for row in rows if row.entry == "methods"]
+def test_rows_of_table_3() -> None:
+    methods = ["poem-paper", "known-task"]
+    rows = [row for row in suite_rows(selection_of(methods=methods)) if row.entry == "methods"]
     wanted = ("method", "poem-paper", 5, None)
     [row] = [r for r in rows if (r.kind, r.method, r.queries, r.snapshot) == wanted]
     # Seeds' means are -20, -15, -10.
@@ -182,21 +190,18 @@ def test_rows_of_table_3(tmp_path: Path) -> None:
     assert [(r.mean, r.deviation, r.queries) for r in known] == [(-20.0, 5.0, None)]
 
 
-def test_an_unfinished_method_shows_the_seeds_that_there_are(tmp_path: Path) -> None:
-    with fill(tmp_path / "store.sqlite", seeds=1) as store:
-        selection = Selection(SUITES["table3"], store.records())
-    rows = [r for r in suite_rows(selection) if r.entry == "methods"]
+def test_an_unfinished_method_shows_the_seeds_that_there_are() -> None:
+    some = [*records_of(methods=["poem-paper"]), *records_of(seeds=1, methods=["anole"])]
+    rows = [r for r in suite_rows(Selection(SUITES["table3"], some)) if r.entry == "methods"]
+    final = {r.method: r.n_seeds for r in rows if r.kind == "method" and r.snapshot is None}
+    assert final == {"poem-paper": 3, "anole": 1}
     [row] = [r for r in rows if (r.method, r.queries, r.snapshot) == ("anole", 10, None)]
     assert (row.n_seeds, row.mean, row.deviation, row.iqm_low) == (1, -15.0, None, None)
 
 
-def test_noisy_answers_have_a_lower_limit(tmp_path: Path) -> None:
-    store = fill(tmp_path / "store.sqlite", "noise", seeds=1)
-    rows = [
-        r
-        for r in suite_rows(Selection(SUITES["noise"], store.records()))
-        if r.kind == "limit" and r.queries == 10
-    ]
+def test_noisy_answers_have_a_lower_limit() -> None:
+    selection = selection_of("noise", seeds=1, snapshots=1, methods=["poem-bayes", "known-task"])
+    rows = [r for r in suite_rows(selection) if r.kind == "limit" and r.queries == 10]
     by_oracle = {r.oracle: r.mean for r in rows if r.method == "known-task"}
     assert set(by_oracle) == {
         o.label for o in (BOLTZMANN, OracleSpec("mistake", 0.1), OracleSpec("mistake", 0.2))
@@ -205,14 +210,11 @@ def test_noisy_answers_have_a_lower_limit(tmp_path: Path) -> None:
     assert by_oracle[BOLTZMANN.label] < by_oracle["10 % of the answers flipped"]
 
 
-def test_other_budgets_stand_in_other_tables(tmp_path: Path) -> None:
-    with fill(tmp_path / "store.sqlite", seeds=1, snapshots=1) as store:
-        for cell in SUITES["table3"].cells(
-            [VEL], [0], ["anole"], replace(FOUR, episodes=3), snapshots=1
-        ):
-            store.add(finished(cell, ladder))
-        suite = replace(SUITES["table3"], entries=SUITES["table3"].entries[:1])
-        tables = suite_tables(Selection(suite, store.records()))
+def test_other_budgets_stand_in_other_tables() -> None:
+    suite = replace(SUITES["table3"], entries=SUITES["table3"].entries[:1])
+    more = suite.cells([VEL], [0], ["anole"], replace(FOUR, episodes=3), snapshots=1)
+    records = records_of(seeds=1, snapshots=1) + [finished(cell, ladder) for cell in more]
+    tables = suite_tables(Selection(suite, records))
     assert [table.title for table in tables] == [
         "HalfCheetahVel: 4 test tasks, 2 episodes each; methods, exact answers",
         "HalfCheetahVel: 4 test tasks, 2 episodes each; differences of methods, exact answers",
@@ -347,12 +349,8 @@ def test_every_format(tmp_path: Path) -> None:
     assert {row["suite"] for row in both} == {"table3", "shipped"}
 
 
-@pytest.mark.parametrize(
-    "suite", ["table3", pytest.param("noise", marks=pytest.mark.slow), "ablation", "epsilon"]
-)
-def test_figures(suite: str, tmp_path: Path) -> None:
-    store = fill(tmp_path / "store.sqlite", suite, seeds=1)
-    _, files = make_report(store, [suite], out=tmp_path)
+@pytest.mark.parametrize("suite", ["table3", "noise", "ablation"])
+def test_figures(suite: str) -> None:
     expected = {
         "table3": {f"{entry}-queries" for entry in ("methods", "prior", "informed", "parts")}
         | {"methods-samples"},
@@ -360,12 +358,18 @@ def test_figures(suite: str, tmp_path: Path) -> None:
         | {f"untold-{o}-queries" for o in ("boltzmann", "mistake-0.1", "mistake-0.2")}
         | {"methods-boltzmann-samples"},
         "ablation": {"design-queries", "design-samples", "rules-queries", "queries-queries"},
-        "epsilon": {"tolerance", "tolerance-cosine"},
     }[suite]
-    names = {f"{suite}-{name}{suffix}" for name in expected for suffix in (".png", ".pdf")} | {
-        f"{suite}.md"
-    }
-    assert {file.name for file in files} == names
+    figures = suite_figures(selection_of(suite, seeds=1))
+    assert figures.keys() == {f"{suite}-{name}" for name in expected}
+    assert all(figure.axes[0].get_lines() for figure in figures.values())
+
+
+def test_figures_are_written_beside_the_report(tmp_path: Path) -> None:
+    store = fill(tmp_path / "store.sqlite", "epsilon", seeds=1)
+    _, files = make_report(store, ["epsilon"], out=tmp_path)
+    figures = ("epsilon-tolerance", "epsilon-tolerance-cosine")
+    names = {f"{name}{suffix}" for name in figures for suffix in (".png", ".pdf")}
+    assert {file.name for file in files} == {*names, "epsilon.md"}
     assert all(file.stat().st_size > 500 for file in files)
     assert all(file.read_bytes()[:4] == b"\x89PNG" for file in files if file.suffix == ".png")
 
@@ -381,11 +385,8 @@ def test_a_store_without_final_cells_has_figures_along_the_training(tmp_path: Pa
     assert names == ["table3.md", "table3-methods-samples.png", "table3-methods-samples.pdf"]
 
 
-def test_lines_show_the_values_of_the_store(tmp_path: Path) -> None:
-    from sb3_poem.benchmark.figures import suite_figures
-
-    store = fill(tmp_path / "store.sqlite")
-    figures = suite_figures(Selection(SUITES["table3"], store.records()))
+def test_lines_show_the_values_of_the_store() -> None:
+    figures = suite_figures(selection_of(methods=["poem-bayes", "anole", "known-task"]))
     [axes] = figures["table3-methods-queries"].axes
     line = next(line for line in axes.get_lines() if line.get_label() == "ANOLE")
     np.testing.assert_allclose(line.get_xydata(), [[k, -20.0 + k] for k in (0, 1, 2, 3, 5, 7, 10)])
@@ -396,12 +397,9 @@ def test_lines_show_the_values_of_the_store(tmp_path: Path) -> None:
     np.testing.assert_allclose(line.get_xydata(), [[s, -10.0] for s in (200, 400, 600, 800, 1000)])
 
 
-def test_a_method_looks_the_same_in_all_figures_and_like_no_other(tmp_path: Path) -> None:
-    from sb3_poem.benchmark.figures import suite_figures
-
-    store = fill(tmp_path / "store.sqlite", snapshots=1)
+def test_a_method_looks_the_same_in_all_figures_and_like_no_other() -> None:
     looks: dict[str, dict[str, tuple[str, str]]] = {}
-    for name, figure in suite_figures(Selection(SUITES["table3"], store.records())).items():
+    for name, figure in suite_figures(selection_of(seeds=1, snapshots=1)).items():
         lines = [line for line in figure.axes[0].get_lines() if line.get_marker() != "None"]
         looks[name] = {line.get_label(): (line.get_color(), line.get_marker()) for line in lines}
         assert len(set(looks[name].values())) == len(lines)
@@ -421,10 +419,9 @@ def test_a_store_without_the_suite_is_refused(tmp_path: Path) -> None:
     assert make_report(store)[0].count("# Tolerance of the paper's rule") == 1
 
 
-def test_a_table_has_the_yardsticks_of_its_own_models_only(tmp_path: Path) -> None:
-    store = fill(tmp_path / "store.sqlite", "ablation", seeds=1, snapshots=1)
+def test_a_table_has_the_yardsticks_of_its_own_models_only() -> None:
     yardsticks: dict[str, set[str]] = {}
-    for row in suite_rows(Selection(SUITES["ablation"], store.records())):
+    for row in suite_rows(selection_of("ablation", seeds=1, snapshots=1)):
         if row.kind in ("limit", "known"):
             yardsticks.setdefault(row.entry, set()).add(row.method)
     assert yardsticks["rules"] == yardsticks["queries"] == {"known-task"}
