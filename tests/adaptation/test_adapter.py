@@ -69,7 +69,7 @@ def test_it_never_reads_rewards(rule):
     """NaN rewards and no reward features, with an oracle outside: the same policy, bit for bit."""
     seeing, blind = adapter(rule=rule), adapter(Blinded(make_env()), rule=rule)
     for a in (seeing, blind):
-        answer(a, 10)
+        answer(a, 3)
     assert blind.answers[0].shown[0].reward_features is None
     np.testing.assert_array_equal(seeing.policy().latent, blind.policy().latent)
 
@@ -99,13 +99,12 @@ def test_it_neither_reads_nor_sets_the_task():
     np.testing.assert_array_equal(env.task, GOAL)
 
 
-@pytest.mark.parametrize(
-    "rule", [*RULES, Bayes(query_rule="random"), Bayes(candidates="aggregate")]
-)
+@pytest.mark.parametrize("rule", [Bayes(query_rule="random"), Bayes(candidates="aggregate")])
 def test_equal_seeds_give_equal_policies(rule):
+    """Of the rules by their defaults, saved adaptations that go on exactly say so."""
     first, second, third = adapter(rule=rule), adapter(rule=rule), adapter(rule=rule, seed=1)
     for a in (first, second, third):
-        answer(a, 5)
+        answer(a, 3)
     np.testing.assert_array_equal(first.policy().latent, second.policy().latent)
     assert not np.array_equal(first.policy().latent, third.policy().latent)
 
@@ -175,14 +174,14 @@ def test_what_a_notebook_shows(point_goal):
 @pytest.mark.parametrize("rule", RULES)
 def test_undo_takes_the_last_answer_back(rule):
     plain, corrected = adapter(rule=rule), adapter(rule=rule)
-    answer(plain, 4)
-    answer(corrected, 2)
+    answer(plain, 3)
+    answer(corrected, 1)
     query = corrected.ask()
     before = corrected.policy().latent
     corrected.tell("equal")
     assert corrected.undo() is query
     np.testing.assert_array_equal(corrected.policy().latent, before)
-    assert corrected.n_answers == 2
+    assert corrected.n_answers == 1
     assert corrected.ask() is query
     answer(corrected, 2)
     np.testing.assert_array_equal(corrected.policy().latent, plain.policy().latent)
