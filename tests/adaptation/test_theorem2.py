@@ -102,16 +102,6 @@ def bound(epsilon):
     return np.array(masses)
 
 
-def test_the_recursion_is_theorem_3():
-    # Without the sampling error the recursion's solution is the formula that the paper prints.
-    epsilon = 0.1
-    c = np.sqrt(2 / np.pi) * SphereModel().lipschitz * slack(epsilon)
-    mass = 1.0
-    for k in range(1, K + 1):
-        mass = 0.5 * mass + c / 2
-        assert mass == pytest.approx((1 - c) / 2**k + c)
-
-
 @pytest.mark.parametrize("epsilon", [0.0, 0.05, 0.2])
 def test_the_density_at_the_truth_grows_as_the_bound_says(epsilon):
     for seed in range(4):
@@ -129,11 +119,6 @@ def test_it_can_fail_with_the_sign_of_the_papers_proof(monkeypatch):
     """
     widening = paper_module.tolerance
     monkeypatch.setattr(paper_module, "tolerance", lambda epsilon: -widening(epsilon))
-    assert not all(run(0.2, seed)[1] for seed in range(3))
-
-
-def test_it_can_fail_without_the_tolerance(monkeypatch):
-    monkeypatch.setattr(paper_module, "tolerance", lambda epsilon: 0.0)
     assert not all(run(0.2, seed)[1] for seed in range(3))
 
 
