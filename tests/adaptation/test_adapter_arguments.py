@@ -78,9 +78,11 @@ def test_only_whole_numbers_will_do(name, value):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"query_rule": "best"}, "`query_rule` must be one of"),
-        ({"candidates": "uniform"}, "`candidates` must be one of"),
-        ({"epsilon": 0.5}, "`epsilon` must be below 0.5"),
+        ({"query_rule": "best"}, "`query_rule` must be one of .*worst-case.*, but is 'best'"),
+        ({"candidates": "uniform"}, "`candidates` must be one of .*prior.*aggregate"),
+        ({"epsilon": 0.5}, "`epsilon` must be below 0.5, but is 0.5"),
+        ({"epsilon": -0.1}, "`epsilon` must be at least 0"),
+        ({"epsilon": float("nan")}, "`epsilon` must be a finite number"),
         ({"n_candidates": 1}, "`n_(candidates|particles)` must be at least 2"),
         ({"inference": "map"}, "`inference` must be one of .*bayes.*paper.*, but is 'map'"),
     ],
@@ -146,23 +148,19 @@ def test_the_policy_is_for_the_task_of_the_adapters_environment():
     a.close()
 
 
-@pytest.mark.parametrize(
-    "env",
-    [
-        lambda: POINT,
-        lambda: gym.make(POINT),
-        lambda: gym.make_vec(POINT, 2),
-        lambda: gym.make_vec(POINT, 2, vectorization_mode="sync"),
-        lambda: DummyVecEnv([lambda: gym.make(POINT)] * 2),
-        lambda: make_task_vec_env(POINT, 2),
-    ],
-)
-def test_models_and_environments_by_name_and_of_every_kind(env, point_goal):
-    expected = PreferenceAdapter(
-        point_goal, POINT, oracle=ReturnOracle(), seed=0, n_queries=2
-    ).adapt()
-    for name in (POINT_GOAL, pretrained_folder(POINT_GOAL)):
-        policy = PreferenceAdapter(name, env(), oracle=ReturnOracle(), seed=0, n_queries=2).adapt()
+def test_models_and_environments_by_name_and_of_every_kind(point_goal):
+    how = {"oracle": ReturnOracle(), "seed": 0, "n_queries": 2, "rule": SMALL}
+    expected = PreferenceAdapter(point_goal, POINT, **how).adapt()
+    for model, env in [
+        (POINT_GOAL, POINT),
+        (pretrained_folder(POINT_GOAL), POINT),
+        (point_goal, gym.make(POINT)),
+        (point_goal, gym.make_vec(POINT, 2)),
+        (point_goal, gym.make_vec(POINT, 2, vectorization_mode="sync")),
+        (point_goal, DummyVecEnv([lambda: gym.make(POINT)] * 2)),
+        (point_goal, make_task_vec_env(POINT, 2)),
+    ]:
+        policy = PreferenceAdapter(model, env, **how).adapt()
         np.testing.assert_allclose(policy.latent, expected.latent, atol=1e-6)
 
 

@@ -144,33 +144,3 @@ def test_reproducible_and_restorable():
     asked = [np.stack(inference.ask()) for inference in (first, second, third)]
     np.testing.assert_array_equal(asked[0], asked[1])
     np.testing.assert_array_equal(asked[0], asked[2])
-
-
-@pytest.mark.parametrize("rule", ["worst-case", "information-gain", "random"])
-@pytest.mark.parametrize("candidates", ["prior", "aggregate"])
-def test_every_rule_asks_about_two_policies(rule, candidates):
-    inference = make(query_rule=rule, candidates=candidates)
-    for _ in range(3):
-        left, right = inference.ask()
-        assert not np.array_equal(left, right)
-        inference.tell(LEFT, left, right)
-    assert inference.estimate().shape == (5,)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"epsilon": 0.5}, "`epsilon` must be below 0.5, but is 0.5"),
-        ({"epsilon": -0.1}, "`epsilon` must be at least 0"),
-        ({"epsilon": float("nan")}, "`epsilon` must be a finite number"),
-        ({"n_candidates": 1}, "`n_candidates` must be at least 2"),
-        (
-            {"candidates": "uniform"},
-            "`candidates` must be one of .*prior.*aggregate.*, but is 'uniform'",
-        ),
-        ({"query_rule": "best"}, "`query_rule` must be one of .*worst-case.*, but is 'best'"),
-    ],
-)
-def test_bad_options(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        make(**arguments)

@@ -87,7 +87,9 @@ def test_successes_are_those_of_the_evaluated_episodes(env_id):
     data = result.to_dict()
     assert data["success_rate"] == pytest.approx(expected.mean(axis=(0, 2)).tolist())
     assert np.array(data["task_success_rates"]) == pytest.approx(expected.mean(axis=2))
-    known = known_task_return(model, model.env, tasks, n_latents=5, n_episodes=3, seed=1)
+    known = known_task_return(
+        model, model.env, tasks, n_latents=5, n_episodes=3, seed=1, limits=False
+    )
     assert known.successes.shape == (6, 3)
     assert known.success_rate == known.successes.mean()
 
@@ -122,7 +124,6 @@ def test_the_callback_logs_them(env_id, name, tmp_path):
         assert 0.0 <= metrics[key] <= 1.0
         assert metrics[key] * 6 == pytest.approx(round(metrics[key] * 6))  # of 3 tasks x 2 episodes
     assert model.ep_success_buffer  # SB3's own rollout/success_rate
-    assert set(model.ep_success_buffer) <= {True, False}
 
 
 def test_the_command_line_reports_them(env_id, tmp_path, capsys):
