@@ -107,7 +107,7 @@ class RewardEncoder(th.nn.Module):
 
 
 def test_the_posterior_is_that_of_all_rewarded_trajectories(trained, monkeypatch):
-    monkeypatch.setitem(trained.policy._modules, "encoder", RewardEncoder())
+    monkeypatch.setattr(trained.policy, "encoder", RewardEncoder())
     env = walks(1)
     env.env_method("set_task", np.array([-0.5]))
     adapter = sighted(trained, env, n_queries=10, seed=1)
