@@ -78,13 +78,10 @@ def test_a_question_that_looked_alike_is_replaced_by_the_next_best(tmp_path, que
     assert len(looked) == 2
 
 
-@pytest.mark.parametrize("nothing", [1, None, 0.3])
-def test_an_oracle_that_returns_something_else(nothing):
-    with pytest.raises(
-        TypeError,
-        match=f"an answer to a pair question must be a Preference.*but is {nothing} of type",
-    ):
-        adapter(oracle=lambda left, right: nothing).adapt()
+def test_an_oracle_that_returns_nothing():
+    message = "an answer to a pair question must be a Preference.*but is None of type"
+    with pytest.raises(TypeError, match=message):
+        adapter(oracle=lambda left, right: None).adapt()
     with pytest.raises(ValueError, match="adapt\\(\\) needs an oracle"):
         adapter().adapt()
 
@@ -170,16 +167,16 @@ def test_the_best_of_four_is_asked_kept_and_answered_by_five_words():
             pair.tell("third")
 
 
-@pytest.mark.parametrize("rule", [Bayes(), Bayes(noise_model="infer"), Paper()])
-@pytest.mark.parametrize("graded", ["much left", Preference.MUCH_LEFT])
-def test_a_pair_takes_no_graded_answer(rule, graded):
+@pytest.mark.parametrize("rule", [Bayes(), Paper()])
+def test_a_pair_takes_no_graded_answer(rule):
     a = adapter(rule=rule)
     query = a.ask()
-    with pytest.raises(ValueError, match=r"a pair question .* 'much left', which only graded"):
-        a.tell(graded)
+    for graded in ("much left", Preference.MUCH_LEFT):
+        with pytest.raises(ValueError, match=r"a pair question .* 'much left', which only graded"):
+            a.tell(graded)
     assert a.pending is query
     with pytest.raises(ValueError, match=r"a pair question .* 'much left', which only graded"):
-        a.adapt(lambda left, right: graded)
+        a.adapt(lambda left, right: "much left")
 
 
 def test_who_answers_must_know_the_kind_of_the_questions():

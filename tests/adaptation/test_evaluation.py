@@ -8,7 +8,7 @@ from functools import partial
 import gymnasium as gym
 import numpy as np
 import pytest
-from scipy.stats import kendalltau, norm
+from scipy.stats import kendalltau
 from stable_baselines3.common.vec_env import DummyVecEnv
 from worlds import HORIZON, SpeedEnv, SpeedModel, SpeedVecEnv
 
@@ -117,7 +117,12 @@ def test_names_and_numbers_of_tasks_will_do():
     again = evaluate_adaptation(model, env, result.tasks, record_at=(0, 2), n_episodes=1, seed=4)
     np.testing.assert_allclose(again.returns, result.returns, atol=1e-4)
     known = known_task_return(
-        "PointGoal", gym.make_vec("poem/PointGoal-v0", 4), n_latents=8, n_episodes=1, seed=4
+        "PointGoal",
+        gym.make_vec("poem/PointGoal-v0", 4),
+        n_latents=8,
+        n_episodes=1,
+        seed=4,
+        limits=False,
     )
     assert known.tasks.shape == (30, 1)
     np.testing.assert_array_equal(known.tasks[:3], result.tasks)
@@ -162,9 +167,9 @@ def test_the_matrix_by_relabelling_is_that_by_rolling_out():
 
 
 def test_known_task_return():
-    known = known_task_return(MODEL, SpeedVecEnv(30), GOALS, n_latents=200, n_episodes=2)
+    known = known_task_return(MODEL, SpeedVecEnv(30), GOALS, n_latents=100, n_episodes=2)
     assert known.returns.shape == (30, 2)
-    assert known.candidate_returns.shape == (30, 200)
+    assert known.candidate_returns.shape == (30, 100)
     gaps = np.abs(MODEL.speed(known.latents) - GOALS[:, 0])
     np.testing.assert_allclose(known.returns[:, 0], -200 * gaps, atol=1e-3)
     tried = np.abs(MODEL.speed(known.candidate_latents)[None, :] - GOALS).min(axis=1)
@@ -180,7 +185,9 @@ def test_known_task_return():
 
 def test_known_task_return_of_policies_that_act_at_random():
     noisy, by_mode = (
-        known_task_return("PointGoal", "poem/PointGoal-v0", 2, 4, 2, deterministic=mode)
+        known_task_return(
+            "PointGoal", "poem/PointGoal-v0", 2, 4, 2, deterministic=mode, limits=False
+        )
         for mode in (False, True)
     )
     assert not np.array_equal(noisy.returns, by_mode.returns)
@@ -211,12 +218,12 @@ def test_winners_are_measured_on_fresh_episodes():
             return features[..., 0] + 0.0 * tasks[..., 0]
 
     known = known_task_return(
-        MODEL, DummyVecEnv([Lucky] * 10), GOALS[:3], n_latents=100, n_episodes=50
+        MODEL, DummyVecEnv([Lucky] * 10), GOALS[:3], n_latents=100, n_episodes=50, limits=False
     )
     assert known.candidate_returns.max() > 1.5 * HORIZON  # the best of a hundred draws
     assert abs(known.mean_return) < 0.5 * HORIZON
     env = DummyVecEnv([Lucky] * 10)
-    several = [known_task_return(MODEL, env, GOALS[:3], 20, 1, seed) for seed in range(5)]
+    several = [known_task_return(MODEL, env, GOALS[:3], 20, 1, seed) for seed in range(2)]
     best = np.mean([one.candidate_returns.max() for one in several])
     assert best > 1.2 * HORIZON
     assert np.mean([one.limit(10) for one in several]) < 0.6 * best  # nor does a limit live on luck
@@ -275,7 +282,7 @@ def test_random_answers_find_nothing():
             return (Preference.LEFT, Preference.RIGHT)[self.rng.integers(2)]
 
     result = evaluate_adaptation(
-        MODEL, SpeedVecEnv(60), GOALS, Coin, record_at=(5, 10), n_episodes=1, seed=1
+        MODEL, SpeedVecEnv(30), GOALS[::2], Coin, record_at=(2, 5), n_episodes=1, seed=1
     )
     # Without information about the goal -150 is the best there is, by always going at 1.5.
     assert np.all(result.mean_returns < -130)
@@ -309,12 +316,6 @@ def test_evaluation_is_reproducible():
     np.testing.assert_allclose(runs[0], runs[2], rtol=1e-6)
 
 
-def test_the_prior_of_the_toy_is_uniform_in_speed():
-    # The closed forms above stand on it.
-    quantiles = norm.ppf(np.linspace(0.1, 0.9, 9))
-    np.testing.assert_allclose(MODEL.speed(quantiles[:, None]), np.linspace(0.3, 2.7, 9))
-
-
 def test_each_measurement_is_told_as_it_comes_and_changes_nothing():
     tasks, told = GOALS[::12], []
     measured = evaluate_adaptation(
@@ -331,12 +332,3 @@ def test_each_measurement_is_told_as_it_comes_and_changes_nothing():
             MODEL, vec_env(4), adapted.latents[:, n - 1], tasks, 2, evaluation_seed(0)
         ).returns
         np.testing.assert_array_equal(one.returns[:, -1], alone)
-
-
-def test_the_progress_bar_counts_answers_and_comes_to_its_end(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    adapt_tasks(
-        MODEL, vec_env(), GOALS[:2], ReturnOracle, record_at=(0, 2), n_queries=5, progress_bar=True
-    )
-    assert "2/2" in capsys.readouterr().err
