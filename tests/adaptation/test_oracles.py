@@ -256,21 +256,20 @@ def test_the_best_of_four_wins_at_the_rates_that_are_claimed():
         ReturnOracle(env, question="graded")
 
 
-@pytest.mark.parametrize("video_format", ["gif", "mp4"])
-def test_a_person_sees_four_in_two_rows(tmp_path, video_format):
+def test_a_person_sees_four_in_two_rows(tmp_path):
     import imageio.v3 as imageio
 
     terminal = Terminal("1", "2", "3", "4", "0", "e", "fourth", "l", "third")
     lines = []
     oracle = HumanOracle(
-        tmp_path, video_format, read=terminal.read, write=lines.append, question="best-of-four"
+        tmp_path, "gif", read=terminal.read, write=lines.append, question="best-of-four"
     )
     shown = [at_speed(1.0, n, [frames(1, 60 * i)[0] for i in range(n)]) for n in (2, 3, 2, 1)]
     words = [oracle(*shown).value for _ in range(8)]
     assert words == ["first", "second", "third", "fourth", "equal", "equal", "fourth", "third"]
     assert "'l' is no answer." in lines
     assert set(terminal.prompts) == {PROMPTS["best-of-four"]}
-    film = imageio.imread(tmp_path / f"query-001.{video_format}")
+    film = imageio.imread(tmp_path / "query-001.gif")
     one = shown[0].frames[0].shape
     assert len(film) == 3
     assert film[0].shape[0] > 2 * one[0]

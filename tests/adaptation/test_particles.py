@@ -114,7 +114,7 @@ def test_many_answers_in_many_dimensions_do_not_thin_the_particles_out(likelihoo
     model = SpeedModel(latent_dim=32)
     inference = make(model, likelihood=likelihood)
     goal, rng = 2.2, np.random.default_rng(0)
-    for _ in range(50):
+    for _ in range(30):
         left, right = inference.ask()
         speeds = model.speed(left), model.speed(right)
         preference = LEFT if abs(speeds[0] - goal) < abs(speeds[1] - goal) else RIGHT

@@ -313,8 +313,9 @@ def test_what_would_quietly_train_something_else_is_refused(
 
 
 def test_lists_are_taken_as_hyperparameters(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.setattr("sb3_poem.benchmark.running.measure_pace", lambda *where: Pace(1e-4, 1e-2))
     runs = ["--runs", str(tmp_path), "--store", str(tmp_path / "s.sqlite")]
     assert (
         main(

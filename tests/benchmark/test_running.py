@@ -72,6 +72,12 @@ TRAINING = Training(1800, tuple(sorted(TINY_MODEL.items())))
 POINT = "poem/PointGoal-v0"
 
 
+@pytest.fixture(autouse=True)
+def few_other_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Limits that are chosen on five hundred other tasks take seconds each."""
+    monkeypatch.setattr("sb3_poem.adaptation.known_task.OTHER_TASKS", 40)
+
+
 @pytest.fixture(scope="module")
 def handed_over(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of models of one epoch; of PEARL's with and without its replay buffer."""
