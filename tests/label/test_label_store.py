@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import signal
+import multiprocessing
 import sqlite3
-import subprocess
-import sys
 from dataclasses import replace
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import pytest
@@ -66,10 +64,9 @@ def test_repeated_answers_count_once_and_late_ones_are_refused(store: Store) -> 
     other, _ = begin(store)
     waiting = store.turn(other, "question", 0)
     assert waiting is not None
-    with pytest.raises(RefusedError):
-        store.add_answer(session, waiting["id"], "left")  # another session's question
-    with pytest.raises(RefusedError):
-        store.add_answer(session, 10**9, "left")
+    for no_question in (waiting["id"], 10**9):  # another session's question, and nobody's
+        with pytest.raises(RefusedError, match="not the one that waits"):
+            store.add_answer(session, no_question, "left")
     assert preferences(store, session) == ["left"]
 
 
@@ -150,11 +147,11 @@ def test_the_target_the_stop_and_the_verdict(store: Store) -> None:
     assert store.add_turn(session, "result", 2, given, turn(), "result.mp4")
     result = store.turn(session, "result", 2)
     assert result is not None
-    with pytest.raises(RefusedError):
+    with pytest.raises(RefusedError, match="not the one that is shown"):
         store.judge(session, last["id"], "yes")
     store.judge(session, result["id"], "not quite")
     assert store.session(session).target == 4
-    with pytest.raises(RefusedError):
+    with pytest.raises(RefusedError, match="not the one that is shown"):
         store.judge(session, result["id"], "not quite")  # a repeated click asks for no more
     assert store.session(session).target == 4
     answer(store, session, "left")
@@ -178,30 +175,25 @@ def test_videos_without_a_turn_are_removed(store: Store) -> None:
     assert [file.name for file in store.videos.iterdir()] == ["0.mp4"]
 
 
-WRITER = """
-import sys
-sys.path.insert(0, {tests!r})
-from test_label_store import answer, begin
-from sb3_poem.label.store import Store
-store = Store(sys.argv[1])
-session, _ = begin(store, step=10**6)
-for n in range(10**6):
-    preference = ("left", "right", "equal")[n % 3]
-    answer(store, session, preference)
-    print(preference, flush=True)
-"""
+def answer_without_end(folder: Path, said: Connection) -> None:
+    store = Store(folder)
+    session, _ = begin(store, step=10**6)
+    for n in range(10**6):
+        preference = ("left", "right", "equal")[n % 3]
+        answer(store, session, preference)
+        said.send(preference)
 
 
 def test_a_kill_loses_no_answer(tmp_path: Path) -> None:
-    code = WRITER.format(tests=str(Path(__file__).parent))
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
-    said = [process.stdout.readline().strip() for _ in range(40)]
-    os.kill(process.pid, signal.SIGKILL)
-    said += process.stdout.read().split()
-    process.wait()
+    fork = multiprocessing.get_context("fork")
+    receiver, sender = fork.Pipe(duplex=False)
+    process = fork.Process(target=answer_without_end, args=(tmp_path, sender), daemon=True)
+    process.start()
+    said = [receiver.recv() for _ in range(40)]
+    process.kill()
+    process.join()
+    while receiver.poll():
+        said.append(receiver.recv())
     store = Store(tmp_path)
     kept = preferences(store, 1)
     store.close()
