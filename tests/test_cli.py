@@ -1,6 +1,7 @@
 """The command line, run as a user runs it, or in this process where that is slow."""
 
 import contextlib
+import multiprocessing
 import os
 import resource
 import shlex
@@ -26,16 +27,13 @@ def processor_seconds_of_children() -> float:
 
 
 def test_help_is_immediate_and_names_every_command() -> None:
-    seconds = []
-    for _ in range(3):
-        # Not the clock's time, which other tests share.
-        start = processor_seconds_of_children()
-        done = sb3_poem("--help")
-        seconds.append(processor_seconds_of_children() - start)
-        assert done.returncode == 0, done.stderr
-        for command in cli.COMMANDS:
-            assert f"\n    {command} " in done.stdout
-    assert min(seconds) < 1.0, seconds
+    start = processor_seconds_of_children()  # not the clock's time, which other tests share
+    done = sb3_poem("--help")
+    seconds = processor_seconds_of_children() - start
+    assert done.returncode == 0, done.stderr
+    for command in cli.COMMANDS:
+        assert f"\n    {command} " in done.stdout
+    assert seconds < 1.0
 
 
 @pytest.mark.parametrize("call", ["build_parser().format_help()", "main(['models'])"])
@@ -61,7 +59,7 @@ def test_help_ends_with_an_example(command: list[str], capsys: pytest.CaptureFix
     assert stop.value.code == 0
     last = capsys.readouterr().out.strip().splitlines()[-1]
     example = shlex.split(last.removeprefix("example:"))
-    assert example[: len(command) + 1][:2] == ["sb3-poem", command[0]], last
+    assert example[: len(command) + 1] == ["sb3-poem", *command], last
     if command[0] != "train":  # whose arguments are rl_zoo3's
         cli.build_parser().parse_args(example[1:])
 
@@ -84,41 +82,32 @@ def test_models_are_listed_a_line_each(capsys: pytest.CaptureFixture[str]) -> No
         ("sb3-poem adapt --oracle ", {"return", "boltzmann", "mistake", "human"}),
     ],
 )
-def test_a_shell_completes_the_line(line: str, expected: set[str], tmp_path: Path) -> None:
+def test_a_shell_completes_the_line(
+    line: str, expected: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     request = {
         "_ARGCOMPLETE": "1",
         "COMP_LINE": line,
         "COMP_POINT": str(len(line)),
         "_ARGCOMPLETE_IFS": "\n",
     }
-    environment = {**os.environ, **request, "_ARGCOMPLETE_STDOUT_FILENAME": str(tmp_path / "out")}
-    subprocess.run([sys.executable, "-m", "sb3_poem"], env=environment, check=True)
+    request["_ARGCOMPLETE_STDOUT_FILENAME"] = str(tmp_path / "out")
+    for name, value in request.items():
+        monkeypatch.setenv(name, value)
+    asked = multiprocessing.get_context("fork").Process(target=cli.main)  # which ends by itself
+    asked.start()
+    asked.join(60)
+    assert asked.exitcode == 0
     assert {word.strip() for word in (tmp_path / "out").read_text().splitlines()} == expected
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ([], "required"),
-        (["dance"], "invalid choice"),
-        (["adapt"], "--model"),
-        (["adapt", "--model", "x", "--colour", "red"], "--colour"),
-        (["adapt", "--model", "x", "--queries", "0"], "at least 1"),
-        (
-            ["adapt", "--model", "x", "--queries", "2.5"],
-            "--queries: invalid whole number value: '2.5'",
-        ),
-        (["adapt", "--model", "x", "--tasks", "0"], "at least 1"),
-        (["adapt", "--model", "x", "--oracle", "coin"], "invalid choice"),
-    ],
-)
-def test_a_wrong_command_is_refused(
-    arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]
+def test_a_flag_that_is_none_ends_as_a_wrong_command_does(
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     with pytest.raises(SystemExit) as stop:
-        cli.main(arguments)
+        cli.main(["adapt", "--model", "x", "--colour", "red"])
     assert stop.value.code == 2
-    assert words in capsys.readouterr().err
+    assert "--colour" in capsys.readouterr().err
 
 
 def test_a_missing_extra_is_named(
@@ -139,13 +128,8 @@ def test_unknown_model_lists_the_shipped_ones(capsys: pytest.CaptureFixture[str]
     assert all(name in error for name in resources.pretrained_names())
 
 
-def test_missing_model_file_is_named(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert cli.main(["adapt", "--model", str(tmp_path / "missing.zip")]) == 1
-    assert "missing.zip: there is no such file" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut off", b"not an archive at all" * 100])
-def test_truncated_or_foreign_model_file_is_refused(
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut off"])
+def test_a_truncated_model_file_is_refused(
     content: bytes, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     path = tmp_path / "model.zip"

@@ -153,22 +153,23 @@ def test_a_request_that_takes_too_long_is_told_so(serve: Serve) -> None:
     assert b"took too long" in answer
 
 
-@pytest.mark.parametrize(
-    "sent",
-    [
-        b"",
-        b"GET /nowhere HTTP/1.1\r\nHost: localhost\r\n\r\n",
-        b"GET /nowhere HTTP/1.1\r\nHost: localhost\r\n\r\nGET / HTTP/1.1\r\nHo",
-        POST + b"Content-Length: 99999\r\n\r\nx",
-        POST + b"Content-Length: 99999\r\n\r\n" + b"x" * 99999,
-        POST + b"Expect: 100-continue\r\nContent-Length: 5\r\n\r\n",
-        b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\r\n",
-    ],
-)
-def test_no_connection_is_held_for_ever(serve: Serve, sent: bytes) -> None:
-    read_all(
-        connect(serve(deadline=0.2), sent), seconds=3.0
-    )  # raises TimeoutError if the server does not close it
+def test_no_connection_is_held_for_ever(serve: Serve) -> None:
+    nowhere = b"GET /nowhere HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    upgrade = b"Connection: Upgrade\r\nUpgrade: websocket\r\n\r\n"
+    port = serve(deadline=0.2)
+    for held in [
+        connect(port, sent)
+        for sent in (
+            b"",
+            nowhere,
+            nowhere + b"GET / HTTP/1.1\r\nHo",
+            POST + b"Content-Length: 99999\r\n\r\nx",
+            POST + b"Content-Length: 99999\r\n\r\n" + b"x" * 99999,
+            POST + b"Expect: 100-continue\r\nContent-Length: 5\r\n\r\n",
+            b"GET / HTTP/1.1\r\nHost: localhost\r\n" + upgrade,
+        )
+    ]:
+        read_all(held, seconds=3.0)  # raises TimeoutError if the server does not close it
 
 
 def test_who_does_not_take_an_answer_is_left(serve: Serve) -> None:
@@ -233,27 +234,26 @@ def test_an_address_is_what_one_household_has(host: str, network: str) -> None:
     assert network_of(host) == network
 
 
+NO_REQUESTS = {
+    b"GET /\xff\xfe HTTP/1.1\r\nHost: localhost\r\n\r\n": b"400",
+    b"GET / HTTP/1.1\r\nHost: localhost\r\nHost: evil\r\n\r\n": b"400",
+    b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * 5000: b"400",
+    b"GET http://evil.example/ HTTP/1.1\r\nHost: localhost\r\n\r\n": b"404",
+    b"CONNECT evil.example:443 HTTP/1.1\r\nHost: localhost\r\n\r\n": b"404",
+    POST + b"Origin: http://[\r\nContent-Length: 0\r\n\r\n": b"403",
+    POST + b"Content-Length: " + b"9" * 5000 + b"\r\n\r\n": b"400",
+    POST + b"Content-Length: 3\r\nContent-Length: 4\r\n\r\nabc": b"400",
+    POST + b"Transfer-Encoding: chunked\r\n\r\n-1\r\n": b"400",
+    b"POST /start HTTP/1.1\r\nHost: evil\r\nTransfer-Encoding: chunked\r\n\r\n-1\r\n": b"400",
+}
+
+
 @pytest.mark.usefixtures("no_traceback")
-@pytest.mark.parametrize(
-    ("sent", "answer"),
-    [
-        (b"GET /\xff\xfe HTTP/1.1\r\nHost: localhost\r\n\r\n", b"400"),
-        (b"GET / HTTP/1.1\r\nHost: localhost\r\nHost: evil\r\n\r\n", b"400"),
-        (b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * 5000, b"400"),
-        (b"GET http://evil.example/ HTTP/1.1\r\nHost: localhost\r\n\r\n", b"404"),
-        (b"CONNECT evil.example:443 HTTP/1.1\r\nHost: localhost\r\n\r\n", b"404"),
-        (POST + b"Origin: http://[\r\nContent-Length: 0\r\n\r\n", b"403"),
-        (POST + b"Content-Length: " + b"9" * 5000 + b"\r\n\r\n", b"400"),
-        (POST + b"Content-Length: 3\r\nContent-Length: 4\r\n\r\nabc", b"400"),
-        (POST + b"Transfer-Encoding: chunked\r\n\r\n-1\r\n", b"400"),
-        (b"POST /start HTTP/1.1\r\nHost: evil\r\nTransfer-Encoding: chunked\r\n\r\n-1\r\n", b"400"),
-    ],
-)
-def test_what_is_no_request_is_refused_without_an_error(
-    serve: Serve, sent: bytes, answer: bytes
-) -> None:
+def test_what_is_no_request_is_refused_without_an_error(serve: Serve) -> None:
     port = serve(deadline=0.3)
-    assert read_all(connect(port, sent)).startswith(b"HTTP/1.1 " + answer)
+    answers = [(sent, connect(port, sent), code) for sent, code in NO_REQUESTS.items()]
+    for sent, connection, code in answers:
+        assert read_all(connection)[:12] == b"HTTP/1.1 " + code, sent[:80]
     assert status(port) == 200
 
 
@@ -354,7 +354,7 @@ def test_a_film_that_does_not_fit_on_the_disk_is_no_film(
 
 
 @pytest.mark.parametrize(
-    "command", [["--model", "PointGoal", "--port", "0"], ["export", "--out", "a.jsonl"], ["replay"]]
+    "command", [["--model", "PointGoal", "--port", "0"], ["export", "--out", "a.jsonl"]]
 )
 def test_commands_say_that_the_disk_is_full_or_the_store_broken(
     command: list[str],
@@ -413,7 +413,6 @@ def test_the_printed_links_host_can_be_reached(host: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "environment", "words"),
     [
-        (["--port", "99999999"], None, "--port 99999999: must be between 0 and 65535"),
         (["--auth-file", "missing"], None, "--auth-file missing: must be a text in UTF-8 (No such"),
         (
             ["--auth-file", "short"],
