@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -30,29 +31,31 @@ from sb3_poem.label.server import ROBOTS
 pytestmark = BROWSER
 
 
-@pytest.mark.parametrize("viewport", [PHONE, LANDSCAPE], ids=["upright", "on its side"])
 def test_four_on_a_phone(
-    open_page: Callable[..., Any],
-    of_four: ForkedServer,
-    point_goal: ModelInfo,
-    viewport: dict[str, int],
+    open_page: Callable[..., Any], of_four: ForkedServer, point_goal: ModelInfo
 ) -> None:
-    person = begin(open_page, of_four, point_goal, 2.0, viewport=viewport, has_touch=True)
+    person = begin(open_page, of_four, point_goal, 2.0, viewport=PHONE, has_touch=True)
     page = person.page
     person.answer(1)
-    assert page.evaluate("() => document.documentElement.scrollWidth") <= viewport["width"]
-    needed = [page.locator(f'[data-preference="{word}"]') for word in KEYS["best-of-four"]]
-    for element in (*page.locator("canvas").all(), page.locator("#play"), *needed):
-        box = element.bounding_box()
-        assert 0 <= box["x"] <= viewport["width"] - box["width"]
-        assert box["y"] + box["height"] <= viewport["height"]  # all that is needed is in sight
-        assert min(box["width"], box["height"]) >= 44
-    assert page.locator("canvas >> nth=0").bounding_box()["width"] >= 160
-    page.click("#full")
-    page.wait_for_function("() => document.fullscreenElement !== null")
-    boxes = [canvas.bounding_box() for canvas in page.locator("canvas").all()]
-    assert boxes[0]["y"] == boxes[1]["y"] < boxes[2]["y"] == boxes[3]["y"]
-    assert boxes[3]["y"] + boxes[3]["height"] <= viewport["height"]
+    full = "() => document.fullscreenElement !== null"
+    for viewport in (PHONE, LANDSCAPE):
+        page.set_viewport_size(viewport)
+        page.evaluate("() => scrollTo(0, 0)")
+        assert page.evaluate("() => document.documentElement.scrollWidth") <= viewport["width"]
+        needed = [page.locator(f'[data-preference="{word}"]') for word in KEYS["best-of-four"]]
+        for element in (*page.locator("canvas").all(), page.locator("#play"), *needed):
+            box = element.bounding_box()
+            assert 0 <= box["x"] <= viewport["width"] - box["width"]
+            assert box["y"] + box["height"] <= viewport["height"]  # all that is needed is in sight
+            assert min(box["width"], box["height"]) >= 44
+        assert page.locator("canvas >> nth=0").bounding_box()["width"] >= 160
+        page.click("#full")
+        page.wait_for_function(full)
+        boxes = [canvas.bounding_box() for canvas in page.locator("canvas").all()]
+        assert boxes[0]["y"] == boxes[1]["y"] < boxes[2]["y"] == boxes[3]["y"]
+        assert boxes[3]["y"] + boxes[3]["height"] <= viewport["height"]
+        page.click("#full")
+        page.wait_for_function(f"!({full})()")
 
 
 TOPS = """() => {
@@ -68,7 +71,7 @@ TOPS = """() => {
 
 
 @pytest.mark.parametrize("viewport", [DESKTOP, PHONE], ids=["desktop", "phone"])
-def test_the_answers_stay_where_they_are(
+def test_a_doubtful_pair_is_shown_again_and_the_answers_stay_where_they_are(
     open_page: Callable[..., Any], server: Server, point_goal: ModelInfo, viewport: dict[str, int]
 ) -> None:
     page = open_page(server.url, viewport=viewport)
@@ -80,37 +83,24 @@ def test_the_answers_stay_where_they_are(
     assert wish["y"] + wish["height"] <= films["y"]  # one wishes before one looks
     person = Person(server, page, point_goal, 2.5)
     page.evaluate("() => showError('The server does not answer. '.repeat(9))")
+    assert page.is_hidden("#doubt")
     person.say("much right" if "left" in person.judge() else "much left")
     while not page.is_visible("#doubt"):
         person.answer()
-    assert person.answered() < server.queries
+    assert "Look at pair 1 again?" in " ".join(page.inner_text("#doubt").split())
+    answered = person.answered()
+    assert answered < server.queries
     page.click("#again")
     page.wait_for_function("() => view.turn.repeats === 0 && !busy")
+    assert page.text_content("#task").startswith("Pair 1 once more: which")
+    assert page.is_hidden("#doubt")
+    assert person.answered() == answered
+    person.answer()
+    record = page.request.get(f"{page.url}/answers.json").json()
+    assert [answer["repeats"] for answer in record["answers"]] == [None] * answered + [0]
     person.answer(server.queries - person.answered())
     page.wait_for_selector("#result:visible")
     assert len(page.evaluate("() => [...tops]")) == 1
-
-
-def test_both_halves_of_the_film_are_in_step(
-    open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
-) -> None:
-    person = begin(open_page, server, point_goal, 1.0)
-    page = person.page
-    for frame in (0, 7, 24, 3):
-        page.evaluate("frame => player.seek(frame)", frame)
-        page.wait_for_function(
-            "frame => !player.video.seeking && player.frame === frame", arg=frame
-        )
-    page.evaluate("() => player.seek(24)")
-    page.wait_for_function(
-        "() => !player.video.seeking && document.querySelector('#frame').value === '24'"
-    )
-    left, right, race = (coloured(page, side) for side in ("left", "right", "race"))
-    # The dot of either side is on its own screen, and both are in the race.
-    assert min(left["blue"], right["orange"]) > 20
-    assert left["orange"] == right["blue"] == 0
-    assert min(race.values()) > 20
-    assert sum(race.values()) > 0.9 * max(left["blue"], right["orange"])  # one may hide the other
 
 
 def coloured(page: Any, side: str) -> dict[str, int]:
@@ -134,7 +124,7 @@ def coloured(page: Any, side: str) -> dict[str, int]:
 BACKGROUND = "element => getComputedStyle(element).backgroundColor"
 
 
-def test_both_robots_in_one_picture(
+def test_both_robots_beside_each_other_and_in_one_picture(
     open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
 ) -> None:
     person = begin(open_page, server, point_goal, 1.0)
@@ -145,9 +135,18 @@ def test_both_robots_in_one_picture(
 
     assert seen() == [False, False, True]  # which tells more where robots go to places
     assert page.get_attribute("#race", "aria-pressed") == "true"
-    page.evaluate("() => player.seek(player.frames - 1)")
-    page.wait_for_function("() => player.drawn === player.frames - 1")
-    assert min(coloured(page, "race").values()) > 20
+    for frame in (0, 7, 3, 24):
+        page.evaluate("frame => player.seek(frame)", frame)
+        page.wait_for_function(
+            "frame => player.drawn === frame && document.querySelector('#frame').value == frame",
+            arg=frame,
+        )
+    left, right, both = (coloured(page, side) for side in ("left", "right", "race"))
+    # The dot of either side is on its own screen, and both are in the race.
+    assert min(left["blue"], right["orange"]) > 20
+    assert left["orange"] == right["blue"] == 0
+    assert min(both.values()) > 20
+    assert sum(both.values()) > 0.9 * max(left["blue"], right["orange"])  # one may hide the other
     assert page.inner_text("#race-figure figcaption") == "Blue Orange"
     # All that names a side has the colour of its robot.
     for side, colour in zip(("left", "right"), PATH_COLOURS, strict=False):
@@ -205,14 +204,15 @@ def test_where_one_picture_tells_less_two_films_are_shown_at_first(
     assert seen() == [False, False, True]
 
 
-@pytest.mark.parametrize("viewport", [DESKTOP, PHONE, LANDSCAPE])
 def test_the_films_fill_the_screen(
-    open_page: Callable[..., Any], server: Server, point_goal: ModelInfo, viewport: dict[str, int]
+    open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
 ) -> None:
-    person = begin(open_page, server, point_goal, 2.0, viewport=viewport)
-    page, width, height = person.page, viewport["width"], viewport["height"]
-    full = "() => document.fullscreenElement !== null"
-    for screens in (["#race-screen"], ["#left-screen", "#right-screen"]):
+    person = begin(open_page, server, point_goal, 2.0)
+    page, full = person.page, "() => document.fullscreenElement !== null"
+    both = ["#left-screen", "#right-screen"]
+    for viewport, screens in product((DESKTOP, PHONE, LANDSCAPE), (["#race-screen"], both)):
+        page.set_viewport_size(viewport)
+        width, height = viewport["width"], viewport["height"]
         before = page.locator(screens[0]).bounding_box()["height"]
         page.keyboard.press("f")
         page.wait_for_function(full)
