@@ -22,6 +22,17 @@ def env_id(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
+@pytest.fixture(
+    params=[
+        *("poem/PointGoal-v0", "poem/HalfCheetahFwdBack-v0", "poem/AntGoal-v0"),
+        "poem/HumanoidDir2D-v0",
+    ]
+)
+def robot_id(request: pytest.FixtureRequest) -> str:
+    """One family of each robot, among them a finite one and one whose tasks are two numbers."""
+    return request.param
+
+
 @pytest.fixture
 def rng() -> np.random.Generator:
     """A generator for actions and tasks."""

@@ -11,11 +11,15 @@ from gymnasium import spaces
 from poem_envs import GoalFamily, TaskFamilyVector
 
 gym.register_envs(gymnasium_robotics)
-FETCH = [("poem/FetchReach-v0", "FetchReach-v4"), ("poem/FetchPush-v0", "FetchPush-v4")]
 
 
-@pytest.mark.parametrize(("env_id", "own_id"), FETCH)
-@pytest.mark.parametrize("reward_type", ["dense", "sparse"])
+@pytest.mark.parametrize(
+    ("env_id", "own_id", "reward_type"),
+    [
+        ("poem/FetchReach-v0", "FetchReach-v4", "sparse"),
+        ("poem/FetchPush-v0", "FetchPush-v4", "dense"),
+    ],
+)
 def test_rewards_are_the_environments_own(env_id, own_id, reward_type, rng):
     family = gym.make(env_id, reward_type=reward_type).unwrapped
     own = gym.make(own_id, reward_type=reward_type).unwrapped
