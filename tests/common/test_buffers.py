@@ -3,7 +3,6 @@
 import pickle
 
 import numpy as np
-import pytest
 import torch as th
 from gymnasium import spaces
 from hypothesis import given, settings
@@ -251,10 +250,3 @@ def test_reset_forgets() -> None:
     buffer.reset()
     assert buffer.size() == 0
     assert not buffer.full
-
-
-def test_needs_a_flat_box() -> None:
-    with pytest.raises((AssertionError, ValueError)):
-        TaskReplayBuffer(
-            10, spaces.Discrete(3), ACTION, "cpu", tasks=np.zeros((1, 1)), feature_dim=1
-        )

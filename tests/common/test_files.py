@@ -2,8 +2,8 @@
 
 import errno
 import os
-import subprocess
-import sys
+import re
+import resource
 from pathlib import Path
 from typing import BinaryIO
 
@@ -62,8 +62,7 @@ def test_permissions_are_those_of_any_new_file(path: Path, umask: int, mode: int
     assert path.stat().st_mode & 0o777 == mode
 
 
-@pytest.mark.parametrize("call", ["fsync", "replace"])
-@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO, errno.EROFS])
+@pytest.mark.parametrize(("call", "code"), [("fsync", errno.ENOSPC), ("replace", errno.EROFS)])
 def test_a_failure_leaves_the_previous_file_whole(
     path: Path, call: str, code: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -92,21 +91,14 @@ def test_an_interrupt_leaves_the_previous_file_whole(
 
 def test_a_full_disk_leaves_the_previous_file_whole(path: Path) -> None:
     """The kernel stops the write half-way, as it does on a full disk."""
-    program = """
-import resource, signal, sys
-from sb3_poem.common.files import write_atomically
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
-try:
-    write_atomically(sys.argv[1], b"x" * 3_000_000)
-except OSError as error:
-    print(error.errno, error)
-"""
-    result = subprocess.run(
-        [sys.executable, "-c", program, str(path)], capture_output=True, text=True, check=True
-    )
-    assert result.stdout.startswith(f"{errno.EFBIG} "), result
-    assert str(path) in result.stdout
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, before[1]))
+    try:
+        with pytest.raises(OSError, match=re.escape(str(path))) as caught:
+            write_atomically(path, b"x" * 3_000_000)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert caught.value.errno == errno.EFBIG
     assert_untouched(path)
 
 
