@@ -30,6 +30,8 @@ def two_tasks(env_id):
     return gym.make(env_id).unwrapped.sample_tasks(2, np.random.default_rng(3))
 
 
+# All whose tasks are drawn differently.
+@pytest.mark.parametrize("env_id", [*ROBOTS, "poem/HalfCheetahFwdBack-v0", "poem/AntVel-v0"])
 def test_the_task_shows_only_when_asked_for(env_id):
     env = gym.make(env_id, render_mode="rgb_array", **SIZE).unwrapped
     pictures = {}
@@ -108,7 +110,7 @@ def test_the_camera_follows_the_robot(env_id):
     env.unwrapped.states[0] = state
     there = env.render()
     middle = (slice(20, 70), slice(40, 80))
-    assert np.abs(here[middle].astype(int) - there[middle]).mean() < 25
+    assert np.abs(here[middle].astype(int) - there[middle]).mean() < 1
     env.close()
 
 
@@ -132,9 +134,8 @@ def test_other_modes_and_cameras():
     assert not np.array_equal(colours, from_afar)
 
 
-@pytest.mark.parametrize("env_id", ROBOTS)
-def test_rendering_without_a_mode(env_id):
-    env = gym.make(env_id).unwrapped
+def test_rendering_without_a_mode():
+    env = gym.make("poem/PointGoal-v0").unwrapped
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="without a render_mode"):
         assert env.render() is None
