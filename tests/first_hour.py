@@ -114,20 +114,15 @@ def works(name: str, call: Callable[[Path], Any], outcome: Any = True) -> Any:
     return pytest.param(call, outcome, id=name)
 
 
-def check_outcome(value: Any, outcome: Any) -> None:
-    """Whether it is the outcome of a row."""
-    if callable(outcome) and not isinstance(outcome, type):
-        assert outcome(value), value
-    else:
-        assert value == outcome
-
-
 def check_works(call: Callable[[Path], Any], outcome: Any, folder: Path) -> None:
     """Whether a row of :func:`works` does, without a warning."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         value = call(folder)
-    check_outcome(value, outcome)
+    if callable(outcome) and not isinstance(outcome, type):
+        assert outcome(value), value
+    else:
+        assert value == outcome
 
 
 def names(folder: Path, pattern: str = "*") -> list[str]:
