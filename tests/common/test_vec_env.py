@@ -1,8 +1,6 @@
 """TaskVecEnv against SB3's DummyVecEnv of single environments."""
 
 import functools
-import subprocess
-import sys
 import warnings
 
 import gymnasium as gym
@@ -22,12 +20,7 @@ from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.vec_env import TaskVecEnv, as_task_vec_env, make_task_vec_env
 
 SMALL = {"buffer_size": 500, "batch_size": 16, "policy_kwargs": {"net_arch": [8]}, "device": "cpu"}
-FAMILIES = [
-    "poem/PointGoal-v0",
-    "poem/HalfCheetahVel-v0",
-    "poem/AntFwdBack-v0",
-    "poem/HumanoidDir2D-v0",
-]
+POINT = "poem/PointGoal-v0"
 
 
 def random_actions(env, steps, seed=0):
@@ -38,7 +31,8 @@ def random_actions(env, steps, seed=0):
     )
 
 
-@pytest.mark.parametrize("env_id", FAMILIES)
+# of the second some episodes end early
+@pytest.mark.parametrize("env_id", [POINT, "poem/HumanoidDir2D-v0"])
 def test_gives_what_dummy_vec_env_gives(env_id):
     n_envs, steps = 4, 60
     env_kwargs = {"max_episode_steps": 20}
@@ -84,7 +78,7 @@ def test_gives_what_dummy_vec_env_gives(env_id):
     assert ended >= 3 * n_envs
 
 
-@pytest.mark.parametrize("env_id", FAMILIES)
+@pytest.mark.parametrize("env_id", [POINT, "poem/HalfCheetahFwdBack-v0"])
 def test_a_copy_looks_like_a_single_environment(env_id):
     ours, theirs = make_task_vec_env(env_id, 3), make_vec_env(env_id, 3)
     for name in ("task_space", "all_tasks", "shared_dynamics", "reward_feature_dim", "task"):
@@ -280,19 +274,16 @@ def test_learning_is_the_same_as_with_dummy_vec_env():
     )
 
 
-def test_takes_environments_that_were_made_after_an_import_of_rl_zoo3():
+def test_takes_environments_that_were_made_after_an_import_of_rl_zoo3(monkeypatch):
     """rl_zoo3 patches Gymnasium's TimeLimit when it is imported, whoever imported that before."""
-    code = """
-import gymnasium as gym
-from sb3_poem.common.vec_env import TaskVecEnv
-import rl_zoo3.gym_patches
-env = TaskVecEnv([lambda: gym.make("poem/PointGoal-v0")] * 2)
-assert env.reset().shape == (2, 2)
-"""
-    subprocess.run([sys.executable, "-c", code], check=True)
+    from rl_zoo3.gym_patches import PatchedTimeLimit
 
-
-POINT = "poem/PointGoal-v0"
+    # as that one, also if it was there before TaskVecEnv
+    names = {"__module__": PatchedTimeLimit.__module__}
+    monkeypatch.setattr(gym.wrappers, "TimeLimit", type("Later", (PatchedTimeLimit,), names))
+    env = TaskVecEnv([functools.partial(gym.make, POINT)] * 2)
+    assert env.env_is_wrapped(gym.wrappers.TimeLimit) == [True, True]
+    assert env.reset().shape == (2, 2)
 
 
 @pytest.mark.parametrize(
