@@ -90,8 +90,24 @@ class ObservationsInADict(Walk):
     observation_space = spaces.Dict(x=Walk.observation_space)
 
 
+class ObservationsInRows(Walk):
+    observation_space = spaces.Box(-10.0, 10.0, (1, 2), np.float64)
+
+
+class NumberedActions(Walk):
+    action_space = spaces.Discrete(3)
+
+
 class UnboundedActions(Walk):
     action_space = spaces.Box(-np.inf, np.inf, (1,), np.float32)
+
+
+class ActionsBoundedBelow(Walk):
+    action_space = spaces.Box(0.0, np.inf, (1,), np.float32)
+
+
+class ActionsBoundedAbove(Walk):
+    action_space = spaces.Box(-np.inf, 0.0, (1,), np.float32)
 
 
 class Float32Tasks(Walk):
@@ -305,8 +321,12 @@ class InfinitePotential(Walk):
 
 BROKEN = [
     (NoFamily, "must be a task family.*subclass poem_envs.TaskFamily"),
-    (ObservationsInADict, "observation_space must be a flat"),
-    (UnboundedActions, "action_space must be .* bounded"),
+    (ObservationsInADict, "observation_space must be a flat .*Box, but is Dict"),
+    (ObservationsInRows, "observation_space must be a flat .*Box, but is Box"),
+    (NumberedActions, r"action_space must be .* bounded .*, but is Discrete\(3\)"),
+    (UnboundedActions, "action_space must be .* bounded below and above, but is"),
+    (ActionsBoundedBelow, "action_space must be .* bounded below and above, but is"),
+    (ActionsBoundedAbove, "action_space must be .* bounded below and above, but is"),
     (Float32Tasks, "task_space must be a .*Box of shape .* float64"),
     (NoFeatureDim, "reward_feature_dim must be a whole number"),
     (TwiceTheSameTask, "all_tasks must have shape .* hold every task once"),
