@@ -2,11 +2,9 @@
 
 import doctest
 import importlib
-import io
 import re
 import runpy
 import shlex
-import shutil
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -21,7 +19,6 @@ from sybil.parsers.markdown import CodeBlockParser
 from poem_envs.testing import check_task_family
 from sb3_poem import PEARLSAC, POEMSAC, PreferenceAdapter, cli
 from sb3_poem.cli import experiment
-from sb3_poem.resources import config_file, shipped_folder
 
 TOP = Path(__file__).parents[1]
 PAGES = (
@@ -37,21 +34,17 @@ LEARN = PEARLSAC.learn
 TINY = "--env-kwargs width:48 height:48"
 #: Further words by subcommand, of which the last counts: as little as can be done
 SMALL = {
-    "train": "-n 1500 --n-trials 1 --verbose 0",
+    "train": "-n 1500 --verbose 0",
     "enjoy": "--no-render --queries 1",
     "record-video": f"--queries 1 {TINY}",
     "adapt": f"--tasks 1 --episodes 1 --queries 2 {TINY}",
     "benchmark": "--list",
 }
-#: Pages to be served, and tables of records that a run has to make first: only read
-ONLY_READ = ("label", "benchmark report", "benchmark run --backend ray")
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A working folder with what the commands name."""
-    shutil.copy(config_file("poem_sac"), tmp_path / "my.yml")
-    (tmp_path / "pretrained").symlink_to(shipped_folder("pretrained"))
+    """The working folder."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -112,9 +105,10 @@ def test_examples_in_docstrings_run(
 
 def test_every_public_class_has_an_example() -> None:
     ours = ("", ".adaptation", ".baselines", ".label", ".pearl_sac", ".poem_sac")
-    for module in ("poem_envs", *(f"sb3_poem{package}" for package in ours)):
-        for name, public in public_classes(module):
-            assert ">>> " in (public.__doc__ or ""), name
+    modules = ("poem_envs", *(f"sb3_poem{package}" for package in ours))
+    found = dict(each for module in modules for each in public_classes(module))
+    assert len(found) > 40
+    assert [name for name, public in found.items() if ">>> " not in (public.__doc__ or "")] == []
 
 
 def public_classes(module: str) -> Iterator[tuple[str, type]]:
@@ -148,21 +142,17 @@ def test_readme_s_commands_run(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(PEARLSAC, "learn", learn_quickly)
-    for name in ("AdaptationEvalCallback", "TrialAdaptationCallback"):
-        monkeypatch.setattr(experiment, name, partial(getattr(experiment, name), n_tasks=2))
+    few = partial(experiment.AdaptationEvalCallback, n_tasks=2)
+    monkeypatch.setattr(experiment, "AdaptationEvalCallback", few)
+    ran = []
     for command in commands("README.md"):
-        if any(set(some.split()) <= set(command.split()) for some in ONLY_READ):
+        words = shlex.split(re.sub("HalfCheetahVel|AntGoal", "PointGoal", command))[1:]
+        if words[0] == "label":  # which serves a page
             continue
-        little = re.sub("HalfCheetahVel|AntGoal", "PointGoal", command)
-        # the third run is the one that keeps a checkpoint, by --save-freq
-        words = shlex.split(little.replace("_1/checkpoint", "_3/checkpoint"))[1:]
-        monkeypatch.setattr("sys.stdin", io.StringIO("l\n" * 20))
-        more = SMALL.get(words[0], "").split()
-        if "human" in words:
-            more = ["--queries", "2", *TINY.split()]
-        if words[0] == "train" and "-P" not in words:  # whose best model is adapted further down
-            more += ["--eval-freq", "-1"]
-        assert cli.main([*words, *more]) == 0, (command, capsys.readouterr().err[-2000:])
+        ran.append(words[0])
+        status = cli.main([*words, *SMALL[words[0]].split()])
+        assert status == 0, (command, capsys.readouterr().err[-2000:])
+    assert set(ran) == set(SMALL)
 
 
 def test_every_kind_of_command_is_shown() -> None:
@@ -209,7 +199,7 @@ def test_results_are_small_and_listed() -> None:
     """
     results = TOP / "benchmarks/results"
     files = [file for file in results.rglob("*") if file.is_file() and file.suffix != ".pdf"]
-    assert sum(file.stat().st_size for file in files) < 4e6
+    assert 0 < sum(file.stat().st_size for file in files) < 4e6
     for file in files:
         manifest = (file.parent / "manifest.md").read_text()
         assert file.name == "manifest.md" or f"({file.name})" in manifest, file.relative_to(TOP)

@@ -200,18 +200,11 @@ def test_wheel_works_installed_elsewhere(wheel: Path, tmp_path: Path) -> None:
     from the checkout.
     """
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    subprocess.run([sys.executable, "-m", "venv", str(tmp_path / "venv")], check=True)
+    command = [sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")]
+    subprocess.run(command, check=True)
     python = tmp_path / "venv/bin/python"
-    install = [
-        str(python),
-        "-m",
-        "pip",
-        "install",
-        "--quiet",
-        "--no-deps",
-        "--no-index",
-        str(wheel),
-    ]
+    install = [sys.executable, "-m", "pip", "--python", str(python), "install", "--quiet"]
+    install += ["--no-deps", "--no-index", str(wheel)]
     subprocess.run(install, check=True, cwd=tmp_path, env=environment)
     # A plain path line: the .pth files in that folder, and so the editable install of the checkout,
     # are not read.
