@@ -35,7 +35,6 @@ NO_PLAYWRIGHT = importlib.util.find_spec("playwright") is None
 BROWSER = [
     pytest.mark.skipif(NO_PLAYWRIGHT, reason="the Python package playwright is not installed"),
     pytest.mark.skipif(CHROMIUM is None, reason="no chromium: apt-get install chromium"),
-    pytest.mark.xdist_group("browser"),
 ]
 SEED = 3
 DESKTOP, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
