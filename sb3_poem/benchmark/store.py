@@ -14,6 +14,7 @@ from sb3_poem import __version__
 SCHEMA = "3"
 BUSY_SECONDS = 120
 TABLES = """
+PRAGMA page_size = 1024; -- a cell takes 3 KB
 CREATE TABLE IF NOT EXISTS about (name TEXT PRIMARY KEY NOT NULL, value TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS cells (
     key TEXT PRIMARY KEY NOT NULL,
