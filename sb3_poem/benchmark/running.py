@@ -220,6 +220,7 @@ def export_model(cells: Sequence[Cell], library: ModelLibrary, store: Store, fol
     order |= {"env_steps": known.result["training_samples"], "updates": known.result["updates"]}
     tasks = f"adaptation to {len(known.result['tasks'])} unseen tasks"
     card: dict[str, Any] = {
+        **training.get("card", {}),  # of a model that was handed over
         **{name: training[name] for name in ("command", "commit", "machine") if name in training},
         "seed": cells[0].seed,
         "wall_seconds": training.get("seconds"),

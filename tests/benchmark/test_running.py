@@ -265,12 +265,17 @@ def test_what_ships_is_exported_with_what_it_earns(
     tmp_path: Path, handed_over: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["benchmark", "run", "--seeds", "1", "--families", "PointGoal", "--tasks", "2"]
-    words += ["--episodes", "1", "--models", str(handed_over / "all"), "--runs", str(tmp_path)]
+    words += ["--episodes", "1", "--models", str(tmp_path / "given"), "--runs", str(tmp_path)]
     words += ["--store", str(tmp_path / "s.sqlite"), "--export", str(tmp_path / "out")]
+    known = {"command": "sb3-poem train", "commit": "abc", "note": "of a test", "license": "gpl"}
+    trained = POEMSAC.load(handed_over / "all/PointGoal/poem/seed0.zip")
+    trained.save_pretrained(tmp_path / "given/PointGoal", {**known, "wall_seconds": 60.0})
     assert main([*words, "--suite", "shipped"]) == 0
     model = POEMSAC.from_pretrained(tmp_path / "out" / "PointGoal")
     assert model.num_timesteps == 300
-    results = json.loads((tmp_path / "out/PointGoal/config.json").read_text())["card"]["results"]
+    card = json.loads((tmp_path / "out/PointGoal/config.json").read_text())["card"]
+    assert {**known, "wall_seconds": 60.0}.items() <= card.items()  # what its folder told of it
+    results = card["results"]
     earned = results["adaptation to 2 unseen tasks"]
     assert [one["inference"] for one in earned] == ["bayes", "paper"]
     with Store(tmp_path / "s.sqlite") as store:
