@@ -83,7 +83,7 @@ def cell_seconds(cell: Cell, pace: Pace) -> float:
         return (episodes + budget.tasks * budget.episodes) * facts.horizon * pace.step
     episodes = budget.tasks * budget.episodes * len(budget.record_at)
     if method.rule != "ANOLE" or method.library:  # else it asks about what there is
-        episodes += budget.tasks * 2 * queries
+        episodes += budget.tasks * method.films * queries
     asks = method.options.get("strategy", method.rule)
     updates = UPDATES_PER_ANSWER.get(asks, 0.0)
     if asks == "greedy":

@@ -14,6 +14,7 @@ from sb3_poem.benchmark.estimate import Pace, cell_seconds, training_seconds
 from sb3_poem.benchmark.store import Record, Store
 from sb3_poem.benchmark.suites import SUITES, Budget, ModelKey, digest
 
+FOUR = "poem-bayes-best-of-four"
 RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
 
 
@@ -69,6 +70,12 @@ def test_the_estimate_grows_with_what_is_asked_for() -> None:
         for name in ("pearl", "maml-reward")
     )
     assert both < alone
+    cells = SUITES["answers"].cells(["poem/AntVel-v0"], [0], ["poem-bayes", FOUR], snapshots=1)
+    pair, four = (
+        cell_seconds(next(cell for cell in cells if cell.method == name), Pace(1e-4, 0.0))
+        for name in ("poem-bayes", FOUR)
+    )
+    assert four - pair == pytest.approx(30 * 10 * 2 * 200 * 1e-4)  # tasks, questions, films, steps
 
 
 def test_the_list_estimates_each_training_and_the_whole(
