@@ -389,4 +389,6 @@ def _latex(table: Table) -> str:
     lines += [rf"\begin{{tabular}}{{l{'r' * (len(table.header) - 1)}}}", r"\toprule"]
     lines += [" & ".join(cell.translate(escape) for cell in table.header) + r" \\", r"\midrule"]
     lines += [" & ".join(cell.translate(escape) for cell in row) + r" \\" for row in table.rows]
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", r"\end{table}"])
+    lines += [r"\bottomrule", r"\end{tabular}"]
+    lines += [r"\par " + note.translate(escape) for note in table.notes]
+    return "\n".join([*lines, r"\end{table}"])

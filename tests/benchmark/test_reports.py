@@ -339,6 +339,7 @@ def test_every_format(tmp_path: Path) -> None:
     latex, _ = make_report(store, ["table3"], kind="latex")
     assert r"POEM (paper) & 3 & -19.0 $\pm$ 5.0 & " in latex
     assert latex.count(r"\begin{tabular}") == latex.count(r"\end{tabular}") == 7
+    assert r"\par task known (POEM's policies): -20.0 $\pm$ 5.0" in latex
     assert "95 %" not in latex.replace(r"95 \%", "")
     table = list(csv.DictReader(io.StringIO(make_report(store, ["table3"], kind="csv")[0])))
     data = json.loads(make_report(store, ["table3"], kind="json")[0])
