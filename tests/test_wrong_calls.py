@@ -427,7 +427,9 @@ ADAPTERS = [
         lambda _: evaluated(oracle_factory=ReturnOracle()),
         "oracle_factory...ReturnOracle",
     ),
-    refused("evaluate tasks", lambda _: evaluated(tasks=[[1.0, 2.0]]), r"tasks has shape..., 1\)"),
+    refused(
+        "evaluate tasks", lambda _: evaluated(tasks=[[1.0, 2.0]]), r"\(n_tasks, 1\)...\(1, 2\)"
+    ),
     argument(evaluated, "record_at", (), "at least one"),
     refused("AdaptedPolicy of nothing", lambda s: AdaptedPolicy.load(s / "no"), "no such file"),
     refused(

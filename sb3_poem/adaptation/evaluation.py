@@ -85,10 +85,7 @@ def adapt_tasks(
     """
     model, vec_env = model_and_env(model, env)
     _check_factory(oracle_factory)
-    tasks = np.asarray(tasks, dtype=np.float64)
-    if tasks.ndim != 2 or len(tasks) < 1:
-        expected = "shape (n_tasks, task_dim) with at least one task"
-        raise ValueError(f"`tasks` must have {expected}, but has shape {tasks.shape}")
+    tasks = _check_tasks(tasks, vec_env)
     check_whole("seed", seed, 0)
     check_whole("n_queries", n_queries, 1)
     record_at = range(n_queries + 1) if record_at is None else record_at
@@ -343,7 +340,15 @@ def choose_test_tasks(
     if tasks is None or isinstance(tasks, (int, np.integer)):
         n_tasks = N_TEST_TASKS if tasks is None else int(tasks)
         return FamilyView.for_training(vec_env, model.horizon).test_tasks(n_tasks, seed)
-    return np.asarray(tasks, dtype=np.float64)
+    return _check_tasks(tasks, vec_env)
+
+
+def _check_tasks(tasks: np.ndarray, vec_env: VecEnv) -> np.ndarray:
+    tasks, dim = np.asarray(tasks, dtype=np.float64), FamilyView(vec_env).task_dim
+    if tasks.shape[1:] != (dim,) or not tasks.size:
+        expected = f"shape (n_tasks, {dim}) with at least one task"
+        raise ValueError(f"`tasks` must have {expected}, but has shape {tasks.shape}")
+    return tasks
 
 
 def evaluation_seed(seed: int, stream: int = 0) -> int:

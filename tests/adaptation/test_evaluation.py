@@ -55,6 +55,10 @@ def vec_env(n=10, **kwargs):
         ),
         (lambda: known_task_return(MODEL, vec_env(1), GOALS, 0), "`n_latents` must be at least 1"),
         (
+            lambda: known_task_return(MODEL, vec_env(1), GOALS[:, 0]),
+            r"`tasks` must have shape \(n_tasks, 1\) with at least one task, but has shape \(",
+        ),
+        (
             lambda: known_task_return(MODEL, vec_env(1), GOALS, selection_episodes=0),
             "`selection_episodes` must be at least 1",
         ),
