@@ -91,6 +91,7 @@ def make_report(
     :raises ValueError: If the store holds nothing of what is asked for.
     """
     records = [record for record in store.records() if seeds is None or record.seed in seeds]
+    narrowed = [*(families or []), *(f"seed {seed}" for seed in seeds or [])]
     texts: list[str] = []
     rows: list[Row] = []
     files: list[Path] = []
@@ -105,7 +106,8 @@ def make_report(
             for condition in selection.conditions
         ):
             if suites:
-                raise ValueError(f"--suite {name}: {store.path} holds no finished cell of it")
+                of = ", ".join(["it", *narrowed])
+                raise ValueError(f"--suite {name}: {store.path} holds no finished cell of {of}")
             continue
         if kind in ("md", "latex"):
             text = format_tables(selection.suite.title, suite_tables(selection), kind)
@@ -118,8 +120,8 @@ def make_report(
             file.write_text(text)
             files += [file, *write_figures(selection, out)]
     if not texts:
-        own = ["the suites' families (name others by --families)"]
-        of = ", ".join([*(families or own), *(f"seed {seed}" for seed in seeds or [])])
+        own = [] if families else ["the suites' families (name others by --families)"]
+        of = ", ".join([*own, *narrowed])
         raise ValueError(f"{store.path} holds no finished cell of {of}")
     return format_rows(rows, kind) if rows else "\n".join(texts), files
 
