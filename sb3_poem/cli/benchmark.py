@@ -54,7 +54,8 @@ def _run(arguments: argparse.Namespace) -> int:
     for failure in failures:
         print(f"FAILED {failure}")
     left = f", {len(failures)} failed: the same command tries them again" if failures else ""
-    print(f"{len(plan.todo) - len(failures)} cells run{left}")
+    finished = store.keys()
+    print(f"{sum(cell.key in finished for cell in plan.todo)} cells run{left}")
     if failures:
         return 1
     cells = [cell for cell in (*plan.done, *plan.todo) if cell.seed == arguments.first_seed]

@@ -408,6 +408,21 @@ def test_cells_whose_model_another_process_trains_come_last(
     assert len(store.keys()) == 2
 
 
+def test_cells_that_failed_are_not_counted_as_run(
+    tmp_path: Path,
+    handed_over: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """With Ray a model that cannot be trained fails by itself, and then with each cell."""
+    failures = ["poem", "poem-paper, return", "poem-paper, Boltzmann"]
+    monkeypatch.setattr("sb3_poem.cli.benchmark.run_with_ray", lambda *_: failures)
+    words = ["--models", str(handed_over / "all"), "--store", str(tmp_path / "s.sqlite")]
+    words += ["--runs", str(tmp_path), "--seeds", "1", "--methods", "poem-paper"]
+    assert main(["benchmark", "run", "--suite", "smoke", *words, "--backend", "ray"]) == 1
+    assert "\n0 cells run, 3 failed" in capsys.readouterr().out
+
+
 def test_processes_that_keep_models_apart_share_the_cells_of_a_store(
     tmp_path: Path, handed_over: Path
 ) -> None:
