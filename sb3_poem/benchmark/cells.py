@@ -189,7 +189,8 @@ def verify_cell(record: Record, library: ModelLibrary, say: Say = print) -> list
         raise ValueError(f"the identity of cell {record.key} has the key {cell.key}: {changed}")
     origin, state = library.origin(cell.model_key), library.state(cell.model_key)
     # What was handed over may be this model under another name: its figures tell.
-    if state != "handed over" and (origin != cell.model or state != "trained"):
+    is_told = state == "handed over" and cell.snapshot is None
+    if not is_told and (origin != cell.model or state != "trained"):
         raise ValueError(
             f"cell {record.key} needs the model of {cell.model!r}, but for {cell.model_key} there "
             f"is that of {origin!r}, {state}: say where it is by --runs, --models or --model"

@@ -225,6 +225,11 @@ def test_a_finished_cell_is_verified(
     nowhere = ["--runs", str(tmp_path / "nowhere"), "--store", words[-1], "--cell", missing.key]
     assert main(["benchmark", "verify", *nowhere]) != 0  # and nothing is trained
     assert "missing: say where it is by --runs" in capsys.readouterr().err
+    early = replace(missing, snapshot=0.5)  # which no model that was handed over is
+    with Store(words[-1]) as store:
+        store.add(replace(record, key=early.key, identity=early.identity()))
+    assert main(["benchmark", "verify", *words, "--cell", early.key]) != 0
+    assert "handed over: say where it is by --runs" in capsys.readouterr().err
     words[1] = str(handed_over / "without")
     assert main(["benchmark", "verify", *words, "--cell", key]) != 0
     assert "say where it is by --runs, --models or --model" in capsys.readouterr().err
