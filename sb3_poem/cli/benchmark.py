@@ -10,7 +10,15 @@ from sb3_poem.benchmark.models import ModelLibrary, Workplace, model_folder
 from sb3_poem.benchmark.ray_backend import run_with_ray
 from sb3_poem.benchmark.running import Plan, describe, export_model, make_plan, run_cells
 from sb3_poem.benchmark.store import Store
-from sb3_poem.benchmark.suites import SUITES, Budget, Training, family_id, family_label, hashable
+from sb3_poem.benchmark.suites import (
+    SUITES,
+    Budget,
+    Cell,
+    Training,
+    family_id,
+    family_label,
+    hashable,
+)
 from sb3_poem.benchmark.tables import make_report
 from sb3_poem.cli.needs import check_device, check_writable, import_packages, parse_pairs, say
 
@@ -100,8 +108,7 @@ def _verify(arguments: argparse.Namespace) -> int:
     store = Store(arguments.store, create=False)
     if arguments.cell is None:
         for one in store.records():
-            oracle = (one.identity["oracle"] or {}).get("kind", "")
-            print(f"{one.key}  {one.family}, {one.method}, seed {one.seed} {oracle}".rstrip())
+            print(f"{one.key}  {Cell.of_identity(one.method, one.identity)}")
         return 0
     record = find_record(store, arguments.cell)
     where = record.provenance.get("device", "cpu"), record.provenance.get("num_threads", 1)
