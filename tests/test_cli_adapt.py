@@ -346,7 +346,8 @@ def test_a_person_who_stops_goes_on_later_as_if_they_had_not(
     answer_by(monkeypatch, tmp_path / "at once", "l\nr\nl\n")
     assert adapt(model[1], *flags, "--save", "policy.safetensors") == 0
     expected = AdaptedPolicy.load("policy.safetensors").latent
-    assert "record-video --model policy.safetensors" in capsys.readouterr().out
+    film = f"record-video --model policy.safetensors {shlex.join(TINY)} --out policy.mp4"
+    assert film in capsys.readouterr().out  # of the environment that was adapted in
 
     answer_by(monkeypatch, tmp_path / "twice", "l\n")  # then the input ends
     assert adapt(model[1], *flags) == 0

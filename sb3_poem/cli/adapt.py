@@ -224,8 +224,12 @@ class Adaptation:
             say(f"  keep the policy:  {again} --save {own}")
         else:
             film = ["sb3-poem", "record-video", "--model", str(arguments.save)]
-            if arguments.gym_packages:
-                film += ["--gym-packages", *arguments.gym_packages]
+            for flag, given in (
+                ("--env", [arguments.env] if arguments.env else []),
+                ("--env-kwargs", arguments.env_kwargs),
+                ("--gym-packages", arguments.gym_packages),
+            ):
+                film += [flag, *given] * bool(given)
             say(f"  watch the policy: {shlex.join([*film, '--out', 'policy.mp4'])}")
         return 130 if interrupted else 0
 
