@@ -217,12 +217,14 @@ def test_a_model_with_a_schedule_of_rl_zoo3_in_a_process_of_its_own(tmp_path: Pa
 def test_a_person_answers_with_a_task(
     model: tuple[POEMSAC, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    answer_by(monkeypatch, tmp_path, "what?\nr\n")
+    answer_by(monkeypatch, tmp_path, "what?\nr\nl\n")
     flags = [
         "--oracle",
         "human",
         "--queries",
-        1,
+        2,
+        "--record",
+        0,
         "--task",
         1.25,
         "--episodes",
@@ -232,7 +234,8 @@ def test_a_person_answers_with_a_task(
     ]
     assert adapt(model[1], *flags, *TINY) == 0
     result = json.loads((tmp_path / "result.json").read_text())
-    assert result["answers"] == [["right"]]
+    assert result["answers"] == [["right", "left"]]
+    assert result["queries"] == [0, 2]  # and the last one, which is what they got
     assert result["tasks"] == [[1.25]]
     assert np.shape(result["task_returns"]) == (1, 2)
 

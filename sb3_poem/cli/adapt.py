@@ -234,17 +234,24 @@ class Adaptation:
         return 130 if interrupted else 0
 
     def _measure(self, latents: np.ndarray, adapter: PreferenceAdapter) -> AdaptationEvaluation:
-        """Measure the latents (n_records, latent_dim) that one task went through."""
-        subject = self.subject
+        """Measure the latents (n_answers + 1, latent_dim) that one task went through."""
+        subject, last = self.subject, len(latents) - 1
+        wanted = self.arguments.record or range(last)
+        records = [n for n in range(last + 1) if n in wanted or n == last]
+        latents = latents[records]
         tasks = np.repeat(subject.tasks, len(latents), axis=0)
         with subject.console.status("Measuring the returns"):
             about = (subject.model, subject.env, latents, tasks, self.arguments.episodes)
             outcomes = evaluate_episodes(*about, evaluation_seed(subject.seed))
         successes = None if outcomes.successes is None else outcomes.successes[None]
         answers = [answer.preference for answer in adapter.answers]
-        records = tuple(range(len(latents)))
         return AdaptationEvaluation(
-            subject.tasks, records, latents[None], [answers], outcomes.returns[None], successes
+            subject.tasks,
+            tuple(records),
+            latents[None],
+            [answers],
+            outcomes.returns[None],
+            successes,
         )
 
     def _report(self, evaluation: AdaptationEvaluation, known: KnownTaskReturn | None) -> None:
