@@ -39,7 +39,7 @@ def main() -> None:
         importlib.import_module(package)
     th.set_num_threads(1)
     model = load_model(args.model)
-    env = gym.make(model.env_id)
+    env = gym.make(model.env_id, **model.env_kwargs)
     tasks = env.unwrapped.sample_tasks(args.tasks, np.random.default_rng(args.seed))
     measured = {"n_episodes": args.episodes, "seed": args.seed}
     adapted = evaluate_adaptation(model, env, tasks, rule=Bayes(), record_at=(0, 10), **measured)
