@@ -8,7 +8,7 @@ that the prediction calls impossible should not veto a latent.
 
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -47,6 +47,12 @@ class NoiseModel:
     kind: str
     rate = 0.0
 
+    _known: ClassVar[dict[str, "type[NoiseModel]"]] = {}
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        NoiseModel._known[vars(cls).get("kind", cls.__name__)] = cls
+
     def probability_above(self, difference: Values, error: Values, magnitude: Values) -> np.ndarray:
         """P(the perceived difference is positive), in [0, 1]; arguments broadcast.
 
@@ -64,7 +70,8 @@ class NoiseModel:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready; :func:`noise_model_from_dict` reads it."""
-        return {"kind": self.kind, **vars(self)}
+        own = {k: v.item() if isinstance(v, np.generic) else v for k, v in vars(self).items()}
+        return {"kind": self.kind, **own}
 
 
 def _logistic(x: Values, slope: Values) -> np.ndarray:
@@ -131,11 +138,12 @@ class BoltzmannNoise(NoiseModel):
 
 
 def noise_model_from_dict(data: dict[str, Any]) -> NoiseModel:
-    """Read what a noise model's ``to_dict`` wrote."""
-    kinds = {cls.kind: cls for cls in (ExactNoise, MistakeNoise, BoltzmannNoise)}
+    """Read what ``to_dict`` of any imported noise model wrote."""
+    kinds = NoiseModel._known
     arguments, kind = {k: v for k, v in data.items() if k != "kind"}, data.get("kind")
     if kind not in kinds:
-        raise ValueError(f"unknown noise model {kind!r}; known are {sorted(kinds)}")
+        known = f"known are {sorted(kinds)}, and others once they are imported"
+        raise ValueError(f"unknown noise model {kind!r}; {known}")
     return kinds[kind](**arguments)
 
 

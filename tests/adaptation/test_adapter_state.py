@@ -1,6 +1,7 @@
 """Saved adaptations: they go on exactly, and what is no such file is refused."""
 
 import json
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -10,7 +11,9 @@ from worlds import SpeedModel
 
 from sb3_poem import POEMSAC, Bayes
 from sb3_poem.adaptation import (
+    MistakeNoise,
     MistakeOracle,
+    NoiseModel,
     PreferenceAdapter,
     ReturnOracle,
 )
@@ -165,8 +168,27 @@ def test_numbers_of_numpy_can_be_saved():
         SpeedModel(),
         make_env(),
         n_queries=np.int64(3),
-        rule=Bayes(epsilon=np.float32(0.125)),
+        rule=Bayes(epsilon=np.float32(0.125), noise_model=MistakeNoise(np.float32(0.25))),
         seed=0,
     )
     resumed = PreferenceAdapter.from_json(adapter.to_json(), SpeedModel(), make_env())
     assert (resumed.n_queries, resumed.rule.epsilon) == (3, 0.125)
+    assert resumed.rule.noise_model == MistakeNoise(0.25)
+
+
+@dataclass(frozen=True)
+class Spiteful(NoiseModel):
+    """Turns round as many answers as one likes."""
+
+    rate: float
+    kind = "spiteful"
+
+
+def test_a_noise_model_of_ones_own_can_be_saved():
+    first = adapter(rule=Bayes(n_particles=20, noise_model=Spiteful(0.75)), n_queries=2)
+    answer(first, 1)
+    resumed = PreferenceAdapter.from_json(first.to_json(), SpeedModel(), make_env())
+    assert resumed.rule.noise_model == Spiteful(0.75)
+    for each in (first, resumed):
+        answer(each, 1)
+    np.testing.assert_array_equal(resumed.policy().latent, first.policy().latent)
