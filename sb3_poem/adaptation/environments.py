@@ -10,9 +10,9 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from poem_envs.registration import plain_id
 from sb3_poem.adaptation.meta_model import MetaModel
-from sb3_poem.common.family_view import FamilyView, vectorised
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.foreign import environment_of
-from sb3_poem.common.vec_env import as_task_vec_env, make_task_vec_env
+from sb3_poem.common.vec_env import make_task_vec_env, vectorised
 from sb3_poem.loading import as_model
 
 Env: TypeAlias = gym.Env | gym.vector.VectorEnv | str | VecEnv
@@ -30,18 +30,14 @@ def model_and_env(
     :raises ValueError: If the model's file asks for what :func:`environment_of` refuses.
     """
     found: MetaModel = as_model(model)
-    if isinstance(env, VecEnv):
-        return found, env
     if isinstance(env, str):
         source, own = describe_model(found), (found.env_id, found.env_kwargs)
         _, arguments = environment_of(source, *own, plain_id(env))
         if render:
             arguments["render_mode"] = "rgb_array"
         return found, make_task_vec_env(env, n_copies, **arguments)
-    if isinstance(env, gym.Env):
+    if isinstance(env, gym.Env | gym.vector.VectorEnv | VecEnv):
         return found, vectorised(env)
-    if isinstance(env, gym.vector.VectorEnv):
-        return found, as_task_vec_env(env)
     kinds = "a gymnasium.Env, an id, a Gymnasium VectorEnv or an SB3 VecEnv"
     raise TypeError(f"`env` must be {kinds}, but is {env!r}")
 

@@ -14,8 +14,9 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_poem.adaptation.noise import INFER, BoltzmannNoise, ExactNoise, MistakeNoise, NoiseModel
 from sb3_poem.adaptation.preference import ANSWERS, BEST_OF_FOUR, Preference, Query, check_shown
 from sb3_poem.common.checks import check_choice, check_number
-from sb3_poem.common.family_view import FamilyView, vectorised
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.trajectory import Trajectory
+from sb3_poem.common.vec_env import vectorised
 
 #: Any callable of the trajectories that a question shows; it gives a preference, or its word. What
 #: else it may say of itself is in the protocols below.
@@ -75,8 +76,8 @@ class TaskOracle(ABC):
     >>> Spoilt(adapter.env)(query.left, query.right)
     <Preference.RIGHT: 'right'>
 
-    :param env: A task family: a ``gym.Env``, or an SB3 ``VecEnv`` of them; also given by
-        :meth:`bind`.
+    :param env: A task family: a ``gym.Env``, or a vector environment of Gymnasium's or SB3's; also
+        given by :meth:`bind`.
     :param task: (task_dim,) the task by whose reward to judge; None takes the one in effect in
         ``env`` (in its first copy) whenever a question is asked.
     :param seed: Of the oracle's own noise.
@@ -96,7 +97,7 @@ class TaskOracle(ABC):
 
     def __init__(
         self,
-        env: gym.Env | VecEnv | None = None,
+        env: gym.Env | gym.vector.VectorEnv | VecEnv | None = None,
         task: np.ndarray | None = None,
         seed: int | None = None,
         thresholds: tuple[float, float] | None = None,
@@ -133,7 +134,7 @@ class TaskOracle(ABC):
     def _perceive(self, returns: np.ndarray) -> np.ndarray:
         """The returns by which to answer, from true ones; both (n,)."""
 
-    def bind(self, env: gym.Env | VecEnv) -> Self:
+    def bind(self, env: gym.Env | gym.vector.VectorEnv | VecEnv) -> Self:
         """Give the oracle its environment; returns itself."""
         self.env = env
         return self
@@ -230,7 +231,7 @@ class MistakeOracle(TaskOracle):
 
 
 def step_rewards(
-    env: gym.Env | VecEnv, task: np.ndarray | None, trajectory: Trajectory
+    env: gym.Env | gym.vector.VectorEnv | VecEnv, task: np.ndarray | None, trajectory: Trajectory
 ) -> np.ndarray:
     """The true rewards (T,) of a trajectory; for the arguments see :class:`TaskOracle`."""
     if trajectory.reward_features is None:

@@ -24,8 +24,9 @@ import yaml
 from poem_envs.registration import family_name
 from sb3_poem.benchmark.methods import VARIANTS
 from sb3_poem.benchmark.suites import ModelKey, family_id
-from sb3_poem.common.family_view import FamilyView, vectorised
+from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.files import write_json_atomically
+from sb3_poem.common.vec_env import vectorised
 from sb3_poem.pearl_sac.arguments import default_copies
 from sb3_poem.pearl_sac.collector import in_whole_waves
 from sb3_poem.pearl_sac.saving import CHECKPOINT

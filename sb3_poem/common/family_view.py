@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common import vec_env as sb3_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from sb3_poem.common.buffers import Segment
 from sb3_poem.common.checks import check_whole
@@ -340,11 +340,6 @@ def seed_copies(vec_env: VecEnv, seeds: Sequence[int]) -> None:
     base.seed(seeds[0])
     # SB3's own list of "seeds to be used in the next call to env.reset()"
     base._seeds = list(seeds)
-
-
-def vectorised(env: gym.Env | VecEnv) -> VecEnv:
-    """The same environment as a vectorised one, of one copy if it is not one."""
-    return DummyVecEnv([lambda: env]) if isinstance(env, gym.Env) else env
 
 
 def _equal(one: Any, other: Any) -> bool:

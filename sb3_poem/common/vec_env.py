@@ -199,6 +199,13 @@ class TaskVecEnv(VecEnv):
         return episode
 
 
+def vectorised(env: gym.Env | gym.vector.VectorEnv | VecEnv) -> VecEnv:
+    """The same environment as a vectorised one of SB3, of one copy if it is not one."""
+    if isinstance(env, gym.Env):
+        return DummyVecEnv([lambda: env])
+    return as_task_vec_env(env) if isinstance(env, gym.vector.VectorEnv) else env
+
+
 def as_task_vec_env(vector_env: gym.vector.VectorEnv) -> VecEnv:
     """Gymnasium's vectorised environment of a task family, from ``gym.make_vec``, as one of SB3."""
     if isinstance(vector_env, TaskFamilyVector):

@@ -164,6 +164,19 @@ def test_models_and_environments_by_name_and_of_every_kind(point_goal):
         np.testing.assert_allclose(policy.latent, expected.latent, atol=1e-6)
 
 
+@pytest.mark.parametrize("mode", ["vector_entry_point", "sync"])
+def test_an_oracle_judges_by_gymnasiums_vector_environment(mode, point_goal):
+    env = gym.make_vec(POINT, 2, vectorization_mode=mode)
+    set_task(env, [0.5])
+    query = PreferenceAdapter(point_goal, env, rule=SMALL, seed=0).ask()
+    shown = query.left, query.right
+    for goal in (0.5, 2.5):
+        single = gym.make(POINT)
+        single.reset(options={"task": [goal]})
+        assert ReturnOracle(env, task=[goal])(*shown) == ReturnOracle(single)(*shown)
+    assert ReturnOracle(env)(*shown) == ReturnOracle(env, task=[0.5])(*shown)
+
+
 def test_the_id_of_the_models_own_environment_makes_that():
     env = make_task_vec_env(POINT, 2, step_length=0.1)
     a = PreferenceAdapter(small(POEMSAC, env), POINT)
