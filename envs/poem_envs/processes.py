@@ -32,7 +32,8 @@ SERVE = "from poem_envs.processes import serve; serve"
 class EpisodeStart(NamedTuple):
     """What a copy needs to begin an episode, which is the copy's how-manieth."""
 
-    rng: np.random.Generator
+    #: None goes on with the one that it has, from which steps may have drawn.
+    rng: np.random.Generator | None
     task: np.ndarray
     seed: int
     episode: int
@@ -65,9 +66,11 @@ class CopyGroup:
         begun = {}
         for copy, start in starts.items():
             env = self.envs[copy]
+            if start.rng is not None:
+                env._np_random = start.rng
             env._task, env._np_random_seed = start.task, start.seed
             env._episode, env._elapsed_steps = start.episode, 0
-            begun[copy] = self.call(copy, "_begin_episode", start.rng), start.rng
+            begun[copy] = self.call(copy, "_begin_episode", env.np_random), env.np_random
         return begun
 
     def step(
@@ -182,6 +185,8 @@ class ProcessCopies:
         self._copies = [own.tolist() for own in np.array_split(np.arange(n), min(nthread, n))]
         self._groups: list[CopyGroup | RemoteGroup] = []
         self._attributes: dict[str, Any] = {}
+        #: The generators that copies have, as they were when their episodes had begun.
+        self._drawn: dict[int, np.random.Generator] = {}
         self._last_observations = np.zeros((n, *space.shape), dtype=space.dtype)
         self._last_infos: dict[str, np.ndarray] = {}
 
@@ -228,13 +233,15 @@ class ProcessCopies:
         by_group: dict[int, tuple[dict[int, EpisodeStart]]] = {}
         for group, copies in enumerate(self._copies):
             own = {copy: starts[copy] for copy in copies if copy in starts}
+            for copy, start in own.items():
+                if start.rng is self._drawn.get(copy):
+                    own[copy] = start._replace(rng=None)
             if own:
                 by_group[group] = (own,)
-        drawn = {}
         for answer in self._call("begin", by_group).values():
             for copy, (observation, rng) in answer.items():
-                self._last_observations[copy], drawn[copy] = observation, rng
-        return drawn
+                self._last_observations[copy], self._drawn[copy] = observation, rng
+        return {copy: self._drawn[copy] for copy in starts}
 
     def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Step all copies; returns reward features and early ends."""
@@ -258,4 +265,4 @@ class ProcessCopies:
     def close(self) -> None:
         for group in self._groups:
             group.close()
-        self._groups = []
+        self._groups, self._drawn = [], {}

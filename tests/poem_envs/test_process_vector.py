@@ -77,6 +77,45 @@ def test_the_number_of_processes_changes_nothing(rng):
     assert any(done.any() for done in results[0][3::7])  # some episodes ended early
 
 
+class Windy(Walk):
+    """Its steps are random, too."""
+
+    keeps = False
+
+    def _begin_episode(self, rng):
+        self.rng = rng
+        return super()._begin_episode(rng)
+
+    def _simulate(self, action):
+        rng = self.rng if self.keeps else self.np_random
+        return super()._simulate(action + rng.normal(0.0, 0.1, size=1))
+
+
+class WindyByItsOwn(Windy):
+    keeps = True
+
+
+@pytest.mark.parametrize("family", [Windy, WindyByItsOwn])
+def test_steps_may_be_random(family):
+    action, seen = np.zeros((3, 1), dtype=np.float32), []
+    singles = [family() for _ in range(3)]
+    seen.append([[one.reset(seed=4 + i)[0][0]] for i, one in enumerate(singles)])
+    for one, places in zip(singles, seen[0], strict=True):
+        for _ in range(2):
+            places += [one.step(action[0])[0][0] for _ in range(4)]
+            places.append(one.reset()[0][0])
+    for nthread in (1, 2):
+        envs = TaskFamilyVector(family, num_envs=3, nthread=nthread)
+        places = [envs.reset(seed=4)[0]]
+        for _ in range(2):
+            places += [envs.step(action)[0] for _ in range(4)]
+            places.append(envs.reset()[0])
+        seen.append(np.array(places)[..., 0].T)
+        envs.close()
+    np.testing.assert_array_equal(seen[1], seen[0])
+    np.testing.assert_array_equal(seen[2], seen[0])
+
+
 class Interrupted(Walk):
     """Its user presses Ctrl-C while this process steps its own copies."""
 
