@@ -68,9 +68,9 @@ def adapt_tasks(
     once.
 
     Task i is adapted as ``PreferenceAdapter(model, env, seed=seed + i, ...)`` would alone, but for
-    rounding, and for action noise with ``deterministic=False``. The tasks are set in ``env``, and
-    known to the oracles; a rule that infers from answers never sees them. Arguments that are not
-    explained here are those of :class:`PreferenceAdapter`.
+    rounding, and for action noise with ``deterministic=False`` or ``MAMLReward``. The tasks are set
+    in ``env``, and known to the oracles; a rule that infers from answers never sees them. Arguments
+    that are not explained here are those of :class:`PreferenceAdapter`.
 
     :param env: A task family. Any number of copies will do; twice the number of tasks is best, and
         an id makes 60.
