@@ -90,7 +90,7 @@ class _Pages:
                 post("/answer", store.add_answer, question=int, preference=str),
                 post("/again", store.ask_again, question=int),
                 post("/undo", store.undo, answered=int),
-                post("/stop", store.stop),
+                post("/stop", store.stop, stopped=int),
                 post("/verdict", store.judge, result=int, verdict=str),
                 post("/wish", store.set_wish, wish=str),
                 self.route("/video/{number}", self.video),

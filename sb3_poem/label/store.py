@@ -300,25 +300,23 @@ class Store:
             self._insert("turns", created=now, repeats=shows["number"], **again)
 
     def undo(self, session: int, answered: int) -> None:
-        """Take the last of ``answered`` answers back, as many as there were where it was asked for;
-        or, after an early stop, go back to the question that waited.
+        """Take the last of ``answered`` answers back, as many as there were where it was asked for,
+        and go on with its question.
         """
         with self._transaction() as execute:
             answers = self.answers(session)
             _insist(answered == len(answers), MOVED_ON)
-            if self.session(session).stopped:
-                execute("UPDATE sessions SET stopped = 0 WHERE id = ?", (session,))
-                return
             _insist(answers, "there is no answer to take back")
             now = time.time()
             execute("UPDATE answers SET undone = ? WHERE id = ?", (now, answers[-1]["id"]))
             which = "session = ? AND number >= ? AND dropped IS NULL"
             execute(f"UPDATE turns SET dropped = ? WHERE {which}", (now, session, answered))
+            execute("UPDATE sessions SET stopped = 0 WHERE id = ?", (session,))
 
-    def stop(self, session: int) -> None:
-        """Show the result after the answers so far."""
+    def stop(self, session: int, stopped: int) -> None:
+        """Show the result after the answers so far; 0 goes back to the question that waited."""
         with self._transaction() as execute:
-            execute("UPDATE sessions SET stopped = 1 WHERE id = ?", (session,))
+            execute("UPDATE sessions SET stopped = ? WHERE id = ?", (stopped != 0, session))
 
     def judge(self, session: int, result: int, verdict: str) -> None:
         """Keep what the person says of the result that is shown; "not quite" asks for more

@@ -131,12 +131,13 @@ def test_a_turn_made_for_an_answer_that_was_taken_back_is_not_kept(store: Store)
 def test_the_target_the_stop_and_the_verdict(store: Store) -> None:
     session, _ = begin(store, step=2)
     answer(store, session, "left")
-    store.stop(session)
+    store.stop(session, 1)
     waiting = store.turn(session, "question", 1)
     assert waiting is not None
     with pytest.raises(RefusedError, match="over for now"):
         store.add_answer(session, waiting["id"], "left")
-    store.undo(session, 1)  # back to the questions; no answer is lost
+    for _ in range(2):  # back to the questions; no answer is lost, though it is sent twice
+        store.stop(session, 0)
     assert preferences(store, session) == ["left"]
     answer(store, session, "right")
     last = store.turn(session, "question", 2)
@@ -155,6 +156,9 @@ def test_the_target_the_stop_and_the_verdict(store: Store) -> None:
         store.judge(session, result["id"], "not quite")  # a repeated click asks for no more
     assert store.session(session).target == 4
     answer(store, session, "left")
+    store.stop(session, 1)
+    store.undo(session, 3)
+    assert not store.session(session).stopped  # its question waits again
 
 
 @pytest.mark.parametrize("version", [3, 99])

@@ -247,7 +247,7 @@ def test_after_the_last_answer_comes_the_result_and_not_quite_asks_more(
         view = await settled(sessions, session)
         assert (view["phase"], view["target"]) == ("question", 4)
         view = await give_answers(sessions, session, ("left",))
-        store.stop(session.id)
+        store.stop(session.id, 1)
         view = await settled(sessions, session)
         assert (view["phase"], view["answered"]) == ("result", 3)
 

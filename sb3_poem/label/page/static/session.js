@@ -162,7 +162,7 @@ async function show(next) {
     byId("belief-sentence").textContent = next.belief.sentence;
   }
   byId("undo").hidden = !next.can_undo;
-  const back = result && answered < target;
+  const back = isStopped();
   byId("undo-text").textContent = back ? "Back to the questions" : "Undo";
   byId("undo-what").hidden = back;
   byId("stop").hidden = phase !== "question" || answered === 0;
@@ -321,7 +321,10 @@ function answer(preference) {
   act("/answer", { question: view.turn.id, preference });
 }
 
-const undo = () => view && view.can_undo && act("/undo", { answered: view.answered });
+const isStopped = () => view.due === "result" && view.answered < view.target;
+// Each says what it comes to, so that sent twice it does no more.
+const goBack = () => (isStopped() ? act("/stop", { stopped: 0 }) : act("/undo", { answered: view.answered }));
+const undo = () => view && view.can_undo && goBack();
 
 for (const button of document.querySelectorAll("[data-preference]")) {
   button.addEventListener("click", () => answer(button.dataset.preference));
@@ -330,7 +333,7 @@ for (const button of document.querySelectorAll("[data-verdict]")) {
   button.addEventListener("click", () => act("/verdict", { result: view.turn.id, verdict: button.dataset.verdict }));
 }
 byId("undo").addEventListener("click", undo);
-byId("stop").addEventListener("click", () => act("/stop", {}));
+byId("stop").addEventListener("click", () => act("/stop", { stopped: 1 }));
 
 const KEYS = {
   ArrowLeft: () => answer("left"),
