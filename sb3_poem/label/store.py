@@ -381,9 +381,14 @@ class Store:
 
     @contextmanager
     def _transaction(self) -> Iterator[Callable[..., sqlite3.Cursor]]:
-        with self._locked(), self._connection:
-            self._connection.execute("BEGIN IMMEDIATE")
-            yield self._connection.execute
+        """All or nothing; one within another is part of it."""
+        with self._locked():
+            if self._connection.in_transaction:
+                yield self._connection.execute
+                return
+            with self._connection:
+                self._connection.execute("BEGIN IMMEDIATE")
+                yield self._connection.execute
 
     def _make_tables(self) -> None:
         with self._transaction() as execute:
@@ -498,9 +503,10 @@ class StoreRecorder:
         frames = max(len(item.frames or ()) for item in query.shown)
         shown = shown_to_dict(query.kind, query.shown)
         turn = Turn(None, shown, None, None, answer.fps, frames)
-        question = store.add_turn(
-            session, "question", number, last, turn, name, answer.asked, answer.shown
-        )
-        if question is None:
-            raise RefusedError(f"session {session} has been answered elsewhere meanwhile")
-        store.add_answer(session, question, answer.preference.value)
+        with store._transaction():  # a question alone would be in the way of the next try
+            question = store.add_turn(
+                session, "question", number, last, turn, name, answer.asked, answer.shown
+            )
+            if question is None:
+                raise RefusedError(f"session {session} has been answered elsewhere meanwhile")
+            store.add_answer(session, question, answer.preference.value)

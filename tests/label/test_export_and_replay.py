@@ -25,7 +25,7 @@ from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.label import LabelWidget, StoreRecorder, families
 from sb3_poem.label.export import FIELDS, answer_record, export, records
 from sb3_poem.label.families import ModelInfo
-from sb3_poem.label.rendering import load_shown_model
+from sb3_poem.label.rendering import StorageError, load_shown_model
 from sb3_poem.label.replay import replay
 from sb3_poem.label.store import Session, Store
 from sb3_poem.resources import pretrained_folder
@@ -335,6 +335,24 @@ def test_the_terminals_answers_are_in_the_same_store(
     ]
     assert kept[1]["left_latent"] == adapter.answers[1].shown[0].latent.tolist()
     assert Path(kept[0]["video"]).read_bytes().startswith(b"GIF8")
+
+
+def test_an_answer_at_the_terminal_that_could_not_be_kept_is_kept_when_there_is_room(
+    store: Store, point_goal: ModelInfo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any) -> int:
+        raise StorageError("the disk is full")
+
+    recorder = StoreRecorder(store, "PointGoal", point_goal.env_id, seed=3)
+    oracle = HumanOracle(tmp_path, read=lambda _: "l", write=lambda _: None, record=recorder)
+    env = gym.make(point_goal.env_id, render_mode="rgb_array", width=64, height=48)
+    model = load_shown_model(point_goal)
+    adapter = PreferenceAdapter(model, env, oracle=oracle, seed=3, n_queries=1)
+    with monkeypatch.context() as context, pytest.raises(StorageError):
+        context.setattr(store, "add_answer", full)
+        adapter.adapt()
+    adapter.adapt()
+    assert [record["preference"] for record in records(store)] == ["left"]
 
 
 def test_the_best_of_four_is_exported_beside_pairs_and_replayed(
