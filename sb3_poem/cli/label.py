@@ -166,7 +166,7 @@ def run_replay(arguments: argparse.Namespace) -> None:
 
     from sb3_poem.adaptation.preference import BEST_OF_FOUR
     from sb3_poem.common.files import write_json_atomically
-    from sb3_poem.label.replay import replay
+    from sb3_poem.label.replay import OtherRobotError, recorded_digest, replay
     from sb3_poem.loading import load_model
     from sb3_poem.resources import pretrained_folder
 
@@ -191,10 +191,17 @@ def run_replay(arguments: argparse.Namespace) -> None:
             recorded = f"was recorded with a model {session.model!r} that does not ship"
             say(f"Session {session.id} {recorded}: name it by --model")
             continue
-        # the store knows a model by its folder's name
-        is_own = given is None or Path(given).resolve().name == session.model
+        # of an answer at a terminal, the store knows the model by its folder's name alone
+        named = given is None or Path(given).resolve().name == session.model
+        digest = recorded_digest(store, session)
+        is_own = named if digest is None else digest == model.digest
         with Console().status(f"Session {session.id}"):
-            results.append(replay(store, session, model, options, arguments.seed or 0, is_own))
+            how = (options, arguments.seed or 0, is_own)
+            try:
+                results.append(replay(store, session, model, *how))
+            except OtherRobotError as error:
+                say(f"Session {session.id} is left out: {error}")
+                continue
         say(
             "Session {session} ({model}): foretold {foretold} of {decided} answers that decide. "
             "{sentence}".format_map(results[-1])

@@ -1,5 +1,6 @@
 """Recorded answers, fed to another model or another rule of inference."""
 
+import json
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -13,6 +14,11 @@ from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.label.beliefs import believed_in_words
 from sb3_poem.label.rendering import session_rule
 from sb3_poem.label.store import Session, Store
+
+
+class OtherRobotError(ValueError):
+    """Trajectories that were recorded of another robot than a model's."""
+
 
 # Latents of another model among which the one is sought that acts most like a recorded trajectory.
 N_CANDIDATES = 256
@@ -38,8 +44,8 @@ def replay(
         "equal"), ``latents`` after 0, 1, ... answers, ``sentence`` (the belief in words) and
         ``action_error``, the root mean squared difference of the actions of such latents from those
         recorded (None where no latents had to be replaced).
-    :raises ValueError: If the model does not fit the recorded trajectories, or the rule asks about
-        pairs and the session about four.
+    :raises OtherRobotError: If the model does not fit the recorded trajectories
+    :raises ValueError: If the rule asks about pairs and the session about four
     """
     options, kind = dict(options or {}), session.question
     if options.get("inference", "bayes") == "bayes":
@@ -83,6 +89,12 @@ def replay(
     }
 
 
+def recorded_digest(store: Store, session: Session) -> str | None:
+    """The digest of the model with which an answered session was recorded; None at a terminal."""
+    first: Any = store.whole_turn(store.answers(session.id)[0]["question"])
+    return None if first["state"] is None else str(json.loads(first["state"])["model"]["digest"])
+
+
 def _most_alike(model: Any, latents: np.ndarray, recorded: Trajectory) -> tuple[Trajectory, float]:
     """The trajectory, with that of the latents (n, d) whose policy acts most as it was acted, and
     the root mean squared difference of the actions.
@@ -100,7 +112,7 @@ def _check_fits(model: Any, trajectory: Trajectory) -> None:
     shown = (trajectory.observations.shape[1], trajectory.actions.shape[1])
     taken = (model.observation_space.shape[0], model.action_space.shape[0])
     if shown != taken:
-        raise ValueError(
+        raise OtherRobotError(
             f"the recorded trajectories have {shown[0]} observations and {shown[1]} actions, but "
             f"the model takes {taken[0]} and {taken[1]}; replay to a model of the same robot"
         )

@@ -25,7 +25,7 @@ from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.label import LabelWidget, StoreRecorder, families
 from sb3_poem.label.export import FIELDS, answer_record, export, records
 from sb3_poem.label.families import ModelInfo
-from sb3_poem.label.rendering import StorageError, load_shown_model
+from sb3_poem.label.rendering import StorageError, Turn, load_shown_model
 from sb3_poem.label.replay import replay
 from sb3_poem.label.store import Session, Store
 from sb3_poem.resources import pretrained_folder
@@ -253,8 +253,24 @@ def test_the_commands(
     )
     assert "foretold" in capsys.readouterr().out
     assert len(json.loads(result.read_text())["sessions"]) == 1
-    assert cli.main(["label", "replay", "--store", folder, "--model", "HalfCheetahVel"]) == 1
-    assert "same robot" in capsys.readouterr().err
+    other = store.create_session("HalfCheetahVel", "poem/HalfCheetahVel-v0", 0, {})[0]
+    spaces = gym.make(other.env_id)
+    run = np.zeros((2, *spaces.observation_space.shape)), np.zeros((1, *spaces.action_space.shape))
+    shown = dict.fromkeys(("left", "right"), Trajectory(*run, np.zeros(5)).to_dict())
+    question = store.add_turn(
+        other.id, "question", 0, None, Turn(None, shown, None, None, 20.0, 2), "2.gif"
+    )
+    assert question is not None
+    store.add_answer(other.id, question, "left")
+    mixed = tmp_path / "mixed.json"
+    command = ["label", "replay", "--store", folder, "--json", str(mixed), "--model"]
+    for model, own, left_out in (("PointGoal", 1, 2), ("HalfCheetahVel", 2, 1)):
+        assert cli.main([*command, model]) == 0  # of two robots' sessions
+        (replayed,) = json.loads(mixed.read_text())["sessions"]
+        assert replayed["session"] == own
+        assert f"Session {left_out} is left out: the recorded" in capsys.readouterr().out
+    with sqlite3.connect(store.path) as connection:
+        connection.execute("delete from answers where session = 2")
     # options before the subcommand are the same options
     monkeypatch.delitem(families.DESCRIPTIONS, "PointGoal")  # as of a family of one's own
     again = tmp_path / "again.json"
@@ -265,18 +281,22 @@ def test_the_commands(
     assert latents[0] == latents[1]
 
 
-def test_replay_knows_a_model_by_its_folder_and_says_which_it_lacks(
-    answered: Session, store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_replay_knows_a_model_by_its_weights_and_says_which_it_lacks(
+    answered: Session,
+    store: Store,
+    point_goal: ModelInfo,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    shutil.copytree(pretrained_folder("PointGoal"), tmp_path / "models" / "PointGoal")
-    result, own = tmp_path / "replay.json", str(tmp_path / "models" / "PointGoal")
-    assert (
-        cli.main(
-            ["label", "replay", "--store", str(store.folder), "--model", own, "--json", str(result)]
-        )
-        == 0
-    )
-    assert json.loads(result.read_text())["sessions"][0]["action_error"] is None
+    shutil.copytree(pretrained_folder("PointGoal"), tmp_path / "models" / "any name")
+    other = load_shown_model(point_goal)
+    other.train_tasks.latent_means += 0.1
+    other.save_pretrained(tmp_path / "models" / "PointGoal")
+    result, command = tmp_path / "replay.json", ["label", "replay", "--store", str(store.folder)]
+    for folder, is_own in (("any name", True), ("PointGoal", False)):
+        model = str(tmp_path / "models" / folder)
+        assert cli.main([*command, "--model", model, "--json", str(result)]) == 0
+        assert (json.loads(result.read_text())["sessions"][0]["action_error"] is None) == is_own
     for gone in (
         "gone",
         str(tmp_path / "models" / "PointGoal"),
@@ -348,9 +368,10 @@ def test_an_answer_at_the_terminal_that_could_not_be_kept_is_kept_when_there_is_
     env = gym.make(point_goal.env_id, render_mode="rgb_array", width=64, height=48)
     model = load_shown_model(point_goal)
     adapter = PreferenceAdapter(model, env, oracle=oracle, seed=3, n_queries=1)
-    with monkeypatch.context() as context, pytest.raises(StorageError):
+    with monkeypatch.context() as context:
         context.setattr(store, "add_answer", full)
-        adapter.adapt()
+        with pytest.raises(StorageError):
+            adapter.adapt()
     adapter.adapt()
     assert [record["preference"] for record in records(store)] == ["left"]
 
