@@ -50,19 +50,23 @@ def export_minari(store: Store, name: str, undone: bool = False) -> dict[str, Pa
     rows = [row for row in store.records() if undone or row["undone"] is None]
     if not rows:
         raise ValueError(f"{store.folder} holds no answers")
-    written = {}
+    datasets = {}
     for env_id in dict.fromkeys(row["env_id"] for row in rows):
         check_env_id(env_id, str(store.path))
         family = re.sub(r"[^\w/-]", "_", re.sub(r"-v\d+$", "", env_id))
-        dataset, where = f"{family}/{name}", get_dataset_path(f"{family}/{name}")
-        if where.exists():
+        dataset = datasets[env_id] = f"{family}/{name}"
+        if get_dataset_path(dataset).exists():
+            where = get_dataset_path(dataset)
             raise ValueError(f"there is a Minari data set {dataset} already, in {where}")
-        try:
+    written: dict[str, Path] = {}
+    try:
+        for env_id, dataset in datasets.items():
+            written[dataset] = get_dataset_path(dataset)
             _write(dataset, env_id, [row for row in rows if row["env_id"] == env_id], store.videos)
-        except BaseException:
+    except BaseException:  # all or none
+        for where in written.values():
             shutil.rmtree(where, ignore_errors=True)
-            raise
-        written[dataset] = where
+        raise
     return written
 
 

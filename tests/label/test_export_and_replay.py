@@ -167,6 +167,15 @@ def test_minari_reads_the_episodes_with_preferences_and_latents(
     assert short.terminations.tolist() == [False] * (len(whole) - 2) + [True]
     assert not short.truncations.any()
     assert other.truncations.tolist()[-1]
+    other = store.create_session("AntVel", "poem/AntVel-v0", 0, {})[0]
+    shown = {side: kept[0][side] for side in ("left", "right")}
+    turn = Turn(None, shown, None, None, 20.0, 2)
+    question = store.add_turn(other.id, "question", 0, None, turn, "a.gif")
+    assert question is not None
+    store.add_answer(other.id, question, "left")
+    assert cli.main([*command, "both-v0"]) == 1
+    assert "recorded in poem/AntVel-v0" in capsys.readouterr().err
+    assert not (tmp_path / "minari/poem/PointGoal/both-v0").exists()  # all or none
     with sqlite3.connect(store.path) as connection:
         connection.execute("update sessions set env_id = 'this:poem/PointGoal-v0'")
     assert cli.main([*command, "answers-v2"]) == 1
