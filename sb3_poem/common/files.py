@@ -45,11 +45,10 @@ def write_json_atomically(path: str | os.PathLike[str], data: dict[str, Any]) ->
 
 def read_json(path: str | os.PathLike[str], what: str) -> dict[str, Any]:
     """Read a JSON object; a ``ValueError`` if the file is truncated, or not ``what``."""
-    text = Path(path).read_text(encoding="utf-8")
-    return parse_json(text, f"{os.fspath(path)} is not {what}")
+    return parse_json(Path(path).read_bytes(), f"{os.fspath(path)} is not {what}")
 
 
-def parse_json(text: str, message: str) -> dict[str, Any]:
+def parse_json(text: str | bytes, message: str) -> dict[str, Any]:
     """A JSON object as data; ``message`` begins that of a ``ValueError``."""
     try:
         data = json.loads(text)

@@ -80,6 +80,7 @@ def test_saving_replaces_the_file_only_once_the_new_one_is_whole(tmp_path, monke
     [
         ("", "is not a saved adaptation"),
         ('{"format": "sb3_poem.Pref', "is not a saved adaptation"),
+        ("PK\x03\x04\xff", "is not a saved adaptation"),
         ("[1]", "holds a list"),
         ('{"format": "optuna"}', "`format` is 'optuna'"),
         ('{"format": "sb3_poem.PreferenceAdapter", "version": 99}', "version 99"),
@@ -88,7 +89,7 @@ def test_saving_replaces_the_file_only_once_the_new_one_is_whole(tmp_path, monke
 )
 def test_foreign_and_truncated_files_are_refused(tmp_path, content, message):
     path = tmp_path / "adaptation.json"
-    path.write_text(content)
+    path.write_bytes(content.encode("latin-1"))
     with pytest.raises(ValueError, match=message):
         PreferenceAdapter.load(path, SpeedModel(), make_env())
 
