@@ -1,6 +1,6 @@
 """Models that a person may choose from, their families in words, and how tasks are drawn."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -143,7 +143,7 @@ class ModelInfo:
     name: str
     folder: Path
     env_id: str
-    env_kwargs: tuple[tuple[str, Any], ...] = ()
+    env_kwargs: tuple[tuple[str, Any], ...] = field(default=(), hash=False)  # may be lists
 
     @property
     def description(self) -> Description:

@@ -22,7 +22,7 @@ from sb3_poem import Bayes, ReturnOracle
 from sb3_poem.adaptation.adapter import PreferenceAdapter
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.label import rendering
-from sb3_poem.label.families import ModelInfo
+from sb3_poem.label.families import ModelInfo, find_models
 from sb3_poem.label.rendering import load_shown_model
 from sb3_poem.label.sessions import UNWORDED, FullError, SessionManager
 from sb3_poem.label.store import RefusedError, Session, Store
@@ -268,6 +268,12 @@ def test_a_video_that_was_deleted_is_filmed_again(
         assert contents(store, session, 1) == before
 
     run_server(life)
+
+
+def test_a_model_is_shown_in_an_environment_whose_arguments_hold_a_list() -> None:
+    healthy = {"healthy_z_range": [0.2, 1.0]}
+    renderer = rendering.renderer_of(find_models("AntVel", env_kwargs=healthy)[0])
+    assert renderer.env.get_attr("healthy_z_range") == [[0.2, 1.0]]
 
 
 def test_no_more_people_than_the_server_takes(run_server: Callable[..., Any]) -> None:
