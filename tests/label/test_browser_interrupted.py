@@ -145,6 +145,13 @@ def test_an_answer_waits_while_the_disk_is_full(
     page.wait_for_function("() => view.answered === 1 && !busy")
     assert page.is_hidden("#error")
     assert person.stored() == ["left"]
+    # Nor is it lost on a server that was started anew, and lets in who has another link.
+    page.route("**/answer", lambda route: route.fulfill(status=401), times=1)
+    page.click("[data-preference=right]")
+    page.wait_for_function("() => Object.keys(readKept()).length === 1 && !busy")
+    page.reload()
+    page.wait_for_function("() => view !== null && view.answered === 2 && !busy")
+    assert person.stored() == ["left", "right"]
 
 
 def test_films_that_cannot_be_shown_are_not_the_servers_fault(

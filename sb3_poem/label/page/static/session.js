@@ -77,7 +77,7 @@ async function deliver(path) {
         await pause(RETRY_MILLISECONDS, "online");
         continue;
       }
-      forget(path);
+      if (error.status !== 401) forget(path); // that waits for who comes by the right link
       throw error;
     }
     showError("");
@@ -90,8 +90,8 @@ function forget(path) {
   storage.removeItem(base + path);
 }
 
-// No answer, no room, or no disk: it may come.
-const isPassing = (error) => error.status === undefined || error.status >= 500;
+// No answer, no room, no disk, or too slow on its way: it may come.
+const isPassing = (error) => error.status === undefined || error.status >= 500 || error.status === 408;
 
 function showError(message) {
   byId("error").textContent = message || "";
