@@ -181,10 +181,9 @@ class _Pages:
     def _adapted_policy(self, session: Session) -> bytes:
         answered = len(self.store.answers(session.id))
         turn = self.store.turn(session.id, "result", answered)
-        info = self.sessions.model(session.model)
-        if turn is None or info is None:
+        if turn is None:
             raise RefusedError("the policy can be downloaded once its result is shown")
-        model = self.sessions.load(info)
+        model = self.sessions.load(self.sessions.model_of(session))
         return AdaptedPolicy(model, json.loads(turn["latent"]), answered).to_bytes()
 
     async def error(self, request: Request, error: Exception) -> Response:

@@ -164,14 +164,19 @@ class SessionManager:
             return {}
         return await asyncio.to_thread(self.store.adapter_data, question)
 
-    def _request(self, session: Session, key: _Key, before: dict[str, Any]) -> TurnRequest:
-        """What a turn is made from; refuses a session whose model is not this server's."""
+    def model_of(self, session: Session) -> ModelInfo:
+        """A session's model; refuses one that is not this server's."""
         info = self.model(session.model)
         if info is None or info.env_id != session.env_id:
             needs = f"the model {session.model!r} in {session.env_id!r}"
             raise RefusedError(
                 f"this session needs {needs}, which this server was not started with"
             )
+        return info
+
+    def _request(self, session: Session, key: _Key, before: dict[str, Any]) -> TurnRequest:
+        """What a turn is made from."""
+        info = self.model_of(session)
         since = time.monotonic() - AT_WORK_SECONDS
         at_work = sum(active.seen > since for active in self._active.values())
         film_every = CROWDED_FILM_EVERY if at_work > self.queue.n_workers else 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 import sys
 import time
 from collections.abc import Iterator
@@ -64,7 +65,7 @@ def settled(client: TestClient, session: str) -> dict[str, Any]:
 
 
 def test_a_whole_conversation(served: tuple[TestClient, Store], tmp_path: Path) -> None:
-    client, _ = served
+    client, store = served
     assert "A dot that goes to a place" in client.get("/").text
     session = begin(client)
     assert client.get(session).status_code == 200
@@ -107,6 +108,12 @@ def test_a_whole_conversation(served: tuple[TestClient, Store], tmp_path: Path) 
     assert policy.model.env_id == "poem/PointGoal-v0"
     direction, _ = policy.predict(np.zeros(2))
     assert direction.shape == (2,)
+    with sqlite3.connect(store.path) as connection:
+        found = store.find(session.removeprefix("/s/"))
+        assert found is not None
+        connection.execute("update sessions set model = 'Other' where id = ?", (found.id,))
+    refused = client.get(f"{session}/policy.safetensors")
+    assert (refused.status_code, "needs the model 'Other'" in refused.text) == (409, True)
 
 
 def test_wrong_tokens_find_nothing(served: tuple[TestClient, Store]) -> None:
