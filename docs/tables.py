@@ -468,8 +468,8 @@ of the [code](guides/benchmark.md#suites) are of earlier and shorter trainings, 
 are not comparable with those here.
 
 **What was not measured.** With the models that ship: all methods on seven of the paper's nine
-families, and on AntVel ANOLE-greedy and POEM without its preference loss; answers with errors, but
-for `Bayes()` where a table says so; ablations and tolerances.
+families, and on AntVel ANOLE-greedy; answers with errors, but for `Bayes()` where a table says so;
+ablations and tolerances; kinds of questions.
 `sb3-poem benchmark run --suite table3 --seeds 3 --snapshots 1 --list` says what each would take.
 """
     return "\n".join([head, *(family_section(family) for family in FAMILIES)])
