@@ -323,7 +323,7 @@ def test_a_full_disk_is_a_sentence_and_what_was_answered_stays(
         posts = {
             "answer": {"question": view["turn"]["id"], "preference": "left"},
             "wish": {"wish": "left"},
-            "stop": {},
+            "stop": {"stopped": 1},
         }
         with full_disk():
             for name, body in posts.items():
