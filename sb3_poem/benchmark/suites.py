@@ -88,10 +88,11 @@ class OracleSpec:
 
     @property
     def label(self) -> str:
-        words = "Boltzmann answers" + ("" if self.value is None else f", beta = {self.value:g}")
-        if self.kind != "boltzmann":
-            flipped = f"{100 * (self.value or 0):g} % of the answers flipped"
-            words = "exact answers" if self.kind == "return" else flipped
+        words = "exact answers"
+        if self.kind == "mistake":
+            words = f"{100 * (self.value or 0):g} % of the answers flipped"
+        elif self.kind == "boltzmann":
+            words = "Boltzmann answers" + ("" if self.value is None else f", beta = {self.value:g}")
         if self.told is not None:
             words += f", told as {self.told.label}"
         if self.thresholds != OracleSpec.thresholds:
