@@ -427,17 +427,18 @@ def results_page() -> str:
     """The page docs/results.md."""
     head = f"""# Results
 
-**The paper's claim.** The paper has POEM 20 to 50 % ahead of the best baseline. By models of these
-entries methods were compared on HalfCheetahVel, on AntVel and on PointGoal, which is small. There
-the paper's own rule, `Paper()`, with candidates from the prior, does not show that. On AntVel it is
-not distinguishable from any of the three ANOLEs after any number of answers. On HalfCheetahVel it
-is not distinguishable from ANOLE and ANOLE-greedy after one answer; after ten it is ahead of ANOLE
-and not distinguishable from ANOLE-greedy. With candidates from the training tasks for all methods
-it is behind these two after one answer, and ahead of both after five and ten; on AntVel it is
-behind both after one, ahead of ANOLE alone after five, and distinguishable from neither after ten.
-On PointGoal it is 12 to 15 % ahead of all three ANOLEs after one answer, and not distinguishable
-from them after five and ten. With shorter trainings (revision 0, three seeds) it is ahead of every
-baseline on HalfCheetahFwdBack after one answer, and behind ANOLE and ANOLE-greedy after ten.
+**The paper's claim.** The paper has POEM 20 to 50 % ahead of the best baseline. With models by the
+entries of `zoo_configs/` all methods were compared on HalfCheetahVel, on AntVel and on PointGoal,
+which is small. There the paper's own rule, `Paper()`, with candidates from the prior, does not show
+that. On AntVel it is not distinguishable from any of the three ANOLEs after any number of answers.
+On HalfCheetahVel it is not distinguishable from ANOLE and ANOLE-greedy after one answer; after ten
+it is ahead of ANOLE and not distinguishable from ANOLE-greedy. With candidates from the training
+tasks for all methods it is behind these two after one answer, and ahead of both after five and ten;
+on AntVel it is behind both after one, ahead of ANOLE alone after five, and distinguishable from
+neither after ten. On PointGoal it is 12 to 15 % ahead of all three ANOLEs after one answer, and not
+distinguishable from them after five and ten. With earlier, shorter trainings (three seeds) it is
+ahead of every baseline on HalfCheetahFwdBack after one answer, and behind ANOLE and ANOLE-greedy
+after ten.
 
 **The models that ship.** Mean return over 30 test tasks, 10 episodes each, after exact answers. No
 training saw the test tasks, but those of the two FwdBack families: these have two tasks, forward
