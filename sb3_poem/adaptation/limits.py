@@ -105,7 +105,7 @@ def information_limit(
     ordered: bool = False,
     n_answers: int = 2,
 ) -> float:
-    """The highest mean return that any method can reach with k answers.
+    """The highest mean return that any method can reach with these policies and k answers.
 
     k answers of m kinds tell at most m^k policies apart, so the best choice of those bounds it
     (:func:`best_codebook`); answers of an oracle that errs tell less than log2(m) bits each, so

@@ -30,7 +30,8 @@ class ANOLE(Rule):
     never rolls out on the new task. Each candidate, a latent, predicts an answer by the reward
     decoder's returns of the two fragments, and what counts is how many answers it contradicts.
 
-    It takes a ``PEARLSAC`` with its replay buffer, unless the adapter has a ``library``.
+    It takes a ``PEARLSAC`` or ``POEMSAC`` with its replay buffer, unless the adapter has a
+    ``library``.
 
     >>> from sb3_poem import PreferenceAdapter
     >>> from sb3_poem.baselines import rollout_fragments
