@@ -48,7 +48,7 @@ policy = adapter.adapt()
 ## Limits
 
 Made for this family alone, in simulation. What it earns on tasks outside of the family's
-distribution, or from people, was not measured. `config.json` holds all arguments and the whole
+distribution, or from people, is not on this card. `config.json` holds all arguments and the whole
 record.
 """
 
