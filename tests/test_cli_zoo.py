@@ -235,7 +235,7 @@ def test_epochs_are_counted_with_the_rollouts_that_compare_policies(
     assert saved == [1, 2, 3]
 
 
-def test_a_search_on_a_family_without_shared_dynamics(
+def test_a_search_in_threads_on_a_family_without_shared_dynamics(
     windy_config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(
@@ -252,6 +252,8 @@ def test_a_search_on_a_family_without_shared_dynamics(
         "-optimize",
         "--n-trials",
         "1",
+        "--n-jobs",
+        "2",
         "--n-evaluations",
         "1",
         "--eval-episodes",

@@ -4,6 +4,7 @@ import contextlib
 import inspect
 import os
 import signal
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
@@ -40,7 +41,9 @@ class TrainingInterrupted(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def handled(handler: Any, *numbers: signal.Signals) -> Iterator[None]:
-    """Let signals be handled so within."""
+    """Let signals be handled so within; in threads but the main one (--n-jobs) as before."""
+    if threading.current_thread() is not threading.main_thread():
+        numbers = ()
     before = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
