@@ -585,6 +585,17 @@ def test_a_second_interrupt_stops_at_once_and_loses_no_older_checkpoint(
     assert not differing(parameters(trained(tmp_path, 3)), whole)
 
 
+def test_an_interrupt_before_the_last_updates_leaves_them_to_do(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], whole: dict[str, th.Tensor]
+) -> None:
+    config = interrupts(tmp_path / "c.yml", {"at": 900, "times": 2})
+    flags = ("-c", config, "-f", tmp_path, *LONG, "--save-freq", 150)
+    assert train(*flags) == 130
+    assert "Interrupted at 900 of 900 steps, saved at 750; go on with" in capfd.readouterr().err
+    assert train(*flags, "--resume", "-params", "n_timesteps:900", "callback:None") == 0
+    assert not differing(parameters(trained(tmp_path, 2)), whole)
+
+
 def test_an_interrupt_before_the_first_checkpoint(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

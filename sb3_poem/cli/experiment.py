@@ -201,7 +201,7 @@ class PoemExperiment(FamilyExperiment):
         super().save_trained_model(model)
         done, total = model.num_timesteps, model._total_timesteps
         saved = self.checkpoint.saved_steps
-        if done < total and self.is_interrupted:
+        if self.is_interrupted:
             kept = ", before the first checkpoint" if saved is None else f", saved at {saved:,}"
             message = f"Interrupted at {done:,} of {total:,} steps{kept * (saved != done)}"
             raise TrainingInterrupted(message, saved is not None)

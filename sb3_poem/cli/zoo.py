@@ -118,7 +118,8 @@ def resumed(given: argparse.Namespace, arguments: Sequence[str]) -> list[str] | 
         which = given.env if given.seed < 0 else f"{given.env} with seed {given.seed}"
         print(f"--resume: {folder} has no checkpoint of {which}; training begins from zero")
         return rest
-    if is_complete(run / f"{env_name}.zip"):
+    files = [run / f"{env_name}.zip", *run.glob(CHECKPOINT)]  # older, if the last updates lack
+    if all(map(is_complete, files)):
         other = "start another run without --resume, or train it further with -i"
         print(f"{run} has finished already; {other}")
         return None
