@@ -1,9 +1,11 @@
 """``sb3-poem train`` and ``enjoy``: rl_zoo3 with our algorithms, files and checks."""
 
+import os
 import runpy
 import shlex
 import signal
 import sys
+import uuid
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -617,6 +619,15 @@ def test_folders_that_are_no_runs_are_passed_over(tmp_path: Path) -> None:
         (tmp_path / f"poem-PointGoal-v0_{name}").mkdir()
         (tmp_path / f"poem-PointGoal-v0_{name}" / "checkpoint.zip").touch()
     assert last_run(tmp_path, "poem-PointGoal-v0", -1) == tmp_path / "poem-PointGoal-v0_10"
+
+
+def test_of_runs_with_a_unique_id_the_newest_is_found(tmp_path: Path) -> None:
+    runs = [tmp_path / f"poem-PointGoal-v0_1_{uuid.UUID(int=number)}" for number in (1, 2, 0)]
+    for second, run in enumerate(runs):
+        run.mkdir()
+        (run / "checkpoint.zip").touch()
+        os.utime(run, (second, second))
+    assert last_run(tmp_path, "poem-PointGoal-v0", -1) == runs[-1]
 
 
 def test_a_model_that_is_trained_further_is_read_once(

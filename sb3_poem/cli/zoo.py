@@ -2,6 +2,7 @@
 
 import argparse
 import difflib
+import re
 import shlex
 import sys
 from collections.abc import Sequence
@@ -31,6 +32,8 @@ DEFAULTS = {
     "enjoy": ["--folder", "logs"],
 }
 TRAIN_EXAMPLE = "example: sb3-poem train --env poem/PointGoal-v0 -P"
+#: What comes after an environment's name in that of a run's folder: a number and what -uuid adds
+RUN = re.compile(r"(\d+)(_[0-9a-f-]{36})?")
 RESUME = "--resume: go on with the last run of this algorithm, environment and seed, if unfinished"
 
 
@@ -146,9 +149,11 @@ def is_complete(model: Path) -> bool:
 
 def last_run(folder: Path, env_name: str, seed: int) -> Path | None:
     """The newest run in an algorithm's folder that is done or can go on; of a seed, if not -1."""
-    runs = {run.name.removeprefix(f"{env_name}_"): run for run in folder.glob(f"{env_name}_*")}
-    for number in sorted(filter(str.isdecimal, runs), key=int, reverse=True):
-        run = runs[number]
+    runs = []
+    for run in folder.glob(f"{env_name}_*"):
+        if found := RUN.fullmatch(run.name.removeprefix(f"{env_name}_")):
+            runs.append((int(found[1]), run.stat().st_mtime, run))  # -uuid gives many one number
+    for *_, run in sorted(runs, reverse=True):
         if seed >= 0 and _seed(run / env_name / "args.yml") != seed:
             continue
         if (run / CHECKPOINT).exists() or is_complete(run / f"{env_name}.zip"):
