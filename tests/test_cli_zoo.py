@@ -18,7 +18,7 @@ import torch as th
 import yaml
 from first_hour import ENTRY as SMALL
 from first_hour import write_entry
-from meta_toys import WindyWalk, differing, parameters
+from meta_toys import Walk, WindyWalk, differing, parameters
 from rl_zoo3 import ALGOS
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
@@ -223,6 +223,17 @@ def windy_config(tmp_path: Path) -> Iterator[Path]:
     config.write_text(yaml.safe_dump({"Windy-v0": entry}))
     yield config
     del gym.registry["Windy-v0"]
+
+
+def test_an_environment_that_needs_arguments_is_trained(tmp_path: Path) -> None:
+    gym.register("Sized-v0", lambda size, **kwargs: Walk(), max_episode_steps=10)
+    entry = {"policy": "MlpPolicy", "n_timesteps": 1, "gradient_steps": 1, "batch_size": 2}
+    (tmp_path / "sized.yml").write_text(yaml.safe_dump({"default": entry}))
+    flags = ("-c", tmp_path / "sized.yml", "-f", tmp_path / "logs", "--eval-freq", -1)
+    try:
+        assert train("--env", "Sized-v0", *flags, "--env-kwargs", "size:1") == 0
+    finally:
+        del gym.registry["Sized-v0"]
 
 
 def test_epochs_are_counted_with_the_rollouts_that_compare_policies(
@@ -596,6 +607,19 @@ def test_an_interrupt_before_the_last_updates_leaves_them_to_do(
     assert "Interrupted at 900 of 900 steps, saved at 750; go on with" in capfd.readouterr().err
     assert train(*flags, "--resume", "-params", "n_timesteps:900", "callback:None") == 0
     assert not differing(parameters(trained(tmp_path, 2)), whole)
+
+
+def test_a_run_goes_on_in_its_own_number_of_copies_and_in_no_other_environment(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    config = interrupts(tmp_path / "c.yml", {"at": 60})
+    flags, kwargs = ("-c", config, "-f", tmp_path, "--eval-freq", -1), ("step_length:0.2",)
+    assert train(*flags, "--env-kwargs", *kwargs, "-params", "n_envs:3") == 130
+    assert train(*flags, "--resume") == 1
+    error = capfd.readouterr().err
+    assert 'it was trained with --env-kwargs {"step_length": 0.2}, not {}' in error
+    assert train(*flags, "--resume", "--env-kwargs", *kwargs) == 0
+    assert (trained(tmp_path, 3).n_envs, trained(tmp_path, 3).num_timesteps) == (3, 300)
 
 
 def test_an_interrupt_before_the_first_checkpoint(

@@ -2,6 +2,7 @@
 
 import contextlib
 import inspect
+import json
 import os
 import signal
 import threading
@@ -136,9 +137,13 @@ class PoemExperiment(FamilyExperiment):
         for key in ("n_timesteps", "policy"):
             if key not in hyperparams:
                 raise ValueError(f"{source} has no {key!r}")
-        if "n_envs" not in hyperparams:
+        resumed = facts_of(self.trained_agent) if self.continue_training else {}
+        if resumed.get("keeps_experience"):  # copies are a hyperparameter: an epoch fills waves
+            hyperparams["n_envs"] = resumed["n_envs"]
+        elif "n_envs" not in hyperparams:
             sizes = hyperparams.get("n_train_tasks"), hyperparams.get("trajectories_per_task", 1)
-            hyperparams["n_envs"] = default_copies(self.env_name.gym_id, *sizes)
+            env_kwargs = hyperparams.get("env_kwargs") or self.env_kwargs
+            hyperparams["n_envs"] = default_copies(self.env_name.gym_id, *sizes, **env_kwargs)
         return hyperparams, saved
 
     def create_envs(self, *args: Any, **kwargs: Any) -> VecEnv:
@@ -174,6 +179,10 @@ class PoemExperiment(FamilyExperiment):
             if not facts_of(file).get("keeps_experience"):
                 return super()._load_pretrained_agent(hyperparams, env)
             model = algorithm.load_checkpoint(file, env, device=self.device)
+            both = model.env_kwargs, model.family.env_kwargs
+            own, given = (json.dumps(each, sort_keys=True, default=str) for each in both)
+            if own != given:
+                raise ValueError(f"it was trained with --env-kwargs {own}, not {given}")
         except ValueError as error:
             raise ValueError(f"-i {file}, --env {self.env_name.gym_id}: {error}") from error
         model.tensorboard_log, model.verbose = self.tensorboard_log, self.verbose

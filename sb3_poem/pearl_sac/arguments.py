@@ -203,11 +203,13 @@ def vectorise(
     return make_task_vec_env(env, default_copies(env, n_train_tasks, trajectories_per_task))
 
 
-def default_copies(env_id: str, n_train_tasks: int | None, trajectories_per_task: int) -> int:
+def default_copies(
+    env_id: str, n_train_tasks: int | None, trajectories_per_task: int, **env_kwargs: Any
+) -> int:
     """How many copies of an environment to step unless told: one for each trajectory of an epoch,
     up to one per task or :data:`DEFAULT_TRAIN_TASKS`, whichever is more.
     """
     if n_train_tasks is None:
-        with contextlib.closing(gym.make(env_id)) as probe:
+        with contextlib.closing(gym.make(env_id, **env_kwargs)) as probe:
             n_train_tasks = default_train_tasks(getattr(probe.unwrapped, "all_tasks", None))
     return min(n_train_tasks * trajectories_per_task, max(n_train_tasks, DEFAULT_TRAIN_TASKS))
