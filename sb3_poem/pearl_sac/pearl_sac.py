@@ -332,7 +332,8 @@ class PEARLSAC(SAC):
         :raises ValueError: If no number of steps is known
         """
         steps = self._checked_steps(total_timesteps, callback)
-        if steps <= self.epoch_steps and self.lr_schedule(0.0) == 0.0:
+        ends_another = self.num_timesteps + steps == self._total_timesteps
+        if steps <= self.epoch_steps and self.lr_schedule(0.0) == 0.0 and not ends_another:
             warnings.warn(
                 "`learning_rate` falls to 0 at the end of the run, and a run of one epoch trains "
                 f"there: nothing is learned. Learn for more than {self.epoch_steps:,} steps, or "

@@ -12,9 +12,10 @@ import pytest
 import torch as th
 import yaml
 from meta_toys import EPOCH, POINT_GOAL, Walk, differing, parameters, small
+from stable_baselines3.common.callbacks import ConvertCallback
 from torch.nn.utils import parameters_to_vector
 
-from sb3_poem import PEARLSAC, POEMSAC
+from sb3_poem import PEARLSAC, POEMSAC, TrainingCheckpointCallback
 from sb3_poem.common.vec_env import make_task_vec_env
 from sb3_poem.loading import ALGORITHMS
 from sb3_poem.pearl_sac.saving import kept_arguments
@@ -145,7 +146,7 @@ def test_the_names_are_those_of_the_command_line() -> None:
     }
 
 
-def test_a_run_of_one_epoch_says_that_a_falling_rate_is_0_in_it() -> None:
+def test_a_run_of_one_epoch_says_that_a_falling_rate_is_0_in_it(tmp_path: Path) -> None:
     few = {"seed": 0, "n_train_tasks": 4, "gradient_steps": 2}
     model = POEMSAC.from_zoo(POINT_GOAL, n_envs=4, **few)
     before = parameters_to_vector(model.policy.actor.parameters())
@@ -157,3 +158,8 @@ def test_a_run_of_one_epoch_says_that_a_falling_rate_is_0_in_it() -> None:
         model.learn(200)
         assert not th.equal(parameters_to_vector(model.policy.actor.parameters()), before)
         POEMSAC("MlpPolicy", POINT_GOAL, **few).learn(100)
+        in_second_epoch = ConvertCallback(lambda *_: model.num_timesteps <= 100)
+        model.learn(200, [TrainingCheckpointCallback(tmp_path / "c.zip"), in_second_epoch])
+        last = POEMSAC.load_checkpoint(tmp_path / "c.zip", POINT_GOAL)
+        assert last.num_timesteps == 100
+        assert last.resume().num_timesteps == 200
