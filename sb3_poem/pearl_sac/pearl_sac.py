@@ -716,6 +716,7 @@ class PEARLSAC(SAC):
                 f"{path} is the experience of other tasks than this model's training tasks, which "
                 "have rewards of their own: load what was saved with the model"
             )
+        self.replay_buffer.load_state(self.replay_buffer.state())  # on this model's device
 
     @classmethod
     def load(

@@ -215,6 +215,9 @@ def test_a_model_and_its_buffer_go_on_as_if_they_had_never_stopped(tmp_path: Pat
     loaded.load_replay_buffer(tmp_path / "buffer")
     loaded.learn(EPOCH, reset_num_timesteps=False)
     assert not differing(parameters(whole), parameters(loaded))
+    loaded.device = th.device("meta")  # in place of a GPU
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    assert loaded.replay_buffer.rows.device == loaded.replay_buffer.ends.device == loaded.device
 
 
 def test_parameters_come_with_their_standardisation(poem: POEMSAC) -> None:
