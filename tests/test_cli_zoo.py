@@ -654,6 +654,15 @@ def test_of_runs_with_a_unique_id_the_newest_is_found(tmp_path: Path) -> None:
     assert last_run(tmp_path, "poem-PointGoal-v0", -1) == runs[-1]
 
 
+def test_a_run_that_a_full_disk_ended_before_it_began_is_passed_over(tmp_path: Path) -> None:
+    for number, content in ((1, "seed: 3"), (2, "")):
+        folder = tmp_path / f"poem-PointGoal-v0_{number}" / "poem-PointGoal-v0"
+        folder.mkdir(parents=True)
+        (folder / "args.yml").write_text(content)
+    (tmp_path / "poem-PointGoal-v0_1" / "checkpoint.zip").touch()
+    assert last_run(tmp_path, "poem-PointGoal-v0", 3) == tmp_path / "poem-PointGoal-v0_1"
+
+
 def test_a_model_that_is_trained_further_is_read_once(
     config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

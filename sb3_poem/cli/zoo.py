@@ -154,9 +154,8 @@ def last_run(folder: Path, env_name: str, seed: int) -> Path | None:
         if found := RUN.fullmatch(run.name.removeprefix(f"{env_name}_")):
             runs.append((int(found[1]), run.stat().st_mtime, run))  # -uuid gives many one number
     for *_, run in sorted(runs, reverse=True):
-        if seed >= 0 and _seed(run / env_name / "args.yml") != seed:
-            continue
-        if (run / CHECKPOINT).exists() or is_complete(run / f"{env_name}.zip"):
+        began = (run / CHECKPOINT).exists() or is_complete(run / f"{env_name}.zip")
+        if began and (seed < 0 or _seed(run / env_name / "args.yml") == seed):
             return run
     return None
 
