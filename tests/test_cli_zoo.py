@@ -385,6 +385,10 @@ def test_files_that_ship_are_found_by_their_names_and_ones_own_come_first(tmp_pa
             ("-params", "n_timesteps:0"),
             ("n_timesteps in -params must be a positive number, got 0",),
         ),
+        (
+            ("-params", "n_envs:1e1"),
+            ("n_envs in -params must be a positive whole number, got 10.0",),
+        ),
         (("-n", "0"), ("-n/--n-timesteps must be at least 1, got 0",)),
         (("-c", "missing.yml"), ("-c missing.yml: there is no such file", "poem_sac_gpu.yml")),
         (("-c", "missing"), ("-c missing: there is no such module", ".yml")),

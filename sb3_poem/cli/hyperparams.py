@@ -55,8 +55,10 @@ def check_entry(entry: Mapping[str, Any], algorithm: str, source: str) -> None:
 def _check_value(what: str, key: str, value: Any, kind: Any) -> None:
     if isinstance(value, str) and (number := _number(value)) is not None:
         raise ValueError(f"{what} is the text {value!r}; write {number!r}")
-    if key in ("n_envs", "n_timesteps"):
+    if key == "n_timesteps":
         fits, wanted = isinstance(value, (int, float)) and value >= 1, "a positive number"
+    elif key == "n_envs":
+        fits, wanted = isinstance(value, int) and value >= 1, "a positive whole number"
     elif key == "learning_rate":
         fits = not isinstance(value, str) or _number(value.partition("_")[2]) is not None
         wanted = "a number, or 'lin_' and a number"
