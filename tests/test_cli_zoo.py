@@ -555,8 +555,10 @@ def test_a_checkpoint_continues_bit_for_bit(
         with pytest.raises(CrashError):
             train(*flags)
     assert not (saved[-1].parent / "poem-PointGoal-v0.zip").exists()
-    assert train(*flags, "-i", saved[-1]) == 0
+    assert train(*flags, "-i", saved[-1], "--seed", 5) == 0
     assert not differing(parameters(trained(tmp_path, 2)), whole)
+    runs = tmp_path / "poem_sac"  # and it has the seed with which it began
+    assert last_run(runs, "poem-PointGoal-v0", 0) == runs / "poem-PointGoal-v0_2"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

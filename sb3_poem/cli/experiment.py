@@ -186,6 +186,7 @@ class PoemExperiment(FamilyExperiment):
         except ValueError as error:
             raise ValueError(f"-i {file}, --env {self.env_name.gym_id}: {error}") from error
         model.tensorboard_log, model.verbose = self.tensorboard_log, self.verbose
+        self.args.seed = model.seed  # by which --resume finds this run, if it is interrupted too
         self.resumes, steps = True, model.num_timesteps
         print(f"Resuming {self.trained_agent} after {steps} steps, with its own hyperparameters")
         return model
