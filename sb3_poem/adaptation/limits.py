@@ -127,10 +127,11 @@ def information_limit(
     returns = check_returns(returns)
     capacity = answer_capacity(noise_model, float(np.ptp(returns, axis=1).max()), n_answers)
     n_tasks, n_policies = returns.shape
-    if k >= 63 or n_answers**k >= min(n_tasks, n_policies):
+    size = int(n_answers) ** min(int(k), 63)  # NumPy's whole numbers would overflow
+    if size >= min(n_tasks, n_policies):
         limit = float(returns.max(axis=1).mean())
     else:
-        limit = _value(returns, best_codebook(returns, n_answers**k, ordered=ordered))
+        limit = _value(returns, best_codebook(returns, size, ordered=ordered))
     if capacity == np.log2(n_answers):
         return limit
     return min(limit, rate_distortion_limit(returns, k * capacity))
