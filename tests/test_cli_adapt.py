@@ -171,7 +171,7 @@ def test_the_environment_is_made_as_in_training(tmp_path: Path) -> None:
         assert result["env_kwargs"] == {"step_length": expected}
         vec_env = make_task_vec_env(ENV_ID, 4, step_length=expected)
         evaluation = evaluate_adaptation(
-            trained, vec_env, np.array(result["tasks"]), record_at=[0], n_episodes=2
+            trained, vec_env, np.array(result["tasks"]), record_at=[0, 1], n_episodes=2
         )
         assert result["mean_return"] == pytest.approx(evaluation.mean_returns.tolist(), rel=1e-4)
 
@@ -186,6 +186,18 @@ def test_the_other_algorithm(tmp_path: Path) -> None:
     vec_env, rule = make_task_vec_env(ENV_ID, 4), Bayes(query_rule="random")
     expected = evaluate_adaptation(pearl, vec_env, 2, record_at=(0, 1), n_episodes=1, rule=rule)
     np.testing.assert_allclose(result["task_returns"], expected.task_returns, rtol=1e-4)
+
+
+def test_all_questions_are_asked_whatever_is_measured(
+    model: tuple[POEMSAC, str], tmp_path: Path
+) -> None:
+    file, policy = tmp_path / "result.json", tmp_path / "a.safetensors"
+    flags = ["--queries", 3, "--record", 1, "--tasks", 1, "--episodes", 1, "--n-candidates", 20]
+    film = ["--video", tmp_path / "a.gif", *TINY]  # of the policies before and after
+    assert adapt(model[1], *flags, *film, "--json", file, "--save", policy) == 0
+    result = json.loads(file.read_text())
+    assert result["queries"] == [0, 1, 3]
+    assert len(result["answers"][0]) == AdaptedPolicy.load(policy).n_answers == 3
 
 
 def test_a_model_with_a_schedule_of_rl_zoo3_in_a_process_of_its_own(tmp_path: Path) -> None:

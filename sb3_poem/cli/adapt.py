@@ -114,7 +114,9 @@ class Adaptation:
             spread = return_spread(subject.model, subject.env, subject.seed)
         factory = make_oracle_factory(self.oracle, self.rule.question, spread)
         measured: list[AdaptationEvaluation] = []
-        record_at = tuple(sorted({*(arguments.record or range(arguments.queries + 1))}))
+        last = arguments.queries
+        first = {0} if arguments.video is not None else set()  # which the film shows, too
+        record_at = tuple(sorted({*(arguments.record or range(last)), last, *first}))
 
         def show(evaluation: AdaptationEvaluation) -> None:
             measured.append(evaluation)

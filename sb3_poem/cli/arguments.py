@@ -206,7 +206,7 @@ def _add_adapt_arguments(parser: argparse.ArgumentParser) -> None:
     tasks = parser.add_argument_group("test tasks")
     _option(tasks, "--tasks", "how many (default: 30; 1 with --oracle human)", _count(1))
     _add_task(tasks, "per task and evaluation")
-    told = "measure after so many answers (default: each)"
+    told = "measure after so many answers, and after the last one (default: after each)"
     _option(tasks, "--record", told, _count(0), nargs="+", metavar="K")
 
     output = parser.add_argument_group("output")
