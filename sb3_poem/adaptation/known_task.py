@@ -16,7 +16,7 @@ from sb3_poem.adaptation.evaluation import (
 from sb3_poem.adaptation.limits import AnswerLimits
 from sb3_poem.adaptation.meta_model import HasSimilarity, MetaModel
 from sb3_poem.adaptation.noise import NoiseModel
-from sb3_poem.common.checks import check_whole
+from sb3_poem.common.checks import check_choice, check_whole
 from sb3_poem.common.family_view import FamilyView, demanded
 from sb3_poem.common.rollouts import rollout_episodes
 
@@ -79,7 +79,7 @@ def known_task_return(
     *,
     selection_episodes: int = 1,
     deterministic: bool = True,
-    limits: bool = True,
+    limits: bool | str = True,
 ) -> KnownTaskReturn:
     """The return if the task were known: for each task the best of many latents, half of N(0, I)
     and half of the training tasks', refined by two rounds of draws around it. Winners are rolled
@@ -96,8 +96,10 @@ def known_task_return(
     :param n_episodes: Fresh episodes per winner.
     :param selection_episodes: Episodes per latent (and task, where dynamics differ) for choosing.
     :param deterministic: Whether policies act by their mode.
-    :param limits: Whether to measure limits, which takes one more rollout of all latents.
+    :param limits: Whether to measure limits, which takes one more rollout of all latents; "exact"
+        leaves out those of answers with errors, which take longest.
     """
+    check_choice("limits", limits, (True, False, "exact"))
     model, vec_env = model_and_env(model, env)
     tasks = choose_test_tasks(model, vec_env, tasks, seed)
     family = FamilyView(vec_env)
@@ -144,7 +146,8 @@ def known_task_return(
         ordered = along.shape[1] == 1
         if ordered:
             chosen_on = chosen_on[np.argsort(along[:, 0])]
-        measured = AnswerLimits.measure(chosen_on, returns, fresh, ordered=ordered)
+        extent = {"ordered": ordered, "erring": limits != "exact"}
+        measured = AnswerLimits.measure(chosen_on, returns, fresh, **extent)
     how = n_episodes, evaluation_seed(seed), deterministic
     outcomes = evaluate_episodes(model, vec_env, best, tasks, *how)
     own = {"tasks": tasks, "latents": best, "candidate_latents": candidates}

@@ -40,7 +40,8 @@ class AnswerLimits:
     (-5.0, -3.0)
 
     :param codebooks: Mean return after 0, 1, 2, ... exact answers, until all policies are in.
-    :param bits: Ascending from 0, and ``returns``, the mean returns when so much is told.
+    :param bits: Ascending from 0, and ``returns``, the mean returns when so much is told; empty if
+        that was not measured.
     :param spread: The largest difference of two policies' returns on a task.
     """
 
@@ -51,7 +52,13 @@ class AnswerLimits:
 
     @classmethod
     def measure(
-        cls, others: np.ndarray, chosen: np.ndarray, fresh: np.ndarray, *, ordered: bool = False
+        cls,
+        others: np.ndarray,
+        chosen: np.ndarray,
+        fresh: np.ndarray,
+        *,
+        ordered: bool = False,
+        erring: bool = True,
     ) -> Self:
         """From returns of the same policies.
 
@@ -59,6 +66,7 @@ class AnswerLimits:
         :param chosen: (n_tasks, n_policies), by which each test task's policy is chosen.
         :param fresh: (n_tasks, n_policies), of other episodes, which score it.
         :param ordered: See :func:`best_codebook`.
+        :param erring: Whether to measure what answers with errors allow, too, which takes longest.
         """
         others, chosen, fresh = (check_returns(returns) for returns in (others, chosen, fresh))
         n_policies, every = others.shape[1], np.arange(len(chosen))
@@ -67,9 +75,9 @@ class AnswerLimits:
             book = best_codebook(others, 2**k, ordered=ordered and 2**k <= ORDERED_POLICIES)
             picks = book[np.argmax(chosen[:, book], axis=1)]
             codebooks.append(float(fresh[every, picks].mean()))
-        bits, returns = [0.0], [codebooks[0]]
+        bits, returns = [0.0] * erring, codebooks[:1] * erring
         marginal = None
-        for slope in SLOPES / max(float(np.ptp(others)), 1e-12):
+        for slope in SLOPES[: len(SLOPES) * erring] / max(float(np.ptp(others)), 1e-12):
             marginal, _ = _best_marginal(others, slope, marginal)
             told = _channel(others, slope, marginal)
             logs = np.log(np.maximum(told, 1e-300) / np.maximum(marginal, 1e-300))
@@ -94,6 +102,8 @@ class AnswerLimits:
         exact = float(np.interp(most, range(len(self.codebooks)), self.codebooks))
         if capacity == np.log2(n_answers):
             return exact
+        if not self.bits:
+            raise ValueError("limits of answers with errors were not measured: limits=True does")
         return min(exact, float(np.interp(k * capacity, self.bits, self.returns)))
 
 

@@ -129,7 +129,7 @@ class Adaptation:
             how: dict[str, Any] = {"n_episodes": arguments.episodes, "seed": subject.seed}
             how |= {"rule": self.rule, "record_at": record_at, "progress_bar": True}
             evaluate_adaptation(*about, on_record=show, **how)
-            known = subject.known_task_return(arguments.episodes)
+            known = subject.known_task_return(arguments.episodes, "exact")
         except KeyboardInterrupt:
             if not measured:
                 raise
@@ -211,7 +211,7 @@ class Adaptation:
             adapter.save(arguments.json)
             say(f"Wrote {arguments.json}")
         if arguments.task is not None and not interrupted:
-            known = subject.known_task_return(arguments.episodes)
+            known = subject.known_task_return(arguments.episodes, "exact")
             self._report(self._measure(latents, adapter), known)
         if arguments.video is not None and not interrupted:
             self._film(latents, (0, adapter.n_answers))

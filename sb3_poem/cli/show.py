@@ -71,7 +71,7 @@ class Shown:
             self.latents = [subject.latent]
             say(f"Policy: that in {arguments.model}, which is adapted already")
         elif arguments.known_task:
-            known = subject.known_task_return(arguments.episodes, limits=False)
+            known = subject.known_task_return(arguments.episodes)
             self.latents, n = [known.latents[0]], len(known.candidate_latents)
             what = f"the best of {n} for this task; return {known.mean_return:.1f}"
             say(f"Policy of {arguments.model}: {what}")

@@ -87,7 +87,7 @@ class Subject:
         if task is None:
             self.tasks = self.family.test_tasks(n_tasks, self.seed)
 
-    def known_task_return(self, n_episodes: int, limits: bool = True) -> KnownTaskReturn:
+    def known_task_return(self, n_episodes: int, limits: bool | str = False) -> KnownTaskReturn:
         """The best of the model's policies for each task, measured on so many episodes."""
         about = (self.model, self.env, self.tasks, None, n_episodes, self.seed)
         selection = min(n_episodes, SELECTION_EPISODES)

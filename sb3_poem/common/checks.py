@@ -76,7 +76,7 @@ def as_observations(observation: Any, shape: tuple[int, ...]) -> np.ndarray:
     return np.asarray(observation)
 
 
-def check_choice(name: str, value: Any, allowed: Sequence[str | None]) -> None:
+def check_choice(name: str, value: Any, allowed: Sequence[object]) -> None:
     """Refuse an option's value that is none of those allowed."""
     if value not in allowed:
         raise ValueError(f"`{name}` must be one of {tuple(allowed)}, but is {value!r}")

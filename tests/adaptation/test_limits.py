@@ -261,6 +261,18 @@ def test_fair_limits_do_not_profit_from_luck():
             assert abs(limits.after(k, noise)) < 0.35  # 100 tasks: the standard error is 0.1
 
 
+def test_limits_of_exact_answers_alone():
+    others, returns = np.random.default_rng(0).normal(size=(2, 12, 9))
+    full = AnswerLimits.measure(others, returns, returns)
+    exact = AnswerLimits.measure(others, returns, returns, erring=False)
+    for n in (2, 4, 5):
+        assert [exact.after(k, None, n) for k in range(4)] == [
+            full.after(k, None, n) for k in range(4)
+        ]
+    with pytest.raises(ValueError, match="errors were not measured: limits=True does"):
+        exact.after(1, MistakeNoise(0.2))
+
+
 def test_fair_limits_on_a_line():
     """Without luck, and with other tasks as dense as these, they are the plain ones."""
     returns, others = SPEEDS[4::8, ::8], SPEEDS[::8, ::8]
