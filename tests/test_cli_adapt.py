@@ -189,13 +189,14 @@ def test_the_other_algorithm(tmp_path: Path) -> None:
 
 
 def test_all_questions_are_asked_whatever_is_measured(
-    model: tuple[POEMSAC, str], tmp_path: Path
+    model: tuple[POEMSAC, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    file, policy = tmp_path / "result.json", tmp_path / "a.safetensors"
+    file, policy = tmp_path / "result[a].json", tmp_path / "a.safetensors"
     flags = ["--queries", 3, "--record", 1, "--tasks", 1, "--episodes", 1, "--n-candidates", 20]
     film = ["--video", tmp_path / "a.gif", *TINY]  # of the policies before and after
     assert adapt(model[1], *flags, *film, "--json", file, "--save", policy) == 0
     result = json.loads(file.read_text())
+    assert f"Wrote {file}\n" in capsys.readouterr().out  # as it is, brackets and all
     assert result["queries"] == [0, 1, 3]
     assert len(result["answers"][0]) == AdaptedPolicy.load(policy).n_answers == 3
 

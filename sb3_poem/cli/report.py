@@ -14,6 +14,7 @@ from scipy.stats import sem
 from sb3_poem.adaptation import AdaptationEvaluation, KnownTaskReturn
 from sb3_poem.adaptation.preference import BEST_OF_FOUR
 from sb3_poem.benchmark.provenance import versions
+from sb3_poem.cli.needs import say
 from sb3_poem.cli.subject import after
 from sb3_poem.common.files import write_json_atomically
 from sb3_poem.plotting import plot_returns
@@ -35,7 +36,7 @@ def write_report(
     """Print the table of what adapting earned, and write JSON and plot; without ``known`` it was
     interrupted.
     """
-    console, limits, best = Console(), None, None
+    limits, best = None, None
     kinds = KINDS_OF_ANSWERS.get(settings.get("question", "pair"), 2)
     facts = {"command": shlex.join(sys.orig_argv), "versions": versions(), **settings}
     facts |= evaluation.to_dict()
@@ -46,14 +47,14 @@ def write_report(
         facts["known_task_returns"] = known.returns.mean(axis=1).tolist()
         if known.success_rate is not None:
             facts["known_task_success_rate"] = known.success_rate
-    console.print(_table(title, evaluation, known, limits, kinds))
+    Console().print(_table(title, evaluation, known, limits, kinds))
     if json_file is not None:
         write_json_atomically(json_file, facts)
-        console.print(f"Wrote {json_file}")
+        say(f"Wrote {json_file}")
     if plot_file is not None:
         earned = (evaluation.record_at, evaluation.task_returns, limits)
         plot_returns(*earned, best, title=title, path=plot_file)
-        console.print(f"Wrote {plot_file}")
+        say(f"Wrote {plot_file}")
 
 
 def _table(
