@@ -515,7 +515,15 @@ def test_an_interrupt_before_anything_was_measured(
         (["--resume"], "--resume is for --oracle human, but that is return"),
         (["--mistake-rate", 0.0], "--mistake-rate is for --oracle mistake, but that is return"),
         (["--beta", 2.0], "--beta is for --oracle boltzmann, but that is return"),
-        (["--thresholds", 0.7, 0.1], "--thresholds 0.7 0.1: must be two shares"),
+        (
+            ["--question", "graded", "--thresholds", 0.7, 0.1],
+            "--thresholds 0.7 0.1: must be two shares",
+        ),
+        (["--thresholds", 0.1, 0.7], "--thresholds is for --question graded, but that is pair"),
+        (
+            ["--infer-noise", "--inference", "paper"],
+            "--infer-noise is for --inference bayes, but that is paper",
+        ),
         (["--oracle", "boltzmann", "--beta", -1.0], "-1.0"),
         (["--json", "a.txt"], "must end in .json"),
         (["--plot", "a.gif"], "must end in .png or"),

@@ -35,7 +35,15 @@ from sb3_poem.label import Store, StoreRecorder
 from sb3_poem.label.beliefs import believed_in_words
 
 DEFAULT_TASKS, DEFAULT_MISTAKE_RATE = 30, 0.2
-ORACLE_OF = {"store": "human", "resume": "human", "beta": "boltzmann", "mistake_rate": "mistake"}
+DEFAULT_THRESHOLDS = (0.1, 0.7)
+#: Options that mean something with a value of another alone
+GOES_WITH = {
+    **dict.fromkeys(("store", "resume"), ("oracle", "human")),
+    "beta": ("oracle", "boltzmann"),
+    "mistake_rate": ("oracle", "mistake"),
+    "thresholds": ("question", "graded"),
+    "infer_noise": ("inference", "bayes"),
+}
 
 
 def run_adapt(arguments: argparse.Namespace) -> int:
@@ -74,12 +82,12 @@ def _check_tasks(arguments: argparse.Namespace) -> int:
     if human and not named and arguments.plot is not None:
         only = "with --oracle human only --task says by which goal to measure them"
         raise ValueError(f"--plot needs returns, and {only}")
-    for flag, oracle in ORACLE_OF.items():
-        given = getattr(arguments, flag)
-        if given is not None and given is not False and arguments.oracle != oracle:
+    for flag, (other, value) in GOES_WITH.items():
+        given, chosen = getattr(arguments, flag), getattr(arguments, other) or "pair"
+        if given is not None and given is not False and chosen != value:
             name = flag.replace("_", "-")
-            raise ValueError(f"--{name} is for --oracle {oracle}, but that is {arguments.oracle}")
-    equal, much = arguments.thresholds
+            raise ValueError(f"--{name} is for --{other} {value}, but that is {chosen}")
+    equal, much = arguments.thresholds = arguments.thresholds or DEFAULT_THRESHOLDS
     if not 0.0 <= equal <= much < np.inf:
         shares = "must be two shares, the first not the larger"
         raise ValueError(f"--thresholds {equal:g} {much:g}: {shares}")

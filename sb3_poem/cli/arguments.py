@@ -192,7 +192,8 @@ def _add_adapt_arguments(parser: argparse.ArgumentParser) -> None:
     _option(questions, "--question", told, choices=QUESTIONS)
     told = "from what differences on an oracle says better and much better, as shares of the spread"
     thresholds: dict[str, Any] = {"nargs": 2, "metavar": ("BETTER", "MUCH")}
-    _option(questions, "--thresholds", f"{told} of returns", float, [0.1, 0.7], **thresholds)
+    told += " of returns (default: 0.1 0.7)"
+    _option(questions, "--thresholds", told, float, **thresholds)
     _switch(questions, "--infer-noise", "infer how often answers err, not be told it (bayes)")
     _option(questions, "--queries", "questions per task", _count(1), 10)
     _option(questions, "--inference", "", default="bayes", choices=INFERENCES)
