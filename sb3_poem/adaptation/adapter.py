@@ -4,6 +4,7 @@ import contextlib
 import json
 import os
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -25,6 +26,7 @@ from sb3_poem.adaptation.rule import (
     as_rule,
     inference_rng,
     latent_of,
+    latents_of,
     rollout_seed,
     seen,
 )
@@ -155,9 +157,10 @@ class PreferenceAdapter:
             self._check_unfinished()
             self.pending = self._make_query(self.inference.ask())
         elif self._needs_frames and self._frames_are_missing(self.pending):
-            # It comes from a file, which holds no frames; the same seed gives the same rollouts.
-            latents = self.inference.same_latents(*(item.latent for item in self.pending.shown))
-            self.pending = self._make_query(latents, self._number_of(self.pending))
+            # Neither a file nor an answer holds frames; the same seed gives the same rollouts.
+            number, latents = self._number_of(self.pending), latents_of(self.pending.shown)
+            shown = self.inference.same_latents(number, *latents)
+            self.pending = self._make_query(shown, number)
         return self.pending
 
     def _frames_are_missing(self, query: Query) -> bool:
@@ -196,7 +199,10 @@ class PreferenceAdapter:
         query = self.pending
         answer = as_preference(preference, query.kind)
         before = self.inference.snapshot()
-        self.inference.tell(answer, *query.shown)
+        shown = query.shown
+        if self.inference.library is None:  # the frames of ten questions would take gigabytes
+            shown = tuple(replace(item, frames=None) for item in shown)
+        self.inference.tell(answer, *shown)
         self.pending, self._previous = None, (before, query)
         self._seen.clear()
 

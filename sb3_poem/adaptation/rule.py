@@ -62,8 +62,10 @@ class Inference(ABC):
     def ask(self) -> tuple[Shown, ...]:
         """What to compare next: latents (d,) to roll out, or trajectories to show."""
 
-    def same_latents(self, *latents: np.ndarray) -> tuple[Shown, ...]:
-        """A question's latents from a file; others where they mean something to one model alone."""
+    def same_latents(self, number: int, *latents: np.ndarray) -> tuple[Shown, ...]:
+        """The latents of question ``number``, from 0, which may come from a file; others where they
+        mean something to one model alone.
+        """
         return latents
 
     @abstractmethod

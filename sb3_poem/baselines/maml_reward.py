@@ -418,15 +418,16 @@ class MAMLRewardInference(Inference):
         self.answers = []
         with _seeded(int(self.seed[0])):
             self.sac = _make_sac(self.model, self.rule, self.n_queries)
-        self.latent = self.model.add(self.sac.actor)
+        #: After each number of answers
+        self.latents = [self.model.add(self.sac.actor)]
 
     def ask(self) -> tuple[Shown, Shown]:
         """The current policy twice, with opposite exploration noise."""
-        return self.latent.copy(), self.latent * np.array([1.0, -1.0])
+        return self.same_latents(-1)
 
-    def same_latents(self, *latents: np.ndarray) -> tuple[Shown, ...]:
-        """The current policy, whose number in the file was another."""
-        return self.ask()
+    def same_latents(self, number: int, *latents: np.ndarray) -> tuple[Shown, Shown]:
+        """The policy after so many answers, whose number in the file was another."""
+        return self.latents[number].copy(), self.latents[number] * np.array([1.0, -1.0])
 
     def tell(self, preference: Preference, *shown: Shown) -> None:
         self.answers.append(Answer(preference, seen(shown)))
@@ -438,10 +439,10 @@ class MAMLRewardInference(Inference):
         with _seeded(int(self.seed[0]) + len(self.answers)):
             self._fill_buffer(clips, [row / scale for row in rewards])
             self.sac.train(self.rule.gradient_steps, self.rule.batch_size)
-        self.latent = self.model.add(self.sac.actor)
+        self.latents.append(self.model.add(self.sac.actor))
 
     def estimate(self) -> np.ndarray:
-        return self.latent.copy()
+        return self.latents[-1].copy()
 
     def restore(self, snapshot: dict[str, Any], answers: list[Answer]) -> None:
         """Tells the answers again."""

@@ -95,6 +95,11 @@ def test_frames_for_ask_and_tell(tmp_path):
         a.to_json(), "PointGoal", "poem/PointGoal-v0", render=True
     )
     np.testing.assert_array_equal(resumed.ask().right.frames, query.right.frames)
+    a.tell("left")
+    assert [item.frames for item in a.answers[0].shown] == [None, None]  # they take megabytes
+    assert a.undo() is query
+    a.tell("left")
+    np.testing.assert_array_equal(a.ask_again(0).right.frames, query.right.frames)
     with pytest.raises(
         ValueError,
         match=r"the question has no frames to show: .*PreferenceAdapter\(..., render=True\)",

@@ -96,7 +96,7 @@ def test_answers_that_are_taken_back_and_given_again_keep_nothing_more(model):
 
 def test_a_pending_question_is_shown_again_by_a_model_that_was_made_anew(model, monkeypatch):
     shown = PreferenceAdapter(model, walks(1), n_queries=3, seed=0, rule=FAST)
-    shown.ask()
+    first = shown.ask()
     shown.tell("left")
     query = shown.ask()
     monkeypatch.setattr(
@@ -112,6 +112,7 @@ def test_a_pending_question_is_shown_again_by_a_model_that_was_made_anew(model, 
     again = resumed.ask()
     np.testing.assert_array_equal(again.left.actions, query.left.actions)
     np.testing.assert_array_equal(again.right.actions, query.right.actions)
+    np.testing.assert_array_equal(resumed.ask_again(0).left.actions, first.left.actions)
 
 
 def test_another_reward_does_not_go_on_where_this_one_stood(model):
