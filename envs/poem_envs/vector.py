@@ -389,8 +389,8 @@ def set_task(env: Any, task: npt.ArrayLike) -> None:
     """
     if isinstance(env, gym.Env) and env.has_wrapper_attr("set_task"):
         env.get_wrapper_attr("set_task")(task)
-    elif isinstance(env, gym.vector.SyncVectorEnv):
-        for single, row in zip(env.envs, _task_of_each(task, env.num_envs), strict=True):
+    elif isinstance(getattr(env, "unwrapped", None), gym.vector.SyncVectorEnv):
+        for single, row in zip(env.unwrapped.envs, _task_of_each(task, env.num_envs), strict=True):
             set_task(single, row)
     elif isinstance(env, gym.vector.VectorEnv) and isinstance(env.unwrapped, TaskFamilyVector):
         env.unwrapped.set_tasks(_task_of_each(task, env.num_envs))

@@ -295,6 +295,12 @@ def test_takes_environments_that_were_made_after_an_import_of_rl_zoo3(monkeypatc
         (lambda: gym.make_vec(POINT, 3), 3),
         (lambda: gym.wrappers.vector.RecordEpisodeStatistics(gym.make_vec(POINT, 3)), 3),
         (lambda: gym.make_vec(POINT, 2, vectorization_mode="sync"), 2),
+        (
+            lambda: gym.wrappers.vector.RecordEpisodeStatistics(
+                gym.make_vec(POINT, 2, vectorization_mode="sync")
+            ),
+            2,
+        ),
         (lambda: make_vec_env(POINT, 2), 2),
         (lambda: VecMonitor(make_task_vec_env(POINT, 3)), 3),
     ],
@@ -303,8 +309,8 @@ def test_a_task_is_chosen_through_whatever_is_around_the_family(make, num_envs):
     def tasks():
         if isinstance(env, gym.Env):
             return env.get_wrapper_attr("task")
-        if isinstance(env, gym.vector.SyncVectorEnv):
-            return np.stack(env.call("task"))
+        if isinstance(env.unwrapped, gym.vector.SyncVectorEnv):
+            return np.stack(env.unwrapped.call("task"))
         return (
             env.unwrapped.tasks
             if isinstance(env, gym.vector.VectorEnv)
