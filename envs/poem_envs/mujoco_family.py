@@ -241,7 +241,7 @@ class DirectionFamily(LeggedFamily):
 
 def _model_path(xml_file: str) -> str:
     path = os.path.expanduser(xml_file)
-    if not path.startswith((".", os.sep)):
+    if os.sep not in path:
         path = os.path.join(os.path.dirname(gymnasium.__file__), "envs", "mujoco", "assets", path)
     if not os.path.exists(path):
         raise OSError(f"{xml_file=} does not exist; give a path, or the name of a Gymnasium model")

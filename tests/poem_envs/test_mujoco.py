@@ -282,13 +282,15 @@ def test_divergence_is_an_error_that_names_the_episode(num_envs, tmp_path, monke
     env.step(actions)
 
 
-def test_other_models(tmp_path):
+def test_other_models(tmp_path, monkeypatch):
     source = make("poem/AntVel-v0")
     path = tmp_path / "ant.xml"
     mujoco.mj_saveLastXML(str(path), mujoco.MjModel.from_xml_path(_asset("ant.xml")))
     env = make("poem/AntVel-v0", xml_file=str(path), frame_skip=2)
     assert env.dt == pytest.approx(0.02)
     assert env.metadata["render_fps"] == 50
+    monkeypatch.chdir(tmp_path.parent)
+    assert make("poem/AntVel-v0", xml_file=f"{tmp_path.name}/ant.xml").model.nu == 8
     assert source.metadata["render_fps"] == 20
     with pytest.raises(OSError, match=r"xml_file='octopus\.xml'"):
         make("poem/AntVel-v0", xml_file="octopus.xml")
