@@ -133,10 +133,11 @@ class AntMazeEnv(_RoboticsFamily):
     There is no early end. `gymnasium.make` truncates episodes after 700 steps.
 
     ## Arguments
-    As :class:`FetchReachEnv`; further ones are those of `AntMaze_UMaze-v5`.
+    As :class:`FetchReachEnv`; further ones are those of `AntMaze_UMaze-v5`. A larger `maze_map`
+    needs bounds of its goals: `goal_low` (-6 by default) and `goal_high` (6).
     """
 
     look = Look(90.0, -90.0, 25.0, (0.0, 0.0, 0.0), body="torso", follows=False)
 
     def __init__(self, **kwargs: Any) -> None:
-        super().__init__("AntMaze_UMaze-v5", goal_low=-6.0, goal_high=6.0, **kwargs)
+        super().__init__("AntMaze_UMaze-v5", **{"goal_low": -6.0, "goal_high": 6.0, **kwargs})

@@ -7,6 +7,7 @@ import gymnasium_robotics
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium_robotics.envs.maze import maps
 
 from poem_envs import GoalFamily, TaskFamilyVector
 
@@ -67,6 +68,12 @@ def test_tasks_are_distributed_as_the_environments_goals():
     goals = np.array([own.reset(seed=seed)[0]["desired_goal"] for seed in range(300)])
     assert tasks.mean(axis=0) == pytest.approx(goals.mean(axis=0), abs=0.8)
     assert tasks.std(axis=0) == pytest.approx(goals.std(axis=0), rel=0.15)
+
+
+def test_a_larger_maze_takes_wider_bounds(rng):
+    larger = {"maze_map": maps.MEDIUM_MAZE, "goal_low": -15.0, "goal_high": 15.0}
+    env = gym.make("poem/AntMaze-v0", **larger).unwrapped
+    assert np.abs(env.sample_tasks(20, rng)).max() > 6.0
 
 
 class Reach(gym.Env):
