@@ -147,7 +147,7 @@ def _wave(
             if "is_success" in infos[copy]:
                 successes[copy] = bool(infos[copy]["is_success"])
             if dones[copy]:
-                after[copy] = infos[copy]["terminal_observation"]
+                after[copy] = np.ravel(infos[copy]["terminal_observation"])
         seen.append(finite(after, step, "an observation"))
         lengths[running] = step
         running = running & ~dones

@@ -143,6 +143,28 @@ def test_without_reward_features():
         evaluate_episodes(MODEL, env, LATENTS[:1], np.ones((1, 1)), 1)
 
 
+class Square(SpeedEnv):
+    """Its observations have rows and columns."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2, 1), np.float64)
+
+    def reset(self, **arguments):
+        observation, info = super().reset(**arguments)
+        return observation[:, None], info
+
+    def step(self, action):
+        observation, *rest = super().step(action)
+        return observation[:, None], *rest
+
+
+def test_observations_of_any_shape_are_flat_up_to_the_last():
+    seen, expected = (
+        rollout_latents(MODEL, DummyVecEnv([kind]), LATENTS[:1])[0].observations
+        for kind in (Square, SpeedEnv)
+    )
+    np.testing.assert_array_equal(seen, expected)
+
+
 class FastFeatures(VecEnvWrapper):
     """As TaskVecEnv: the features as one array, and none in the infos."""
 
