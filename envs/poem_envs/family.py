@@ -290,7 +290,7 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
                 f"features has shape {features.shape}, but its last dimension must be "
                 f"reward_feature_dim={feature_dim}"
             )
-        return self._reward(tasks, features)
+        return np.asarray(self._reward(tasks, features), dtype=np.float64)[()]
 
     @property
     def has_potential(self) -> bool:

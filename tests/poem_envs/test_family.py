@@ -64,6 +64,18 @@ def test_a_minimal_family_in_make_vec_env():
         del gym.registry["test/Walk1D-v0"]
 
 
+def test_rewards_are_float64_whatever_the_family_computes_them_in():
+    class Sparse(Walk1D):
+        def _reward(self, tasks, features):
+            return np.abs(features[..., 0] - tasks[..., 0]) < 0.5
+
+    envs = TaskFamilyVector(Sparse, num_envs=2, nthread=1)
+    envs.reset(options={"tasks": [[0.0], [1.0]]})
+    rewards = envs.step(np.zeros((2, 1)))[1]
+    assert rewards.dtype == np.float64
+    assert rewards.tolist() == [1.0, 0.0]
+
+
 class NoReward(TaskFamily):
     observation_space, action_space = Walk1D.observation_space, Walk1D.action_space
     task_space, reward_feature_dim = Walk1D.task_space, 1
