@@ -122,6 +122,10 @@ class TwiceTheSameTask(Walk):
     all_tasks = np.array([[0.5], [0.5]])
 
 
+class NoTasks(Walk):
+    all_tasks = np.zeros((0, 1))
+
+
 class TasksOutsideTheirSpace(Walk):
     all_tasks = np.array([[0.5], [1.5]])
 
@@ -150,6 +154,12 @@ class FeaturesOfAnotherWidth(Walk):
         return np.zeros(np.broadcast_shapes(tasks.shape, features.shape)[:-1])
 
     compute_rewards = _reward  # without the check of the base class
+
+
+class FeaturesThatAreNotNumbers(FeaturesOfAnotherWidth):
+    def _simulate(self, action):
+        observation, features, terminated = Walk._simulate(self, action)
+        return observation, features * np.nan, terminated
 
 
 class SuccessAsANumber(Walk):
@@ -182,6 +192,11 @@ class FlatTasks(Walk):
     def sample_tasks(self, n, rng):
         tasks = super().sample_tasks(n, rng)
         return tasks[:, 0] if n > 1 else tasks
+
+
+class DrawnWithoutTheirDimension(Walk):
+    def _draw_tasks(self, n, rng):
+        return rng.uniform(-1, 1, n)
 
 
 class UnseededStart(Walk):
@@ -330,6 +345,7 @@ BROKEN = [
     (Float32Tasks, "task_space must be a .*Box of shape .* float64"),
     (NoFeatureDim, "reward_feature_dim must be a whole number"),
     (TwiceTheSameTask, "all_tasks must have shape .* hold every task once"),
+    (NoTasks, r"all_tasks must have shape \(n, 1\), .*, but is \[\]"),
     (TasksOutsideTheirSpace, "all_tasks must have shape .* lie in task_space"),
     (
         Float32Observations,
@@ -338,11 +354,13 @@ BROKEN = [
     (ObservationsOutsideTheirSpace, "reset returned .* not inside observation_space .* widen it"),
     (NotANumber, "finite float as reward, but gave nan"),
     (FeaturesOfAnotherWidth, r'info\["reward_features"\] must be .* shape \(reward_feature_dim,\)'),
+    (FeaturesThatAreNotNumbers, r'info\["reward_features"\] must be a finite .* array\(\[nan\]\)'),
     (SuccessAsANumber, r'info\["success"\] must be a bool'),
     (TasksOfTheGlobalGenerator, "sample_tasks must draw from the generator that it is given"),
     (TasksOfTheEpisodesGenerator, "sample_tasks must leave the environment's own generator alone"),
     (TasksBeyondTheirSpace, "not in task_space"),
     (OneTaskOnly, "must draw different tasks"),
+    (DrawnWithoutTheirDimension, r"sample_tasks\(8, rng\) must return a .* shape \(8, 1\)"),
     (FlatTasks, r"sample_tasks\(8, rng\) must return a float64 array of shape \(8, 1\)"),
     (UnseededStart, "the same episode again, but did not: draw all randomness"),
     (StartAfterTheLastEpisode, "the same episode again, but did not: .*reset the whole state"),

@@ -63,7 +63,7 @@ def check_definition(family: Any) -> None:
     if not wrong and family.all_tasks is not None:
         all_tasks = np.asarray(family.all_tasks)
         inside = all_tasks.shape[1:] == tasks.shape and all(task in tasks for task in all_tasks)
-        if not inside or len(np.unique(all_tasks, axis=0)) < len(all_tasks):
+        if not inside or len(np.unique(all_tasks, axis=0)) < max(1, len(all_tasks)):
             wrong.append(
                 f"all_tasks must have shape (n, {tasks.shape[0]}), lie in task_space {tasks} and "
                 f"hold every task once, but is {all_tasks.tolist()}"

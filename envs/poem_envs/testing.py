@@ -25,8 +25,8 @@ def check_task_family(
     render: bool = True,
     **env_kwargs: Any,
 ) -> None:
-    """Check that an environment keeps the contract of a task family: the spaces, the drawing of
-    tasks, seeds, when a task takes effect, that the task is hidden, that relabelling is exact, the
+    """Check that an environment keeps the contract of a task family: the drawing of tasks, the
+    spaces, seeds, when a task takes effect, that the task is hidden, that relabelling is exact, the
     potential (of a family that has one), the vectorised version (of a registered id that has one),
     rendering and closing, in this order.
 
@@ -44,8 +44,8 @@ def check_task_family(
     elif not callable(env):
         raise TypeError(f"env is {env!r}, but must be a class, a function, or a registered id")
     case = Case(partial(_make, env, **env_kwargs), n_steps, seed)
-    check_spaces(case)
     check_sampling(case)
+    check_spaces(case)
     check_seeds(case)
     check_set_task(case)
     check_hidden_task(case)
@@ -122,9 +122,10 @@ def check_spaces(case: Case) -> None:
         f"ends, but gave {simulated!r}"
     )
     features, shape = simulated[1], (env.reward_feature_dim,)
-    assert _is_array(features, shape, np.float64), (
-        f'info["reward_features"] must be a float64 array of shape (reward_feature_dim,) = {shape},'
-        f" but is {features!r}; return it from _simulate"
+    ok = _is_array(features, shape, np.float64) and np.isfinite(features).all()
+    assert ok, (
+        'info["reward_features"] must be a finite float64 array of shape (reward_feature_dim,) = '
+        f"{shape}, but is {features!r}; return it from _simulate"
     )
     reward = np.asarray(env.compute_rewards(env.task, features))
     assert reward.shape == (), (
