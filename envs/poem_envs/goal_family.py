@@ -49,7 +49,8 @@ class GoalFamily(TaskFamily):
     (:attr:`max_episode_steps`), unless the family is registered with another or ``gym.make`` is
     given one. Other wrappers than those of ``gym.make`` are refused.
 
-    :param env: An id, or a function that makes the environment
+    :param env: An id, or a function that makes the environment. ``"module:id"`` names the module
+        that registers it, which processes of :class:`~poem_envs.TaskFamilyVector` need to know
     :param observe_achieved_goal: Whether the observation holds the achieved goal, which is needed
         unless ``"observation"`` says where the agent is by itself
     :param set_goal: Gives the environment a goal after its reset, so that its own info and images
