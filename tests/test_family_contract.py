@@ -433,6 +433,12 @@ class _Batch(BatchFamily):
         return -np.abs(features[..., 0] - tasks[..., 0])
 
 
+def test_a_batch_that_does_not_draw_its_copies():
+    family = type("Family", (_Batch,), {"metadata": Walk.metadata})
+    with pytest.raises(NotImplementedError, match=r"Family has no _render_copy\(copy, "):
+        check_task_family(family)
+
+
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [

@@ -31,9 +31,10 @@ class BatchFamily(TaskFamily):
 
     A subclass defines ``_allocate(n)``, ``_begin_episodes(copies, rngs)``, ``_advance(actions)``
     (features ``(n, reward_feature_dim)`` and early ends ``(n,)``), ``_observations()``
-    (``(n, obs_dim)``) and ``_reward``. It sets what :class:`TaskFamily` asks for
-    in its class, in the constructor, which hands all that it does not know to ``super().__init__``,
-    or, as a dataclass whose fields are its arguments, in ``__post_init__``.
+    (``(n, obs_dim)``) and ``_reward``, and ``_render_copy(copy, render_mode, task)`` in place of
+    ``render()`` if it can be drawn. It sets what :class:`TaskFamily` asks for in its class, in the
+    constructor, which hands all that it does not know to ``super().__init__``, or, as a dataclass
+    whose fields are its arguments, in ``__post_init__``.
 
     >>> class Drift(BatchFamily):
     ...     observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float64)
@@ -95,7 +96,8 @@ class BatchFamily(TaskFamily):
 
     def _render_copy(self, copy: int, render_mode: str, task: np.ndarray | None) -> Any:
         """Render one copy, in one of Gymnasium's modes, with its task unless that is None."""
-        raise NotImplementedError
+        name = type(self).__name__
+        raise NotImplementedError(f"{name} has no _render_copy(copy, render_mode, task)")
 
     def _describe(self, copy: int) -> str:
         """Where a copy's episode is, for error messages."""
