@@ -11,6 +11,7 @@ from typing import Any
 import imageio.v3 as imageio
 import numpy as np
 import pytest
+from filelock import lock_descriptor
 from rl_zoo3.utils import SimpleLinearSchedule
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 
@@ -377,6 +378,10 @@ def test_a_person_who_stops_goes_on_later_as_if_they_had_not(
     assert adapt(model[1], *flags, "--resume") == 130
     assert "Interrupted after 2 of 3 answers" in capsys.readouterr().out
     answer_by(monkeypatch, tmp_path / "twice", "l\n")
+    with Path("label_data/session-1.lock").open() as other:
+        assert lock_descriptor(other.fileno(), blocking=False)
+        assert cli.main(shlex.split(again)[1:]) == 1
+    assert "session 1 of label_data is being answered at another" in capsys.readouterr().err
     assert cli.main(shlex.split(again)[1:]) == 0
     assert "Query 3: " in capsys.readouterr().out
 

@@ -26,6 +26,7 @@ from sb3_poem.adaptation.environments import COPIES
 from sb3_poem.adaptation.evaluation import evaluation_seed
 from sb3_poem.adaptation.policy import POLICY_SUFFIX
 from sb3_poem.benchmark.cells import make_oracle_factory
+from sb3_poem.benchmark.models import try_lock
 from sb3_poem.benchmark.suites import OracleSpec
 from sb3_poem.cli.arguments import DEFAULT_STORE
 from sb3_poem.cli.needs import check_output, say
@@ -158,10 +159,19 @@ class Adaptation:
         answers and the posterior, from which :meth:`PreferenceAdapter.load` continues.
         """
         arguments, subject = self.arguments, self.subject
-        store = Store(arguments.store or DEFAULT_STORE)
-        name, n_queries = Path(arguments.model).name, arguments.queries
-        about = (name, subject.env_id, subject.seed, self.options, n_queries)
+        store, name = Store(arguments.store or DEFAULT_STORE), Path(arguments.model).name
+        about = (name, subject.env_id, subject.seed, self.options, arguments.queries)
         recorder = StoreRecorder(store, *about, resume=arguments.resume)
+        session = recorder.session.id
+        with try_lock(store.folder / f"session-{session}.lock") as mine:
+            if not mine:
+                there = f"session {session} of {store.folder} is being answered"
+                raise ValueError(f"--resume: {there} at another terminal; stop it there first")
+            return self._ask(recorder)
+
+    def _ask(self, recorder: StoreRecorder) -> int:
+        arguments, subject = self.arguments, self.subject
+        store, n_queries = recorder.store, arguments.queries
         session, kept = f"session {recorder.session.id}", recorder.kept()
         if arguments.resume:
             nothing = "There is nothing to go on with; beginning"
