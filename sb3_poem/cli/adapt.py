@@ -177,7 +177,9 @@ class Adaptation:
             nothing = "There is nothing to go on with; beginning"
             found = "Going on with" if recorder.resumed else nothing
             say(f"{found} {session} of {store.folder}")
-        oracle = HumanOracle(record=recorder, question=self.rule.question)
+        # Of each session, as another terminal may show its films meanwhile
+        films = Path("preference_queries", f"session-{recorder.session.id}")
+        oracle = HumanOracle(films, record=recorder, question=self.rule.question)
         env = subject.make_env("rgb_array", show_task=False)
         how: dict[str, Any] = {"oracle": oracle, "n_queries": n_queries, "seed": subject.seed}
         adapter = PreferenceAdapter(subject.model, env, rule=self.rule, **how)
