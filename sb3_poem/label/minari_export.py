@@ -25,7 +25,8 @@ DESCRIPTION = (
 
 def export_minari(store: Store, name: str, undone: bool = False) -> dict[str, Path]:
     """Write all answers where Minari keeps its data sets (``MINARI_DATASETS_PATH``), one data set
-    for each environment: ``"poem/PointGoal/<name>"``, say.
+    for each environment: ``"poem/PointGoal/<name>"``, say, or of several versions of one
+    ``"poem/PointGoal-v0/<name>"`` and so on.
 
     Rewards are zero. An episode that is shorter than its environment's time limit has terminated,
     another one is truncated. Reward features are in the infos, without a first one (NaN), since a
@@ -50,10 +51,11 @@ def export_minari(store: Store, name: str, undone: bool = False) -> dict[str, Pa
     rows = [row for row in store.records() if undone or row["undone"] is None]
     if not rows:
         raise ValueError(f"{store.folder} holds no answers")
-    datasets = {}
-    for env_id in dict.fromkeys(row["env_id"] for row in rows):
+    datasets, families = {}, {row["env_id"]: re.sub(r"-v\d+$", "", row["env_id"]) for row in rows}
+    for env_id, family in families.items():
         check_env_id(env_id, str(store.path))
-        family = re.sub(r"[^\w/-]", "_", re.sub(r"-v\d+$", "", env_id))
+        is_one = [*families.values()].count(family) == 1  # version of the environment
+        family = re.sub(r"[^\w/-]", "_", family if is_one else env_id)
         dataset = datasets[env_id] = f"{family}/{name}"
         if get_dataset_path(dataset).exists():
             where = get_dataset_path(dataset)

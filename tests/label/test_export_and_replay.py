@@ -9,6 +9,7 @@ import sqlite3
 import sys
 import time
 import urllib.request
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -176,6 +177,16 @@ def test_minari_reads_the_episodes_with_preferences_and_latents(
     assert cli.main([*command, "both-v0"]) == 1
     assert "recorded in poem/AntVel-v0" in capsys.readouterr().err
     assert not (tmp_path / "minari/poem/PointGoal/both-v0").exists()  # all or none
+    for session, version in ((answered, "v0"), (other, "v1")):
+        env_id = f"my/Robot-{version}"
+        monkeypatch.setitem(gym.registry, env_id, replace(gym.spec("poem/PointGoal-v0"), id=env_id))
+        with sqlite3.connect(store.path) as connection:
+            changed = (env_id, session.id)
+            connection.execute("update sessions set env_id = ? where id = ?", changed)
+    assert cli.main([*command, "versions-v0"]) == 0
+    for version, episodes in (("v0", 8), ("v1", 2)):
+        dataset = minari.load_dataset(f"my/Robot-{version}/versions-v0")
+        assert dataset.total_episodes == episodes
     with sqlite3.connect(store.path) as connection:
         connection.execute("update sessions set env_id = 'this:poem/PointGoal-v0'")
     assert cli.main([*command, "answers-v2"]) == 1
