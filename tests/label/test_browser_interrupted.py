@@ -152,6 +152,12 @@ def test_an_answer_waits_while_the_disk_is_full(
     page.reload()
     page.wait_for_function("() => view !== null && view.answered === 2 && !busy")
     assert person.stored() == ["left", "right"]
+    # Nor by a proxy before it that shows a page of its own, where one logs in.
+    page.wait_for_function(SHOWN)
+    login = {"content_type": "text/html", "body": "<p>Log in</p>"}
+    page.route("**/answer", lambda route: route.fulfill(**login), times=1)
+    page.click("[data-preference=equal]")
+    page.wait_for_function("() => view.answered === 3 && !busy", timeout=15_000)
 
 
 def test_films_that_cannot_be_shown_are_not_the_servers_fault(

@@ -38,13 +38,11 @@ async function ask(path, body) {
     body: JSON.stringify(body),
   };
   const response = await fetch(base + path, options);
-  const data = await response.json().catch(() => ({ error: `The server answers ${response.status}.` }));
-  if (!response.ok) {
-    const error = new Error(data.error || `The server answers ${response.status}.`);
-    error.status = response.status;
-    throw error;
-  }
-  return data;
+  const data = await response.json().catch(() => null);
+  if (response.ok && data) return data;
+  const error = new Error(data?.error || `The server answers ${response.status}.`);
+  if (!response.ok) error.status = response.status; // else it is not ours: another's login page, say
+  throw error;
 }
 
 // What the server has not confirmed, by path: it outlives the page, and is sent until it is kept.
