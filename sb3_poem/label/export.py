@@ -37,8 +37,8 @@ def records(
     :param trajectories: Whether observations, actions and reward features are in them.
     :param undone: Whether answers that were taken back are among them.
     """
-    for row in store.records():
-        if session in (None, row["session"]) and (undone or row["undone"] is None):
+    for row in store.records(session):
+        if undone or row["undone"] is None:
             yield answer_record(row, store.videos.resolve(), trajectories)
 
 

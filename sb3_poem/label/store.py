@@ -342,8 +342,10 @@ class Store:
         with self._transaction() as execute:
             execute("UPDATE sessions SET wish = ? WHERE id = ?", (wish, session))
 
-    def records(self) -> list[sqlite3.Row]:
-        """All answers with their questions, those taken back too, in the order of time."""
+    def records(self, session: int | None = None) -> list[sqlite3.Row]:
+        """The answers of one session or of all, with their questions, those taken back too, in the
+        order of time.
+        """
         return self._all(
             """SELECT sessions.id AS session, sessions.source, sessions.model, sessions.env_id,
                 sessions.seed, sessions.options, sessions.wish, answers.number, answers.preference,
@@ -356,13 +358,14 @@ class Store:
                     ORDER BY results.number DESC LIMIT 1) AS verdict
             FROM answers JOIN sessions ON sessions.id = answers.session
                 JOIN turns ON turns.id = answers.question
-            ORDER BY answers.id"""
+            WHERE ? IS NULL OR sessions.id = ? ORDER BY answers.id""",
+            *(session, session),
         )
 
     def remove_orphans(self) -> int:
         """Delete videos that no turn names, as of answers that were not given; returns how many."""
+        files = list(self.videos.iterdir())  # before the names: a file comes before its turn
         kept = {row["video"] for row in self._all("SELECT video FROM turns")}
-        files = self.videos.iterdir()
         orphans = [file for file in files if file.is_file() and file.name not in kept]
         for file in orphans:
             file.unlink(missing_ok=True)

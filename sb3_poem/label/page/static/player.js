@@ -69,8 +69,9 @@ class Player {
   async play() {
     try {
       await this.video.play();
-    } catch {
-      this.wantsToPlay = false; // the browser does not let videos begin by themselves
+    } catch (error) {
+      // the browser does not let videos begin by themselves, unless it is another film that begins
+      if (error.name !== "AbortError") this.wantsToPlay = false;
     }
     this.showState();
   }

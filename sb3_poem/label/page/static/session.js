@@ -328,7 +328,7 @@ for (const button of document.querySelectorAll("[data-preference]")) {
   button.addEventListener("click", () => answer(button.dataset.preference));
 }
 for (const button of document.querySelectorAll("[data-verdict]")) {
-  button.addEventListener("click", () => act("/verdict", { result: view.turn.id, verdict: button.dataset.verdict }));
+  button.addEventListener("click", () => view.turn && act("/verdict", { result: view.turn.id, verdict: button.dataset.verdict }));
 }
 byId("undo").addEventListener("click", undo);
 byId("stop").addEventListener("click", () => act("/stop", { stopped: 1 }));
