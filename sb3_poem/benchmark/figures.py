@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -163,11 +164,13 @@ def _grid(
     figure = Figure(figsize=size, layout="constrained")
     FigureCanvasAgg(figure)
     grid: Any = figure.subplots(len(rows), len(found), squeeze=False)
-    panels = []
+    panels, families = [], [condition.family for condition in found]
     for column, (condition, series) in enumerate(found.items()):
+        alike = families.count(condition.family) > 1
+        name = fill(str(condition), 45) if alike else condition.family
         for row, detail in enumerate(rows):
             axes = grid[row][column]
-            axes.set_title(f"{condition.family}{', ' * bool(detail)}{detail}", fontsize=10)
+            axes.set_title(f"{name}{', ' * bool(detail)}{detail}", fontsize=10)
             axes.grid(alpha=0.25)
             axes.spines[["top", "right"]].set_visible(False)
             if column == 0:

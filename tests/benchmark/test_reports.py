@@ -306,6 +306,9 @@ def test_families_of_one_name_and_curves_of_different_parts_stay_apart(tmp_path:
         "HalfCheetahVel": {None, 0.2, 0.4, 0.6, 0.8},
         "mine/HalfCheetahVel-v0": {None, 0.5},
     }
+    panels = suite_figures(selection)["table3-methods-queries"].axes
+    titles = {panel.get_title().partition(":")[0] for panel in panels}
+    assert titles == {"HalfCheetahVel", "mine/HalfCheetahVel-v0"}
     tables = [
         table for table in suite_tables(selection) if table.title.endswith("methods, exact answers")
     ]
