@@ -14,7 +14,7 @@ from sb3_poem.benchmark.figures import write_figures
 from sb3_poem.benchmark.methods import METHODS
 from sb3_poem.benchmark.results import Condition, Selection, Series, summarise
 from sb3_poem.benchmark.store import Store
-from sb3_poem.benchmark.suites import EXACT, SUITES, Entry, OracleSpec
+from sb3_poem.benchmark.suites import EXACT, SUITES, Entry, OracleSpec, family_label
 
 SUFFIX = {"md": ".md", "latex": ".tex", "csv": ".csv", "json": ".json"}
 #: Table 3 of Xu & Zhu (ICML 2025): family -> row -> [mean, standard deviation] after 1, 5 and 10
@@ -200,7 +200,7 @@ def _rows(
         rates = one.success_rates
         for i, queries in enumerate(one.queries):
             row = METHODS[one.method].paper_row if has_paper else None
-            paper = paper_figure(condition.family, row, queries)
+            paper = paper_figure(family_label(condition.env_id), row, queries)
             yield Row(
                 **place,
                 method=one.method,

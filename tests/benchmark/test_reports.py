@@ -297,6 +297,7 @@ def test_families_of_one_name_and_curves_of_different_parts_stay_apart(tmp_path:
     measured: dict[str, set[float | None]] = {}
     for row in suite_rows(selection):
         measured.setdefault(row.condition.split(":")[0], set()).add(row.snapshot)
+        assert row.paper_mean is None or not row.condition.startswith("mine")
     with Store(tmp_path / "store.sqlite") as store:
         for family, conditions in (("mine/HalfCheetahVel-v0", 1), ("HalfCheetahVel", 1), (None, 2)):
             rows = json.loads(make_report(store, ["table3"], family and [family], "json")[0])
