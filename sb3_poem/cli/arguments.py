@@ -282,7 +282,8 @@ def _add_benchmark(commands: Any) -> None:
     report = _add_command(parts, "report --suite smoke --out results", told)
     everything = "default: all that the store holds"
     _option(report, "--suite", everything, nargs="+", choices=SUITES)
-    _option(report, "--families", everything, nargs="+", metavar="FAMILY")
+    told = "default: with --suite all that the store holds, else each suite's own"
+    _option(report, "--families", told, nargs="+", metavar="FAMILY")
     _option(report, "--seeds", everything, _count(0), nargs="+", metavar="SEED")
     _option(report, "--format", "", default="md", choices=("md", "latex", "csv", "json"))
     _file(report, "--out", "write tables, and figures as PNG and PDF (default: print)", "FOLDER")
