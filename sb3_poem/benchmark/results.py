@@ -27,7 +27,7 @@ from sb3_poem.benchmark.suites import (
     family_label,
 )
 
-BOOTSTRAP_SAMPLES = 2000
+BOOTSTRAP_SAMPLES = 10_000
 
 
 @dataclass(frozen=True)
