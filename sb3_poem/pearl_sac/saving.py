@@ -66,8 +66,6 @@ LARGEST = {
     "buffer_size": 100_000_000,
 }
 LARGEST_OF_OTHERS = 1_000_000
-#: What older files say of arguments that are gone: as every model is trained now
-RETIRED = {"preference_source": "auto", "preference_group_size": 4}
 
 Model = TypeVar("Model", bound=SAC)
 
@@ -304,9 +302,6 @@ def build_model(
 
     :raises ValueError: If something is missing or does not fit; the message names ``source``
     """
-    given = config["arguments"].items()
-    arguments = {name: value for name, value in given if (name, value) not in RETIRED.items()}
-    config = {**config, "arguments": arguments}
     try:
         _check_numbers(algorithm, config, tensors)
         arguments = {**config["arguments"], "device": device, "_init_setup_model": False}

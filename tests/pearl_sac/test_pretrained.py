@@ -271,20 +271,6 @@ def test_every_argument_comes_back(algorithm: type[PEARLSAC], tmp_path: Path) ->
         assert {name: getattr(loaded, name) for name in given} == given
 
 
-def test_arguments_of_an_older_version(tmp_path: Path) -> None:
-    model = small(POEMSAC)
-    model.save_pretrained(tmp_path / "m")
-    file = tmp_path / "m" / "config.json"
-    config = json.loads(file.read_text())
-    config["arguments"] |= {"preference_source": "auto", "preference_group_size": 4}
-    file.write_text(json.dumps(config))
-    assert_same_predictions(model, POEMSAC.from_pretrained(tmp_path / "m"))
-    config["arguments"]["preference_source"] = "rollout"
-    file.write_text(json.dumps(config))
-    with pytest.raises(ValueError, match="`preference_source` is no argument that a model is"):
-        POEMSAC.from_pretrained(tmp_path / "m")
-
-
 def test_an_activation_that_cannot_be_named_is_refused(tmp_path: Path) -> None:
     class Squared(th.nn.Module):
         def forward(self, x: th.Tensor) -> th.Tensor:
