@@ -72,7 +72,7 @@ def _client(what: str) -> Any:
         import huggingface_hub.errors
     except ImportError as error:
         raise ImportError(
-            f"{what} needs huggingface_hub: pip install '.[hub]' in a checkout"
+            f"{what} needs huggingface_hub: pip install -c constraints.txt '.[hub]' in a checkout"
         ) from error
     return huggingface_hub
 

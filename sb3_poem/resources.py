@@ -63,7 +63,7 @@ def pretrained_folder(name: str) -> Path:
     names = pretrained_names()
     if name not in names:
         known = f"there are: {', '.join(names)}{did_you_mean(name, names)}"
-        raise FileNotFoundError(f"No model {name!r} is shipped; {known}")
+        raise FileNotFoundError(f"No model {name!r} is here or is shipped; {known}")
     return shipped_folder("pretrained") / name
 
 

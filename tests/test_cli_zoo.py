@@ -394,7 +394,7 @@ def test_files_that_ship_are_found_by_their_names_and_ones_own_come_first(tmp_pa
         (("-c", "missing"), ("-c missing: there is no such module", ".yml")),
         (
             ("--env", "HalfCheetahVel"),
-            ("--env HalfCheetahVel", "did you mean poem/HalfCheetahVel-v0?"),
+            ("--env HalfCheetahVel", "did you mean 'poem/HalfCheetahVel-v0'?"),
         ),
         (("--env", "nothing-like-it"), ("--env nothing-like-it", "--gym-packages")),
     ],

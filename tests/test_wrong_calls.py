@@ -376,7 +376,7 @@ ADAPTERS = [
     refused(
         "an oracle without an answer",
         lambda _: asked().adapt(lambda left, right: None),
-        "answer...left...None...oracle returned nothing",
+        "answer...left...None...oracle return nothing",
     ),
     refused(
         "load misspelt",

@@ -22,6 +22,18 @@ def did_you_mean(name: str, known: Iterable[str], n: int = 1, cutoff: float = 0.
     return f"; did you mean {' or '.join(map(repr, close))}?" if close else ""
 
 
+def ids_like(name: str) -> str:
+    """The end of a message that refuses an id: the registered one that is like it, whole or by its
+    family's name; empty if none is.
+
+    >>> ids_like("HalfCheetahVel")
+    "; did you mean 'poem/HalfCheetahVel-v0'?"
+    """
+    ids = {known: env_id for env_id in gym.registry for known in (env_id, family_name(env_id))}
+    close = difflib.get_close_matches(name, ids, n=1)
+    return f"; did you mean {ids[close[0]]!r}?" if close else ""
+
+
 def plain_id(env_id: str) -> str:
     """An environment's id as the registry has it.
 
@@ -33,7 +45,7 @@ def plain_id(env_id: str) -> str:
     if module:
         importlib.import_module(module)
     if name not in gym.registry:
-        hint = did_you_mean(name, gym.registry) or ", nor any like it."
+        hint = ids_like(name) or ", nor any like it."
         raise gym.error.NameNotFound(
             f"No environment {name!r} is registered with Gymnasium{hint} One of your own is "
             "registered by an import of its module: 'module:id', on the command line --gym-packages"

@@ -12,7 +12,7 @@ import numpy as np
 from poem_envs.mujoco_rendering import close_viewers, fit_buffer, leave_out_details, prepared_viewer
 from poem_envs.registration import did_you_mean
 
-INSTALL = "pip install '.[metaworld]' in a checkout"
+INSTALL = "pip install -c constraints.txt '.[metaworld]' in a checkout"
 
 
 def load_metaworld() -> Any:

@@ -117,7 +117,7 @@ def as_preference(answer: object, kind: str = "pair") -> Preference:
     words = ", ".join(f'"{each.value}"' for each in reversed(ANSWERS[kind]))
     must = f"an answer to a {kind} question must be a Preference or its word, one of {words}"
     if not isinstance(answer, str | Preference):
-        nothing = "; the oracle returned nothing" if answer is None else ""
+        nothing = "; did the oracle return nothing?" if answer is None else ""
         raise TypeError(f"{must}, but is {given} of type {type(answer).__name__}{nothing}")
     raise ValueError(f"{must}, but is {given}")
 

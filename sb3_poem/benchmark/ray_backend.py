@@ -42,7 +42,8 @@ def run_with_ray(
         import ray
     except ImportError as error:
         raise ValueError(
-            f"--backend ray needs Ray: pip install '.[ray]' in a checkout ({error})"
+            "--backend ray needs Ray: pip install -c constraints.txt '.[ray]' in a checkout "
+            f"({error})"
         ) from error
     own = not ray.is_initialized()
     if own:

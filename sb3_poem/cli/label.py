@@ -25,7 +25,8 @@ def run_page(arguments: argparse.Namespace) -> None:
     """Serve the page until it is stopped."""
     for package in ("jinja2", "markdown_it", "starlette", "uvicorn"):
         if find_spec(package) is None:
-            raise ValueError(f"the page needs {package}: pip install '.[label]' in a checkout")
+            install = "pip install -c constraints.txt '.[label]' in a checkout"
+            raise ValueError(f"the page needs {package}: {install}")
     from sb3_poem.label.access import LOOPBACK, Access, is_loopback
     from sb3_poem.label.families import find_models
     from sb3_poem.label.render_queue import RenderQueue, process_pool

@@ -6,7 +6,8 @@ from typing import Any
 from sb3_poem.resources import pretrained_folder, pretrained_names
 
 HEADER = ("name", "environment", "algorithm", "steps", "return after 0 and 10 answers")
-FOOTER = "Returns are means over 30 test tasks by the rule `bayes`; cards have all figures."
+FOOTER = """Returns are means over 30 test tasks by the rule `bayes`; cards, in pretrained/, have
+all figures. MetaWorld's models need the extra metaworld."""
 
 
 def run_models(_: Any) -> None:

@@ -9,11 +9,13 @@ from typing import Any
 from rich.console import Console
 
 from poem_envs.headless import has_display
+from poem_envs.registration import family_name
 from sb3_poem.adaptation import evaluate_adaptation
 from sb3_poem.cli.needs import check_output, say
 from sb3_poem.cli.subject import COPIES_FOR_ONE_TASK, Subject, after, describe_task
 from sb3_poem.cli.zoo import last_run
 from sb3_poem.pearl_sac.saving import CHECKPOINT
+from sb3_poem.resources import pretrained_names
 
 
 def run_enjoy(arguments: argparse.Namespace) -> None:
@@ -100,10 +102,11 @@ def _last_run(arguments: argparse.Namespace) -> str:
     folder = Path(arguments.folder) / arguments.algo
     run = folder / f"{name}_{number}" if number else last_run(folder, name, seed=-1)
     if run is None or not run.is_dir():
+        ships = family_name(arguments.env)
+        which = ships if ships in pretrained_names() else "NAME (`sb3-poem models` lists them)"
         raise FileNotFoundError(
             f"there is no run{f' {number}' * bool(number)} of {arguments.algo} on {arguments.env} "
-            f"in --folder {arguments.folder}: train one, or take a model that ships by --model "
-            "(`sb3-poem models` lists them)"
+            f"in --folder {arguments.folder}: train one, or show one that ships by --model {which}"
         )
     model = run / f"{name}.zip"
     return str(model if model.exists() else run / CHECKPOINT)

@@ -1,7 +1,6 @@
 """rl_zoo3's train and enjoy with this package's algorithms, environments and hyperparameters."""
 
 import argparse
-import difflib
 import re
 import shlex
 import sys
@@ -19,7 +18,7 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import StoreDict
 
 from poem_envs.headless import has_display
-from sb3_poem.benchmark.suites import family_label
+from poem_envs.registration import ids_like
 from sb3_poem.cli.experiment import TrainingInterrupted, make_experiment
 from sb3_poem.cli.hyperparams import SAMPLERS, convert_params
 from sb3_poem.cli.needs import check_device, import_packages
@@ -100,11 +99,8 @@ def check_arguments(given: argparse.Namespace) -> None:
         elif given.algo in ALGORITHMS:
             check_archive(given.trained_agent, ALGORITHMS[given.algo], {})
     if given.env not in gym.registry:
-        names = {name: env_id for env_id in gym.registry for name in (env_id, family_label(env_id))}
-        hint = "name the module that registers it by --gym-packages"
-        for close in difflib.get_close_matches(given.env, names, n=1):
-            hint = f"did you mean {names[close]}?"
-        raise ValueError(f"--env {given.env}: there is no such environment; {hint}")
+        hint = ids_like(given.env) or "; name the module that registers it by --gym-packages"
+        raise ValueError(f"--env {given.env}: there is no such environment{hint}")
 
 
 def resumed(given: argparse.Namespace, arguments: Sequence[str]) -> list[str] | None:

@@ -14,6 +14,7 @@ def __getattr__(name: str) -> Any:
     try:
         from sb3_poem.label.widget import LabelWidget
     except ModuleNotFoundError as error:
-        needs = "LabelWidget needs the extra: pip install '.[label]' in a checkout"
+        install = "pip install -c constraints.txt '.[label]' in a checkout"
+        needs = f"LabelWidget needs the extra: {install}"
         raise ModuleNotFoundError(f"{needs} ({error})", name=error.name) from error
     return LabelWidget

@@ -21,6 +21,8 @@ ANY_WAY = 60.0
 NEARBY = 0.5
 # Of a distance in space, the part towards who looks or away that is worth saying.
 DEEP = 0.5
+#: A place is not sure where the posterior reaches as far from it as this share of its distance
+UNSURE = 0.5
 NOTHING_YET = "It knows nothing yet of what you want."
 
 
@@ -91,6 +93,8 @@ def sentence(
         if description.unit:
             far, about = (_length(description, length) for length in (distance, radius))
             where += f", about {far} away, give or take {about}"
+        elif radius >= UNSURE * distance:
+            where += ", but is not sure yet"
         return f"It believes that you mean a place {where}."
     return (
         "Each dot is a behaviour that still fits your answers; the closer together they lie, the "

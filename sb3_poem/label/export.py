@@ -115,7 +115,8 @@ def _parquet(rows: list[dict[str, Any]], trajectories: bool) -> bytes:
         from pyarrow import parquet
     except ImportError:
         raise ValueError(
-            "Parquet needs pyarrow: pip install '.[label]' in a checkout, or export to .jsonl"
+            "Parquet needs pyarrow: pip install -c constraints.txt '.[label]' in a checkout, or "
+            "export to .jsonl"
         ) from None
     numbers = pa.list_(pa.float64())
     places = [place for place in ALL_PLACES if any(f"{place}_latent" in row for row in rows)]

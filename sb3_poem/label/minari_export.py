@@ -44,7 +44,7 @@ def export_minari(store: Store, name: str, undone: bool = False) -> dict[str, Pa
         from minari.storage import get_dataset_path
     except ImportError as error:
         raise ImportError(
-            f"Minari is missing: pip install '.[minari]' in a checkout ({error})"
+            f"Minari is missing: pip install -c constraints.txt '.[minari]' in a checkout ({error})"
         ) from error
     if NAME.fullmatch(name) is None:
         raise ValueError(f"a Minari data set's name must be like answers-v0, but is {name!r}")

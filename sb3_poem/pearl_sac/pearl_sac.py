@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from typing import Any, ClassVar, Self, TypeVar
 
+import gymnasium
 import numpy as np
 import torch as th
 from gymnasium import spaces
@@ -274,12 +275,14 @@ class PEARLSAC(SAC):
         if isinstance(policy_name, type) and issubclass(policy_name, ours):
             return policy_name
         if policy_name != "MlpPolicy":
-            raise ValueError(
-                f'policy is {policy_name!r}, but must be "MlpPolicy" or a subclass of '
-                f"{ours.__name__}: observations are flat vectors. Put features of images into the "
-                "family's observation; poem_envs.GoalFamily flattens those of a goal-conditioned "
-                "environment"
+            wanted = f'"MlpPolicy" or a subclass of {ours.__name__}'
+            hint = (
+                "observations are flat vectors. Put features of images into the family's "
+                "observation; poem_envs.GoalFamily flattens those of a goal-conditioned environment"
             )
+            if policy_name in gymnasium.registry:
+                hint = "the environment is the second argument"
+            raise ValueError(f"policy is {policy_name!r}, but must be {wanted}: {hint}")
         return ours
 
     @classmethod
@@ -381,12 +384,13 @@ class PEARLSAC(SAC):
         ):
             raise TypeError(f"callback must be a callback, a function or a list, not {callback!r}")
         if self.verbose > 0:
-            epoch, updates = self.epoch_steps, self.gradient_steps
-            n = int(-(-total // epoch))
+            epoch = self.epoch_steps
+            n, updates = int(-(-total // epoch)), self.gradient_steps
+            updates = epoch if updates < 0 else updates
             print(
                 f"Training for {total:,.0f} steps in {n:,} epoch{'s' * (n != 1)}: each has "
-                f"{epoch:,} environment steps, then {updates if updates >= 0 else epoch:,} "
-                "gradient steps"
+                f"{epoch:,} environment steps, then {updates:,} gradient steps, {n * updates:,} in "
+                "all"
             )
         return total
 
@@ -586,9 +590,10 @@ class PEARLSAC(SAC):
         """The environment as a task family; refused if the model was loaded without one."""
         if self._family is None:
             if self.env is None:
+                which = "..." if self.env_id is None else repr(self.env_id)
                 raise ValueError(
                     "the model has no environment; give it one with set_env, or load it with "
-                    "env=..."
+                    f"env={which}"
                 )
             self._family = self._family_of(self.env)
         return self._family

@@ -201,6 +201,7 @@ def test_the_sentence_says_what_the_needle_shows() -> None:
         ("poem/AntGoal-v0", [[2, 0], [-2, 0.1], [0, 2]], "within about 3 m of where it begins"),
         ("poem/AntGoal-v0", [[0, 0], [0, 0]], "within about 0.1 m of where it begins"),
         ("poem/PointGoal-v0", [[2.4], [2.3]], "up and to the left"),
+        ("poem/PointGoal-v0", [[2.4], [0.9]], "straight up, but is not sure yet"),
     ],
 )
 def test_places_that_people_say(env_id: str, places: Any, words: str) -> None:

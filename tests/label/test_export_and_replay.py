@@ -198,7 +198,7 @@ def test_minari_reads_the_episodes_with_preferences_and_latents(
     assert not (tmp_path / "minari/poem/AntVel/answers-v2").exists()
     monkeypatch.setitem(sys.modules, "minari.storage", None)
     assert cli.main([*command, "answers-v3"]) == 1
-    assert "pip install '.[minari]' in a checkout" in capsys.readouterr().err
+    assert "pip install -c constraints.txt '.[minari]' in a checkout" in capsys.readouterr().err
 
 
 def test_replay_to_the_same_rule_is_where_the_session_was(

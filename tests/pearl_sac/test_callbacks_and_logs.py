@@ -186,7 +186,8 @@ def test_verbose_prints_a_table(capsys: pytest.CaptureFixture[str]) -> None:
     model.learn(2 * EPOCH + 1, Printed())
     printed = Printed.printed + capsys.readouterr().out
     sentence = (
-        "Training for 601 steps in 3 epochs: each has 300 environment steps, then 5 gradient steps"
+        "Training for 601 steps in 3 epochs: each has 300 environment steps, then 5 gradient steps, "
+        "15 in all"
     )
     assert printed.index(sentence) < printed.index("decoder_error")
     assert printed.count("decoder_error") == 3

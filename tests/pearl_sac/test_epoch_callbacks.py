@@ -260,7 +260,7 @@ def test_evaluation_of_a_finite_family_is_on_all_its_tasks() -> None:
     how = {"n_tasks": 5, "record_at": (1,), "adaptation_kwargs": {"oracle_factory": unanswered}}
     env = make_task_vec_env("poem/HalfCheetahFwdBack-v0", 2, max_episode_steps=5)
     model = small(POEMSAC, env, n_train_tasks=2)
-    with pytest.raises(TypeError, match="the oracle returned nothing"):  # which ends it
+    with pytest.raises(TypeError, match="did the oracle return nothing"):  # which ends it
         model.learn(1, AdaptationEvalCallback(every=1, **how))
     assert sorted(found.tasks) == [-1.0, 1.0]
     assert found.envs[0].get_attr("spec")[0].id == "poem/HalfCheetahFwdBack-v0"
