@@ -62,8 +62,8 @@ REMARKS = {
     "MetaWorldML10": "The likelihood that `Bayes` has by default here was chosen by what another "
     "model earned on these test tasks.",
 }
-MANIPULATIONS = """By manipulation, three test tasks each. An episode succeeds by Meta-World's own
-criterion if one of its 200 steps does; rewards are version 2."""
+MANIPULATIONS = """Seed 0 by manipulation, three test tasks each. An episode succeeds by
+Meta-World's own criterion if one of its 200 steps does; rewards are version 2."""
 CAPTIONS = {
     "table3-prior-queries": "Return against answers, the prior's candidates",
     "table3-informed-queries": "Return against answers, training tasks' candidates",
