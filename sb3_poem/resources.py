@@ -62,8 +62,8 @@ def pretrained_folder(name: str) -> Path:
     """
     names = pretrained_names()
     if name not in names:
-        known = f"there are: {', '.join(names)}{did_you_mean(name, names)}"
-        raise FileNotFoundError(f"No model {name!r} is here or is shipped; {known}")
+        known = f"those shipped are: {', '.join(names)}{did_you_mean(name, names)}"
+        raise FileNotFoundError(f"There is no model {name!r} here, and none is shipped; {known}")
     return shipped_folder("pretrained") / name
 
 

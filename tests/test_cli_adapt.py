@@ -381,7 +381,7 @@ def test_a_person_who_stops_goes_on_later_as_if_they_had_not(
     with Path("label_data/session-1.lock").open() as other:
         assert lock_descriptor(other.fileno(), blocking=False)
         assert cli.main(shlex.split(again)[1:]) == 1
-    assert "session 1 of label_data is being answered at another" in capsys.readouterr().err
+    assert "session 1 of label_data is in use at another" in capsys.readouterr().err
     assert cli.main(shlex.split(again)[1:]) == 0
     films = Path("preference_queries/session-1")  # no other session's
     assert f"Query 3: {films}/query-003.gif" in capsys.readouterr().out

@@ -611,8 +611,9 @@ def test_an_interrupt_before_the_last_updates_leaves_them_to_do(
     flags = ("-c", config, "-f", tmp_path, *LONG, "--save-freq", 150)
     assert train(*flags) == 130
     assert "Interrupted at 900 of 900 steps, saved at 750; go on with" in capfd.readouterr().err
+    assert train(*flags, "--resume") == 130  # this run has no checkpoint of its own
     assert train(*flags, "--resume", "-params", "n_timesteps:900", "callback:None") == 0
-    assert not differing(parameters(trained(tmp_path, 2)), whole)
+    assert not differing(parameters(trained(tmp_path, 3)), whole)
 
 
 def test_a_run_goes_on_in_its_own_number_of_copies_and_in_no_other_environment(

@@ -165,8 +165,8 @@ class Adaptation:
         session = recorder.session.id
         with try_lock(store.folder / f"session-{session}.lock") as mine:
             if not mine:
-                there = f"session {session} of {store.folder} is being answered"
-                raise ValueError(f"--resume: {there} at another terminal; stop it there first")
+                there = f"session {session} of {store.folder} is in use at another terminal"
+                raise ValueError(f"--resume: {there}; let it end there, or stop it, first")
             return self._ask(recorder)
 
     def _ask(self, recorder: StoreRecorder) -> int:

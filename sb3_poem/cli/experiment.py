@@ -140,6 +140,8 @@ class PoemExperiment(FamilyExperiment):
         resumed = facts_of(self.trained_agent) if self.continue_training else {}
         if resumed.get("keeps_experience"):  # copies are a hyperparameter: an epoch fills waves
             hyperparams["n_envs"] = resumed["n_envs"]
+            if "n_envs" in saved:
+                saved["n_envs"] = resumed["n_envs"]
         elif "n_envs" not in hyperparams:
             sizes = hyperparams.get("n_train_tasks"), hyperparams.get("trajectories_per_task", 1)
             env_kwargs = hyperparams.get("env_kwargs") or self.env_kwargs
@@ -208,9 +210,11 @@ class PoemExperiment(FamilyExperiment):
             model.env.close()
 
     def save_trained_model(self, model: Any) -> None:
-        super().save_trained_model(model)
         done, total = model.num_timesteps, model._total_timesteps
         saved = self.checkpoint.saved_steps
+        # not a model whose last updates lack, with no checkpoint to tell it from a finished one
+        if not self.is_interrupted or done < total or saved is not None:
+            super().save_trained_model(model)
         if self.is_interrupted:
             kept = ", before the first checkpoint" if saved is None else f", saved at {saved:,}"
             message = f"Interrupted at {done:,} of {total:,} steps{kept * (saved != done)}"

@@ -54,8 +54,8 @@ def export_minari(store: Store, name: str, undone: bool = False) -> dict[str, Pa
     datasets, families = {}, {row["env_id"]: re.sub(r"-v\d+$", "", row["env_id"]) for row in rows}
     for env_id, family in families.items():
         check_env_id(env_id, str(store.path))
-        is_one = [*families.values()].count(family) == 1  # version of the environment
-        family = re.sub(r"[^\w/-]", "_", family if is_one else env_id)
+        has_versions = [*families.values()].count(family) > 1
+        family = re.sub(r"[^\w/-]", "_", env_id if has_versions else family)
         dataset = datasets[env_id] = f"{family}/{name}"
         if get_dataset_path(dataset).exists():
             where = get_dataset_path(dataset)

@@ -364,8 +364,9 @@ class Store:
 
     def remove_orphans(self) -> int:
         """Delete videos that no turn names, as of answers that were not given; returns how many."""
-        files = list(self.videos.iterdir())  # before the names: a file comes before its turn
         kept = {row["video"] for row in self._all("SELECT video FROM turns")}
+        old = time.time() - 60  # a younger one's turn may be still to come
+        files = [file for file in self.videos.iterdir() if file.stat().st_mtime < old]
         orphans = [file for file in files if file.is_file() and file.name not in kept]
         for file in orphans:
             file.unlink(missing_ok=True)

@@ -280,7 +280,7 @@ class PEARLSAC(SAC):
                 "observations are flat vectors. Put features of images into the family's "
                 "observation; poem_envs.GoalFamily flattens those of a goal-conditioned environment"
             )
-            if policy_name in gymnasium.registry:
+            if isinstance(policy_name, str) and policy_name in gymnasium.registry:
                 hint = "the environment is the second argument"
             raise ValueError(f"policy is {policy_name!r}, but must be {wanted}: {hint}")
         return ours
@@ -389,8 +389,9 @@ class PEARLSAC(SAC):
             updates = epoch if updates < 0 else updates
             print(
                 f"Training for {total:,.0f} steps in {n:,} epoch{'s' * (n != 1)}: each has "
-                f"{epoch:,} environment steps, then {updates:,} gradient steps, {n * updates:,} in "
-                "all"
+                f"{epoch:,} environment steps, then {updates:,} gradient steps"
+                + f", {n * updates:,} in all"
+                * (self.learning_starts == 0)
             )
         return total
 

@@ -213,7 +213,7 @@ def test_an_oracle_without_an_environment_judges_by_that_of_each_adapter():
         (
             {"model": "PointGaol"},
             FileNotFoundError,
-            "No model 'PointGaol' is here or is shipped; there are: .*PointGoal",
+            "There is no model 'PointGaol' here, and none is shipped; those shipped are: .*PointGoal",
         ),
         (
             {"model": "logs/model.zip"},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import sqlite3
 from dataclasses import replace
 from multiprocessing.connection import Connection
@@ -175,8 +176,10 @@ def test_videos_without_a_turn_are_removed(store: Store) -> None:
     begin(store)
     for name in ("0.mp4", "orphan.mp4", ".writing-x.mp4"):
         (store.videos / name).write_bytes(b"x")
+        os.utime(store.videos / name, (0, 0))
+    (store.videos / "new.mp4").write_bytes(b"x")  # another process is about to add its turn
     assert store.remove_orphans() == 2
-    assert [file.name for file in store.videos.iterdir()] == ["0.mp4"]
+    assert {file.name for file in store.videos.iterdir()} == {"0.mp4", "new.mp4"}
 
 
 def answer_without_end(folder: Path, said: Connection) -> None:

@@ -40,7 +40,8 @@ async function ask(path, body) {
   const response = await fetch(base + path, options);
   const data = await response.json().catch(() => null);
   if (response.ok && data) return data;
-  const error = new Error(data?.error || `The server answers ${response.status}.`);
+  const other = "Something else than the server answers: perhaps you must log in again, in another tab.";
+  const error = new Error(data?.error || (response.ok ? other : `The server answers ${response.status}.`));
   if (!response.ok) error.status = response.status; // else it is not ours: another's login page, say
   throw error;
 }
