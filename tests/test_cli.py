@@ -141,7 +141,7 @@ def test_a_truncated_model_file_is_refused(
 def test_shipped_files_of_other_names_are_not_found() -> None:
     with pytest.raises(FileNotFoundError, match="poem_sac"):
         resources.config_file("poem_zac")
-    with pytest.raises(FileNotFoundError, match="there are:"):
+    with pytest.raises(FileNotFoundError, match="those shipped are:"):
         resources.pretrained_folder("Nobody")
 
 

@@ -210,7 +210,7 @@ def test_what_is_not_to_be_had_is_said(
             call()
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     for call in (lambda: load_model(NAME), lambda: model.push_to_hub(NAME)):
-        with pytest.raises(ImportError, match=r"pip install '\.\[hub\]'"):
+        with pytest.raises(ImportError, match=r"pip install -c constraints.txt '\.\[hub\]'"):
             call()
     assert cli.main(["adapt", "--model", NAME]) == 1
     assert "sb3-poem adapt: error: ann/runner: there is no such file" in capsys.readouterr().err

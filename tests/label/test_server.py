@@ -493,5 +493,5 @@ def test_what_the_page_asks(
 def test_the_widget_names_the_extra_that_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "sb3_poem.label.widget", raising=False)
     monkeypatch.setitem(sys.modules, "sb3_poem.label.server", None)  # as without starlette
-    with pytest.raises(ImportError, match=r"pip install '\.\[label\]'"):
+    with pytest.raises(ImportError, match=r"pip install -c constraints.txt '\.\[label\]'"):
         from sb3_poem.label import LabelWidget  # noqa: F401

@@ -155,7 +155,7 @@ def test_meta_world_is_an_extra(monkeypatch, make, name):
         raise sawyer.PackageNotFoundError(name)
 
     monkeypatch.setattr(sawyer, "version", absent)
-    needed = r"need metaworld >= 3.1, < 4: pip install '\.\[metaworld\]'"
+    needed = r"need metaworld >= 3.1, < 4: pip install -c constraints.txt '\.\[metaworld\]'"
     with pytest.raises(ImportError, match=needed):
         make(f"poem/MetaWorld{name}-v0")
 
