@@ -345,7 +345,12 @@ def questions(family: str) -> list[str]:
         if ", told as " in oracle:
             oracle, _, told = oracle.partition(", told as ")
             told = f"as {told}"
-        about = [oracle.removesuffix(" answers"), method.question.replace("-", " "), told]
+        oracle = oracle.replace(" answers, graded from", ", from").removesuffix(" of the spread on")
+        about = [
+            oracle.removesuffix(" answers").replace(" of the answers", ""),
+            method.question.replace("-", " "),
+            told,
+        ]
         mine = {k: returns[family, one["oracle"], method.name, k] for k in ANSWERS}
         earned = [summarise(mine[k]) for k in ANSWERS[1:]]
         sign, pairs = "", method.name.replace(f"-{method.question}", "")
@@ -470,7 +475,7 @@ are not comparable with those here.
 
 **What was not measured.** With the models that ship: all methods on seven of the paper's nine
 families; answers with errors, but for `Bayes()` where a table says so; ablations and tolerances;
-kinds of questions.
+kinds of questions, but on HalfCheetahVel.
 `sb3-poem benchmark run --suite table3 --seeds 3 --snapshots 1 --list` says what each would take.
 """
     return "\n".join([head, *(family_section(family) for family in FAMILIES)])
