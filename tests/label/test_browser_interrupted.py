@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -107,6 +109,25 @@ def test_what_is_said_offline_is_sent_later(
     page.wait_for_url(f"{server.url}/")
     page.goto(address)
     assert page.input_value("#wish") == "at once"
+
+
+def test_a_server_that_is_silent_is_asked_again(
+    open_page: Callable[..., Any], server: Server, point_goal: ModelInfo
+) -> None:
+    page = open_page(server.url)
+    soon = "const timeout = AbortSignal.timeout; AbortSignal.timeout = (ms) => timeout(ms / 10);"
+    page.add_init_script(f"{{ {soon} }}")
+    page.click(f"button[value={point_goal.name}]")
+    page.wait_for_function(SHOWN)
+    os.kill(server.process.pid, signal.SIGSTOP)  # takes requests, and answers none
+    try:
+        page.keyboard.press("1")
+        page.wait_for_selector("#error:visible")
+        assert "kept in this browser" in page.text_content("#error")
+    finally:
+        os.kill(server.process.pid, signal.SIGCONT)
+    page.wait_for_function("() => view.answered === 1 && view.phase === 'question' && !busy")
+    assert page.is_hidden("#error")
 
 
 def test_tabs_of_one_conversation_keep_what_each_could_not_send(

@@ -60,7 +60,9 @@ def test_four_on_a_phone(
 
 TOPS = """() => {
   window.tops = new Set();
+  window.waited = false;
   const measure = () => {
+    waited ||= Boolean(document.getElementById("progress")?.offsetParent);
     const answers = document.getElementById("answers");
     const shown = answers && answers.offsetParent;
     if (shown) tops.add(Math.round(answers.getBoundingClientRect().top + scrollY));
@@ -77,8 +79,8 @@ def test_a_doubtful_pair_is_shown_again_and_the_answers_stay_where_they_are(
     page = open_page(server.url, viewport=viewport)
     page.add_init_script(f"({TOPS})()")  # in every frame, from the first on
     page.click(f"button[value={point_goal.name}]")
-    page.wait_for_selector("#progress:visible")
     page.wait_for_function(SHOWN)
+    assert page.evaluate("() => waited")
     wish, films = (page.locator(part).bounding_box() for part in ("#wish", "#screens"))
     assert wish["y"] + wish["height"] <= films["y"]  # one wishes before one looks
     person = Person(server, page, point_goal, 2.5)

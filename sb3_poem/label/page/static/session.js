@@ -4,6 +4,7 @@
 const POLL_MILLISECONDS = 150;
 const RETRY_MILLISECONDS = 1000;
 const SLOW_AFTER_MILLISECONDS = 4000;
+const GIVE_UP_MILLISECONDS = 20000; // and ask again: a lost connection may never say so
 const base = window.location.pathname.replace(/\/+$/, "");
 const byId = (id) => document.getElementById(id);
 const four = document.querySelector('[data-preference="first"]') !== null;
@@ -31,14 +32,20 @@ function browserStorage() {
 }
 
 async function ask(path, body) {
-  const options = body === undefined ? {} : {
-    method: "POST",
-    keepalive: true, // a page that is closed still sends it
-    headers: { "Content-Type": "application/json" },
-    body: JSON.stringify(body),
-  };
+  const options = { signal: AbortSignal.timeout(GIVE_UP_MILLISECONDS) };
+  if (body !== undefined) {
+    Object.assign(options, {
+      method: "POST",
+      keepalive: true, // a page that is closed still sends it
+      headers: { "Content-Type": "application/json" },
+      body: JSON.stringify(body),
+    });
+  }
   const response = await fetch(base + path, options);
-  const data = await response.json().catch(() => null);
+  const data = await response.json().catch((error) => {
+    if (error.name === "TimeoutError") throw error;
+    return null;
+  });
   if (response.ok && data) return data;
   const other = "Something else than the server answers: perhaps you must log in again, in another tab.";
   const error = new Error(data?.error || (response.ok ? other : `The server answers ${response.status}.`));
@@ -123,9 +130,9 @@ async function act(path, body) {
   busy = false;
 }
 
-// `fetch` has a TypeError for a server that it does not reach.
+// `fetch` has a TypeError for a server that it does not reach, a TimeoutError for one that is silent.
 function inSentence(error) {
-  if (!(error instanceof TypeError)) return error.message;
+  if (!["TypeError", "TimeoutError"].includes(error.name)) return error.message;
   return "The server does not answer. What you answered is kept in this browser, and sent as soon as it does…";
 }
 
