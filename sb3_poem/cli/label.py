@@ -11,7 +11,19 @@ from typing import Any
 import gymnasium
 from rich.console import Console
 
+from sb3_poem.adaptation.preference import BEST_OF_FOUR
 from sb3_poem.cli.needs import check_output, import_packages, parse_pairs, say
+from sb3_poem.common.files import write_json_atomically
+from sb3_poem.label.export import export
+from sb3_poem.label.families import find_models
+from sb3_poem.label.minari_export import export_minari
+from sb3_poem.label.render_queue import RenderQueue, process_pool
+from sb3_poem.label.rendering import make_env, renderer_of, session_rule
+from sb3_poem.label.replay import OtherRobotError, recorded_digest, replay
+from sb3_poem.label.sessions import SessionManager
+from sb3_poem.label.store import Store
+from sb3_poem.loading import load_model
+from sb3_poem.resources import pretrained_folder
 
 SHORTEST_PASSWORD = 12
 AUTH_VARIABLE = "SB3_POEM_AUTH"
@@ -28,12 +40,7 @@ def run_page(arguments: argparse.Namespace) -> None:
             install = "pip install -c constraints.txt '.[label]' in a checkout"
             raise ValueError(f"the page needs {package}: {install}")
     from sb3_poem.label.access import LOOPBACK, Access, is_loopback
-    from sb3_poem.label.families import find_models
-    from sb3_poem.label.render_queue import RenderQueue, process_pool
-    from sb3_poem.label.rendering import make_env, session_rule
     from sb3_poem.label.server import bind, link_host, make_app, make_server
-    from sb3_poem.label.sessions import SessionManager
-    from sb3_poem.label.store import Store
 
     user, password = read_password(arguments.auth, arguments.auth_file)
     instructions = read_text("--instructions", arguments.instructions)
@@ -130,8 +137,6 @@ def read_text(flag: str, file: Path | None) -> str:
 
 def check_shown(models: Sequence[Any]) -> None:
     """Refuse an environment of the user's in which a model cannot be shown, before people come."""
-    from sb3_poem.label.rendering import renderer_of
-
     for info in models:
         try:
             renderer_of(info)
@@ -141,9 +146,6 @@ def check_shown(models: Sequence[Any]) -> None:
 
 
 def run_export(arguments: argparse.Namespace) -> None:
-    from sb3_poem.label.export import export
-    from sb3_poem.label.minari_export import export_minari
-
     kind, undone = arguments.format, arguments.undone
     for path in arguments.out:
         if kind is None:
@@ -164,12 +166,6 @@ def run_replay(arguments: argparse.Namespace) -> None:
     """Feed the recorded answers to a model and a rule."""
     # A model that rl_zoo3 trained may hold its schedules.
     import rl_zoo3  # noqa: F401
-
-    from sb3_poem.adaptation.preference import BEST_OF_FOUR
-    from sb3_poem.common.files import write_json_atomically
-    from sb3_poem.label.replay import OtherRobotError, recorded_digest, replay
-    from sb3_poem.loading import load_model
-    from sb3_poem.resources import pretrained_folder
 
     check_output("--json", arguments.json, (".json",))
     store, given = _open_store(arguments.store), arguments.model
@@ -216,10 +212,8 @@ def run_replay(arguments: argparse.Namespace) -> None:
     store.close()
 
 
-def _open_store(folder: Path) -> Any:
+def _open_store(folder: Path) -> Store:
     """The store that was named, if there is one."""
-    from sb3_poem.label.store import Store
-
     if not (folder / "answers.sqlite").is_file():
         raise ValueError(f"--store {folder}: there are no answers there (no answers.sqlite)")
     return Store(folder)
