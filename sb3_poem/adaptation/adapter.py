@@ -155,7 +155,7 @@ class PreferenceAdapter:
         """
         if self.pending is None:
             self._check_unfinished()
-            self.pending = self._make_query(self.inference.ask())
+            self.pending = self._make_query(self.inference.ask(), self.n_answers)
         elif self._needs_frames and self._frames_are_missing(self.pending):
             # Neither a file nor an answer holds frames; the same seed gives the same rollouts.
             number, latents = self._number_of(self.pending), latents_of(self.pending.shown)
@@ -289,9 +289,8 @@ class PreferenceAdapter:
                 return number
         return self.n_answers
 
-    def _make_query(self, shown: Sequence[Shown], number: int | None = None) -> Query:
-        number, frames = self.n_answers if number is None else number, self._needs_frames
-        rolled = tuple(self._rolled_out(item, number, frames) for item in shown)
+    def _make_query(self, shown: Sequence[Shown], number: int) -> Query:
+        rolled = tuple(self._rolled_out(item, number, self._needs_frames) for item in shown)
         return Query(rolled, self.rule.question)
 
     def _rolled_out(self, shown: Shown, number: int, frames: int) -> Trajectory:

@@ -111,11 +111,8 @@ class Bayes(Rule):
         error, which takes tasks that share their dynamics.
     :param decision: "expected-fitness", "posterior-mean" or "most-likely", see
         :func:`sb3_poem.adaptation.decisions.decide`.
-    :param noise_model: How the oracle errs, or "infer"; None takes the oracle's own, else no error.
-        The prior of "infer": with probability 0.2 a quarter of the answers is turned round, else
-        none; with 0.2 the oracle's doubt is twice the family's spread of returns
-        (:func:`~sb3_poem.adaptation.return_spread`), else none; in that unit differences are equal
-        up to 0, 0.12 or 0.4 (0.4, 0.4, 0.2), and much from 0.45, 1 or 2 (0.3, 0.5, 0.2).
+    :param noise_model: How the oracle errs, or "infer", by the prior over people that
+        docs/algorithms/bayes.md tabulates; None takes the oracle's own, else no error.
     :param epsilon: Tolerated error of eq. 9, in [0, 0.5), for ``query_rule="worst-case"``.
     :param question: "pair" (left, right or equal), "graded" (much better, too) or "best-of-four".
     :raises ValueError: If an option is out of its range.
@@ -171,9 +168,7 @@ class Bayes(Rule):
             )
         if likelihood == "similarity" and not compares:
             without = "which takes training on tasks that share their dynamics"
-            known = (
-                f", nor a decoder whose error is known, {without}" if not self.likelihood else ""
-            )
+            known = f", nor a decoder whose error is known, {without}" * (not self.likelihood)
             raise ValueError(
                 f'likelihood="similarity" needs a model with `similarities` (POEMSAC); this {name} '
                 f"has none{known}"

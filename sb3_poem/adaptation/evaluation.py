@@ -302,18 +302,17 @@ def evaluate_adaptation(
     own, vec_env = model_and_env(model, env)
     tasks, start = choose_test_tasks(own, vec_env, tasks, seed), evaluation_seed(seed)
     outcomes: list[EpisodeOutcomes] = []
-    found: AdaptationEvaluation | None = None
+    found: list[AdaptationEvaluation] = []
 
     def measure(adapted: TaskAdaptations) -> None:
-        nonlocal found
         latents = adapted.latents[:, -1], adapted.tasks
         outcomes.append(evaluate_episodes(own, vec_env, *latents, n_episodes, start, deterministic))
         returns = np.stack([each.returns for each in outcomes], axis=1)
         known = [each.successes for each in outcomes if each.successes is not None]
         successes = np.stack(known, axis=1) if len(known) == len(outcomes) else None
-        found = AdaptationEvaluation(**vars(adapted), returns=returns, successes=successes)
+        found.append(AdaptationEvaluation(**vars(adapted), returns=returns, successes=successes))
         if on_record is not None:
-            on_record(found)
+            on_record(found[-1])
 
     adapt_tasks(
         own,
@@ -329,8 +328,7 @@ def evaluate_adaptation(
         progress_bar=progress_bar,
         on_record=measure,
     )
-    assert found is not None
-    return found
+    return found[-1]
 
 
 def choose_test_tasks(

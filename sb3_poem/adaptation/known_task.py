@@ -106,9 +106,9 @@ def known_task_return(
     shared = family.shared_dynamics
     if n_latents is None:
         n_latents = LATENTS_WITH_SHARED_DYNAMICS if shared else LATENTS_WITH_OWN_DYNAMICS
-    numbers = {"n_latents": n_latents, "n_episodes": n_episodes}
-    for name, number in {**numbers, "selection_episodes": selection_episodes}.items():
-        check_whole(name, number, 1)
+    check_whole("n_latents", n_latents, 1)
+    check_whole("n_episodes", n_episodes, 1)
+    check_whole("selection_episodes", selection_episodes, 1)
     rng = np.random.default_rng([seed, 2])
     candidates = _draw_latents(model, n_latents, rng)
     others = tasks[:0]

@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 from scipy.optimize import minimize_scalar
-from scipy.special import entr
+from scipy.special import entr, softmax
 
 from sb3_poem.adaptation.noise import BoltzmannNoise, ExactNoise, MistakeNoise, NoiseModel
 from sb3_poem.common.checks import check_number, check_whole
@@ -79,12 +79,12 @@ class AnswerLimits:
         marginal = None
         for slope in SLOPES[: len(SLOPES) * erring] / max(float(np.ptp(others)), 1e-12):
             marginal, _ = _best_marginal(others, slope, marginal)
-            told = _channel(others, slope, marginal)
+            told = softmax(slope * others + np.log(marginal), axis=1)  # p(j | i)
             logs = np.log(np.maximum(told, 1e-300) / np.maximum(marginal, 1e-300))
             rate = float((told * logs).sum(axis=1).mean() / np.log(2.0))
             if rate > bits[-1]:
                 bits.append(rate)
-                scored = _channel(chosen, slope, marginal) * fresh
+                scored = softmax(slope * chosen + np.log(marginal), axis=1) * fresh
                 returns.append(float(scored.sum(axis=1).mean()))
         spread = float(np.ptp(chosen, axis=1).max())
         return cls(tuple(codebooks), tuple(bits), tuple(returns), spread)
@@ -335,13 +335,6 @@ def _best_marginal(
         # No policy may vanish for good by rounding: its task would then have none.
         marginal = np.maximum(marginal * growth, 1e-200)
     return marginal, smallest + slope * float(best.mean())
-
-
-def _channel(returns: np.ndarray, slope: float, marginal: np.ndarray) -> np.ndarray:
-    """(n_tasks, n_policies) p(j | i) for a marginal."""
-    logs = slope * returns + np.log(marginal)
-    weights = np.exp(logs - logs.max(axis=1, keepdims=True))
-    return weights / weights.sum(axis=1, keepdims=True)
 
 
 def _logistic_capacity(amplitude: float) -> float:
