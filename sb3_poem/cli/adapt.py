@@ -266,15 +266,9 @@ class Adaptation:
             about = (subject.model, subject.env, latents, tasks, self.arguments.episodes)
             outcomes = evaluate_episodes(*about, evaluation_seed(subject.seed))
         successes = None if outcomes.successes is None else outcomes.successes[None]
-        answers = [answer.preference for answer in adapter.answers]
-        return AdaptationEvaluation(
-            subject.tasks,
-            tuple(records),
-            latents[None],
-            [answers],
-            outcomes.returns[None],
-            successes,
-        )
+        answers = [[answer.preference for answer in adapter.answers]]
+        adapted = (subject.tasks, tuple(records), latents[None], answers)
+        return AdaptationEvaluation(*adapted, outcomes.returns[None], successes)
 
     def _report(self, evaluation: AdaptationEvaluation, known: KnownTaskReturn | None) -> None:
         """Print and write what was measured; without ``known`` it was interrupted."""
