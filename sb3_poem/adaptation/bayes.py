@@ -328,8 +328,6 @@ class BayesInference(Inference):
         differences = np.linspace(-largest, largest, TABLE_POINTS)
         table = differences, said(differences)
         pair = queries.most_telling_pair(values, weights, *table, visibility)
-        if self.n_shown == 2:
-            return pair
         return queries.most_telling_set(pair, self.n_shown, values, weights, said)
 
     def tell(self, preference: Preference, *shown: Shown) -> None:

@@ -221,8 +221,7 @@ def property_one(similarities: np.ndarray, returns: np.ndarray) -> tuple[float, 
     first, second = np.triu_indices(returns.shape[1], 1)
     order = np.sign(returns[:, first] - returns[:, second])
     guess = np.sign(similarities[:, first] - similarities[:, second])
-    decided = np.count_nonzero(order)
-    if not decided:
+    if not order.any():
         return float("nan"), float("nan")
     agreement = order * guess
     accuracy = float((0.5 * (1.0 + agreement))[order != 0].mean())

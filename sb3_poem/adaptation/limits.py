@@ -136,9 +136,8 @@ def information_limit(
     check_whole("k", k, 0)
     returns = check_returns(returns)
     capacity = answer_capacity(noise_model, float(np.ptp(returns, axis=1).max()), n_answers)
-    n_tasks, n_policies = returns.shape
     size = int(n_answers) ** min(int(k), 63)  # NumPy's whole numbers would overflow
-    if size >= min(n_tasks, n_policies):
+    if size >= min(returns.shape):
         limit = float(returns.max(axis=1).mean())
     else:
         limit = _value(returns, best_codebook(returns, size, ordered=ordered))

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from tqdm import tqdm
 
 from sb3_poem.adaptation import (
@@ -57,7 +56,7 @@ def run_adapt(arguments: argparse.Namespace) -> int:
         raise ValueError(f"--save {arguments.save}: a policy is kept there already; {other}")
     human = arguments.oracle == "human"
     n_tasks = _check_tasks(arguments)
-    subject = Subject(arguments, Console(), n_tasks, COPIES_FOR_ONE_TASK if human else COPIES)
+    subject = Subject(arguments, n_tasks, COPIES_FOR_ONE_TASK if human else COPIES)
     if subject.latent is not None:
         what = "a policy that is adapted already; name the model instead"
         raise ValueError(f"--model {arguments.model} is {what}")

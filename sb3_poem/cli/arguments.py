@@ -111,14 +111,13 @@ def _count(minimum: int) -> Callable[[str], int]:
     return count
 
 
-def _share(most: float) -> Callable[[str], float]:
-    def share(text: str) -> float:
-        if not 0.0 <= (value := float(text)) <= most:
-            raise argparse.ArgumentTypeError(f"must be from 0 to {most:g}, got {text}")
-        return value
+def _rate(text: str) -> float:
+    if not 0.0 <= (value := float(text)) <= 0.5:
+        raise argparse.ArgumentTypeError(f"must be from 0 to 0.5, got {text}")
+    return value
 
-    share.__name__ = "number"
-    return share
+
+_rate.__name__ = "number"
 
 
 def _add_environment(group: Group, default: str) -> None:
@@ -187,7 +186,7 @@ def _add_adapt_arguments(parser: argparse.ArgumentParser) -> None:
     told = "a program that knows the task, and answers by the return, or errs; or you"
     _option(questions, "--oracle", told, default="return", choices=oracles)
     _option(questions, "--beta", "of --oracle boltzmann (default: the paper's)", float)
-    _option(questions, "--mistake-rate", "of --oracle mistake (default: 0.2)", _share(0.5))
+    _option(questions, "--mistake-rate", "of --oracle mistake (default: 0.2)", _rate)
     told = "left or right; graded: much better, too; or which of four is best (default: pair)"
     _option(questions, "--question", told, choices=QUESTIONS)
     told = "from what differences on an oracle says better and much better, as shares of the spread"
@@ -229,7 +228,7 @@ def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
     _option(model, "--inference", "", default="bayes", choices=INFERENCES)
     told = "left or right; graded: how much better, too; or which of four is best (default: graded"
     _option(model, "--question", f"{told}; paper: pair)", choices=QUESTIONS)
-    _option(model, "--mistake-rate", "of people (default: inferred)", _share(0.5))
+    _option(model, "--mistake-rate", "of people (default: inferred)", _rate)
     _option(model, "--seed", "of every session (default: each has its own)", _count(0))
     _file(model, "--instructions", "text or Markdown that people read before the first question")
 
@@ -267,7 +266,7 @@ def _add_label_arguments(parser: argparse.ArgumentParser) -> None:
     told = "a model's .zip, a pretrained folder, or a shipped model (default: each session's own)"
     _option(replay, "--model", told, **own)
     _option(replay, "--inference", "default: bayes", choices=INFERENCES, **own)
-    _option(replay, "--mistake-rate", "default: inferred", _share(0.5), **own)
+    _option(replay, "--mistake-rate", "default: inferred", _rate, **own)
     _option(replay, "--seed", "of the inference (default: 0)", _count(0), **own)
     _file(replay, "--json", "write what was foretold, and the latents after each answer")
 

@@ -6,8 +6,6 @@ from math import ceil
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from poem_envs.headless import has_display
 from poem_envs.registration import family_name
 from sb3_poem.adaptation import evaluate_adaptation
@@ -59,7 +57,7 @@ class Shown:
     def __init__(self, arguments: argparse.Namespace, render_mode: str | None) -> None:
         if arguments.model is None:
             arguments.model = _last_run(arguments)
-        self.subject = subject = Subject(arguments, Console(), 1, COPIES_FOR_ONE_TASK)
+        self.subject = subject = Subject(arguments, 1, COPIES_FOR_ONE_TASK)
         self.has_task = subject.latent is None or arguments.task is not None
         self.shows_task = self.has_task and render_mode is not None
         subject.make_env(render_mode, self.shows_task).close()  # before it is adapted

@@ -44,17 +44,14 @@ def after(n_answers: int) -> str:
 class Subject:
     """A model, an environment with many copies, and test tasks or the one of ``--task``."""
 
-    def __init__(
-        self, arguments: argparse.Namespace, console: Console, n_tasks: int, copies: int
-    ) -> None:
-        self.console = console
-        self.seed: int = arguments.seed
+    def __init__(self, arguments: argparse.Namespace, n_tasks: int, copies: int) -> None:
+        self.console, self.seed = Console(), int(arguments.seed)
         check_device(arguments.device)
         import_packages(arguments.gym_packages)
         th.set_num_threads(arguments.num_threads)
         #: (latent_dim,) of a file that holds a policy, which is adapted already
         self.latent: np.ndarray | None = None
-        with console.status("Reading the model"):
+        with self.console.status("Reading the model"):
             if Path(arguments.model).suffix == POLICY_SUFFIX:
                 policy = AdaptedPolicy.load(arguments.model, arguments.device)
                 assert isinstance(policy.model, PEARLSAC)
