@@ -168,7 +168,9 @@ class Bayes(Rule):
             )
         if likelihood == "similarity" and not compares:
             without = "which takes training on tasks that share their dynamics"
-            known = f", nor a decoder whose error is known, {without}" * (not self.likelihood)
+            known = (
+                f", nor a decoder whose error is known, {without}" if not self.likelihood else ""
+            )
             raise ValueError(
                 f'likelihood="similarity" needs a model with `similarities` (POEMSAC); this {name} '
                 f"has none{known}"

@@ -259,8 +259,9 @@ class HumanAnswer:
 class HumanOracle:
     """Shows a question's trajectories beside each other in a video file, and asks at the terminal.
 
-    The files are ``query-001.gif`` and so on (or ``.mp4``) within the folder; the prompt says which
-    words and numbers it takes.
+    The files are ``query-001.gif`` and so on (or ``.mp4``) within the folder. The prompt takes l or
+    left, r or right, and e, equal, = or ?, or a number: 1 or 2 of a pair, 1 (left is much better)
+    to 5 of a graded question, and 1 to 4, or 0, of a best of four.
 
     >>> from sb3_poem import PreferenceAdapter
     >>> import gymnasium as gym
