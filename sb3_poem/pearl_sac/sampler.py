@@ -80,7 +80,10 @@ class MetaBatchSampler:
 
     def sample(self, n: int, batch_size: int) -> list[MetaBatch]:
         """Draw ``n`` meta-batches of ``batch_size`` transitions a task."""
-        choices = [self.choose_tasks() for _ in range(n)]
+        rng, n_tasks = self.generators.numpy, len(self.train_tasks)
+        size = min(self.meta_batch_size, n_tasks)
+        # each once: a task twice is a pair without a difference
+        choices = [rng.choice(n_tasks, size=size, replace=False) for _ in range(n)]
         chosen = np.concatenate(choices)
         task_ids = th.as_tensor(chosen, device=self.device)  # (n * tasks,)
         transitions, bootstraps = self._transitions(task_ids, chosen, batch_size)
@@ -94,16 +97,9 @@ class MetaBatchSampler:
         of_actions, of_next = (part.reshape(-1, batch_size, action_dim) for part in parts)
         known = (task_ids, transitions, context, context_rewards, returns)
         whole = MetaBatch(*known, of_latents, of_actions, of_next, bootstraps)
-        stops = np.cumsum([len(choice) for choice in choices]).tolist()
-        rows = (slice(stop - len(one), stop) for one, stop in zip(choices, stops, strict=True))
+        rows = (slice(start, start + size) for start in range(0, len(chosen), size))
         batches = (mapped(itemgetter(some), whole) for some in rows)
         return [batch._replace(returns=batch.returns[:, batch.task_ids]) for batch in batches]
-
-    def choose_tasks(self) -> np.ndarray:
-        """Indices of a meta-batch, each once: a task twice is a pair without a difference."""
-        n_tasks = len(self.train_tasks)
-        size = min(self.meta_batch_size, n_tasks)
-        return self.generators.numpy.choice(n_tasks, size=size, replace=False)
 
     def _transitions(
         self, task_ids: th.Tensor, chosen: np.ndarray, batch_size: int

@@ -7,7 +7,6 @@ import inspect
 import io
 import itertools
 import json
-import math
 import pickle
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -24,6 +23,7 @@ from torch import nn
 
 from sb3_poem.common.buffers import ContextStore
 from sb3_poem.common.checks import check_whole
+from sb3_poem.common.files import parse_json
 from sb3_poem.common.foreign import check_env_id
 from sb3_poem.common.networks import parse_tensors
 from sb3_poem.hub import FILES
@@ -42,11 +42,8 @@ POLICY_FACTS = ("net_arch", "layer_norm", "n_critics", "optimizer_kwargs")
 #: Classes that it names: where they are, and their base class
 CLASSES = {"activation_fn": (nn, nn.Module), "optimizer_class": (th.optim, th.optim.Optimizer)}
 SPACES = ("observation_space", "action_space", "task_space")
-ARRAYS = {
-    "train_tasks": "tasks",
-    "latent_means": "latent_means",
-    "latent_variances": "latent_variances",
-}
+#: The fields of TrainTasks, by the names of their tensors
+ARRAYS = ("train_tasks", "latent_means", "latent_variances")
 # rebuilt from the critics: half of their size for nothing otherwise
 DERIVED = "critic_target."
 #: Arguments that decide what the networks are; a trained model has them for good
@@ -59,13 +56,8 @@ NOT_KEPT = {
     *("verbose", "device", "_init_setup_model", "unsupported"),
 }
 #: The most that a file may ask for, of whole numbers
-LARGEST = {
-    "n_envs": 10_000,
-    "horizon": 100_000,
-    "reward_feature_dim": 10_000,
-    "buffer_size": 100_000_000,
-}
-LARGEST_OF_OTHERS = 1_000_000
+LARGEST = {"n_envs": 10**4, "horizon": 10**5, "reward_feature_dim": 10**4, "buffer_size": 10**8}
+LARGEST_OF_OTHERS = 10**6
 
 Model = TypeVar("Model", bound=SAC)
 
@@ -205,8 +197,8 @@ def model_contents(
             raise ValueError(f"{argument} must be in {module.__name__} to be saved, but is {value}")
     state, boxes = policy.state_dict(), {name: getattr(model, name) for name in SPACES}
     tensors = {f"policy.{name}": state[name] for name in state if not name.startswith(DERIVED)}
-    for name, field in ARRAYS.items():
-        tensors[name] = th.as_tensor(getattr(model.train_tasks, field))
+    for name, array in zip(ARRAYS, vars(model.train_tasks).values(), strict=True):
+        tensors[name] = th.as_tensor(array)
     for name, box in boxes.items():
         tensors[f"{name}.low"], tensors[f"{name}.high"] = map(th.as_tensor, (box.low, box.high))
     # those with which training goes on; a schedule's place takes its default
@@ -260,13 +252,8 @@ def parse_config(text: str | bytes, source: str) -> dict[str, Any]:
     :raises ValueError: If it is truncated, of another program or version, or its ``env_id`` would
         import a module
     """
-    try:
-        config = json.loads(text)
-    except (ValueError, RecursionError) as error:  # of thousands of brackets
-        what = "is truncated, or no configuration of sb3_poem"
-        raise ValueError(f"{source} {what}: {error}") from error
-    found = config.get("format") if isinstance(config, dict) else None
-    if found != FORMAT:
+    config = parse_json(text, f"{source} is truncated, or no configuration of sb3_poem")
+    if (found := config.get("format")) != FORMAT:
         what = f"its format is {found!r}, expected {FORMAT!r}"
         raise ValueError(f"{source} is not of this version of sb3_poem: {what}")
     check_env_id(config.get("env_id"), source)
@@ -346,8 +333,6 @@ def _check_numbers(algorithm: type, config: dict[str, Any], tensors: dict[str, t
             raise ValueError(f"`{name}` is no argument that a model is saved with")
         if type(parameters[name].default) is int or (name in LARGEST and value is not None):
             check_whole(name, value, -1, LARGEST.get(name, LARGEST_OF_OTHERS))
-        elif isinstance(value, float) and not math.isfinite(value):
-            raise ValueError(f"`{name}` must be finite, but is {value}")
     expected, n_tasks = arguments.get("n_train_tasks"), len(tensors["train_tasks"])
     if expected not in (None, n_tasks):
         raise ValueError(f"`n_train_tasks` is {expected}, but there are {n_tasks} train_tasks")

@@ -306,7 +306,7 @@ REFUSED_NUMBERS: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     ({}, {"trajectories_per_task": 10**12}, "`trajectories_per_task` must be at most"),
     ({}, {"horizon": 10**12}, "`horizon` must be at most"),
     ({}, {"horizon": 1e12}, "`horizon` must be a whole number"),
-    ({}, {"kl_coef": NAN}, "`kl_coef` must be finite, but is nan"),
+    ({}, {"kl_coef": NAN}, "`kl_coef` must be a finite number, but is nan"),
     ({}, {"seed": -1}, "does not hold a complete POEMSAC"),
     (
         {},
