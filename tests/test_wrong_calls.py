@@ -244,7 +244,7 @@ ALGORITHMS = [
     ),
     refused("learn a text", lambda _: made().learn("1000"), "total_timesteps...1000"),
     refused("learn misspelt", lambda _: made().learn(1, callbacks=[]), "callbacks"),
-    refused("callback=3", lambda _: made().learn(1, callback=3), "callback must be...not 3"),
+    refused("callback=3", lambda _: made().learn(1, callback=3), "callback must be...is 3"),
     refused("an environment", lambda _: POEMSAC.from_zoo(gym.make(POINT_GOAL)), "env_id...by env="),
     refused(
         "steps in words", lambda _: POEMSAC.from_zoo(POINT_GOAL, n_timesteps="many"), "n_timesteps"

@@ -101,8 +101,7 @@ def check_arguments(given: Mapping[str, Any], algorithm: type) -> None:
     """Refuse the first of PEARLSAC's arguments, by name, that is outside its range."""
     policy_kwargs, scale, device = given["policy_kwargs"], given["reward_scale"], given["device"]
     if not isinstance(policy_kwargs, dict | None):
-        needed = "a dictionary of the policy's arguments"
-        raise TypeError(f"policy_kwargs must be {needed}, but is {policy_kwargs!r}")
+        raise TypeError(f"policy_kwargs must be a dictionary, but is {policy_kwargs!r}")
     refuse_unsupported(policy_kwargs or (), f"{algorithm.__name__}'s policy")
     for name in policy_kwargs or ():
         if given["policy"] == "MlpPolicy" and name not in POLICY_ARGUMENTS:
@@ -183,18 +182,17 @@ def vectorise(
     n_train_tasks: int | None = None,
     trajectories_per_task: int = 1,
     **env_kwargs: Any,
-) -> GymEnv | None:
+) -> GymEnv:
     """An environment as SB3 takes it. A registered id becomes ``n_copies`` with these arguments;
     None: as many as are worth while.
     """
     if isinstance(env, gym.vector.VectorEnv):
         return as_task_vec_env(env)
-    if env is None or isinstance(env, gym.Env | VecEnv):
+    if isinstance(env, gym.Env | VecEnv):
         return env
     if not isinstance(env, str):
-        what = f"the class {env.__name__}" if isinstance(env, type) else f"a {type(env).__name__}"
         raise TypeError(
-            f"env is {what}, but must be an environment, a vectorised one (DummyVecEnv, "
+            f"env is {env!r}, but must be an environment, a vectorised one (DummyVecEnv, "
             "SubprocVecEnv, TaskVecEnv), or a registered id"
         )
     env = plain_id(env)

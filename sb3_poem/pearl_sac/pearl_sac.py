@@ -69,8 +69,7 @@ class PEARLSAC(SAC):
     under its own latest latent, and gradient steps on meta-batches of tasks. It keeps a replay
     buffer for every task and the contexts of the last epoch, and learns a context encoder, a
     latent-conditioned actor and critics, and a reward decoder together. Observations are
-    standardised by the mean and deviation of all that were collected. Arguments that are not
-    described are SAC's.
+    standardised by the mean and deviation of all that were collected.
 
     >>> model = PEARLSAC("MlpPolicy", "poem/PointGoal-v0", n_train_tasks=4, gradient_steps=1)
     >>> model = model.learn(200)  # two epochs of four episodes
@@ -222,18 +221,14 @@ class PEARLSAC(SAC):
         self._logs_pending = False
         self.keeps_experience = False  # in files, of which only checkpoints do
         self.policy_class = self._get_policy_from_name(policy)
-        given = vectorise(env, None, n_train_tasks, trajectories_per_task)
-        if _init_setup_model:
-            if given is None:
-                raise TypeError(
-                    "env is None, but must be an environment of a task family, a vectorised one, "
-                    "or a registered id"
-                )
-            given = self._wrap_env(given, verbose)
-            self._family = self._family_of(given)  # before SB3 speaks of other policies
+        vec_env = None  # as of a model that is read from a file
+        if env is not None or _init_setup_model:
+            given = vectorise(env, None, n_train_tasks, trajectories_per_task)
+            vec_env = self._wrap_env(given, verbose)
+            self._family = self._family_of(vec_env)  # before SB3 speaks of other policies
         of_sac = arguments.keys() & inspect.signature(SAC).parameters.keys()
         inherited = {name: arguments[name] for name in of_sac} | {
-            "env": given,
+            "env": vec_env,
             "replay_buffer_class": TaskReplayBuffer,
             "policy_kwargs": dict(policy_kwargs or {}),  # ours to complete, not the caller's
         }
@@ -376,13 +371,10 @@ class PEARLSAC(SAC):
                 f"number of environment steps; an epoch has {self.epoch_steps:,}"
             )
         check_number("total_timesteps", total, 0)
-        if isinstance(callback, type):
-            name = callback.__name__
-            raise TypeError(f"callback is the class {name}, but must be an object: {name}(...)")
-        if not (
-            callback is None or isinstance(callback, BaseCallback | list) or callable(callback)
-        ):
-            raise TypeError(f"callback must be a callback, a function or a list, not {callback!r}")
+        known = callback is None or isinstance(callback, BaseCallback | list) or callable(callback)
+        if not known or isinstance(callback, type):
+            needed = "an object of a callback's class, a function or a list"
+            raise TypeError(f"callback must be {needed}, but is {callback!r}")
         if self.verbose > 0:
             epoch = self.epoch_steps
             n, updates = int(-(-total // epoch)), self.gradient_steps
@@ -465,7 +457,7 @@ class PEARLSAC(SAC):
                     self._n_updates = updater.n_updates
                 updater.check_finite(history["gradient_norm"][-len(block) :], first)
         self._refresh_posteriors()
-        seconds = max(time.perf_counter() - started, 1e-9)
+        seconds = time.perf_counter() - started
         self.logger.record("time/updates_per_second", gradient_steps / seconds)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         for name, values in history.items():
@@ -590,13 +582,9 @@ class PEARLSAC(SAC):
     def family(self) -> FamilyView:
         """The environment as a task family; refused if the model was loaded without one."""
         if self._family is None:
-            if self.env is None:
-                which = "..." if self.env_id is None else repr(self.env_id)
-                raise ValueError(
-                    "the model has no environment; give it one with set_env, or load it with "
-                    f"env={which}"
-                )
-            self._family = self._family_of(self.env)
+            own = "..." if self.env_id is None else repr(self.env_id)
+            needed = f"give it one with set_env, or load it with env={own}"
+            raise ValueError(f"the model has no environment; {needed}")
         return self._family
 
     def _family_of(self, env: VecEnv) -> FamilyView:
@@ -629,10 +617,7 @@ class PEARLSAC(SAC):
         own: dict[str, Any] = {}
         if isinstance(env, str):
             _, own = environment_of(repr(self), self.env_id, self.env_kwargs, plain_id(env))
-        given = vectorise(env, self.n_envs, **own)
-        if given is None:
-            raise TypeError("env is None, but set_env needs an environment")
-        vec_env = self._wrap_env(given, self.verbose)
+        vec_env = self._wrap_env(vectorise(env, self.n_envs, **own), self.verbose)
         check_for_correct_spaces(vec_env, self.observation_space, self.action_space)
         family = self._family_of(vec_env)
         self.n_envs = vec_env.num_envs  # experience is kept per task, not per copy

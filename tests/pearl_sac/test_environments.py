@@ -132,7 +132,7 @@ def test_set_env_takes_an_id() -> None:
     model.set_env(POINT_GOAL)
     assert isinstance(model.env, TaskVecEnv)
     assert model.n_envs == 2
-    with pytest.raises(TypeError, match="env is None, but set_env needs an environment"):
+    with pytest.raises(TypeError, match="env is None, but must be an environment"):
         model.set_env(None)
 
 
