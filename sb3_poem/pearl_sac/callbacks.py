@@ -100,6 +100,7 @@ class TrainingCheckpointCallback(EpochCallback):
         self._collecting = False
 
     def _on_training_end(self) -> None:
+        self._stops = False
         if not self._collecting:  # half an epoch could not be continued bit for bit
             super()._on_training_end()
 

@@ -126,6 +126,13 @@ def test_a_training_that_is_told_to_stop_goes_on_bit_for_bit(
     assert not differing(parameters(loaded.resume(checkpoint)), five_epochs)
 
 
+def test_a_stop_in_the_last_epoch_does_not_interrupt_the_next_training(tmp_path: Path) -> None:
+    checkpoint = TrainingCheckpointCallback(tmp_path / "checkpoint.zip")
+    model = small(PEARLSAC).learn(EPOCH, [StopAt(N_TASKS, checkpoint), checkpoint])
+    assert checkpoint.saved_steps == EPOCH
+    assert model.learn(EPOCH, checkpoint).epoch == 2
+
+
 class StopAt(BaseCallback):
     def __init__(self, steps: int, checkpoint: TrainingCheckpointCallback) -> None:
         super().__init__()
