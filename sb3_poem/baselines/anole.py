@@ -185,8 +185,7 @@ class ANOLEInference(Inference):
 
 def has_experience(model: MetaModel) -> bool:
     """Whether a model has steps in its replay buffer; a loaded one has none."""
-    buffer = model.replay_buffer if isinstance(model, PEARLSAC) else None
-    return buffer is not None and bool(buffer.counts.any())
+    return isinstance(model, PEARLSAC) and bool(model.replay_buffer.counts.any())
 
 
 def berlekamp_volumes(contradictions: np.ndarray, n_left: int, budget: int) -> np.ndarray:

@@ -379,11 +379,10 @@ class PEARLSAC(SAC):
             epoch = self.epoch_steps
             n, updates = int(-(-total // epoch)), self.gradient_steps
             updates = epoch if updates < 0 else updates
+            in_all = f", {n * updates:,} in all" * (self.learning_starts == 0)
             print(
                 f"Training for {total:,.0f} steps in {n:,} epoch{'s' * (n != 1)}: each has "
-                f"{epoch:,} environment steps, then {updates:,} gradient steps"
-                + f", {n * updates:,} in all"
-                * (self.learning_starts == 0)
+                f"{epoch:,} environment steps, then {updates:,} gradient steps{in_all}"
             )
         return total
 

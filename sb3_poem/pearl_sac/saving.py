@@ -5,7 +5,6 @@ and pretrained folders, in which nothing can run code.
 import contextlib
 import inspect
 import io
-import itertools
 import json
 import pickle
 import zipfile
@@ -343,8 +342,6 @@ def _check_numbers(algorithm: type, config: dict[str, Any], tensors: dict[str, t
     if not isinstance(arch, dict) or not DEFAULT_NET_ARCH.keys() <= arch.keys():
         names = ", ".join(DEFAULT_NET_ARCH)
         raise ValueError(f"net_arch must have the widths of {names}, but is {str(arch)[:60]}")
-    for width in itertools.chain(*arch.values()):
-        check_whole("net_arch", width, 1)
     n_layers = sum(map(len, arch.values())) + config["n_critics"] * (len(arch["qf"]) + 1)
     if n_layers > len(tensors):
         asked = f"net_arch and n_critics ask for {n_layers} layers"

@@ -51,11 +51,8 @@ class POEMPolicy(LatentPolicy):
         return normalize(rewards) @ normalize(policies).T / self.temperature
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {
-            **super()._get_constructor_parameters(),
-            "two_encoder": self.two_encoder,
-            "temperature": self.temperature,
-        }
+        own = {"two_encoder": self.two_encoder, "temperature": self.temperature}
+        return super()._get_constructor_parameters() | own
 
 
 MlpPolicy = POEMPolicy
