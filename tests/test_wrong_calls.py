@@ -258,7 +258,7 @@ ALGORITHMS = [
     refused(
         "a callback's class",
         lambda _: made().learn(1, CheckpointCallback),
-        "callback...class CheckpointCallback",
+        "callback must be an object...class .*CheckpointCallback",
     ),
     refused(
         "set_env",
