@@ -42,7 +42,11 @@ POLICY_FACTS = ("net_arch", "layer_norm", "n_critics", "optimizer_kwargs")
 CLASSES = {"activation_fn": (nn, nn.Module), "optimizer_class": (th.optim, th.optim.Optimizer)}
 SPACES = ("observation_space", "action_space", "task_space")
 #: The fields of TrainTasks, by the names of their tensors
-ARRAYS = ("train_tasks", "latent_means", "latent_variances")
+ARRAYS = {
+    "train_tasks": "tasks",
+    "latent_means": "latent_means",
+    "latent_variances": "latent_variances",
+}
 # rebuilt from the critics: half of their size for nothing otherwise
 DERIVED = "critic_target."
 #: Arguments that decide what the networks are; a trained model has them for good
@@ -196,8 +200,8 @@ def model_contents(
             raise ValueError(f"{argument} must be in {module.__name__} to be saved, but is {value}")
     state, boxes = policy.state_dict(), {name: getattr(model, name) for name in SPACES}
     tensors = {f"policy.{name}": state[name] for name in state if not name.startswith(DERIVED)}
-    for name, array in zip(ARRAYS, vars(model.train_tasks).values(), strict=True):
-        tensors[name] = th.as_tensor(array)
+    for name, field in ARRAYS.items():
+        tensors[name] = th.as_tensor(getattr(model.train_tasks, field))
     for name, box in boxes.items():
         tensors[f"{name}.low"], tensors[f"{name}.high"] = map(th.as_tensor, (box.low, box.high))
     # those with which training goes on; a schedule's place takes its default
