@@ -21,9 +21,8 @@ class _Ant(LeggedFamily):
     ctrl_cost_weight: float = 0.5
     healthy_z_range: tuple[float, float] = (0.2, 1.0)
 
-    def _reward_features(self, qpos_before: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        velocity = (self._qpos[:, :2] - qpos_before[:, :2]) / self.dt
-        return np.column_stack([velocity, np.square(actions).sum(axis=1)])
+    def _movement(self, qpos_before: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        return (self._qpos[:, :2] - qpos_before[:, :2]) / self.dt
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
@@ -238,8 +237,8 @@ class AntGoalEnv(_Ant):
         angle = rng.uniform(0.0, 2 * np.pi, size=n)
         return np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
 
-    def _reward_features(self, qpos_before: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        return np.column_stack([self._qpos[:, :2], np.square(actions).sum(axis=1)])
+    def _movement(self, qpos_before: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        return self._qpos[:, :2]
 
     def _reward(self, tasks: np.ndarray, features: np.ndarray) -> np.ndarray:
         return self._potential(tasks, features) - self.ctrl_cost_weight * features[..., 2]

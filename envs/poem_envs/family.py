@@ -36,28 +36,19 @@ class _NothingToRender:
         return {"render_modes": []}
 
 
-#: What a family must set, in its class or its constructor, and to what.
-REQUIRED_ATTRIBUTES = {
-    "observation_space": "a flat gymnasium.spaces.Box",
-    "action_space": "a flat gymnasium.spaces.Box, bounded below and above",
-    "task_space": "a gymnasium.spaces.Box of shape (task_dim,) and dtype float64",
-    "reward_feature_dim": "a whole number from 1 on",
-}
-
-
 def check_definition(family: Any) -> None:
     """Refuse a family whose attributes are not what they must be, and say what would be right."""
-    given: list[Any] = [getattr(family, name, None) for name in REQUIRED_ATTRIBUTES]
-    observations, actions, tasks, features = given
-    fits = (
-        is_flat(observations),
-        is_flat(actions) and actions.is_bounded(),
-        is_flat(tasks) and tasks.dtype == np.float64,
-        isinstance(features, (int, np.integer)) and features >= 1,
+    names = ("observation_space", "action_space", "task_space", "reward_feature_dim")
+    observations, actions, tasks, features = given = [getattr(family, name, None) for name in names]
+    demands = (
+        (is_flat(observations), "a flat Box"),
+        (is_flat(actions) and actions.is_bounded(), "a flat Box, bounded below and above"),
+        (is_flat(tasks) and tasks.dtype == np.float64, "a Box of shape (task_dim,), dtype float64"),
+        (isinstance(features, int | np.integer) and features >= 1, "a whole number from 1 on"),
     )
     wrong = [
         f"{name} must be {what}, but is {value!r}"
-        for (name, what), value, right in zip(REQUIRED_ATTRIBUTES.items(), given, fits, strict=True)
+        for name, value, (right, what) in zip(names, given, demands, strict=True)
         if not right
     ]
     if not wrong and family.all_tasks is not None:
@@ -243,7 +234,7 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
         """Further entries of the info of every step, say ``{"success": True}``; always the same."""
         return {}
 
-    def _describe_episode(self) -> str:
+    def _describe_episode(self, copy: int = 0) -> str:
         return (
             f"step {self._elapsed_steps} of episode {self._episode} since "
             f"reset(seed={self.np_random_seed})"
@@ -284,12 +275,9 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
         features = np.asarray(features, dtype=np.float64)
         task_dim, feature_dim = self.task_space.shape[0], self.reward_feature_dim
         if tasks.shape[-1:] != (task_dim,):
-            raise ValueError(f"tasks has shape {tasks.shape}, but must end in task_dim={task_dim}")
+            raise ValueError(f"tasks has shape {tasks.shape}, not (..., {task_dim=})")
         if features.shape[-1:] != (feature_dim,):
-            raise ValueError(
-                f"features has shape {features.shape}, but its last dimension must be "
-                f"reward_feature_dim={feature_dim}"
-            )
+            raise ValueError(f"features has shape {features.shape}, not (..., {feature_dim=})")
         return np.asarray(self._reward(tasks, features), dtype=np.float64)[()]
 
     @property

@@ -22,9 +22,8 @@ class _HalfCheetah(MujocoFamily):
     forward_reward_weight: float = 1.0
     ctrl_cost_weight: float = 0.05
 
-    def _reward_features(self, qpos_before: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        velocity = (self._qpos[:, 0] - qpos_before[:, 0]) / self.dt
-        return np.stack([velocity, np.square(actions).sum(axis=1)], axis=1)
+    def _movement(self, qpos_before: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        return (self._qpos[:, 0] - qpos_before[:, 0]) / self.dt
 
 
 class HalfCheetahVelEnv(_HalfCheetah):

@@ -121,11 +121,10 @@ class HumanoidDir2DEnv(DirectionFamily):
         super()._begin_episodes(copies, rngs)
         self._derive(copies, np.zeros((len(copies), self.model.nu)))
 
-    def _reward_features(self, qpos_before: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    def _movement(self, qpos_before: np.ndarray, actions: np.ndarray) -> np.ndarray:
         before = self._centre_of_mass.copy()
         self._derive(np.arange(len(actions)), actions)
-        velocity = (self._centre_of_mass - before) / self.dt
-        return np.column_stack([velocity, np.square(actions).sum(axis=1)])
+        return (self._centre_of_mass - before) / self.dt
 
     def _observations(self) -> np.ndarray:
         return np.concatenate([super()._observations(), self._derived], axis=1)

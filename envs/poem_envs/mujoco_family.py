@@ -20,7 +20,7 @@ from poem_envs.vector import BatchFamily
 class MujocoFamily(MujocoFilms, BatchFamily):
     """Base class of the families of MuJoCo robots.
 
-    A robot sets the class attributes and defines :meth:`_reward_features`, :meth:`_draw_start`
+    A robot sets the class attributes and defines :meth:`_movement`, :meth:`_draw_start`
     where its start is another, and :meth:`_unhealthy` where it can fall. A family on top of it
     defines tasks, reward, and how a task is shown (:meth:`_task_markers`).
 
@@ -32,9 +32,7 @@ class MujocoFamily(MujocoFilms, BatchFamily):
     (most for Humanoid, whose model allows its solver few iterations); apart from it the dynamics
     are Gymnasium's bit for bit.
 
-    **Velocities** of the reward are differences of positions over the control step, ``(after -
-    before) / dt``, both taken from the integrated state. Gymnasium's Ant and Humanoid read body
-    positions, which MuJoCo updates one physics step late.
+    **Velocities** of the reward are differences of integrated positions over the control step.
 
     Images have ``width`` and ``height`` in pixels, and hold at most ``max_geom`` shapes.
 
@@ -100,9 +98,9 @@ class MujocoFamily(MujocoFilms, BatchFamily):
         qvel = self.init_qvel + scale * rng.standard_normal(self.model.nv)
         return qpos, qvel
 
-    def _reward_features(self, qpos_before: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """What the reward of the step just taken depends on, the cost of actions last: a new array
-        ``(n, reward_feature_dim)``, of positions before ``(n, nq)`` and of those that are now.
+    def _movement(self, qpos_before: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """What the reward of the step just taken depends on but for the action, ``(n, ...)``: made
+        of positions before ``(n, nq)`` and of those that are now.
         """
         raise NotImplementedError
 
@@ -131,7 +129,8 @@ class MujocoFamily(MujocoFilms, BatchFamily):
         self._check_divergence(after)
         qpos_before = self._qpos.copy()
         self.states[:] = after
-        return self._reward_features(qpos_before, actions), self._unhealthy()
+        movement = self._movement(qpos_before, actions)
+        return np.column_stack([movement, np.square(actions).sum(axis=1)]), self._unhealthy()
 
     def _integrate(self, actions: np.ndarray) -> np.ndarray:
         """The states after a control step: a view that the next call overwrites."""
@@ -161,9 +160,9 @@ class MujocoFamily(MujocoFilms, BatchFamily):
             copy = int(np.flatnonzero(diverged)[0])
             qpos, qvel = np.split(np.abs(self.states[copy, 1:]), [self.model.nq])
             raise RuntimeError(
-                f"the simulation of {type(self).__name__} diverged at {self._describe(copy)}: "
-                "MuJoCo met a state that is not finite or too large; the state before had "
-                f"max|qpos|={qpos.max():.3g} and max|qvel|={qvel.max():.3g}"
+                f"the simulation of {type(self).__name__} diverged at "
+                f"{self._describe_episode(copy)}: MuJoCo met a state that is not finite or too "
+                f"large; before, max|qpos|={qpos.max():.3g} and max|qvel|={qvel.max():.3g}"
             )
 
     def _observations(self) -> np.ndarray:

@@ -99,10 +99,6 @@ class BatchFamily(TaskFamily):
         name = type(self).__name__
         raise NotImplementedError(f"{name} has no _render_copy(copy, render_mode, task)")
 
-    def _describe(self, copy: int) -> str:
-        """Where a copy's episode is, for error messages."""
-        return self._describe_episode()
-
     def _begin_episode(self, rng: np.random.Generator) -> np.ndarray:
         self._begin_episodes(np.zeros(1, dtype=np.intp), [rng])
         return self._observations()[0]
@@ -197,8 +193,7 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
             )
         self.metadata = {**one.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}
         self.num_envs = num_envs
-        limit = getattr(one, "max_episode_steps", None)
-        self.max_episode_steps = limit if max_episode_steps is None else max_episode_steps
+        self.max_episode_steps = max_episode_steps or getattr(one, "max_episode_steps", None)
         self.render_mode = render_mode
         self.single_observation_space = one.observation_space
         self.single_action_space = one.action_space
@@ -221,7 +216,7 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
             one._allocate(num_envs)
             # no method of this object, which would live as long as the family does
             facts = self._elapsed_steps, self._episodes, self._np_random_seed
-            one._describe = functools.partial(_describe, *facts)  # type: ignore[method-assign]
+            one._describe_episode = functools.partial(_describe, *facts)  # type: ignore[method-assign]
         else:
             self._copies = ProcessCopies(make, num_envs, nthread, one.observation_space)
         self.closed = False
@@ -313,8 +308,7 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         features, terminations = self._copies._advance(actions)
         rewards = self.family.compute_rewards(self._tasks, features)
         observations = self._copies._observations()
-        limit = np.inf if self.max_episode_steps is None else self.max_episode_steps
-        truncations = self._elapsed_steps >= limit
+        truncations = self._elapsed_steps >= (self.max_episode_steps or np.inf)
         infos: dict[str, Any] = {"reward_features": features, **self._copies._step_infos()}
         if "success" in infos:
             self._succeeded |= infos["success"].astype(bool)

@@ -175,7 +175,7 @@ def test_compute_rewards_refuses_wrong_dimensions():
     task_dim, feature_dim = env.task_space.shape[0], env.reward_feature_dim
     with pytest.raises(ValueError, match="task_dim"):
         env.compute_rewards(np.zeros(task_dim + 1), np.zeros(feature_dim))
-    with pytest.raises(ValueError, match="reward_feature_dim"):
+    with pytest.raises(ValueError, match="feature_dim=2"):
         env.compute_rewards(np.zeros(task_dim), np.zeros((3, feature_dim + 1)))
 
 

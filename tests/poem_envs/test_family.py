@@ -98,7 +98,7 @@ class NoSpaces(TaskFamily):
         (
             NoSpaces,
             r"NoSpaces: action_space must be a flat .*Box, bounded.*, but is None; task_space must "
-            r"be a .*Box of shape \(task_dim,\) and dtype float64, .*; reward_feature_dim must be a",
+            r"be a .*Box of shape \(task_dim,\), dtype float64, .*; reward_feature_dim must be a",
         ),
     ],
 )
