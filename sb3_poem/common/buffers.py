@@ -128,7 +128,31 @@ class TaskReplayBuffer(ReplayBuffer):
 
     def at(self, tasks: th.Tensor, slots: th.Tensor) -> TaskBatch:
         """The transitions in slots (...) of tasks (...); next steps follow, round the ring."""
-        return self._gather(tasks * self.rows.shape[1] + slots)
+        words, obs_dim, mark = sum(self.widths), self.obs_dim, self._mark
+        # the very last row repeats another and is never drawn, so that every row has a successor
+        drawable = self.rows.shape[0] * self.rows.shape[1] - 1
+        with_successor = self.rows.as_strided((drawable, words + obs_dim), (words, 1))
+        flat = tasks * self.rows.shape[1] + slots
+        rows = with_successor.index_select(0, flat.reshape(-1))
+        floats = rows.view(th.float32)
+        # what is dense is converted and searched several times as fast
+        marks = rows[:, mark].contiguous()
+        ends = marks.nonzero().view(-1)
+        after_ends = self.ends.index_select(0, marks.index_select(0, ends).abs())
+        floats[:, words:].index_copy_(0, ends, after_ends)
+        ended, terminated = marks != 0, (marks < 0).float()
+        units = rows[:, mark + 1 : words].contiguous().view(th.int16)
+        actions = (units * (1.0 / ACTION_UNITS))[:, : self.action_dim]
+        floats, shape = floats.unflatten(0, flat.shape), flat.shape
+        return TaskBatch(
+            floats[..., :obs_dim],
+            actions.unflatten(0, shape),
+            floats[..., words:],
+            floats[..., mark - 1],
+            terminated.view(shape),
+            floats[..., obs_dim : mark - 1],
+            ended.view(shape),
+        )
 
     def reward_magnitudes(self) -> th.Tensor:
         """(n_tasks,) root mean square of each task's rewards; NaN of a task without any."""
@@ -187,33 +211,6 @@ class TaskReplayBuffer(ReplayBuffer):
         actions = packed.view(np.int16)[..., 2 * (mark + 1) :][..., : self.action_dim]
         np.rint(units, out=actions, casting="unsafe")
         return th.from_numpy(packed).to(self.device), is_end, terminated
-
-    def _gather(self, flat: th.Tensor) -> TaskBatch:
-        """Transitions (...) at row numbers (...) over all tasks."""
-        words, obs_dim, mark = sum(self.widths), self.obs_dim, self._mark
-        # the very last row repeats another and is never drawn, so that every row has a successor
-        drawable = self.rows.shape[0] * self.rows.shape[1] - 1
-        with_successor = self.rows.as_strided((drawable, words + obs_dim), (words, 1))
-        rows = with_successor.index_select(0, flat.reshape(-1))
-        floats = rows.view(th.float32)
-        # what is dense is converted and searched several times as fast
-        marks = rows[:, mark].contiguous()
-        ends = marks.nonzero().view(-1)
-        after_ends = self.ends.index_select(0, marks.index_select(0, ends).abs())
-        floats[:, words:].index_copy_(0, ends, after_ends)
-        ended, terminated = marks != 0, (marks < 0).float()
-        units = rows[:, mark + 1 : words].contiguous().view(th.int16)
-        actions = (units * (1.0 / ACTION_UNITS))[:, : self.action_dim]
-        floats, shape = floats.unflatten(0, flat.shape), flat.shape
-        return TaskBatch(
-            floats[..., :obs_dim],
-            actions.unflatten(0, shape),
-            floats[..., words:],
-            floats[..., mark - 1],
-            terminated.view(shape),
-            floats[..., obs_dim : mark - 1],
-            ended.view(shape),
-        )
 
     def _reserve(self, rows_per_task: int) -> None:
         capacity = self.capacity

@@ -58,18 +58,14 @@ class Trajectory:
         steps = len(self.actions)
         if steps < 1:
             raise ValueError("a trajectory needs at least one step, but `actions` is empty")
-        if len(self.observations) != steps + 1:
-            raise ValueError(
-                f"`observations` must hold one more row than `actions` ({steps + 1}), but holds "
-                f"{len(self.observations)}"
-            )
         if self.latent.ndim != 1:
             raise ValueError(f"`latent` must have shape (latent_dim,), but has {self.latent.shape}")
-        if self.reward_features is not None and len(self.reward_features) != steps:
-            raise ValueError(
-                f"`reward_features` must hold one row a step ({steps}), but holds "
-                f"{len(self.reward_features)}"
-            )
+        for name, rows in (("observations", steps + 1), ("reward_features", steps)):
+            array = getattr(self, name)
+            if array is not None and len(array) != rows:
+                raise ValueError(
+                    f"`{name}` must hold {rows} rows for {steps} actions, but holds {len(array)}"
+                )
 
     def __repr__(self) -> str:
         frames = "" if self.frames is None else f", {len(self.frames)} frames"

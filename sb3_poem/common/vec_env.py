@@ -27,6 +27,8 @@ ABSORBED_WRAPPERS = (TimeLimit, OrderEnforcing, PassiveEnvChecker, Monitor)
 MAKE_VEC_ARGUMENTS = frozenset({"max_episode_steps", "nthread", "num_envs", "vectorization_mode"})
 #: What TaskVecEnv reads of a vectorised environment's infos by itself
 READ_INFOS = {"reward_features", "final_obs", "_final_obs"}
+#: What every copy has one of, and where the vectorised environment holds all of them
+OF_EACH_COPY = {"task": "tasks", "np_random": "np_random", "np_random_seed": "np_random_seed"}
 
 
 class TaskVecEnv(VecEnv):
@@ -259,21 +261,6 @@ class _Copy:
     def unwrapped(self) -> "_Copy":
         return self
 
-    @property
-    def task(self) -> np.ndarray | None:
-        tasks = self._vector_env.tasks
-        return None if tasks is None else tasks[self._index]
-
-    @property
-    def np_random(self) -> np.random.Generator:
-        rngs: Any = self._vector_env.np_random  # one a copy
-        return rngs[self._index]
-
-    @property
-    def np_random_seed(self) -> int:
-        seeds: Any = self._vector_env.np_random_seed
-        return seeds[self._index]
-
     def set_task(self, task: npt.ArrayLike) -> None:
         self._vector_env.set_tasks([np.asarray(task)], copies=[self._index])
 
@@ -289,6 +276,9 @@ class _Copy:
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") or name in self._HIDDEN:
             raise AttributeError(f"a copy of a vectorised task family has no attribute {name!r}")
+        if name in OF_EACH_COPY:
+            of_all = getattr(self._vector_env, OF_EACH_COPY[name])
+            return None if of_all is None else of_all[self._index]
         return getattr(self._vector_env.family, name)
 
 

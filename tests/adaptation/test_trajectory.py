@@ -49,10 +49,10 @@ def test_broken_arrays_are_refused(data):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"observations": np.zeros((3, 2))}, "`observations` must hold one more row"),
+        ({"observations": np.zeros((3, 2))}, "`observations` must hold 4 rows"),
         ({"actions": np.zeros((0, 1))}, "at least one step"),
         ({"latent": np.zeros((1, 4))}, "`latent` must have shape"),
-        ({"reward_features": np.zeros((2, 1))}, "`reward_features` must hold one row a step"),
+        ({"reward_features": np.zeros((2, 1))}, "`reward_features` must hold 3 rows"),
     ],
 )
 def test_shapes_are_checked(changes, message):
