@@ -46,6 +46,8 @@ PRIMITIVES = tuple(
 )
 # At the edges of the picture, as its width and its height count from the lower left corner.
 COMPASS = (("ahead", 0.5, 0.95), ("left", 0.07, 0.5), ("back", 0.5, 0.05), ("right", 0.92, 0.5))
+#: Words, and where in space they stand, ``(3,)``.
+Labels = list[tuple[str, np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -333,10 +335,8 @@ class FilmRenderer(StateRenderer):
         seen = [(labels[i][0], x[i], y[i]) for i in np.flatnonzero(inside)]
         return seen + (list(COMPASS) if marks != "metres" else [])
 
-    def _add_metres(
-        self, start: np.ndarray, width: float, apart: int
-    ) -> list[tuple[str, np.ndarray]]:
-        """Lines across the x axis; their words and where these stand."""
+    def _add_metres(self, start: np.ndarray, width: float, apart: int) -> Labels:
+        """Lines across the x axis."""
         x, y = self._camera.lookat[:2]
         near, far, reach = y - 0.3 * width, y + 0.6 * width, MOST_MARKS // 2 + 2
         middle, labels = round((x - start[0]) / apart), []
@@ -347,10 +347,8 @@ class FilmRenderer(StateRenderer):
             labels.append((f"{apart * number} m", np.array([x, 0.6 * near + 0.4 * y, LAYER])))
         return labels
 
-    def _add_circles(
-        self, start: np.ndarray, width: float, apart: int
-    ) -> list[tuple[str, np.ndarray]]:
-        """Circles around the start; their words and where these stand."""
+    def _add_circles(self, start: np.ndarray, width: float, apart: int) -> Labels:
+        """Circles around the start."""
         look, way = self.look, (self._camera.lookat - start) * (1, 1, 0)
         away = float(np.linalg.norm(way))
         if look.marks == "circles":

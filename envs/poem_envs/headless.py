@@ -32,14 +32,12 @@ def choose_headless_backend() -> None:
     if has_display() or "MUJOCO_GL" in os.environ:
         return
     backend = _offscreen_backend()
-    if backend is not None:
-        os.environ["MUJOCO_GL"] = backend
-        _logger.info("no display: rendering with MUJOCO_GL=%s", backend)
-        return
-    raise RuntimeError(
-        "rendering on a machine without a display needs libEGL or libOSMesa: install libegl1 or "
-        "libosmesa6"
-    )
+    if backend is None:
+        raise RuntimeError(
+            "rendering without a display needs libEGL or libOSMesa: install libegl1 or libosmesa6"
+        )
+    os.environ["MUJOCO_GL"] = backend
+    _logger.info("no display: rendering with MUJOCO_GL=%s", backend)
 
 
 def release_graphics() -> None:

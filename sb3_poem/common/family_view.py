@@ -78,7 +78,7 @@ class FamilyView:
         self.all_tasks: np.ndarray | None = self._get("all_tasks")
         self.shared_dynamics = bool(self._get("shared_dynamics"))
         #: Whether the family has :meth:`compute_potential`
-        self.has_potential = bool(self._get("has_potential", False))
+        self.has_potential = bool(self._get("has_potential"))
         self.spec: EnvSpec | None = self._get("spec")
         #: Of its registration
         self.env_id = None if self.spec is None else self.spec.id
@@ -229,8 +229,8 @@ class FamilyView:
         """Frames of a second of its films."""
         return float(self._get("metadata").get("render_fps", 20))
 
-    def _get(self, name: str, default: Any = None) -> Any:
-        return self.env.get_attr(name, indices=[0])[0] if self.env.has_attr(name) else default
+    def _get(self, name: str) -> Any:
+        return self.env.get_attr(name, indices=[0])[0] if self.env.has_attr(name) else None
 
     def _call(self, method: str, *arguments: Any, dtype: Any = np.float64) -> np.ndarray:
         return np.asarray(self.env.env_method(method, *arguments, indices=[0])[0], dtype=dtype)
