@@ -205,20 +205,17 @@ def vectorised(env: gym.Env | gym.vector.VectorEnv | VecEnv) -> VecEnv:
     """The same environment as a vectorised one of SB3, of one copy if it is not one."""
     if isinstance(env, gym.Env):
         return DummyVecEnv([lambda: env])
-    return as_task_vec_env(env) if isinstance(env, gym.vector.VectorEnv) else env
-
-
-def as_task_vec_env(vector_env: gym.vector.VectorEnv) -> VecEnv:
-    """Gymnasium's vectorised environment of a task family, from ``gym.make_vec``, as one of SB3."""
-    if isinstance(vector_env, TaskFamilyVector):
-        return TaskVecEnv(vector_env)
-    if isinstance(vector_env, gym.vector.SyncVectorEnv):
-        return DummyVecEnv([functools.partial(Monitor, env) for env in vector_env.envs])
-    raise ValueError(
-        f"env is a {type(vector_env).__name__}, but must be gym.make_vec(id, n) of a task family "
-        "(poem_envs.TaskFamily) without wrappers, or SB3's make_vec_env(id, n, vec_env_cls=...) "
-        "with TaskVecEnv, DummyVecEnv or SubprocVecEnv"
-    )
+    if isinstance(env, TaskFamilyVector):
+        return TaskVecEnv(env)
+    if isinstance(env, gym.vector.SyncVectorEnv):
+        return DummyVecEnv([functools.partial(Monitor, single) for single in env.envs])
+    if isinstance(env, gym.vector.VectorEnv):
+        raise ValueError(
+            f"env is a {type(env).__name__}, but must be gym.make_vec(id, n) of a task family "
+            "(poem_envs.TaskFamily) without wrappers, or SB3's make_vec_env(id, n, "
+            "vec_env_cls=...) with TaskVecEnv, DummyVecEnv or SubprocVecEnv"
+        )
+    return env
 
 
 def make_task_vec_env(

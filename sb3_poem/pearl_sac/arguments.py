@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from poem_envs.registration import did_you_mean, plain_id
 from sb3_poem.common.checks import check_number, check_number_or_auto, check_whole
 from sb3_poem.common.precision import hidden_dtype
-from sb3_poem.common.vec_env import as_task_vec_env, make_task_vec_env
+from sb3_poem.common.vec_env import make_task_vec_env, vectorised
 from sb3_poem.pearl_sac.policies import DEFAULT_NET_ARCH
 from sb3_poem.pearl_sac.train_tasks import DEFAULT_TRAIN_TASKS, default_train_tasks
 
@@ -187,7 +187,7 @@ def vectorise(
     None: as many as are worth while.
     """
     if isinstance(env, gym.vector.VectorEnv):
-        return as_task_vec_env(env)
+        return vectorised(env)
     if isinstance(env, gym.Env | VecEnv):
         return env
     if not isinstance(env, str):

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecMoni
 from poem_envs.registration import plain_id
 from sb3_poem import set_task
 from sb3_poem.common.family_view import FamilyView
-from sb3_poem.common.vec_env import TaskVecEnv, as_task_vec_env, make_task_vec_env
+from sb3_poem.common.vec_env import TaskVecEnv, make_task_vec_env, vectorised
 
 SMALL = {"buffer_size": 500, "batch_size": 16, "policy_kwargs": {"net_arch": [8]}, "device": "cpu"}
 POINT = "poem/PointGoal-v0"
@@ -351,7 +351,7 @@ def test_a_task_of_what_is_no_family():
 @pytest.mark.parametrize("mode", ["vector_entry_point", "sync"])
 def test_gymnasiums_vector_environments_are_taken_as_they_are(mode):
     vector_env = gym.make_vec(POINT, 2, vectorization_mode=mode, step_length=0.1)
-    env = as_task_vec_env(vector_env)
+    env = vectorised(vector_env)
     family = FamilyView.for_training(env)
     assert (family.num_envs, family.horizon, family.env_id, family.env_kwargs) == (
         2,
@@ -366,4 +366,4 @@ def test_gymnasiums_vector_environments_are_taken_as_they_are(mode):
     with pytest.raises(
         ValueError, match=r"env is a RecordEpisodeStatistics, but must be gym.make_vec\(id, n\)"
     ):
-        as_task_vec_env(gym.wrappers.vector.RecordEpisodeStatistics(vector_env))
+        vectorised(gym.wrappers.vector.RecordEpisodeStatistics(vector_env))
