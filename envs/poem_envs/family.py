@@ -39,7 +39,8 @@ class _NothingToRender:
 def check_definition(family: Any) -> None:
     """Refuse a family whose attributes are not what they must be, and say what would be right."""
     names = ("observation_space", "action_space", "task_space", "reward_feature_dim")
-    observations, actions, tasks, features = given = [getattr(family, name, None) for name in names]
+    given: list[Any] = [getattr(family, name, None) for name in names]
+    observations, actions, tasks, features = given
     demands = (
         (is_flat(observations), "a flat Box"),
         (is_flat(actions) and actions.is_bounded(), "a flat Box, bounded below and above"),
