@@ -138,6 +138,11 @@ class AntFwdBackEnv(_Ant, DirectionFamily):
     features are $(v_x, v_y, \|action\|_2^2)$.
 
     ## Arguments
+    ```python
+    import gymnasium as gym
+    env = gym.make("poem_envs:poem/AntFwdBack-v0", ctrl_cost_weight=0.5)
+    ```
+
     | Parameter               | Type      | Default | Description                       |
     | ----------------------- | --------- | ------- | --------------------------------- |
     | `forward_reward_weight` | **float** | `1.0`   | Weight of the speed term          |
@@ -200,6 +205,11 @@ class AntGoalEnv(_Ant):
     :class:`AntVelEnv`. `gymnasium.make` truncates episodes after 200 steps.
 
     ## Arguments
+    ```python
+    import gymnasium as gym
+    env = gym.make("poem_envs:poem/AntGoal-v0", ctrl_cost_weight=0.1)
+    ```
+
     | Parameter                  | Type      | Default | Description                     |
     | -------------------------- | --------- | ------- | ------------------------------- |
     | `distance_reward_weight`   | **float** | `1.0`   | Weight of the distance term     |

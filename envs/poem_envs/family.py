@@ -276,9 +276,10 @@ class TaskFamily(gym.Env[np.ndarray, np.ndarray], metaclass=_FamilyType):
         features = np.asarray(features, dtype=np.float64)
         task_dim, feature_dim = self.task_space.shape[0], self.reward_feature_dim
         if tasks.shape[-1:] != (task_dim,):
-            raise ValueError(f"tasks has shape {tasks.shape}, not (..., {task_dim=})")
+            raise ValueError(f"tasks has shape {tasks.shape}, but must have (..., {task_dim=})")
         if features.shape[-1:] != (feature_dim,):
-            raise ValueError(f"features has shape {features.shape}, not (..., {feature_dim=})")
+            needed = f"(..., reward_feature_dim={feature_dim})"
+            raise ValueError(f"features has shape {features.shape}, but must have {needed}")
         return np.asarray(self._reward(tasks, features), dtype=np.float64)[()]
 
     @property

@@ -33,6 +33,7 @@ class MujocoFamily(MujocoFilms, BatchFamily):
     are Gymnasium's bit for bit.
 
     **Velocities** of the reward are differences of integrated positions over the control step.
+    Gymnasium's Ant and Humanoid read body positions, which MuJoCo updates one physics step late.
 
     Images have ``width`` and ``height`` in pixels, and hold at most ``max_geom`` shapes.
 
