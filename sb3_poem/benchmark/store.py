@@ -63,6 +63,7 @@ class Store:
             self.path.parent.mkdir(parents=True, exist_ok=True)
         try:
             self._database = sqlite3.connect(self.path, timeout=BUSY_SECONDS)
+            self._database.row_factory = sqlite3.Row
             about = self._about(create)
         except sqlite3.DatabaseError as error:
             raise ValueError(
@@ -116,10 +117,7 @@ class Store:
     def records(self) -> Iterator[Record]:
         """Finished cells, in the order of their names."""
         order = "SELECT * FROM cells ORDER BY family, method, seed, key"
-        found = self._database.execute(order)
-        names = [column[0] for column in found.description]
-        for values in found.fetchall():
-            row = dict(zip(names, values, strict=True))
+        for row in map(dict, self._database.execute(order).fetchall()):
             packed = {name: json.loads(zlib.decompress(row[name])) for name in PACKED}
             yield Record(**row | packed)
 

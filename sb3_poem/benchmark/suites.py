@@ -420,12 +420,11 @@ _QUESTIONS = Entry(
     compared=QUESTIONS,
     films=(4, 20),
 )
-_GRADED = tuple(name for name in QUESTIONS if METHODS[name].question == "graded")
 _THRESHOLDS = replace(
     _QUESTIONS,
     name="thresholds",
     title="Other thresholds",
-    methods=_GRADED,
+    methods=tuple(name for name in QUESTIONS if METHODS[name].question == "graded"),
     oracles=(OracleSpec(thresholds=(0.3, 1.6)),),
 )
 _MISJUDGED = replace(

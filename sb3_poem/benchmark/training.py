@@ -24,6 +24,7 @@ import yaml
 from poem_envs.registration import family_name
 from sb3_poem.benchmark.methods import VARIANTS
 from sb3_poem.benchmark.suites import ModelKey, family_id
+from sb3_poem.common.checks import check_whole
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.files import write_json_atomically
 from sb3_poem.common.vec_env import vectorised
@@ -112,9 +113,8 @@ def training_plan(key: ModelKey) -> TrainingPlan:
     if tasks is None:
         tasks = facts.n_train_tasks
     each = hyperparameters.get("trajectories_per_task", 1)
-    for name, number in (("n_train_tasks", tasks), ("trajectories_per_task", each)):
-        if not isinstance(number, int) or number < 1:
-            raise ValueError(f"{name} must be a whole number of at least 1, got {number!r}")
+    check_whole("n_train_tasks", tasks, 1)
+    check_whole("trajectories_per_task", each, 1)
     copies = int(hyperparameters.get("n_envs") or default_copies(facts.env_id, tasks, each))
     rollouts = in_whole_waves(tasks * each, copies)
     if variant.algorithm == "poem_sac" and not facts.shared_dynamics:

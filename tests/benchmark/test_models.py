@@ -290,9 +290,9 @@ def test_a_named_folder_without_a_model(tmp_path: Path) -> None:
         (["--device", "gpu"], "--device gpu: there is no such device"),
         (
             ["--params", "trajectories_per_task:0"],
-            "trajectories_per_task must be a whole number of at least 1, got 0",
+            "`trajectories_per_task` must be at least 1, but is 0",
         ),
-        (["--params", "n_train_tasks:few"], "n_train_tasks must be a whole number .*, got 'few'"),
+        (["--params", "n_train_tasks:few"], "`n_train_tasks` must be a whole number, but is 'few'"),
         (
             ["--params", "net_arch:{'pi': [64]}"],
             "--params net_arch:.*: .* is a dictionary; write it as text",
