@@ -68,8 +68,6 @@ class _Active:
 class SessionManager:
     """All sessions of a server. Its methods belong to one event loop.
 
-    :param queue: Where turns are made.
-    :param models: Those that may be chosen.
     :param options: Of the adaptations, JSON-ready.
     :param n_queries: Questions before the first result, and between results.
     :param max_sessions: How many people may be at work at once.
@@ -158,12 +156,6 @@ class SessionManager:
         path = self.store.videos / row["video"]
         return path if path.is_file() else None
 
-    async def _before(self, question: int | None) -> dict[str, Any]:
-        """The conversation up to a question's turn."""
-        if question is None:
-            return {}
-        return await asyncio.to_thread(self.store.adapter_data, question)
-
     def model_of(self, session: Session) -> ModelInfo:
         """A session's model; refuses one that is not this server's."""
         info = self.model(session.model)
@@ -234,7 +226,10 @@ class SessionManager:
             self._keep_only(active, key.question, key)
             job = active.jobs.get(key)
             if job is None or _has_failed(job):
-                request = self._request(session, key, await self._before(key.question))
+                before: dict[str, Any] = {}
+                if key.question is not None:
+                    before = await asyncio.to_thread(self.store.adapter_data, key.question)
+                request = self._request(session, key, before)
                 job = active.jobs[key] = self.queue.submit(request, Priority.WAITED_FOR)
             job.priority = Priority.WAITED_FOR
             made, video = await asyncio.shield(job.done), job.request.video
@@ -256,14 +251,13 @@ class SessionManager:
         active = self._active[session.id]
         kind = "result" if answered + 1 >= session.target else "question"
         self._keep_only(active, question)
-        answers = ANSWERS[session.question][::-1]
-        if all(_Key(question, answer.value, kind) in active.jobs for answer in answers):
+        answers = {_Key(question, one.value, kind): one for one in ANSWERS[session.question][::-1]}
+        if answers.keys() <= active.jobs.keys():
             return
-        before = await self._before(question)
+        before = await asyncio.to_thread(self.store.adapter_data, question)
         if active.kept != (question, None):  # it has been answered meanwhile
             return
-        for answer in answers:
-            key = _Key(question, answer.value, kind)
+        for key, answer in answers.items():
             if key in active.jobs:
                 continue
             try:

@@ -168,11 +168,11 @@ class Store:
 
     def sessions(self) -> list[Session]:
         """All sessions, the oldest first."""
-        return [_session(row) for row in self._all("SELECT * FROM sessions ORDER BY id")]
+        return [_session(row) for row in self._execute("SELECT * FROM sessions ORDER BY id")]
 
     def answers(self, session: int) -> list[sqlite3.Row]:
         """The rows of the answers in force, in order, with their films' ``fps`` and ``frames``."""
-        return self._all(
+        return self._execute(
             "SELECT answers.*, turns.fps, turns.frames "
             "FROM answers JOIN turns ON turns.id = answers.question "
             "WHERE answers.session = ? AND undone IS NULL ORDER BY answers.number",
@@ -202,7 +202,7 @@ class Store:
             ORDER BY answers.number"""
         return [
             {"preference": row["preference"], **json.loads(row["trajectories"])}
-            for row in self._all(query, session, before)
+            for row in self._execute(query, session, before)
         ]
 
     def adapter_data(self, turn: int) -> dict[str, Any]:
@@ -253,9 +253,8 @@ class Store:
 
     def mark_shown(self, turn: int) -> None:
         """Note that a turn has been shown, the first time."""
-        with self._transaction() as execute:
-            now = (time.time(), turn)
-            execute("UPDATE turns SET shown = ? WHERE id = ? AND shown IS NULL", now)
+        put = "UPDATE turns SET shown = ? WHERE id = ? AND shown IS NULL"
+        self._execute(put, time.time(), turn)
 
     def add_answer(self, session: int, question: int, preference: str) -> int:
         """Keep an answer to a question's turn, if that one waits: once this returns, it is on the
@@ -315,8 +314,7 @@ class Store:
 
     def stop(self, session: int, stopped: int) -> None:
         """Show the result after the answers so far; 0 goes back to the question that waited."""
-        with self._transaction() as execute:
-            execute("UPDATE sessions SET stopped = ? WHERE id = ?", (stopped != 0, session))
+        self._execute("UPDATE sessions SET stopped = ? WHERE id = ?", stopped != 0, session)
 
     def judge(self, session: int, result: int, verdict: str) -> None:
         """Keep what the person says of the result that is shown; "not quite" asks for more
@@ -339,14 +337,13 @@ class Store:
         """Keep what the person wants, in their own words; a wish that is too long is refused."""
         fits = len(wish) <= MAX_WISH
         _insist(fits, f"what you wish for may be {MAX_WISH} characters long at most")
-        with self._transaction() as execute:
-            execute("UPDATE sessions SET wish = ? WHERE id = ?", (wish, session))
+        self._execute("UPDATE sessions SET wish = ? WHERE id = ?", wish, session)
 
     def records(self, session: int | None = None) -> list[sqlite3.Row]:
         """The answers of one session or of all, with their questions, those taken back too, in the
         order of time.
         """
-        return self._all(
+        return self._execute(
             """SELECT sessions.id AS session, sessions.source, sessions.model, sessions.env_id,
                 sessions.seed, sessions.options, sessions.wish, answers.number, answers.preference,
                 turns.repeats,
@@ -364,7 +361,7 @@ class Store:
 
     def remove_orphans(self) -> int:
         """Delete videos that no turn names, as of answers that were not given; returns how many."""
-        kept = {row["video"] for row in self._all("SELECT video FROM turns")}
+        kept = {row["video"] for row in self._execute("SELECT video FROM turns")}
         old = time.time() - 60  # a younger one's turn may be still to come
         files = [file for file in self.videos.iterdir() if file.stat().st_mtime < old]
         orphans = [file for file in files if file.is_file() and file.name not in kept]
@@ -411,10 +408,9 @@ class Store:
         return self._connection.execute(statement, values).lastrowid or 0
 
     def _one(self, query: str, *arguments: Any) -> sqlite3.Row | None:
-        with self._locked():
-            return self._connection.execute(query, arguments).fetchone()
+        return next(iter(self._execute(query, *arguments)), None)
 
-    def _all(self, query: str, *arguments: Any) -> list[sqlite3.Row]:
+    def _execute(self, query: str, *arguments: Any) -> list[sqlite3.Row]:
         with self._locked():
             return self._connection.execute(query, arguments).fetchall()
 
