@@ -57,8 +57,7 @@ def export_minari(store: Store, name: str, undone: bool = False) -> dict[str, Pa
         has_versions = [*families.values()].count(family) > 1
         family = re.sub(r"[^\w/-]", "_", env_id if has_versions else family)
         dataset = datasets[env_id] = f"{family}/{name}"
-        if get_dataset_path(dataset).exists():
-            where = get_dataset_path(dataset)
+        if (where := get_dataset_path(dataset)).exists():
             raise ValueError(f"there is a Minari data set {dataset} already, in {where}")
     written: dict[str, Path] = {}
     try:

@@ -212,8 +212,8 @@ def session_rule(options: dict[str, Any]) -> Rule:
     """The rule that a session's options name; who answers is inferred, unless they say how often
     that person errs.
     """
-    infers = "mistake_rate" not in options
-    return named_rule(**{**({"noise_model": INFER} if infers else {}), **options})
+    usual = {} if "mistake_rate" in options else {"noise_model": INFER}
+    return named_rule(**{**usual, **options})
 
 
 def make_turn(request: TurnRequest) -> Turn:

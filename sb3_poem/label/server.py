@@ -40,7 +40,6 @@ _logger = logging.getLogger(__name__)
 PAGE = Path(__file__).with_name("page")
 #: Pictures of families, which docs/pictures.py makes
 ROBOTS = PAGE / "static" / "robots"
-LONGEST_TOKEN = 64
 DISK_FULL = (
     "This could not be kept: the disk of this server is full, or cannot be written. What you "
     "answered before is safe; tell whoever runs the page, and try again when there is room."
@@ -109,8 +108,7 @@ class _Pages:
         """Of requests that belong to the session of the address's token."""
 
         async def find_session(request: Request) -> Response:
-            token = request.path_params["token"]
-            session = await self.sessions.find(token) if len(token) <= LONGEST_TOKEN else None
+            session = await self.sessions.find(request.path_params["token"])
             if session is None:
                 await asyncio.sleep(0.05)
                 raise HTTPException(404, LOST)
