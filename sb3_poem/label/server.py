@@ -224,7 +224,8 @@ async def _fields(request: Request, **kinds: type) -> dict[str, Any]:
         raise HTTPException(400, f"the request must be a JSON object with {names}")
     for name, kind in kinds.items():
         value: Any = data[name]
-        if type(value) is not kind or (kind is int and not 0 <= value <= LARGEST):
+        is_kind = isinstance(value, kind) and not isinstance(value, bool)
+        if not is_kind or (kind is int and not 0 <= value <= LARGEST):
             what = "a whole number" if kind is int else "a text"
             raise HTTPException(400, f"`{name}` must be {what}")
         if kind is str and any("\ud800" <= character <= "\udfff" for character in value):
