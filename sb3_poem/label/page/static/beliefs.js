@@ -38,31 +38,39 @@ function drawBelief(svg, belief) {
   ({ speed: drawSpeed, direction: drawDirection, place: drawPlane, projection: drawPlane })[belief.picture](svg, belief);
 }
 
+// Shares of the posterior, along an arc that begins at an angle and turns by another.
+function drawMass(svg, shares, start, turn) {
+  shares.forEach((share, i) => {
+    if (share < 0.02) return;
+    const from = start + (turn * i) / shares.length;
+    const d = arc(78, from, from + turn / shares.length);
+    shape(svg, "path", { d, class: "mass", "stroke-opacity": 0.12 + 0.88 * share });
+  });
+}
+
+function drawNeedle(svg, length, angle) {
+  const [x2, y2] = polar(length, angle);
+  shape(svg, "line", { x1: 0, y1: 0, x2, y2, class: "needle" });
+  shape(svg, "circle", { cx: 0, cy: 0, r: 5, class: "hub" });
+}
+
 function drawSpeed(svg, belief) {
   svg.setAttribute("viewBox", "-110 -100 220 122");
   const angle = (speed) => Math.PI * (1 - Math.min(1, Math.max(0, speed / belief.extent)));
-  const bins = 36;
   shape(svg, "path", { d: arc(78, Math.PI, 0), class: "track" });
-  const heights = histogram(belief.points.map((p) => p[0]), belief.weights, 0, belief.extent, bins, false);
-  heights.forEach((height, i) => {
-    if (height < 0.02) return;
-    const from = Math.PI * (1 - i / bins);
-    shape(svg, "path", { d: arc(78, from, from - Math.PI / bins), class: "mass", "stroke-opacity": 0.12 + 0.88 * height });
-  });
+  const speeds = belief.points.map((p) => p[0]);
+  drawMass(svg, histogram(speeds, belief.weights, 0, belief.extent, 36, false), Math.PI, -Math.PI);
   for (let speed = 0; speed <= belief.extent; speed++) {
     const [x, y] = polar(98, angle(speed));
     shape(svg, "text", { x, y: y + 4, class: "tick" }, String(speed));
   }
-  const [x, y] = polar(62, angle(belief.estimate[0]));
-  shape(svg, "line", { x1: 0, y1: 0, x2: x, y2: y, class: "needle" });
-  shape(svg, "circle", { cx: 0, cy: 0, r: 5, class: "hub" });
+  drawNeedle(svg, 62, angle(belief.estimate[0]));
   shape(svg, "text", { x: 0, y: 18, class: "tick" }, belief.unit);
 }
 
 function drawDirection(svg, belief) {
-  const line = belief.points.every((p) => Math.abs(p[1]) < 1e-6);
-  svg.setAttribute("viewBox", line ? "-120 -48 240 96" : "-110 -110 220 220");
-  if (line) {
+  if (belief.points.every((p) => Math.abs(p[1]) < 1e-6)) { // forward or backward
+    svg.setAttribute("viewBox", "-120 -48 240 96");
     const right = belief.points.reduce((sum, p, i) => sum + (p[0] >= 0 ? belief.weights[i] : 0), 0);
     [[-1, 1 - right], [1, right]].forEach(([way, share]) => {
       const d = `M${way * 8} -14H${way * 60}V-30L${way * 104} 0L${way * 60} 30V14H${way * 8}Z`;
@@ -73,18 +81,11 @@ function drawDirection(svg, belief) {
     return;
   }
   svg.setAttribute("viewBox", "-140 -114 280 228");
-  const bins = 48;
   shape(svg, "circle", { cx: 0, cy: 0, r: 78, class: "track" });
   name(svg, belief.words, 94);
   const angles = belief.points.map((p) => Math.atan2(p[1], p[0]));
-  histogram(angles, belief.weights, -Math.PI, Math.PI, bins, true).forEach((height, i) => {
-    if (height < 0.02) return;
-    const from = -Math.PI + (2 * Math.PI * i) / bins;
-    shape(svg, "path", { d: arc(78, from, from + (2 * Math.PI) / bins), class: "mass", "stroke-opacity": 0.12 + 0.88 * height });
-  });
-  const [x, y] = polar(60, Math.atan2(belief.estimate[1], belief.estimate[0]));
-  shape(svg, "line", { x1: 0, y1: 0, x2: x, y2: y, class: "needle" });
-  shape(svg, "circle", { cx: 0, cy: 0, r: 5, class: "hub" });
+  drawMass(svg, histogram(angles, belief.weights, -Math.PI, Math.PI, 48, true), -Math.PI, 2 * Math.PI);
+  drawNeedle(svg, 60, Math.atan2(belief.estimate[1], belief.estimate[0]));
 }
 
 // The words for right, upwards, left and downwards, as far from the middle; the films have the same directions.

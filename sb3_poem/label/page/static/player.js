@@ -77,10 +77,7 @@ class Player {
   }
 
   step(by) {
-    this.wantsToPlay = false;
-    this.video.pause();
     this.seek((this.frame + by + this.frames) % this.frames);
-    this.showState();
   }
 
   seek(frame) {
@@ -102,10 +99,9 @@ class Player {
       }
       canvas.getContext("2d").drawImage(this.video, index * part, 0, part, height, 0, 0, part, height);
     });
-    const frame = this.frame;
-    this.drawn = frame;
-    this.controls.frame.value = String(frame);
-    const seconds = (frame / this.fps).toFixed(1);
+    this.drawn = this.frame;
+    this.controls.frame.value = String(this.drawn);
+    const seconds = (this.drawn / this.fps).toFixed(1);
     this.controls.moment.textContent = `${seconds} s`;
     this.controls.frame.setAttribute("aria-valuetext", `${seconds} seconds`);
   }

@@ -345,12 +345,10 @@ const KEYS = {
   ArrowLeft: () => answer("left"),
   ArrowRight: () => answer("right"),
   u: undo,
-  U: undo,
   r: race,
-  R: race,
   f: fullScreen,
-  F: fullScreen,
   Escape: () => document.fullscreenElement && fullScreen(), // where the browser does not leave by itself
+  " ": () => player.toggle(),
   ",": () => player.step(-1),
   ".": () => player.step(1),
 };
@@ -365,13 +363,10 @@ document.addEventListener("keydown", (event) => {
   if (!byId("keys").checked) return;
   const control = event.target.closest("input, button, a, summary"); // has a meaning for some keys
   if (control && (event.key === " " || (event.key.startsWith("Arrow") && control.matches("input")))) return;
-  if (event.key === " ") {
-    event.preventDefault();
-    player.toggle();
-  } else if (KEYS[event.key]) {
-    event.preventDefault();
-    KEYS[event.key]();
-  }
+  const meant = KEYS[event.key] ?? KEYS[event.key.toLowerCase()];
+  if (!meant) return;
+  event.preventDefault();
+  meant();
 });
 
 let wishTimer = null;
