@@ -59,6 +59,8 @@ ten to pairs, by the same rule and on the same tasks, or not distinguishable (?)
 SIGNS = {"ahead": "+", "behind": "-", "not distinguishable": "?", "": ""}
 #: What else is to be known of a family's figures
 REMARKS = {
+    "AntDir2D": "Of kinds of questions, seeds 1 and 2 were trained anew on another processor, whose "
+    "numbers round differently.",
     "MetaWorldML10": "The likelihood that `Bayes` has by default here was chosen by what another "
     "model earned on these test tasks.",
 }
@@ -475,7 +477,7 @@ are not comparable with those here.
 
 **What was not measured.** With the models that ship: all methods on seven of the paper's nine
 families; answers with errors, but for `Bayes()` where a table says so; ablations and tolerances;
-kinds of questions, but on HalfCheetahVel.
+kinds of questions, but on HalfCheetahVel and AntDir2D.
 `sb3-poem benchmark run --suite table3 --seeds 3 --snapshots 1 --list` says what each would take.
 """
     return "\n".join([head, *(family_section(family) for family in FAMILIES)])
