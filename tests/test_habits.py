@@ -457,6 +457,14 @@ def copies(env: gym.Env) -> gym.Env:
     return pickle.loads(pickle.dumps(copy.deepcopy(env)))
 
 
+def copies_of_a_robot(_: Path) -> bool:
+    env = gym.make(CHEETAH)
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    copied, action = copies(env), env.action_space.sample()
+    return np.array_equal(copied.step(action)[0], env.step(action)[0])
+
+
 def film_of_a_question(folder: Path) -> bool:
     PreferenceAdapter(trained(), POINT_GOAL, render=True).ask().to_video(folder / "question.gif")
     return (folder / "question.gif").stat().st_size > 0
@@ -518,6 +526,7 @@ ENVIRONMENTS = [
     works("reset seed", lambda _: tasks(point()) == tasks(point())),
     works("spec", lambda _: gym.spec(POINT_GOAL).max_episode_steps, 25),
     works("deepcopy", lambda _: tasks(copies(point())) == tasks(point())),
+    works("deepcopy of a robot that has moved", copies_of_a_robot),
     works(
         "the adapter's environment",
         lambda _: PreferenceAdapter(trained(), POINT_GOAL).env.num_envs,

@@ -82,6 +82,10 @@ class MujocoFamily(MujocoFilms, BatchFamily):
         low, high = self.model.actuator_ctrlrange.astype(np.float32).T
         self.action_space = spaces.Box(low, high, dtype=np.float32)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """All but threads and graphics, which a copy makes for itself."""
+        return {**vars(self), "_rollout": None, "_renderer": None, "_film_renderer": None}
+
     @property
     def dt(self) -> float:
         """Seconds in a control step."""
