@@ -134,7 +134,9 @@ def check_arguments(given: Mapping[str, Any], algorithm: type) -> None:
 def warn_of_idle_callbacks(callback: BaseCallback, total_timesteps: int, n_envs: int) -> None:
     """Say which of SB3's callbacks, which count a step of all copies as one call, never act."""
     calls = -(-total_timesteps // n_envs)
-    for each in getattr(callback, "callbacks", [callback]):
+    found = [callback]
+    for each in found:
+        found += getattr(each, "callbacks", ())  # a progress bar puts a list into another
         for name in ("save_freq", "eval_freq"):
             every = getattr(each, name, 0)
             if isinstance(every, int) and every - each.n_calls % max(every, 1) > calls:

@@ -76,11 +76,13 @@ def test_every_must_be_positive(tmp_path: Path) -> None:
         AdaptationEvalCallback(record_at=(0, -1))
 
 
-def test_a_callback_that_never_acts_is_told(tmp_path: Path) -> None:
+@pytest.mark.filterwarnings("ignore:rich is experimental")
+@pytest.mark.parametrize("bar", [False, True])  # which SB3 puts beside a list, in another
+def test_a_callback_that_never_acts_is_told(tmp_path: Path, bar: bool) -> None:
     model = small(PEARLSAC)
     calls = EPOCH // model.n_envs  # SB3 counts a step of all copies as one
     with pytest.warns(UserWarning, match=f"save_freq={EPOCH} counts calls.* pass {calls}$"):
-        model.learn(EPOCH, [CheckpointCallback(EPOCH, str(tmp_path / "never"))])
+        model.learn(EPOCH, [CheckpointCallback(EPOCH, str(tmp_path / "never"))], progress_bar=bar)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         model.learn(EPOCH, CheckpointCallback(calls, str(tmp_path / "once")))
