@@ -253,6 +253,10 @@ LEARN = [
         seen_by_a_function,
         {"infos", "rewards", "dones", "actions", "new_obs"}.issubset,
     ),
+    works(
+        "StopTrainingOnMaxEpisodes verbose",
+        lambda _: "the POEMSAC model" in printed(lambda: called(STOP(1, verbose=1))),
+    ),
     works("a function that stops", lambda _: called(lambda *_: False).num_timesteps, N_TASKS),
     works("progress_bar", lambda _: "600/600" in printed(lambda: called(None, progress_bar=True))),
     works("log_interval", logged, [2 * EPOCH, 4 * EPOCH]),

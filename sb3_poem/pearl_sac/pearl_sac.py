@@ -339,8 +339,9 @@ class PEARLSAC(SAC):
                 stacklevel=2,
             )
         self.env_id, self.env_kwargs = self.family.env_id, self.family.env_kwargs
+        tb_log_name = tb_log_name or self.algorithm  # which callbacks read, too
         total_timesteps, callback = self._setup_learn(
-            steps, callback, reset_num_timesteps, tb_log_name or self.algorithm, progress_bar
+            steps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
         warn_of_idle_callbacks(callback, steps, self.n_envs)
         callback.on_training_start(locals(), globals())
