@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import copy
 import functools
+import importlib
 import io
 import json
 import pickle
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -282,6 +284,16 @@ def loaded(folder: Path, **arguments: Any) -> POEMSAC:
     return POEMSAC.load(saved(folder), **arguments)
 
 
+def without_its_module(folder: Path) -> float:
+    (folder / "schedules.py").write_text("def rate(progress): return 1e-3")
+    sys.path.insert(0, str(folder))
+    made(learning_rate=importlib.import_module("schedules").rate).save(folder / "model")
+    sys.path.remove(str(folder))
+    del sys.modules["schedules"]
+    others = {"learning_rate": 1e-5, "lr_schedule": lambda _: 1e-5}
+    return POEMSAC.load(folder / "model", custom_objects=others).learning_rate
+
+
 def with_its_parameters(_: Path) -> bool:
     other = made(seed=9)
     other.set_parameters(trained().get_parameters())
@@ -347,6 +359,7 @@ FILES = [
         lambda f: loaded(f, custom_objects={"learning_rate": 1e-5}).learning_rate,
         1e-5,
     ),
+    works("load custom_objects of a module that is gone", without_its_module, 1e-5),
     works("load an argument", lambda f: loaded(f, gamma=0.5).gamma, 0.5),
     works(
         "print_system_info",

@@ -727,7 +727,8 @@ class PEARLSAC(SAC):
             model, env is of another family, or an argument would change what the networks are
         """
         refuse_unknown(kwargs.keys() - inspect.signature(cls).parameters.keys(), cls)
-        saving.check_archive(path, cls, kwargs)
+        check_device(device)
+        saving.check_archive(path, cls, kwargs, custom_objects)
         with saving.reading(path, cls):
             model = super().load(path, None, device, custom_objects, print_system_info, **kwargs)
         model._check_arguments(vars(model))

@@ -96,7 +96,10 @@ def reading(path: str | Path | io.BufferedIOBase, algorithm: type) -> Iterator[N
 
 
 def check_archive(
-    path: str | Path | io.BufferedIOBase, algorithm: type, changes: Mapping[str, Any]
+    path: str | Path | io.BufferedIOBase,
+    algorithm: type,
+    changes: Mapping[str, Any],
+    custom_objects: dict[str, Any] | None = None,
 ) -> None:
     """Refuse a zip of which ``load`` cannot make the model with these changes of arguments, from
     all that it holds but tensors.
@@ -111,7 +114,7 @@ def check_archive(
     with reading(path, algorithm), zipfile.ZipFile(file) as archive:
         if "data" not in archive.namelist():
             raise zipfile.BadZipFile("it holds no data of a model")
-        data = json_to_data(archive.read("data").decode())
+        data = json_to_data(archive.read("data").decode(), custom_objects)
     if (found := data.get("algorithm")) != algorithm.__name__:
         what = f"{path} holds a {found or 'model of another algorithm'}"
         raise ValueError(f"{what}, not a {algorithm.__name__}")
