@@ -151,9 +151,7 @@ class Poisoned(gym.Wrapper):
 
 
 def walks(n: int, family: type[Walk] = Walk, steps: int = 10, **kwargs: Any) -> DummyVecEnv:
-    """Copies of a walk that is cut after some steps. Not registered, so that a model needs
-    ``horizon=steps``.
-    """
+    """Copies of a walk that is cut after some steps. Not registered."""
     return DummyVecEnv([lambda: gym.wrappers.TimeLimit(family(**kwargs), steps) for _ in range(n)])
 
 

@@ -523,6 +523,11 @@ ENVIRONMENTS = [
     ),
     works("make_vec sync", lambda _: on(MADE(vectorization_mode="sync")).n_envs, 3),
     works("GoalFamily", lambda _: made(GoalFamily(FETCH), n_train_tasks=2).horizon, 50),
+    works(
+        "TimeLimit around one's own family",
+        lambda _: made(wrappers.TimeLimit(Toy(), 9)).learn(1).horizon,
+        9,
+    ),
     works("one's own family", lambda _: on(gym.make("Toy-v0")).horizon, 10),
     works("one's own family by its id", lambda _: on("Toy-v0").horizon, 10),
     works("RecordVideo", lambda f: filmed(f, recorder), [".mp4"]),

@@ -96,7 +96,8 @@ class FamilyView:
         is seen, done or paid: those of Gymnasium and SB3 are refused by name, others by the first
         experience, see :meth:`check_experience`.
 
-        :param horizon: Steps of an episode; None reads the time limit of the registration
+        :param horizon: Steps of an episode; None reads the time limit of the registration, or of a
+            ``TimeLimit``
         """
         family = cls(env)
         family._unknown_wrappers = ", ".join(family.unknown_wrappers())
@@ -108,6 +109,8 @@ class FamilyView:
         if limit is None:  # a GoalFamily that was not made by gym.make
             limit = self._get("max_episode_steps")
         steps = horizon if limit is None else limit
+        if steps is None:
+            steps = self._get("_max_episode_steps")  # of a TimeLimit
         if steps is None:
             raise ValueError(
                 "horizon is unknown: register the environment with max_episode_steps, or pass "

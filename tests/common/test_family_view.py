@@ -78,8 +78,9 @@ def test_the_horizon_must_be_known_and_agree() -> None:
     with pytest.raises(
         ValueError, match=r"horizon is unknown: .*max_episode_steps, or pass horizon"
     ):
-        FamilyView.for_training(walks(1))
-    assert FamilyView.for_training(walks(1), 10).horizon == 10
+        FamilyView.for_training(DummyVecEnv([Walk]))
+    assert FamilyView.for_training(DummyVecEnv([Walk]), 10).horizon == 10
+    assert FamilyView.for_training(walks(1)).horizon == 10  # its TimeLimit's
     with pytest.raises(
         ValueError,
         match="horizon is 30, but the environment ends episodes after 25 steps; they must agree",
