@@ -311,6 +311,12 @@ ALGORITHMS = [
         "is an environment; the model that ships is 'PointGoal'",
     ),
     refused(
+        "from_pretrained device",
+        lambda _: POEMSAC.from_pretrained("PointGoal", device="gpu"),
+        "^device gpu...cuda",
+    ),
+    refused("load device", lambda s: POEMSAC.load(s / "poem.zip", device="gpu"), "^device gpu"),
+    refused(
         "from_pretrained of a zip", lambda s: POEMSAC.from_pretrained(s / "poem.zip"), r"\bload\b"
     ),
     refused(

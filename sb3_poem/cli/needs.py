@@ -50,13 +50,9 @@ def parse_pairs(flag: str, pairs: Sequence[str]) -> dict[str, Any]:
 
 def check_device(name: str) -> None:
     """Refuse a ``--device`` that PyTorch does not know."""
-    import torch as th
+    from sb3_poem.common import precision
 
-    try:
-        th.device("cpu" if name == "auto" else name)
-    except RuntimeError as error:
-        known = "there are auto, cpu and cuda"
-        raise ValueError(f"--device {name}: there is no such device; {known}") from error
+    precision.check_device(name, "--device")
 
 
 def import_packages(names: Sequence[str]) -> None:

@@ -23,6 +23,15 @@ ALIGNMENT = 16
 LAYER_NORM_EPS = 1e-5  # of torch's layer_norm
 
 
+def check_device(device: th.device | str, name: str = "device") -> None:
+    """Refuse what PyTorch does not know as a device; it may not be there."""
+    try:
+        th.device("cpu" if device == "auto" else device)
+    except (RuntimeError, TypeError):
+        known = "there are auto, cpu and cuda"
+        raise ValueError(f"{name} {device}: there is no such device; {known}") from None
+
+
 def hidden_dtype(precision: str, device_type: str) -> th.dtype:
     """Type of the hidden layers' arithmetic on a device, "cpu" or "cuda"."""
     check_choice("precision", precision, ("auto", "bf16", "fp32"))

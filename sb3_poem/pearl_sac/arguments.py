@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from poem_envs.registration import did_you_mean, plain_id
 from sb3_poem.common.checks import check_number, check_number_or_auto, check_whole
-from sb3_poem.common.precision import hidden_dtype
+from sb3_poem.common.precision import check_device, hidden_dtype
 from sb3_poem.common.vec_env import make_task_vec_env, vectorised
 from sb3_poem.pearl_sac.policies import DEFAULT_NET_ARCH
 from sb3_poem.pearl_sac.train_tasks import DEFAULT_TRAIN_TASKS, default_train_tasks
@@ -126,6 +126,7 @@ def check_arguments(given: Mapping[str, Any], algorithm: type) -> None:
     if given["shaping_coef"] > 0 and given["gamma"] == 1:
         raise ValueError("shaping_coef must be 0 with gamma=1: staying has no finite value then")
     hidden_dtype(given["precision"], "cpu")  # refuses an unknown name
+    check_device(device)
     if str(device).startswith("cuda") and not th.cuda.is_available():  # which SB3 says nothing of
         what = f"device is {device!r}, but torch sees no CUDA device: the CPU is used"
         warnings.warn(what, stacklevel=3)

@@ -27,7 +27,7 @@ from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.files import write_atomically
 from sb3_poem.common.foreign import environment_of
 from sb3_poem.common.networks import RunningNorm, digest_of
-from sb3_poem.common.precision import hidden_dtype
+from sb3_poem.common.precision import check_device, hidden_dtype
 from sb3_poem.common.random import Generators
 from sb3_poem.common.trajectory import Trajectory
 from sb3_poem.hub import upload

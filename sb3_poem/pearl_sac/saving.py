@@ -25,6 +25,7 @@ from sb3_poem.common.checks import check_whole
 from sb3_poem.common.files import parse_json
 from sb3_poem.common.foreign import check_env_id
 from sb3_poem.common.networks import parse_tensors
+from sb3_poem.common.precision import check_device
 from sb3_poem.hub import FILES
 from sb3_poem.pearl_sac.model_card import model_card
 from sb3_poem.pearl_sac.policies import DEFAULT_NET_ARCH
@@ -295,6 +296,7 @@ def build_model(
 
     :raises ValueError: If something is missing or does not fit; the message names ``source``
     """
+    check_device(device)
     try:
         _check_numbers(algorithm, config, tensors)
         arguments = {**config["arguments"], "device": device, "_init_setup_model": False}
