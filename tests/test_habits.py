@@ -419,6 +419,8 @@ PREDICT = [
         lambda _: trained().policy(trained().policy.obs_to_tensor(OBS)[0]).shape,
         (6, 2),
     ),
+    works("no observation", lambda _: trained().predict(OBS[:0], np.zeros(5))[0].shape, (0, 2)),
+    works("adapted, no observation", lambda _: adapted().predict(OBS[:0])[0].shape, (0, 2)),
     works("evaluate_policy", lambda _: evaluated(points(2))),
     works("evaluate_policy with Monitor", lambda _: evaluated(Monitor(point()))),
 ]

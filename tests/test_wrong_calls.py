@@ -444,6 +444,18 @@ ADAPTERS = [
         "text.zip is truncated",
     ),
     refused(
+        "a factory of nothing",
+        lambda _: evaluated(oracle_factory=lambda **_: None),
+        "oracle_factory...None",
+    ),
+    refused("no tasks", lambda _: evaluate_adaptation(trained(), vec(), 0), "tasks...0"),
+    refused(
+        "an observation without its dimension",
+        lambda _: AdaptedPolicy(trained(), np.zeros(5)).predict(None),
+        "observation",
+        ValueError,
+    ),
+    refused(
         "AdaptedPolicy's latent",
         lambda _: AdaptedPolicy(trained(), np.zeros(3)),
         r"latent...\(3,\)...\(5,\)",

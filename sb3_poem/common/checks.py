@@ -73,7 +73,11 @@ def as_observations(observation: Any, shape: tuple[int, ...]) -> np.ndarray:
         raise ValueError(f"`observation` must be an array, but is {given}")
     if isinstance(observation, dict):
         raise TypeError(f"`observation` must be an array of shape {shape}, but is a dictionary")
-    return np.asarray(observation)
+    array = np.asarray(observation)
+    if array.shape != shape and array.shape[1:] != shape:
+        taken = f"the policy takes {shape}, or several of them"
+        raise ValueError(f"observation has shape {array.shape}, but {taken}")
+    return array
 
 
 def check_choice(name: str, value: Any, allowed: Sequence[object]) -> None:

@@ -111,10 +111,10 @@ class MLP(nn.Module):
         if self.low_precision is not None:
             return self.low_precision.evaluate(x, frozen)
         # a product of two dimensions is no view, so that activations may work in place
-        h = x.reshape(-1, x.shape[-1])
+        h = x.reshape(math.prod(x.shape[:-1]), x.shape[-1])
         for layer in self.hidden:
             h = self.activation(_linear(h, layer, frozen))
-        return _linear(h, self.output, frozen).view(*x.shape[:-1], -1)
+        return _linear(h, self.output, frozen).view(*x.shape[:-1], self.output.out_features)
 
 
 def _linear(x: th.Tensor, layer: nn.Module, frozen: bool) -> th.Tensor:

@@ -242,9 +242,7 @@ class LatentPolicy(SACPolicy):
         obs = obs.astype(np.float32, copy=False)
         single = obs.ndim == 1
         obs = np.atleast_2d(obs)
-        n, d, expected = len(obs), self.latent_dim, self.observation_space.shape
-        if (shape := obs.shape[1:]) != expected:
-            raise ValueError(f"observation has shape {shape}, but the policy takes {expected}")
+        n, d = len(obs), self.latent_dim
         if not (finite := np.isfinite(obs).all(axis=1)).all():
             raise ValueError(f"observation {int(np.argmin(finite))} holds NaN or infinity")
         if state is None and not self._warned_of_no_latent:

@@ -108,7 +108,7 @@ def test_predict_without_determinism_explores(poem: POEMSAC) -> None:
         (OBS, np.zeros((6, 4)), r"state has shape \(6, 4\)"),
         (OBS, np.zeros((1, 6, 5)), r"state has shape"),
         (OBS[0], np.zeros((2, 5)), r"state has shape \(2, 5\)"),
-        (OBS[:, :1], None, r"observation has shape \(1,\), but the policy takes \(2,\)"),
+        (OBS[:, :1], None, r"observation has shape \(6, 1\), but the policy takes \(2,\)"),
         (np.zeros(3), None, r"observation has shape \(3,\)"),
         (np.where(np.eye(6, 2, -3), np.nan, OBS), None, "observation 3 holds NaN or infinity"),
         (np.where(np.eye(6, 2, -4), np.inf, OBS), None, "observation 4 holds NaN or infinity"),
