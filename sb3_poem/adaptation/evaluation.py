@@ -92,6 +92,9 @@ def adapt_tasks(
     kept = check_whole_numbers("record_at", record_at, 0, n_queries)
     numbered = list(enumerate(tasks, seed))
     oracles = [oracle_factory(env=vec_env, task=task, seed=number) for number, task in numbered]
+    for oracle in oracles:
+        if not callable(oracle):
+            raise TypeError(f"`oracle_factory` must return an oracle, but returned {oracle!r}")
     rule = (Bayes() if rule is None else as_rule(rule)).answered_by(oracles[0])
     settings = [
         Setting(n_queries, library(task) if callable(library) else library, vec_env, task)
@@ -337,6 +340,7 @@ def choose_test_tasks(
     """Tasks as they are, or so many test tasks as :func:`evaluate_adaptation` explains."""
     if tasks is None or isinstance(tasks, (int, np.integer)):
         n_tasks = N_TEST_TASKS if tasks is None else int(tasks)
+        check_whole("tasks", n_tasks, 1)
         return FamilyView.for_training(vec_env, model.horizon).test_tasks(n_tasks, seed)
     return _check_tasks(tasks, vec_env)
 
