@@ -261,6 +261,11 @@ ALGORITHMS = [
         "callback must be an object...class .*CheckpointCallback",
     ),
     refused(
+        "functions in a list",
+        lambda _: made().learn(1, [lambda *_: True]),
+        "callback must be...list...function.*is .<function",
+    ),
+    refused(
         "set_env",
         lambda _: made().set_env(gym.make("Pendulum-v1")),
         "task family|spaces do not match",
@@ -306,16 +311,16 @@ ALGORITHMS = [
         "from_pretrained", lambda _: POEMSAC.from_pretrained("PointGaol"), "PointGaol...PointGoal"
     ),
     refused(
-        "from_pretrained of an id",
-        lambda _: POEMSAC.from_pretrained("poem/PointGoal-v0"),
-        "is an environment; the model that ships is 'PointGoal'",
-    ),
-    refused(
         "from_pretrained device",
         lambda _: POEMSAC.from_pretrained("PointGoal", device="gpu"),
         "^device gpu...cuda",
     ),
     refused("load device", lambda s: POEMSAC.load(s / "poem.zip", device="gpu"), "^device gpu"),
+    refused(
+        "from_pretrained of an id",
+        lambda _: POEMSAC.from_pretrained("poem/PointGoal-v0"),
+        "is an environment; the model that ships is 'PointGoal'",
+    ),
     refused(
         "from_pretrained of a zip", lambda s: POEMSAC.from_pretrained(s / "poem.zip"), r"\bload\b"
     ),
@@ -434,16 +439,6 @@ ADAPTERS = [
         "oracle_factory...ReturnOracle",
     ),
     refused(
-        "evaluate tasks", lambda _: evaluated(tasks=[[1.0, 2.0]]), r"\(n_tasks, 1\)...\(1, 2\)"
-    ),
-    argument(evaluated, "record_at", (), "at least one"),
-    refused("AdaptedPolicy of nothing", lambda s: AdaptedPolicy.load(s / "no"), "no such file"),
-    refused(
-        "AdaptedPolicy of a text",
-        lambda s: AdaptedPolicy.load(s / "text.zip"),
-        "text.zip is truncated",
-    ),
-    refused(
         "a factory of nothing",
         lambda _: evaluated(oracle_factory=lambda **_: None),
         "oracle_factory...None",
@@ -454,6 +449,16 @@ ADAPTERS = [
         lambda _: AdaptedPolicy(trained(), np.zeros(5)).predict(None),
         "observation",
         ValueError,
+    ),
+    refused(
+        "evaluate tasks", lambda _: evaluated(tasks=[[1.0, 2.0]]), r"\(n_tasks, 1\)...\(1, 2\)"
+    ),
+    argument(evaluated, "record_at", (), "at least one"),
+    refused("AdaptedPolicy of nothing", lambda s: AdaptedPolicy.load(s / "no"), "no such file"),
+    refused(
+        "AdaptedPolicy of a text",
+        lambda s: AdaptedPolicy.load(s / "text.zip"),
+        "text.zip is truncated",
     ),
     refused(
         "AdaptedPolicy's latent",

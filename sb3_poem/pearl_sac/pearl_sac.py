@@ -372,9 +372,12 @@ class PEARLSAC(SAC):
                 f"number of environment steps; an epoch has {self.epoch_steps:,}"
             )
         check_number("total_timesteps", total, 0)
-        known = callback is None or isinstance(callback, BaseCallback | list) or callable(callback)
+        if isinstance(callback, list):
+            known = all(isinstance(each, BaseCallback) for each in callback)
+        else:
+            known = callback is None or isinstance(callback, BaseCallback) or callable(callback)
         if not known or isinstance(callback, type):
-            needed = "an object of a callback's class, a function or a list"
+            needed = "an object of a callback's class, a list of such objects or a function"
             raise TypeError(f"callback must be {needed}, but is {callback!r}")
         if self.verbose > 0:
             epoch = self.epoch_steps
