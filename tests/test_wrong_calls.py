@@ -239,6 +239,11 @@ ALGORITHMS = [
     refused("policy_kwargs misspelt", lambda _: policy(netarch=[8]), "'netarch'...net_arch"),
     refused("widths outside", lambda _: policy(encoder=[8]), r"'encoder'...net_arch=dict\(encoder"),
     argument(made, "policy_kwargs", [64, 64]),
+    argument(policy, "n_critics", 0, "at least 1"),
+    argument(policy, "optimizer_class", "Adam", "must be a class"),
+    argument(made, "seed", 2**32, str(2**32 - 1)),
+    refused("set_random_seed", lambda _: made().set_random_seed(1.5), "`seed`...whole...1.5"),
+    refused("load seed", lambda s: POEMSAC.load(s / "poem.zip", seed="1"), "`seed`...'1'"),
     refused(
         "tensorboard_log", lambda s: made(tensorboard_log=str(s / "text.zip")).learn(1), "text.zip"
     ),

@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from poem_envs.registration import plain_id
 from sb3_poem.common.buffers import ContextStore, Segment, TaskReplayBuffer
-from sb3_poem.common.checks import check_number
+from sb3_poem.common.checks import check_number, check_whole
 from sb3_poem.common.family_view import FamilyView
 from sb3_poem.common.files import write_atomically
 from sb3_poem.common.foreign import environment_of
@@ -307,9 +307,11 @@ class PEARLSAC(SAC):
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """As SB3's: what follows depends on the seed. The training tasks stay."""
-        super().set_random_seed(None if seed is None else int(seed))  # random takes no NumPy's
         if seed is not None:
+            check_whole("seed", seed, 0, 2**32 - 1)
+            seed = int(seed)  # random takes no NumPy's
             self.generators = Generators(seed, self.device)
+        super().set_random_seed(seed)
 
     # ------------------------------------------------------------------ learning: Algorithm 1
 

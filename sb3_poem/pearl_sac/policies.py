@@ -84,6 +84,10 @@ class LatentPolicy(SACPolicy):
     ) -> None:
         if not (isinstance(activation_fn, type) and issubclass(activation_fn, nn.Module)):
             raise TypeError(f"activation_fn must be a class, as nn.ReLU, but is {activation_fn!r}")
+        if not callable(optimizer_class):
+            needed = "a class, as torch.optim.Adam"
+            raise TypeError(f"optimizer_class must be {needed}, but is {optimizer_class!r}")
+        check_whole("n_critics", n_critics, 1)
         optimizer_kwargs = optimizer_kwargs or {}
         others = {"foreach", "differentiable"} & optimizer_kwargs.keys()
         if optimizer_class is th.optim.Adam and not others:
