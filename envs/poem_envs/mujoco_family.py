@@ -104,8 +104,9 @@ class MujocoFamily(MujocoFilms, BatchFamily):
         return qpos, qvel
 
     def _movement(self, qpos_before: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """What the reward of the step just taken depends on but for the action, ``(n, ...)``: made
-        of positions before ``(n, nq)`` and of those that are now.
+        """What the reward of the step just taken depends on, ``(n,)`` or ``(n, k)``: made of
+        positions before ``(n, nq)`` and of those that are now. The last reward feature is added to
+        it, the action's squared length.
         """
         raise NotImplementedError
 

@@ -2,9 +2,9 @@
 
 import time
 from collections.abc import Sequence
-from copy import deepcopy
+from copy import copy as shallow_copy
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -127,7 +127,7 @@ class PointGoalEnv(BatchFamily):
                 for x, y in chosen[number][drawn[number] : now]:
                     trails.disc(x, y, 0.02, _COLOURS[shown[number]])
                 drawn[number] = now
-            canvas = deepcopy(trails)
+            canvas = trails.copy()
             for i, path, now in zip(shown, chosen, moments, strict=True):
                 canvas.disc(path[now][0], path[now][1], 0.07, _COLOURS[i])
             images.append(canvas.image())
@@ -152,6 +152,12 @@ class Canvas:
         line = np.abs(np.hypot(self._x, self._y) - 1.0) - 0.0075
         self._paint(np.maximum(line, -self._y), GREY, self._pixels)
         self.disc(0.0, 0.0, 0.02, GREY)
+
+    def copy(self) -> Self:
+        """One of its own with the same shapes on it."""
+        copied = shallow_copy(self)
+        copied._pixels = self._pixels.copy()
+        return copied
 
     def disc(self, x: float, y: float, radius: float, colour: npt.ArrayLike) -> None:
         """Paint a filled circle around a point."""

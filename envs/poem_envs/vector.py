@@ -361,7 +361,7 @@ class TaskFamilyVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
             rngs[copy] = drawn
 
 
-def _describe(steps: np.ndarray, episodes: np.ndarray, seeds: list[int], copy: int) -> str:
+def _describe(steps: np.ndarray, episodes: np.ndarray, seeds: list[int], copy: int = 0) -> str:
     return (
         f"step {steps[copy]} of episode {episodes[copy]} since reset(seed={seeds[copy]}) in "
         f"environment copy {copy}"

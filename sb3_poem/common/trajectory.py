@@ -60,9 +60,11 @@ class Trajectory:
             raise ValueError("a trajectory needs at least one step, but `actions` is empty")
         if self.latent.ndim != 1:
             raise ValueError(f"`latent` must have shape (latent_dim,), but has {self.latent.shape}")
-        for name, rows in (("observations", steps + 1), ("reward_features", steps)):
-            array = getattr(self, name)
-            if array is not None and len(array) != rows:
+        parts = [("observations", self.observations, steps + 1)]
+        if self.reward_features is not None:
+            parts.append(("reward_features", self.reward_features, steps))
+        for name, array, rows in parts:
+            if len(array) != rows:
                 raise ValueError(
                     f"`{name}` must hold {rows} rows for {steps} actions, but holds {len(array)}"
                 )

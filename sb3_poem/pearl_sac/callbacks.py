@@ -84,7 +84,9 @@ class TrainingCheckpointCallback(EpochCallback):
         self._stops = self._collecting = False
 
     def stop(self) -> None:
-        """End training after the epoch at hand with a checkpoint and a ``KeyboardInterrupt``."""
+        """End training after the epoch at hand with a checkpoint and a ``KeyboardInterrupt``; after
+        the last epoch it has ended without one.
+        """
         self._stops = True
 
     def _on_rollout_start(self) -> None:

@@ -57,6 +57,7 @@ class LatentPolicy(SACPolicy):
         with many observations
     :param latent_dim: Dimension d of the latent
     :param context_has_value: Whether a context transition carries Q(s, a)
+    :param n_critics: Number of critics
     :param optimizer_class: Optimiser of all networks
     :param optimizer_kwargs: Its arguments; Adam is fused unless they say otherwise
     """

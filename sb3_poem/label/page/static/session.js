@@ -5,6 +5,7 @@ const POLL_MILLISECONDS = 150;
 const RETRY_MILLISECONDS = 1000;
 const SLOW_AFTER_MILLISECONDS = 4000;
 const GIVE_UP_MILLISECONDS = 20000; // and ask again: a lost connection may never say so
+const SILENT = ["TimeoutError", "AbortError"]; // of `fetch` then, by the browser
 const base = window.location.pathname.replace(/\/+$/, "");
 const byId = (id) => document.getElementById(id);
 const four = document.querySelector('[data-preference="first"]') !== null;
@@ -32,7 +33,7 @@ function browserStorage() {
 }
 
 async function ask(path, body) {
-  const options = { signal: AbortSignal.timeout(GIVE_UP_MILLISECONDS) };
+  const options = { signal: AbortSignal.timeout?.(GIVE_UP_MILLISECONDS) };
   if (body !== undefined) {
     Object.assign(options, {
       method: "POST",
@@ -43,7 +44,7 @@ async function ask(path, body) {
   }
   const response = await fetch(base + path, options);
   const data = await response.json().catch((error) => {
-    if (error.name === "TimeoutError") throw error;
+    if (SILENT.includes(error.name)) throw error;
     return null;
   });
   if (response.ok && data) return data;
@@ -130,9 +131,9 @@ async function act(path, body) {
   busy = false;
 }
 
-// `fetch` has a TypeError for a server that it does not reach, a TimeoutError for one that is silent.
+// `fetch` has a TypeError for a server that it does not reach.
 function inSentence(error) {
-  if (!["TypeError", "TimeoutError"].includes(error.name)) return error.message;
+  if (!["TypeError", ...SILENT].includes(error.name)) return error.message;
   return "The server does not answer. What you answered is kept in this browser, and sent as soon as it does…";
 }
 
@@ -363,7 +364,7 @@ document.addEventListener("keydown", (event) => {
   if (!byId("keys").checked) return;
   const control = event.target.closest("input, button, a, summary"); // has a meaning for some keys
   if (control && (event.key === " " || (event.key.startsWith("Arrow") && control.matches("input")))) return;
-  const meant = KEYS[event.key] ?? KEYS[event.key.toLowerCase()];
+  const meant = KEYS[event.key] ?? KEYS[event.key?.toLowerCase()];
   if (!meant) return;
   event.preventDefault();
   meant();
