@@ -59,8 +59,8 @@ ten to pairs, by the same rule and on the same tasks, or not distinguishable (?)
 SIGNS = {"ahead": "+", "behind": "-", "not distinguishable": "?", "": ""}
 #: What else is to be known of a family's figures
 REMARKS = {
-    "AntDir2D": "Of kinds of questions, seeds 1 and 2 were trained anew on another processor, which "
-    "rounds differently.",
+    "AntDir2D": "Of kinds of questions, seeds 1 and 2 were trained anew on another processor, "
+    "which rounds differently.",
     "MetaWorldML10": "The likelihood that `Bayes` has by default here was chosen by what another "
     "model earned on these test tasks.",
 }

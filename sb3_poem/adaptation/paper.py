@@ -9,6 +9,7 @@ from sb3_poem.adaptation import queries
 from sb3_poem.adaptation.meta_model import HasSimilarity, MetaModel
 from sb3_poem.adaptation.preference import SIGNS, Preference, preference_log_likelihood
 from sb3_poem.adaptation.priors import SOURCES, Prior, make_prior
+from sb3_poem.adaptation.queries import tolerance
 from sb3_poem.adaptation.rule import (
     Answer,
     Inference,
@@ -133,7 +134,7 @@ class PaperInference(Inference):
         return similarities[:, 0::2] - similarities[:, 1::2]
 
     def _satisfied(self, differences: np.ndarray) -> np.ndarray:
-        slack = queries.tolerance(self.rule.epsilon)
+        slack = tolerance(self.rule.epsilon)
         signs = np.array([SIGNS[answer.preference] for answer in self.answers])
         return np.count_nonzero(differences * signs >= -slack, axis=1)
 
