@@ -19,7 +19,7 @@ import yaml
 from first_hour import ENTRY as SMALL
 from first_hour import write_entry
 from meta_toys import Walk, WindyWalk, differing, parameters
-from rl_zoo3 import ALGOS
+from rl_zoo3 import ALGOS, exp_manager
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import SimpleLinearSchedule
@@ -650,6 +650,17 @@ def test_folders_that_are_no_runs_are_passed_over(tmp_path: Path) -> None:
         (tmp_path / f"poem-PointGoal-v0_{name}").mkdir()
         (tmp_path / f"poem-PointGoal-v0_{name}" / "checkpoint.zip").touch()
     assert last_run(tmp_path, "poem-PointGoal-v0", -1) == tmp_path / "poem-PointGoal-v0_10"
+
+
+def test_no_run_writes_into_the_folder_of_another(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those that begin together count the same runs before them."""
+    monkeypatch.setattr(exp_manager, "get_latest_run_id", lambda *_: 0)
+    for number in (1, 2, 3):
+        assert train("-c", config, "-f", tmp_path, "--seed", number) == 0
+        folder = tmp_path / "poem_sac" / f"poem-PointGoal-v0_{number}"
+        assert POEMSAC.load(folder / "poem-PointGoal-v0").seed == number
 
 
 def test_of_runs_with_a_unique_id_the_newest_is_found(tmp_path: Path) -> None:

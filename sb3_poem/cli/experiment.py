@@ -103,6 +103,19 @@ class FamilyExperiment(ExperimentManager):
         if args.vec_env == "dummy" and vectorises:
             self.vec_env_class = TaskVecEnv
 
+    def create_log_folder(self) -> None:
+        """As rl_zoo3's, but in no folder of another run, as of one that begins at the same time."""
+        name, _, number = self.save_path.rpartition("_")
+        while True:
+            try:
+                os.makedirs(self.save_path)
+                break
+            except FileExistsError:
+                number = str(int(number) + 1)
+                self.save_path = f"{name}_{number}"
+        self.params_path = f"{self.save_path}/{self.env_name}"
+        super().create_log_folder()
+
 
 class PoemExperiment(FamilyExperiment):
     """A meta-training run: evaluated by adaptation to held-out tasks, and resumable from
