@@ -701,10 +701,18 @@ class PEARLSAC(SAC):
     ) -> None:
         """As SB3's.
 
-        :raises ValueError: If it is the experience of other tasks than this model's
+        :raises ValueError: If it is truncated or foreign, or the experience of other tasks than
+            this model's
         """
         own = self.replay_buffer
-        super().load_replay_buffer(path, truncate_last_traj)
+        try:
+            super().load_replay_buffer(path, truncate_last_traj)
+        except OSError:
+            raise
+        except Exception as error:  # what foreign data may raise is no closed list
+            self.replay_buffer = own
+            what = "is truncated, or no replay buffer that save_replay_buffer wrote"
+            raise ValueError(f"{path} {what}: {error}") from error
         tasks, widths = getattr(self.replay_buffer, "tasks", ()), own.widths
         if not np.array_equal(tasks, own.tasks) or self.replay_buffer.widths != widths:
             self.replay_buffer = own
@@ -733,9 +741,9 @@ class PEARLSAC(SAC):
         """
         refuse_unknown(kwargs.keys() - inspect.signature(cls).parameters.keys(), cls)
         check_device(device)
-        saving.check_archive(path, cls, kwargs, custom_objects)
+        file = saving.check_archive(path, cls, kwargs, custom_objects)
         with saving.reading(path, cls):
-            model = super().load(path, None, device, custom_objects, print_system_info, **kwargs)
+            model = super().load(file, None, device, custom_objects, print_system_info, **kwargs)
         model._check_arguments(vars(model))
         if env is not None:
             model.set_env(env, force_reset)

@@ -92,7 +92,8 @@ def reading(path: str | Path | io.BufferedIOBase, algorithm: type) -> Iterator[N
         broken = isinstance(error, BROKEN) or isinstance(error.__cause__, BROKEN)
         if not broken or isinstance(error, th.OutOfMemoryError):
             raise
-        what = f"{path} is truncated, or no model saved by {algorithm.__name__}"
+        file = path.name if isinstance(path, io.BufferedReader) else path
+        what = f"{file} is truncated, or no model saved by {algorithm.__name__}"
         raise ValueError(f"{what}: {error}") from error
 
 
@@ -101,17 +102,14 @@ def check_archive(
     algorithm: type,
     changes: Mapping[str, Any],
     custom_objects: dict[str, Any] | None = None,
-) -> None:
+) -> str | Path | io.BufferedIOBase:
     """Refuse a zip of which ``load`` cannot make the model with these changes of arguments, from
-    all that it holds but tensors.
+    all that it holds but tensors; where it is.
     """
     file = path
     if not isinstance(path, io.BufferedIOBase):
-        _check_is_file(Path(path), algorithm.__name__)
-        file = path if Path(path).is_file() else f"{path}.zip"
-        if not Path(file).is_file():
-            also = "" if Path(path).suffix == ".zip" else f", nor {file}"
-            raise FileNotFoundError(f"there is no file {path}{also}")
+        file = Path(path) if Path(path).is_file() else Path(f"{path}.zip")
+        _check_is_model(file, Path(path), algorithm.__name__)
     with reading(path, algorithm), zipfile.ZipFile(file) as archive:
         if "data" not in archive.namelist():
             raise zipfile.BadZipFile("it holds no data of a model")
@@ -127,6 +125,7 @@ def check_archive(
             why = ": a coefficient that is learned stays one, as does a fixed one"
         if fixed and value != (kept := found.get(name)):
             raise ValueError(f"{name} is {kept!r} in {path}, and cannot become {value!r}{why}")
+    return file
 
 
 def facts_of(path: str | Path) -> dict[str, Any]:
@@ -140,15 +139,18 @@ def facts_of(path: str | Path) -> dict[str, Any]:
         return {}
 
 
-def _check_is_file(path: Path, algorithm: str) -> None:
-    """Refuse what another method reads."""
+def _check_is_model(file: Path, path: Path, algorithm: str) -> None:
+    """Refuse what another method reads, and a file that is not there; ``path`` is as given."""
     what, method = "the name of a model that ships", "from_pretrained"
-    if path.is_file() and facts_of(path).get("keeps_experience"):
-        what, method = "a checkpoint", "load_checkpoint"
+    if file.is_file():
+        if not facts_of(file).get("keeps_experience"):
+            return
+        path, what, method = file, "a checkpoint", "load_checkpoint"
     elif path.is_dir():
         what = "a folder"
-    elif path.with_name(f"{path.name}.zip").is_file() or str(path) not in pretrained_names():
-        return
+    elif str(path) not in pretrained_names():
+        also = "" if path.suffix == ".zip" else f", nor {file}"
+        raise FileNotFoundError(f"there is no file {path}{also}")
     raise ValueError(f"{path} is {what}: use {algorithm}.{method}({str(path)!r})")
 
 

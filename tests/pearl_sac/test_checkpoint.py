@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import resource
 import subprocess
 import sys
@@ -335,6 +336,18 @@ def test_files_that_are_no_checkpoints(tmp_path: Path) -> None:
         assert name in str(caught.value)
     with pytest.raises(FileNotFoundError):
         POEMSAC.load_checkpoint(tmp_path / "nothing.pt")
+
+
+def test_a_damaged_checkpoint_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.zip"
+    small(POEMSAC).save_checkpoint(path)
+    with pytest.raises(ValueError, match=r"checkpoint\.zip is a checkpoint: use POEMSAC"):
+        POEMSAC.load(tmp_path / "checkpoint")
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=f"^{re.escape(str(path))} is truncated, or no model"):
+        POEMSAC.load_checkpoint(path)
 
 
 def test_a_pickle_in_place_of_a_checkpoint_does_not_run(tmp_path: Path) -> None:

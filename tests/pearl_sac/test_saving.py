@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import pickle
 from pathlib import Path
 
 import gymnasium as gym
@@ -203,6 +204,28 @@ def test_a_replay_buffer_of_other_tasks_is_refused(tmp_path: Path, other: dict[s
     foreign().save_replay_buffer(tmp_path / "of_sac")
     with pytest.raises(ValueError, match="of_sac is the experience of other tasks than"):
         model.load_replay_buffer(tmp_path / "of_sac")
+
+
+def test_a_file_that_is_no_replay_buffer_is_refused(poem: POEMSAC, tmp_path: Path) -> None:
+    poem.save_replay_buffer(tmp_path / "buffer")
+    half = (tmp_path / "buffer.pkl").read_bytes()[:2000]
+    poem.save(tmp_path / "model")
+    zipped, other = (tmp_path / "model.zip").read_bytes(), pickle.dumps({"a": "dictionary"})
+    model = POEMSAC.load(tmp_path / "model", POINT_GOAL)
+    for content in (half, zipped, other, b"hello", b""):
+        (tmp_path / "buffer.pkl").write_bytes(content)
+        with pytest.raises(ValueError, match="buffer is truncated, or no replay buffer that"):
+            model.load_replay_buffer(tmp_path / "buffer")
+    assert model.replay_buffer.size() == 0  # its own
+
+
+def test_a_file_beside_a_folder_of_the_same_name(poem: POEMSAC, tmp_path: Path) -> None:
+    poem.save_pretrained(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"model is a folder: use POEMSAC\.from_pretrained"):
+        POEMSAC.load(tmp_path / "model")
+    poem.save(tmp_path / "model")
+    assert_same_model(poem, POEMSAC.load(tmp_path / "model"))
+    assert POEMSAC.from_pretrained(tmp_path / "model").digest == poem.digest
 
 
 def test_a_model_and_its_buffer_go_on_as_if_they_had_never_stopped(tmp_path: Path) -> None:
