@@ -12,17 +12,18 @@ from typing import Any
 
 def write_atomically(path: str | Path, content: bytes | Callable[[BufferedWriter], object]) -> None:
     """Write a file, and missing folders, completely or not at all: a crash, a kill or a full disk
-    leaves the previous file whole. ``content`` may be a function that writes to an open file.
+    leaves the previous file whole. Of a link the file is written to which it leads. ``content`` may
+    be a function that writes to an open file.
     """
-    path = Path(path)
-    temporary = path.parent / f".{path.name}.{uuid.uuid4().hex}"
+    target = Path(os.path.realpath(path))
+    temporary = target.parent / f".{target.name}.{uuid.uuid4().hex}"
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        target.parent.mkdir(parents=True, exist_ok=True)
         with open(temporary, "xb") as file:  # with the permissions that the user's umask leaves
             content(file) if callable(content) else file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        os.replace(temporary, path)
+        os.replace(temporary, target)
     except OSError as error:
         before = "what was there before, if anything, is untouched"
         message = f"could not write {path} ({error.strerror}); {before}"
@@ -31,7 +32,7 @@ def write_atomically(path: str | Path, content: bytes | Callable[[BufferedWriter
         with contextlib.suppress(OSError):
             os.unlink(temporary)
     with contextlib.suppress(OSError):  # not every file system lets a folder be synchronised
-        folder = os.open(path.parent, os.O_RDONLY)
+        folder = os.open(target.parent, os.O_RDONLY)
         try:
             os.fsync(folder)
         finally:

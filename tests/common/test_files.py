@@ -52,6 +52,14 @@ def test_makes_folders_and_takes_strings(tmp_path: Path) -> None:
     assert (tmp_path / "a" / "b" / "c.bin").read_bytes() == b"x"
 
 
+def test_a_link_stays_one(path: Path, tmp_path: Path) -> None:
+    for name, target in (("link", path), ("dangling", tmp_path / "elsewhere" / "new")):
+        (tmp_path / name).symlink_to(target)
+        write_atomically(tmp_path / name, b"after")
+        assert (tmp_path / name).is_symlink()
+        assert target.read_bytes() == b"after"
+
+
 @pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o077, 0o600)])
 def test_permissions_are_those_of_any_new_file(path: Path, umask: int, mode: int) -> None:
     before = os.umask(umask)
