@@ -4,6 +4,7 @@ import json
 import sqlite3
 import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -61,20 +62,26 @@ class Store:
                     f"--store {path}: there is no such file; `sb3-poem benchmark run` makes it"
                 )
             self.path.parent.mkdir(parents=True, exist_ok=True)
-        try:
+        with self._usable():
             self._database = sqlite3.connect(self.path, timeout=BUSY_SECONDS)
             self._database.row_factory = sqlite3.Row
             about = self._about(create)
-        except sqlite3.DatabaseError as error:
-            raise ValueError(
-                f"--store {path} cannot be used as a store of the benchmark: {error}"
-            ) from error
         if about.get("schema") != SCHEMA:
             raise ValueError(
                 f"--store {path} was written in schema {about.get('schema')!r} by sb3_poem "
                 f"{about.get('version')!r}, but this is sb3_poem {__version__}, which reads schema "
                 f"{SCHEMA!r}; use that version, or another file"
             )
+
+    @contextmanager
+    def _usable(self) -> Iterator[None]:
+        """Say which file it is that is damaged, or no store."""
+        try:
+            yield
+        except (sqlite3.DatabaseError, zlib.error) as error:
+            raise ValueError(
+                f"--store {self.path} cannot be used as a store of the benchmark: {error}"
+            ) from error
 
     def _about(self, create: bool) -> dict[str, str]:
         """What the file says about itself; it is made, or completed, first."""
@@ -103,23 +110,25 @@ class Store:
         return key in self.keys()
 
     def keys(self) -> set[str]:
-        return {key for (key,) in self._database.execute("SELECT key FROM cells")}
+        with self._usable():
+            return {key for (key,) in self._database.execute("SELECT key FROM cells")}
 
     def add(self, record: Record) -> bool:
         """Keep a finished cell, and tell whether it is new; if not, what is there stays."""
         row = vars(record) | {name: _pack(getattr(record, name)) for name in PACKED}
         row["created"] = record.created or datetime.now(UTC).isoformat(timespec="seconds")
         names = f"({', '.join(row)}) VALUES (:{', :'.join(row)})"
-        with self._database:
+        with self._usable(), self._database:
             added = self._database.execute(f"INSERT OR IGNORE INTO cells {names}", row)
         return added.rowcount == 1
 
     def records(self) -> Iterator[Record]:
         """Finished cells, in the order of their names."""
         order = "SELECT * FROM cells ORDER BY family, method, seed, key"
-        for row in map(dict, self._database.execute(order).fetchall()):
-            packed = {name: json.loads(zlib.decompress(row[name])) for name in PACKED}
-            yield Record(**row | packed)
+        with self._usable():
+            for row in map(dict, self._database.execute(order).fetchall()):
+                packed = {name: json.loads(zlib.decompress(row[name])) for name in PACKED}
+                yield Record(**row | packed)
 
 
 def _pack(value: dict[str, Any]) -> bytes:

@@ -108,6 +108,24 @@ def test_other_files_are_refused_and_stay_as_they_are(tmp_path: Path) -> None:
     assert not (tmp_path / "missing.sqlite").exists()
 
 
+def test_a_damaged_store_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "store.sqlite"
+    with Store(path) as store:
+        for number in range(60):
+            store.add(some_record(number))
+    content = path.read_bytes()
+    packed = content.index(zlib.compress(b"{", 9)[:2])  # where a column begins
+    pages = content[:4096] + b"\xff" * 2048 + content[6144:]
+    for damaged in (pages, content[:packed] + b"\0" + content[packed + 1 :]):
+        path.write_bytes(damaged)
+        with (
+            pytest.raises(ValueError, match=r"store\.sqlite cannot be used as a store"),
+            Store(path, create=False) as store,
+        ):
+            list(store.records())
+            store.keys()
+
+
 WRITER = """
 import sys
 sys.path[:0] = {path!r}
