@@ -449,6 +449,22 @@ def test_a_session_of_another_model_of_that_name_is_not_gone_on_with(
     assert "question 1 of session 2 was another one" in capsys.readouterr().err
 
 
+def test_answers_are_replayed_to_the_model_that_a_link_led_to(
+    model: tuple[POEMSAC, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model[0].save_pretrained(tmp_path / "run_7")
+    (tmp_path / "latest").symlink_to("run_7")
+    store = tmp_path / "label_data"
+    for folder, name in ((tmp_path, "latest"), (tmp_path / "run_7", ".")):
+        answer_by(monkeypatch, folder, "l\n")
+        flags = ["--oracle", "human", "--queries", 1, "--store", store, *TINY]
+        assert adapt(name, *flags) == 0
+        replayed = ["replay", "--store", str(store), "--model", name, "--json", "replay.json"]
+        assert cli.main(["label", *replayed]) == 0
+        for session in json.loads(Path("replay.json").read_text())["sessions"]:
+            assert session["action_error"] is None  # its own latents, not those most alike
+
+
 @pytest.mark.parametrize("answers", ["", None])
 def test_a_person_without_standard_input_is_told(
     model: tuple[POEMSAC, str],

@@ -158,7 +158,8 @@ class Adaptation:
         answers and the posterior, from which :meth:`PreferenceAdapter.load` continues.
         """
         arguments, subject = self.arguments, self.subject
-        store, name = Store(arguments.store or DEFAULT_STORE), Path(arguments.model).name
+        store = Store(arguments.store or DEFAULT_STORE)
+        name = Path(arguments.model).resolve().name  # by which replay knows it, as "." or a link
         about = (name, subject.env_id, subject.seed, self.options, arguments.queries)
         recorder = StoreRecorder(store, *about, resume=arguments.resume)
         session = recorder.session.id
