@@ -118,12 +118,8 @@ def test_a_damaged_store_is_named(tmp_path: Path) -> None:
     pages = content[:4096] + b"\xff" * 2048 + content[6144:]
     for damaged in (pages, content[:packed] + b"\0" + content[packed + 1 :]):
         path.write_bytes(damaged)
-        with (
-            pytest.raises(ValueError, match=r"store\.sqlite cannot be used as a store"),
-            Store(path, create=False) as store,
-        ):
-            list(store.records())
-            store.keys()
+        with pytest.raises(ValueError, match=r"store\.sqlite cannot be used as a store"):
+            list(Store(path, create=False).records())
 
 
 WRITER = """
